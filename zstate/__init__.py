@@ -1,0 +1,1 @@
+"""A robot's state wherever Zenoh reaches."""

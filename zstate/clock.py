@@ -1,0 +1,61 @@
+"""Where "now" comes from: the system, or the hand of a test.
+
+Nothing in ``model``, ``buffer`` or ``wire`` reads a clock by itself; it is handed one of these.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Two questions about time. Stamps are integer nanoseconds since the Unix epoch."""
+
+    def now(self) -> int:
+        """The present stamp [ns]."""
+        ...
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        """Block until ``stamp``, or until ``stop`` is set. True when the stamp was reached."""
+        ...
+
+
+class SystemClock:
+    """The wall clock of this machine."""
+
+    def now(self) -> int:
+        return time.time_ns()
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        remaining_s = (stamp - time.time_ns()) * 1e-9
+        return not stop.wait(remaining_s) if remaining_s > 0.0 else not stop.is_set()
+
+
+class ManualClock:
+    """A clock that moves only when told to, for tests and for replay by hand."""
+
+    def __init__(self, start: int = 0) -> None:
+        self._now = start
+        self._moved = threading.Condition()
+
+    def now(self) -> int:
+        return self._now
+
+    def set(self, stamp: int) -> None:
+        """Jump to ``stamp``, forwards or backwards, and wake whoever waits for it."""
+        with self._moved:
+            self._now = stamp
+            self._moved.notify_all()
+
+    def advance(self, seconds: float) -> None:
+        """Move forwards by ``seconds``."""
+        self.set(self._now + round(seconds * 1e9))
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        with self._moved:
+            # ``stop`` cannot notify this condition, so it is looked at every 50 ms of real time.
+            while self._now < stamp and not stop.is_set():
+                self._moved.wait(0.05)
+        return not stop.is_set()

@@ -1,0 +1,363 @@
+"""Every exception of zstate, as one tree.
+
+ZStateError
+├── InvalidInput (ValueError)          an argument that cannot be used; nothing was changed
+│   ├── FrameMismatch                  ``a_from_b @ c_from_d`` with b != c
+│   ├── InsertRefused                  the buffer did not take a transform        .reason .edge
+│   └── ConfigError                    a configuration file or option             .path
+├── ModelError (ValueError)            a robot model that cannot be used          .source .findings
+│   └── UnknownModel                   no model of that name                      .name .near_misses
+├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
+├── NetworkError                       Zenoh said no
+│   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
+│   ├── PortBusy                       somebody listens there already             .endpoint
+│   └── Closed                         used after close(), or after fork
+└── LookupFailed                       .target .source .edge .requested .oldest .newest .rate_hz .writer
+    ├── UnknownFrame                   never heard of it                          .name .near_misses
+    ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
+    ├── Disconnected                   two trees                                  .roots
+    ├── NoData                         an edge without any sample
+    ├── InFuture                       asked after the newest sample of an edge
+    ├── InPast                         asked before the oldest sample of an edge
+    └── Stale                          newer data was demanded by ``max_age_s``   .age_s .max_age_s
+
+A wait that ran out raises the reason it was still waiting for, as a subclass that is also
+``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Protocol
+
+
+class ZStateError(Exception):
+    """What every error of zstate is."""
+
+
+class InvalidInput(ZStateError, ValueError):
+    """An argument that cannot be used. Nothing was changed by the call."""
+
+
+class FrameMismatch(InvalidInput):
+    """Two transforms were composed whose inner frames differ."""
+
+
+class InsertRefused(InvalidInput):
+    """The buffer did not take a transform; what it held before is untouched.
+
+    ``reason`` is one word or two for programs and counters ("loop", "second parent", ...);
+    ``edge`` is (parent, child) as given.
+    """
+
+    def __init__(self, message: str, *, reason: str, edge: tuple[str, str]) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.edge = edge
+
+
+class ConfigError(InvalidInput):
+    """A configuration file or option that cannot be used; ``path`` says where in it."""
+
+    def __init__(self, message: str, *, path: str = "") -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class Found(Protocol):
+    """What a ModelError needs to know of a finding (see ``zstate.model.urdf.Finding``)."""
+
+    @property
+    def line(self) -> int | None: ...
+    @property
+    def message(self) -> str: ...
+    @property
+    def severity(self) -> str: ...
+
+
+class ModelError(ZStateError, ValueError):
+    """A robot model that cannot be used, with everything that is wrong with it.
+
+    ``findings`` holds errors and warnings in the order of their lines; ``source`` names the file
+    or text they were found in.
+    """
+
+    def __init__(self, source: str, findings: Sequence[Found] = (), message: str = "") -> None:
+        self.source = source
+        self.findings = tuple(findings)
+        super().__init__(message or self._summary())
+
+    def _summary(self) -> str:
+        errors = [f for f in self.findings if f.severity == "error"]
+        count = f"{len(errors)} finding{'s' if len(errors) != 1 else ''}"
+        lines = [f"{self.source} cannot be used ({count})"]
+        for finding in errors:
+            where = f"line {finding.line}" if finding.line is not None else "file"
+            lines.append(f"  {where}  {finding.message}")
+        return "\n".join(lines)
+
+
+class UnknownModel(ModelError):
+    """No file, URDF text or catalog entry answers to that name."""
+
+    def __init__(self, name: str, near_misses: Sequence[str], message: str) -> None:
+        super().__init__(name, (), message)
+        self.name = name
+        self.near_misses = tuple(near_misses)
+
+
+class MessageError(ZStateError, ValueError):
+    """Bytes that are not a message we can read.
+
+    ``reason`` is a counter's name: "foreign", "newer version", "truncated" or "malformed".
+    """
+
+    def __init__(self, message: str, *, reason: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class NetworkError(ZStateError):
+    """Zenoh refused, or the network does not do what was asked."""
+
+
+class Unreachable(NetworkError, TimeoutError):
+    """Nothing answers at the endpoints."""
+
+    def __init__(self, message: str, *, endpoints: Sequence[str]) -> None:
+        super().__init__(message)
+        self.endpoints = tuple(endpoints)
+
+
+class PortBusy(NetworkError):
+    """Somebody listens at that endpoint already."""
+
+    def __init__(self, message: str, *, endpoint: str) -> None:
+        super().__init__(message)
+        self.endpoint = endpoint
+
+
+class Closed(NetworkError):
+    """Used after ``close()``, or in a process forked from the one that opened it."""
+
+
+class LookupFailed(ZStateError):
+    """A question the buffer cannot answer, with what it knows.
+
+    ``target`` and ``source`` are the frames as asked, ``edge`` is the (parent, child) at fault.
+    ``requested``, ``oldest`` and ``newest`` are stamps [ns], ``rate_hz`` and ``writer`` belong to
+    the edge; each is None when it does not apply. The text is built when it is read: a failed
+    lookup in a control loop costs little.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        source: str,
+        *,
+        edge: tuple[str, str] | None = None,
+        requested: int | None = None,
+        oldest: int | None = None,
+        newest: int | None = None,
+        rate_hz: float | None = None,
+        writer: str | None = None,
+    ) -> None:
+        super().__init__()
+        self.target = target
+        self.source = source
+        self.edge = edge
+        self.requested = requested
+        self.oldest = oldest
+        self.newest = newest
+        self.rate_hz = rate_hz
+        self.writer = writer
+
+    def __str__(self) -> str:
+        return f"pose of {self.source!r} in {self.target!r}: {self.explanation()}"
+
+    def explanation(self) -> str:
+        """What happened, with which values, and what to do."""
+        raise NotImplementedError
+
+    def _edge_text(self) -> str:
+        if self.edge is None:
+            return "an edge"
+        details = [] if self.writer is None else [f"writer {self.writer}"]
+        if self.rate_hz is not None:
+            details.append(f"{self.rate_hz:.4g} Hz")
+        suffix = f" ({', '.join(details)})" if details else ""
+        return f"{self.edge[0]!r} -> {self.edge[1]!r}{suffix}"
+
+
+class UnknownFrame(LookupFailed):
+    """A frame that no model, static edge or sample has named so far."""
+
+    def __init__(
+        self,
+        target: str,
+        source: str,
+        *,
+        name: str,
+        near_misses: Sequence[str] = (),
+        frame_count: int = 0,
+        requested: int | None = None,
+    ) -> None:
+        super().__init__(target, source, requested=requested)
+        self.name = name
+        self.near_misses = tuple(near_misses)
+        self.frame_count = frame_count
+
+    def explanation(self) -> str:
+        if self.name.startswith("/"):
+            return f"the frame name {self.name!r} begins with a slash; write {self.name.lstrip('/')!r}"
+        if not self.name:
+            return "a frame name is empty; name both frames"
+        if not self.frame_count:
+            return (
+                f"the frame {self.name!r} is unknown: this buffer has not heard of any frame yet; "
+                "is a publisher running, and was the listener given time (timeout_s=...)?"
+            )
+        if self.near_misses:
+            return f"the frame {self.name!r} is unknown; did you mean {_any_of(self.near_misses)}?"
+        return (
+            f"the frame {self.name!r} is unknown among {self.frame_count} frames; "
+            "`buffer.frames()` or `zstate tree` lists them"
+        )
+
+
+class AmbiguousFrame(LookupFailed):
+    """A bare frame name that more than one robot has."""
+
+    def __init__(self, target: str, source: str, *, name: str, candidates: Sequence[str]) -> None:
+        super().__init__(target, source)
+        self.name = name
+        self.candidates = tuple(candidates)
+
+    def explanation(self) -> str:
+        return f"the frame name {self.name!r} is not unique; name it in full: {_any_of(self.candidates)}"
+
+
+class Disconnected(LookupFailed):
+    """Both frames are known, but no chain of edges joins them. ``roots``: (target's, source's)."""
+
+    def __init__(
+        self, target: str, source: str, *, roots: tuple[str, str], requested: int | None = None
+    ) -> None:
+        super().__init__(target, source, requested=requested)
+        self.roots = roots
+
+    def explanation(self) -> str:
+        target_root, source_root = self.roots
+        return (
+            f"they are in two trees: {self.target!r} is under root {target_root!r}, {self.source!r} under "
+            f"root {source_root!r}; missing is an edge whose child is {source_root!r} or {target_root!r} "
+            f"(for instance `zstate static {target_root} {source_root} --xyz ...`)"
+        )
+
+
+class NoData(LookupFailed):
+    """An edge of the path has no sample at all, or ``latest`` was asked of static edges only."""
+
+    def explanation(self) -> str:
+        if self.edge is None:
+            return "every edge of the path is static, so there is no newest instant; ask `lookup` instead"
+        return f"no sample of {self._edge_text()} has arrived yet; is its writer running (`zstate ls`)?"
+
+
+class InFuture(LookupFailed):
+    """The instant asked for lies after the newest sample of ``edge``."""
+
+    def explanation(self) -> str:
+        return (
+            f"asked {_span(self.requested, self.newest)} after the newest sample of {self._edge_text()}; "
+            "wait for it (timeout_s=...), ask for the newest instant (at=None), or predict (predict_s=...)"
+        )
+
+
+class InPast(LookupFailed):
+    """The instant asked for lies before the oldest sample of ``edge``; waiting cannot mend it."""
+
+    def explanation(self) -> str:
+        return (
+            f"asked {_span(self.oldest, self.requested)} before the oldest sample of {self._edge_text()}; "
+            f"the history there spans {_span(self.newest, self.oldest)}: start the listener earlier or give "
+            "the buffer more history_s"
+        )
+
+
+class Stale(LookupFailed):
+    """The answer is older than ``max_age_s`` allows."""
+
+    def __init__(
+        self,
+        target: str,
+        source: str,
+        *,
+        age_s: float,
+        max_age_s: float,
+        edge: tuple[str, str] | None = None,
+        requested: int | None = None,
+        oldest: int | None = None,
+        newest: int | None = None,
+        rate_hz: float | None = None,
+        writer: str | None = None,
+    ) -> None:
+        super().__init__(
+            target,
+            source,
+            edge=edge,
+            requested=requested,
+            oldest=oldest,
+            newest=newest,
+            rate_hz=rate_hz,
+            writer=writer,
+        )
+        self.age_s = age_s
+        self.max_age_s = max_age_s
+
+    def explanation(self) -> str:
+        return (
+            f"the newest answer is {duration_text(round(self.age_s * 1e9))} old, {self.max_age_s:g} s are "
+            f"allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`), and do the "
+            "clocks of both machines agree?"
+        )
+
+
+class WaitTimeout(LookupFailed, TimeoutError):
+    """A wait that ran out. Always raised as a subclass of the reason it still waited for."""
+
+    waited_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"after waiting {self.waited_s:g} s, {super().__str__()}"
+
+
+@cache
+def _timeout_class(reason: type[LookupFailed]) -> type[WaitTimeout]:
+    return type(f"{reason.__name__}Timeout", (WaitTimeout, reason), {"__doc__": WaitTimeout.__doc__})
+
+
+def timed_out(reason: LookupFailed, waited_s: float) -> WaitTimeout:
+    """The same facts as ``reason``, as an error that is also a TimeoutError."""
+    error = _timeout_class(type(reason)).__new__(_timeout_class(type(reason)))
+    error.__dict__.update(reason.__dict__)
+    error.waited_s = waited_s
+    return error
+
+
+def duration_text(nanoseconds: int) -> str:
+    """A duration as a person says it: 85 ns, 12.0 us, 3.5 ms, 4.2 s."""
+    size = abs(nanoseconds)
+    for unit, scale in (("s", 1_000_000_000), ("ms", 1_000_000), ("us", 1_000)):
+        if size >= scale:
+            return f"{nanoseconds / scale:.1f} {unit}"
+    return f"{nanoseconds} ns"
+
+
+def _span(later: int | None, earlier: int | None) -> str:
+    return "some time" if later is None or earlier is None else duration_text(later - earlier)
+
+
+def _any_of(names: Sequence[str]) -> str:
+    return " or ".join(repr(name) for name in names)

@@ -1,0 +1,1 @@
+"""How it travels: Zenoh sessions, streams, latched values and presence."""

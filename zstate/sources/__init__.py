@@ -1,0 +1,1 @@
+"""Where joint states come from."""
