@@ -1,0 +1,278 @@
+"""What each joint does to its link, as a formula of the joint's numbers.
+
+The pose of a link in its parent needs no tree and no solver: with ``x = scale * position + shift``,
+
+- a hinge turns by ``x`` about a fixed axis: ``q = q_cos cos(x/2) + q_sin sin(x/2)``, where ``q_cos`` is
+  the origin's rotation and ``q_sin`` is that times the half turn about the axis;
+- a slide moves by ``x`` along a fixed axis: ``t = t0 + t1 x``;
+- a planar joint moves by x, y in the plane of its frame and then turns by yaw about its z;
+- a floating joint is its origin times the given pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.errors import InvalidInput
+from zstate.model.robot import Joint, JointType, RobotModel
+
+EdgeKind = Literal["fixed", "hinge", "slide", "planar", "floating"]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Floats = NDArray[np.float64]
+
+NORM_TOLERANCE = 1e-3
+"""A floating joint's quaternion this close to unit length is normalised; beyond, it is refused."""
+
+_KINDS: dict[JointType, EdgeKind] = {
+    "fixed": "fixed",
+    "revolute": "hinge",
+    "continuous": "hinge",
+    "prismatic": "slide",
+    "planar": "planar",
+    "floating": "floating",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeForm:
+    """``parent_from_child`` as a function of the position vector.
+
+    ``column`` and ``velocity_column`` say where the numbers of the joint (of its master, for a mimic)
+    begin in the vectors of positions and velocities; -1 for a fixed edge. ``scale`` and ``shift`` are
+    1 and 0 except for mimics. ``q_cos``, ``q_sin``, ``t0`` and ``t1`` are those of the module's formulas
+    (quaternions x y z w; a planar joint's turn by yaw); ``origin`` is ``parent_from_joint`` as pose7
+    with a unit quaternion and ``axis`` the unit axis in the joint's frame, z for planar joints.
+    """
+
+    parent: str
+    child: str
+    kind: EdgeKind
+    column: int
+    velocity_column: int
+    scale: float
+    shift: float
+    q_cos: Quaternion
+    q_sin: Quaternion
+    t0: Vector
+    t1: Vector
+    origin: tuple[float, float, float, float, float, float, float]
+    axis: Vector
+
+
+def edge_forms(model: RobotModel) -> tuple[EdgeForm, ...]:
+    """The formula of every edge, fixed ones included, in the order of ``model.joints``."""
+    return tuple(_form(model, joint) for joint in model.joints)
+
+
+class EdgeTable:
+    """All edges of a robot at once: positions in, ``parent_from_child`` out.
+
+    Immutable, so any thread may use it. Positions are trusted to be finite and of the right length.
+    """
+
+    def __init__(self, model: RobotModel) -> None:
+        self.forms = edge_forms(model)
+        self._rest = _rest_poses(self.forms)
+        self._turns = _Turns.of(self.forms)
+        self._slides = _Slides.of(self.forms)
+        self._floats = _Floats.of(self.forms)
+
+    def poses(self, positions: Floats, out: Floats | None = None) -> Floats:
+        """``parent_from_child`` of every edge, rows as ``forms``: x y z [m], qx qy qz qw.
+
+        ``positions`` (..., nq) give (..., E, 7), written into ``out`` when that is given. The sign of a
+        quaternion is arbitrary. Raises InvalidInput for a floating joint without a unit quaternion.
+        """
+        if out is None:
+            out = np.empty((*positions.shape[:-1], *self._rest.shape))
+        out[...] = self._rest
+        if self._turns is not None:
+            self._turns.write(positions, out)
+        if self._slides is not None:
+            self._slides.write(positions, out)
+        if self._floats is not None:
+            self._floats.write(positions, out)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Turns:
+    """The edges that turn about an axis: hinges, and planar joints by their yaw."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    half_scale: Floats
+    half_shift: Floats
+    q_cos: Floats
+    q_sin: Floats
+
+    @classmethod
+    def of(cls, forms: tuple[EdgeForm, ...]) -> _Turns | None:
+        turning = [(row, form) for row, form in enumerate(forms) if form.kind in ("hinge", "planar")]
+        if not turning:
+            return None
+        return cls(
+            rows=np.array([row for row, _ in turning], dtype=np.intp),
+            columns=np.array([f.column + 2 * (f.kind == "planar") for _, f in turning], dtype=np.intp),
+            half_scale=np.array([0.5 * form.scale for _, form in turning]),
+            half_shift=np.array([0.5 * form.shift for _, form in turning]),
+            q_cos=np.array([form.q_cos for _, form in turning]),
+            q_sin=np.array([form.q_sin for _, form in turning]),
+        )
+
+    def write(self, positions: Floats, out: Floats) -> None:
+        half = positions.take(self.columns, axis=-1) * self.half_scale + self.half_shift
+        # One complex exponential is both cosine and sine, and accurate at any number of turns.
+        unit: NDArray[np.complex128] = np.exp(1j * half)
+        rotation = unit.real[..., None] * self.q_cos
+        rotation += unit.imag[..., None] * self.q_sin
+        out[..., self.rows, 3:] = rotation
+
+
+@dataclass(frozen=True, slots=True)
+class _Slides:
+    """The edges whose translation moves along one axis, or along two: planar joints."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    offsets: Floats
+    steps: Floats
+
+    @classmethod
+    def of(cls, forms: tuple[EdgeForm, ...]) -> _Slides | None:
+        sliding = [(row, form) for row, form in enumerate(forms) if form.kind in ("slide", "planar")]
+        if not sliding:
+            return None
+        return cls(
+            rows=np.array([row for row, _ in sliding], dtype=np.intp),
+            columns=np.array([(form.column, form.column + (form.kind == "planar")) for _, form in sliding]),
+            offsets=np.array([np.array(form.t0) + np.array(form.t1) * form.shift for _, form in sliding]),
+            steps=np.array([_steps(form) for _, form in sliding]),
+        )
+
+    def write(self, positions: Floats, out: Floats) -> None:
+        travelled = np.einsum("nij,...nj->...ni", self.steps, positions[..., self.columns])
+        out[..., self.rows, :3] = travelled + self.offsets
+
+
+@dataclass(frozen=True, slots=True)
+class _Floats:
+    """The edges that are given as a pose: the origin acts on it linearly, as a 7 x 7 matrix."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    offsets: Floats
+    origins: Floats
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, forms: tuple[EdgeForm, ...]) -> _Floats | None:
+        floating = [(row, form) for row, form in enumerate(forms) if form.kind == "floating"]
+        if not floating:
+            return None
+        origins = np.zeros((len(floating), 7, 7))
+        for matrix, (_, form) in zip(origins, floating, strict=True):
+            matrix[:3, :3] = rotation_matrix(form.q_cos)
+            matrix[3:, 3:] = _left_product(form.q_cos)
+        return cls(
+            rows=np.array([row for row, _ in floating], dtype=np.intp),
+            columns=np.array([np.arange(form.column, form.column + 7) for _, form in floating]),
+            offsets=np.array([(*form.t0, 0.0, 0.0, 0.0, 0.0) for _, form in floating]),
+            origins=origins,
+            names=tuple(f"{form.parent!r} -> {form.child!r}" for _, form in floating),
+        )
+
+    def write(self, positions: Floats, out: Floats) -> None:
+        poses = positions[..., self.columns]
+        norms: Floats = np.sqrt(np.square(poses[..., 3:]).sum(axis=-1, keepdims=True))
+        if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
+            self._refuse(norms[..., 0])
+        poses[..., 3:] /= norms
+        out[..., self.rows, :] = self.offsets + np.einsum("nij,...nj->...ni", self.origins, poses)
+
+    def _refuse(self, norms: Floats) -> None:
+        worst = int(np.abs(norms - 1.0).argmax())
+        raise InvalidInput(
+            f"the floating joint of {self.names[worst % len(self.names)]} was given a quaternion of length "
+            f"{norms.item(worst):.6g}; its last four numbers are qx qy qz qw of length 1"
+        )
+
+
+def rotation_matrix(rotation: Quaternion) -> Floats:
+    """The 3 x 3 matrix of a unit quaternion x y z w."""
+    x, y, z, w = rotation
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _form(model: RobotModel, joint: Joint) -> EdgeForm:
+    kind = _KINDS[joint.type]
+    axis = _unit3((0.0, 0.0, 1.0) if kind == "planar" else joint.axis) if kind != "fixed" else joint.axis
+    rotation = _unit4(joint.origin[3:])
+    still = (0.0, 0.0, 0.0)
+    master = model.mimic_of(joint)
+    return EdgeForm(
+        parent=joint.parent,
+        child=joint.child,
+        kind=kind,
+        column=model.columns.get(master.joint, -1),
+        velocity_column=model.velocity_columns.get(master.joint, -1),
+        scale=master.multiplier,
+        shift=master.offset,
+        q_cos=rotation,
+        q_sin=_times_pure(rotation, axis) if kind in ("hinge", "planar") else (*still, 0.0),
+        t0=joint.origin[:3],
+        t1=_as_vector(rotation_matrix(rotation) @ axis) if kind == "slide" else still,
+        origin=(*joint.origin[:3], *rotation),
+        axis=axis,
+    )
+
+
+def _rest_poses(forms: tuple[EdgeForm, ...]) -> Floats:
+    rest = np.zeros((len(forms), 7))
+    for row, form in zip(rest, forms, strict=True):
+        row[:3] = form.t0
+        row[3:] = form.q_cos
+    return rest
+
+
+def _steps(form: EdgeForm) -> Floats:
+    """How the translation changes per unit of the joint's two numbers; a slide has but one."""
+    if form.kind == "planar":
+        return rotation_matrix(form.q_cos)[:, :2]
+    return np.outer(form.t1, (form.scale, 0.0))
+
+
+def _left_product(rotation: Quaternion) -> Floats:
+    """The 4 x 4 matrix that multiplies by ``rotation`` from the left."""
+    x, y, z, w = rotation
+    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+
+
+def _times_pure(rotation: Quaternion, axis: Vector) -> Quaternion:
+    x, y, z, w = (_left_product(rotation) @ (*axis, 0.0)).tolist()
+    return (x, y, z, w)
+
+
+def _as_vector(values: Floats) -> Vector:
+    x, y, z = values.tolist()
+    return (x, y, z)
+
+
+def _unit3(values: Vector) -> Vector:
+    return _as_vector(np.array(values) / np.linalg.norm(values))
+
+
+def _unit4(values: Quaternion) -> Quaternion:
+    x, y, z, w = (np.array(values) / np.linalg.norm(values)).tolist()
+    return (x, y, z, w)
