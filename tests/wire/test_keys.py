@@ -1,0 +1,83 @@
+import pytest
+
+from zstate.errors import InvalidInput
+from zstate.wire import keys
+
+
+def test_every_key_of_a_robot_lies_under_its_own_prefix():
+    assert keys.stream_key("panda", "joint_states") == "zstate/panda/joint_states"
+    assert keys.stream_key("panda", "tf") == "zstate/panda/tf"
+    assert keys.stream_key("panda", "tf_static", "mount") == "zstate/panda/tf_static/mount"
+    assert keys.stream_key("panda", "robot_description") == "zstate/panda/robot_description"
+    assert keys.stream_key("panda", "joint_commands") == "zstate/panda/joint_commands"
+    assert keys.lookup_key("panda") == "zstate/panda/lookup"
+    assert keys.writer_key("panda", "tf", "x") == "zstate/panda/@writer/tf/x"
+    assert keys.CLOCK_KEY == "zstate/clock"
+
+
+def test_an_expression_hears_one_robot_or_all_and_every_static_writer():
+    assert keys.stream_expression("panda", "joint_states") == "zstate/panda/joint_states"
+    assert keys.stream_expression("*", "joint_states") == "zstate/*/joint_states"
+    assert keys.stream_expression("*", "tf_static") == "zstate/*/tf_static/*"
+    assert keys.writer_expression("panda") == "zstate/panda/@writer/*/*"
+    assert keys.writer_expression("*") == "zstate/*/@writer/*/*"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        "a/b",
+        "/a",
+        "*",
+        "a*",
+        "$*",
+        "a$b",
+        "a?",
+        "a#",
+        "@a",
+        "a b",
+        "a\tb",
+        "a\n",
+        "a\x00",
+        "a\u2028b",
+        "\x7f",
+    ],
+)
+def test_a_robot_or_writer_name_that_is_not_one_chunk_is_refused_by_name(name: str):
+    for use in (
+        keys.check_robot,
+        keys.check_writer,
+        keys.lookup_key,
+        lambda n: keys.stream_key(n, "tf"),
+        lambda n: keys.stream_key("panda", "tf_static", n),
+    ):
+        with pytest.raises(InvalidInput) as caught:
+            use(name)
+        assert repr(name) in str(caught.value)
+        assert "letters, digits" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["panda", "r1", "arm-2.left", "über", "a@b", "clock"])
+def test_ordinary_names_are_taken_as_they_are(name: str):
+    assert keys.check_robot(name) == name
+
+
+def test_a_star_is_no_robot_to_write_for():
+    with pytest.raises(InvalidInput):
+        keys.stream_key("*", "joint_states")
+
+
+def test_the_robot_of_a_key_is_its_second_chunk():
+    assert keys.robot_of("zstate/panda/tf_static/mount") == "panda"
+    for stranger in ("zstate/clock", "ros/panda/tf", "zstate//tf", ""):
+        with pytest.raises(InvalidInput, match="not of the form"):
+            keys.robot_of(stranger)
+
+
+def test_a_bare_frame_gets_its_robot_and_a_full_name_stays():
+    assert keys.full_name("r1", "odom") == "r1/odom"
+    assert keys.full_name("r1", "fleet/map") == "fleet/map"
+    for bad in ("", "/odom", "odom/"):
+        with pytest.raises(InvalidInput, match="'robot/frame'"):
+            keys.full_name("r1", bad)

@@ -1,0 +1,226 @@
+import struct
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zstate.errors import MessageError
+from zstate.wire.messages import (
+    Clock,
+    JointCommand,
+    JointState,
+    Message,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+    to_block,
+)
+from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
+from zstate.wire.wire import Wire
+
+NAMES = ("j1", "j2")
+ORDER = order_digest(NAMES)
+EDGES = (("b", "a"), ("a", "h"))
+STAMP = 1_700_000_000_123_456_789
+
+# MessagePack, by its specification: 0x90|n fixarray, 0xcf uint64, 0xcd uint16, 0xc4 n bin8,
+# 0xa0|n fixstr, 0xc0 nil, 0x00..0x7f positive fixint; integers are big-endian.
+UINT64 = b"\xcf"
+UINT16 = b"\xcd"
+NIL = b"\xc0"
+
+
+def bin8(data: bytes) -> bytes:
+    return b"\xc4" + bytes([len(data)]) + data
+
+
+def fixstr(text: str) -> bytes:
+    return bytes([0xA0 | len(text)]) + text.encode()
+
+
+def header(fields: int) -> bytes:
+    stamp = UINT64 + struct.pack(">Q", STAMP)
+    seq = UINT16 + struct.pack(">H", 300)
+    session = UINT64 + struct.pack(">Q", 2**63 + 5)
+    return bytes([0x90 | fields]) + stamp + seq + session + bin8(ORDER)
+
+
+GOLDEN: dict[str, tuple[Message, bytes]] = {
+    "joint state": (
+        JointState(STAMP, 300, 2**63 + 5, ORDER, to_block([0.5, -1.0])),
+        header(8) + bin8(struct.pack("<2d", 0.5, -1.0)) + NIL * 3,
+    ),
+    "joint state without a model": (
+        JointState(STAMP, 300, 2**63 + 5, ORDER, to_block([0, 1]), to_block([2, 3]), to_block([4, 5]), NAMES),
+        header(8)
+        + b"".join(bin8(struct.pack("<2d", *pair)) for pair in ((0, 1), (2, 3), (4, 5)))
+        + b"\x92"
+        + fixstr("j1")
+        + fixstr("j2"),
+    ),
+    "transforms": (
+        TransformSample(STAMP, 300, 2**63 + 5, ORDER, to_block([1, 2, 3, 0, 0, 0, 1])),
+        header(6) + bin8(struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)) + NIL,
+    ),
+    "command": (
+        JointCommand(STAMP, 300, 2**63 + 5, ORDER, velocities=to_block([0.25])),
+        header(7) + NIL + bin8(struct.pack("<d", 0.25)) + NIL,
+    ),
+    "statics": (
+        StaticTransforms(7, (("b", "c"),), to_block([0, 0, 1, 0, 0, 0, 1])),
+        b"\x93\x07\x91\x92" + fixstr("b") + fixstr("c") + bin8(struct.pack("<7d", 0, 0, 1, 0, 0, 0, 1)),
+    ),
+    "description": (
+        RobotDescription(7, "<robot/>", "00ff", NAMES, EDGES),
+        b"\x96\x07"
+        + fixstr("<robot/>")
+        + fixstr("00ff")
+        + b"\x92"
+        + fixstr("j1")
+        + fixstr("j2")
+        + b"\x92\x92"
+        + fixstr("b")
+        + fixstr("a")
+        + b"\x92"
+        + fixstr("a")
+        + fixstr("h")
+        + fixstr("system"),
+    ),
+    "clock": (Clock(0, 1, 2), b"\x93\x00\x01\x02"),
+}
+MESSAGES = [message for message, _ in GOLDEN.values()]
+
+
+@pytest.mark.parametrize(("message", "golden"), GOLDEN.values(), ids=GOLDEN.keys())
+def test_the_bytes_are_those_of_the_messagepack_specification(message: Message, golden: bytes):
+    assert encode(message) == golden
+    assert decode(golden, ENCODINGS[type(message)], type(message)) == message
+
+
+def test_the_encoding_names_type_and_version():
+    assert ENCODINGS[JointState] == "zstate/JointState;v=1"
+    assert ENCODINGS[RobotDescription] == "zstate/RobotDescription;v=1"
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 29, 31, 32, 200])
+def test_a_sample_takes_at_most_54_bytes_plus_8_per_number_in_the_worst_case(count: int):
+    worst = (2**63 - 1, 2**40, 2**64 - 1, ORDER)
+    block = to_block(np.zeros(count))
+    assert len(encode(JointState(*worst, block))) <= 54 + 8 * count
+    assert len(encode(JointState(*worst, block, block, block))) <= 54 + 8 * 3 * count
+    assert len(encode(JointCommand(*worst, block, block, block))) <= 54 + 8 * 3 * count
+    assert len(encode(TransformSample(*worst, block * 7))) <= 54 + 8 * 7 * count
+
+
+def test_seven_positions_take_at_most_110_bytes():
+    assert len(encode(JointState(2**63 - 1, 2**40, 2**64 - 1, ORDER, to_block(np.zeros(7))))) <= 110
+
+
+def reason(payload: bytes, encoding: str, kind: type[Message] = JointState) -> str:
+    with pytest.raises(MessageError) as caught:
+        decode(payload, encoding, kind)
+    return caught.value.reason
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=GOLDEN.keys())
+def test_a_message_cut_off_anywhere_is_truncated(message: Message):
+    whole = encode(message)
+    kind = type(message)
+    reasons = {reason(whole[:length], ENCODINGS[kind], kind) for length in range(len(whole))}
+    assert reasons == {"truncated"}
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    ["", "zenoh/bytes", "text/plain", "zstate/Clock;v=1", "zstate/JointState", "zstate/JointState;v=0"],
+)
+def test_a_message_under_another_encoding_is_foreign_and_the_encoding_is_named(encoding: str):
+    with pytest.raises(MessageError, match="another program") as caught:
+        decode(encode(MESSAGES[0]), encoding, JointState)
+    assert caught.value.reason == "foreign"
+    assert repr(encoding) in str(caught.value)
+
+
+def test_a_newer_version_is_told_from_a_stranger():
+    assert reason(b"whatever", "zstate/JointState;v=2") == "newer version"
+    assert reason(b"whatever", "zstate/Clock;v=2") == "foreign"
+
+
+def test_fields_that_a_later_writer_appends_are_passed_over():
+    fields = msgspec.msgpack.decode(encode(MESSAGES[0]))
+    assert decode(msgspec.msgpack.encode([*fields, "more"]), ENCODINGS[JointState], JointState) == MESSAGES[0]
+
+
+GOOD = [0, 0, 1, ORDER, b"12345678"]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        [0.5, *GOOD[1:]],
+        [2**63, *GOOD[1:]],
+        [0, -1, *GOOD[2:]],
+        [0, 0, "1", *GOOD[3:]],
+        [0, 0, 1, b"short", b""],
+        [*GOOD[:4], b"1234567"],
+        [*GOOD[:4], [1.0]],
+        [*GOOD, b"1"],
+        [*GOOD, None, None, ["wrong"]],
+        GOOD[:3],
+        "text",
+        None,
+        {"stamp": 0},
+    ],
+)
+def test_wrong_types_ranges_and_lengths_are_malformed(fields: object):
+    assert reason(msgspec.msgpack.encode(fields), ENCODINGS[JointState]) == "malformed"
+
+
+def test_bytes_after_the_message_are_malformed():
+    assert reason(encode(MESSAGES[0]) + b"\x00", ENCODINGS[JointState]) == "malformed"
+
+
+def test_text_that_is_not_utf8_is_malformed():
+    description = encode(MESSAGES[5]).replace(b"<robot/>", b"\xff\xfe12345.")
+    assert reason(description, ENCODINGS[RobotDescription], RobotDescription) == "malformed"
+
+
+def test_arrays_nested_without_end_are_malformed():
+    bomb = b"\x99" + encode(MESSAGES[0])[1:] + b"\x91" * 1_000_000 + b"\xc0"
+    assert reason(bomb, ENCODINGS[JointState]) == "malformed"
+
+
+def test_infinite_numbers_are_not_the_wires_business():
+    state = JointState(0, 0, 1, ORDER, to_block([np.nan, np.inf]))
+    assert decode(encode(state), ENCODINGS[JointState], JointState) == state
+
+
+@given(st.binary(max_size=200), st.sampled_from(list(ENCODINGS)))
+def test_arbitrary_bytes_raise_nothing_but_a_message_error(payload: bytes, kind: type[Message]):
+    try:
+        decode(payload, ENCODINGS[kind], kind)
+    except MessageError as error:
+        assert error.reason in {"truncated", "malformed"}
+
+
+@given(st.sampled_from(MESSAGES), st.integers(0, 10_000), st.integers(0, 255))
+def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, at: int, value: int):
+    payload = bytearray(encode(message))
+    payload[at % len(payload)] = value
+    try:
+        decode(bytes(payload), ENCODINGS[type(message)], type(message))
+    except MessageError as error:
+        assert error.reason in {"truncated", "malformed"}
+
+
+def test_the_native_wire_says_every_stream_through_the_seam():
+    wire: Wire = NativeWire()
+    by_type = {type(message): message for message in MESSAGES}
+    for stream, kind in STREAM_TYPES.items():
+        message = by_type[kind]
+        assert wire.encoding(stream) == ENCODINGS[kind]
+        assert wire.decode(stream, wire.encode(message), wire.encoding(stream)) == message
+        assert wire.key("r1", stream, "w").startswith(wire.expression("r1", stream).rstrip("*"))

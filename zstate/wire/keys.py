@@ -1,0 +1,106 @@
+"""The native key space: one prefix for each robot, one chunk for its name.
+
+==========================================  ==========================================
+``zstate/<robot>/joint_states``             JointState, each sample
+``zstate/<robot>/tf``                       TransformSample, each sample
+``zstate/<robot>/tf_static/<writer>``       StaticTransforms, latched
+``zstate/<robot>/robot_description``        RobotDescription, latched
+``zstate/<robot>/joint_commands``           JointCommand, to a driver
+``zstate/<robot>/lookup``                   a queryable
+``zstate/<robot>/@writer/<stream>/<id>``    liveliness token of one writer
+``zstate/clock``                            Clock
+==========================================  ==========================================
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from zstate.errors import InvalidInput
+
+Stream = Literal["joint_states", "tf", "tf_static", "robot_description", "joint_commands"]
+
+CLOCK_KEY = "zstate/clock"
+ANY = "*"
+
+_RESERVED = frozenset("/*$?#")
+
+
+def check_robot(name: str) -> str:
+    """``name`` if it can be one chunk of a key; InvalidInput saying what is wrong otherwise."""
+    return _check_chunk("robot", name)
+
+
+def check_writer(name: str) -> str:
+    """The same for the name under which static edges are written."""
+    return _check_chunk("writer", name)
+
+
+def _check_chunk(what: str, name: str) -> str:
+    problem = _chunk_problem(name)
+    if problem:
+        raise InvalidInput(
+            f"the {what} name {name!r} {problem}; it is one chunk of a Zenoh key: use letters, digits, "
+            "'_', '-' or '.', for instance 'arm_1'"
+        )
+    return name
+
+
+def _chunk_problem(name: str) -> str:
+    if not name:
+        return "is empty"
+    if name.startswith("@"):
+        return "begins with '@'"
+    for character in name:
+        if character in _RESERVED or character.isspace() or not character.isprintable():
+            return f"contains {character!r}"
+    return ""
+
+
+def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
+    """The key on which a writer puts ``stream``; ``tf_static`` has one per ``writer``."""
+    key = f"zstate/{check_robot(robot)}/{stream}"
+    return f"{key}/{check_writer(writer)}" if stream == "tf_static" else key
+
+
+def stream_expression(robot: str, stream: Stream) -> str:
+    """The key expression that hears every writer of ``stream``; robot ``"*"`` means all robots."""
+    key = f"zstate/{robot if robot == ANY else check_robot(robot)}/{stream}"
+    return f"{key}/*" if stream == "tf_static" else key
+
+
+def lookup_key(robot: str) -> str:
+    """The key that answers lookups for devices without a buffer."""
+    return f"zstate/{check_robot(robot)}/lookup"
+
+
+def writer_key(robot: str, stream: Stream, identity: str) -> str:
+    """The liveliness token of one writer; ``identity`` is already one chunk."""
+    return f"zstate/{check_robot(robot)}/@writer/{stream}/{identity}"
+
+
+def writer_expression(robot: str) -> str:
+    """The key expression of all tokens of ``robot``, or of every robot for ``"*"``."""
+    return f"zstate/{robot if robot == ANY else check_robot(robot)}/@writer/*/*"
+
+
+def robot_of(key: str) -> str:
+    """The robot whose key this is. InvalidInput for a key that is not under ``zstate/<robot>/``."""
+    chunks = key.split("/", 2)
+    if len(chunks) < 3 or chunks[0] != "zstate" or not chunks[1]:
+        raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/...'")
+    return chunks[1]
+
+
+def full_name(robot: str, frame: str) -> str:
+    """How a frame of ``robot`` is called among several robots: ``robot/frame``.
+
+    A name that has a slash is a full name already. An empty one, or one that begins or ends with a
+    slash, is InvalidInput.
+    """
+    if not frame or frame.startswith("/") or frame.endswith("/"):
+        raise InvalidInput(
+            f"the frame name {frame!r} of robot {robot!r} is empty or has a slash at its end; "
+            "write 'frame' or 'robot/frame'"
+        )
+    return frame if "/" in frame else f"{robot}/{frame}"
