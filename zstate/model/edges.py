@@ -90,6 +90,7 @@ class EdgeTable:
         """
         if out is None:
             out = np.empty((*positions.shape[:-1], *self._rest.shape))
+        positions = self.normalised(positions)
         out[...] = self._rest
         if self._turns is not None:
             self._turns.write(positions, out)
@@ -98,6 +99,13 @@ class EdgeTable:
         if self._floats is not None:
             self._floats.write(positions, out)
         return out
+
+    def normalised(self, positions: Floats) -> Floats:
+        """``positions`` with the quaternions of floating joints at unit length.
+
+        Raises InvalidInput where a length is off by more than ``NORM_TOLERANCE``.
+        """
+        return positions if self._floats is None else self._floats.normalised(positions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,12 +195,17 @@ class _Floats:
             names=tuple(f"{form.parent!r} -> {form.child!r}" for _, form in floating),
         )
 
+    def normalised(self, positions: Floats) -> Floats:
+        quaternions = positions[..., self.columns[:, 3:]]
+        norms: Floats = np.sqrt(np.square(quaternions).sum(axis=-1, keepdims=True))
+        if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
+            self._refuse(norms)
+        unit = positions.copy()
+        unit[..., self.columns[:, 3:]] = quaternions / norms
+        return unit
+
     def write(self, positions: Floats, out: Floats) -> None:
         poses = positions[..., self.columns]
-        norms: Floats = np.sqrt(np.square(poses[..., 3:]).sum(axis=-1, keepdims=True))
-        if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
-            self._refuse(norms[..., 0])
-        poses[..., 3:] /= norms
         out[..., self.rows, :] = self.offsets + np.einsum("nij,...nj->...ni", self.origins, poses)
 
     def _refuse(self, norms: Floats) -> None:
