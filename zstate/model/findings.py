@@ -1,0 +1,76 @@
+"""Finding: one thing a validator has to say about a model; Findings collects them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Literal
+
+from zstate.errors import ModelError
+
+Severity = Literal["error", "warning"]
+
+# A hostile file may hold thousands of unknown names, each compared with thousands of known ones.
+_MOST_SUGGESTIONS = 25
+_LONGEST_COMPARED = 100
+_LONGEST_QUOTED = 80
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One fault or doubt: in which line (None: of the file as a whole), what, and how bad.
+
+    An "error" makes the model unusable; a "warning" is something its author should know.
+    """
+
+    line: int | None
+    message: str
+    severity: Severity
+
+
+class Findings:
+    """What has been found so far in one source."""
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self._found: list[Finding] = []
+        self._suggestions_left = _MOST_SUGGESTIONS
+
+    def error(self, line: int | None, message: str) -> None:
+        """Note a fault that makes the model unusable."""
+        self._found.append(Finding(line, message, "error"))
+
+    def warning(self, line: int | None, message: str) -> None:
+        """Note something doubtful that does not prevent use."""
+        self._found.append(Finding(line, message, "warning"))
+
+    def suggestion(self, name: str, candidates: Iterable[str]) -> str:
+        """``; did you mean 'x'?``, or nothing when no candidate is close to ``name``."""
+        near = self._near_miss(name, candidates)
+        return "" if near is None else f"; did you mean {near!r}?"
+
+    def _near_miss(self, name: str, candidates: Iterable[str]) -> str | None:
+        if not self._suggestions_left or len(name) > _LONGEST_COMPARED:
+            return None
+        self._suggestions_left -= 1
+        comparable = [candidate for candidate in candidates if len(candidate) <= _LONGEST_COMPARED]
+        for candidate in comparable:
+            if candidate.lower() == name.lower():
+                return candidate
+        near = get_close_matches(name, comparable, n=1)
+        return near[0] if near else None
+
+    def sorted(self) -> tuple[Finding, ...]:
+        """All findings by line; those of the whole file first."""
+        return tuple(sorted(self._found, key=lambda finding: finding.line or 0))
+
+    def raise_errors(self) -> None:
+        """Raise ModelError with everything found if there is an error among it."""
+        if any(finding.severity == "error" for finding in self._found):
+            raise ModelError(self.source, self.sorted())
+
+
+def quoted(text: str) -> str:
+    """``text`` in quotes, shortened where a file holds something endless."""
+    return repr(text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}...")

@@ -1,0 +1,210 @@
+"""One <joint> element to one Joint, with everything that is wrong with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from zstate.model.findings import Findings, quoted
+from zstate.model.numbers import NumberFault, read_number, read_numbers
+from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic
+from zstate.model.xml import Element
+
+Pose7 = tuple[float, float, float, float, float, float, float]
+Vector3 = tuple[float, float, float]
+
+_X: Final = (1.0, 0.0, 0.0)
+_Z: Final = (0.0, 0.0, 1.0)
+_SMALLEST_AXIS = 1e-6
+_AXIS_TOLERANCE = 1e-3  # files round axes to three or four digits; that is no reason for a warning
+_ONCE = ("parent", "child", "origin", "axis", "limit", "mimic")
+
+
+class JointReader:
+    """Reads joints whose parents and children must be among ``links``.
+
+    A joint with faults is returned as well, with neutral values where they were wrong, and an
+    unknown parent or child as "": so that the checks of the tree need not stumble over them.
+    """
+
+    def __init__(self, findings: Findings, links: Iterable[str]) -> None:
+        self._findings = findings
+        self._links = dict.fromkeys(links)
+
+    def read(self, element: Element) -> Joint:
+        """The joint that ``element`` describes; faults go to the findings."""
+        name = element.attributes.get("name", "")
+        label = f"joint {quoted(name)}"
+        for tag in _ONCE:
+            for again in element.all(tag)[1:]:
+                self._findings.error(again.line, f"{label} has more than one <{tag}>")
+        kind = self._type(element, label)
+        return Joint(
+            name=name,
+            type=kind,
+            parent=self._end(element, label, "parent"),
+            child=self._end(element, label, "child"),
+            origin=self._origin(element, label),
+            axis=self._axis(element, label, kind),
+            limits=self._limits(element, label, kind),
+            mimic=self._mimic(element, label, kind),
+            line=element.line,
+        )
+
+    def _type(self, element: Element, label: str) -> JointType:
+        given = element.attributes.get("type")
+        for known in POSITION_COUNTS:
+            if given == known:
+                return known
+        if given is None:
+            message = f"{label} has no type; one of {', '.join(POSITION_COUNTS)}"
+        else:
+            near = self._findings.suggestion(given, POSITION_COUNTS)
+            message = f"{label} has the unknown type {quoted(given)}{near or _choices(POSITION_COUNTS)}"
+        self._findings.error(element.line, message)
+        return "fixed"
+
+    def _end(self, element: Element, label: str, tag: str) -> str:
+        """The link named by <parent> or <child>, or "" when there is none of that name."""
+        ends = element.all(tag)
+        if not ends:
+            self._findings.error(element.line, f'{label} has no <{tag} link="..."/>')
+            return ""
+        link = ends[0].attributes.get("link")
+        if link is None:
+            self._findings.error(
+                ends[0].line, f'{label}: its <{tag}> names no link; write <{tag} link="..."/>'
+            )
+            return ""
+        if link not in self._links:
+            near = self._findings.suggestion(link, self._links)
+            self._findings.error(ends[0].line, f"{label}: its {tag} {quoted(link)} is not a link{near}")
+            return ""
+        return link
+
+    def _origin(self, element: Element, label: str) -> Pose7:
+        origins = element.all("origin")
+        if not origins:
+            return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        if "quat_xyzw" in origins[0].attributes:
+            self._findings.error(origins[0].line, f"{label}: origin quat_xyzw is not read; write rpy")
+        x, y, z = self._vector(origins[0], label, "xyz")
+        return (x, y, z, *quaternion_from_rpy(*self._vector(origins[0], label, "rpy")))
+
+    def _axis(self, element: Element, label: str, kind: JointType) -> Vector3:
+        axes = element.all("axis")
+        default = _Z if kind == "planar" else _X
+        # Exporters write an axis of zeros for joints that have none.
+        if not axes or kind in {"fixed", "floating"}:
+            return default
+        if "xyz" not in axes[0].attributes:
+            self._findings.error(axes[0].line, f"{label}: its <axis> has no xyz")
+            return default
+        x, y, z = self._vector(axes[0], label, "xyz", default)
+        length = math.hypot(x, y, z)
+        if length < _SMALLEST_AXIS:
+            self._findings.error(
+                axes[0].line, f"{label} has the axis {_text(x, y, z)}, which has no direction"
+            )
+            return default
+        if abs(length - 1.0) > _AXIS_TOLERANCE:
+            message = (
+                f"{label} has the axis {_text(x, y, z)} of length {length:.4g}; it is made a unit vector"
+            )
+            self._findings.warning(axes[0].line, message)
+        axis = (x / length, y / length, z / length)
+        if kind == "planar":
+            self._check_planar_axis(axes[0], label, axis)
+        return axis
+
+    def _check_planar_axis(self, element: Element, label: str, axis: Vector3) -> None:
+        if math.dist(axis, _Z) > _AXIS_TOLERANCE:
+            self._findings.error(
+                element.line,
+                f"{label} is planar about the axis {_text(*axis)}; planar joints move in the x-y plane of "
+                "their own frame and turn about +z: turn its origin instead",
+            )
+
+    def _limits(self, element: Element, label: str, kind: JointType) -> Limits:
+        limits = element.all("limit")
+        if not limits:
+            if kind in {"revolute", "prismatic"}:
+                message = f'{label} is {kind} and has no <limit lower="..." upper="..."/>'
+                self._findings.error(element.line, message)
+            return Limits()
+        lower, upper, velocity, effort = (
+            self._number(limits[0], label, name) for name in ("lower", "upper", "velocity", "effort")
+        )
+        if kind == "fixed":
+            return Limits()
+        rest = (math.inf if velocity is None else velocity, math.inf if effort is None else effort)
+        if kind not in {"revolute", "prismatic"}:
+            if kind == "continuous" and (lower, upper) != (None, None):
+                message = f"{label} is continuous, so its lower and upper limits are not used"
+                self._findings.warning(limits[0].line, message)
+            return Limits(-math.inf, math.inf, *rest)
+        if (lower or 0.0) > (upper or 0.0):
+            message = f"{label} has its limits reversed: lower {lower or 0.0:g}, upper {upper or 0.0:g}"
+            self._findings.error(limits[0].line, message)
+        return Limits(lower or 0.0, upper or 0.0, *rest)
+
+    def _mimic(self, element: Element, label: str, kind: JointType) -> Mimic | None:
+        mimics = element.all("mimic")
+        if not mimics:
+            return None
+        if "joint" not in mimics[0].attributes:
+            self._findings.error(mimics[0].line, f'{label}: its <mimic> names no joint="..."')
+            return None
+        if kind in {"floating", "planar"}:
+            message = f"{label} is {kind} and cannot mimic: a mimic is one number"
+            self._findings.error(mimics[0].line, message)
+        multiplier = self._number(mimics[0], label, "multiplier")
+        offset = self._number(mimics[0], label, "offset")
+        if kind == "fixed":
+            self._findings.warning(mimics[0].line, f"{label} is fixed, so its <mimic> is not used")
+            return None
+        return Mimic(mimics[0].attributes["joint"], 1.0 if multiplier is None else multiplier, offset or 0.0)
+
+    def _vector(self, element: Element, label: str, name: str, default: Vector3 = (0.0, 0.0, 0.0)) -> Vector3:
+        text = element.attributes.get(name)
+        if text is None:
+            return default
+        try:
+            x, y, z = read_numbers(text, 3)
+        except NumberFault as fault:
+            self._findings.error(element.line, f"{label}: {element.tag} {name}: {fault}")
+            return default
+        return x, y, z
+
+    def _number(self, element: Element, label: str, name: str) -> float | None:
+        """The number in that attribute; None when there is none, or none that can be read."""
+        text = element.attributes.get(name)
+        if text is None:
+            return None
+        try:
+            return read_number(text)
+        except NumberFault as fault:
+            self._findings.error(element.line, f"{label}: {element.tag} {name}: {fault}")
+            return None
+
+
+def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """x y z w of Rz(yaw) Ry(pitch) Rx(roll) [rad]: URDF's turns about fixed axes, x first."""
+    sr, cr = math.sin(roll / 2), math.cos(roll / 2)
+    sp, cp = math.sin(pitch / 2), math.cos(pitch / 2)
+    sy, cy = math.sin(yaw / 2), math.cos(yaw / 2)
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def _text(*numbers: float) -> str:
+    return f"'{' '.join(f'{number:g}' for number in numbers)}'"
+
+
+def _choices(names: Iterable[str] | Sequence[str]) -> str:
+    return f"; one of {', '.join(names)}"

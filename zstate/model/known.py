@@ -1,0 +1,144 @@
+"""Robots known by name, such as "panda", and the URDF files behind them. Never touches the network.
+
+Looked in, in this order: zstate's own models/, the example-robot-data package, and what
+robot_descriptions has cloned earlier.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from importlib import metadata, util
+from pathlib import Path
+
+from zstate.errors import UnknownModel
+
+_HERE = Path(__file__).resolve()
+
+# What people type, where the file is called otherwise; paths in example-robot-data/robots.
+_ALIASES = {
+    "alexander": "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf",
+    "allegro": "allegro_hand_description/urdf/allegro_right_hand.urdf",
+    "anymal": "anymal_b_simple_description/robots/anymal.urdf",
+    "anymal_b": "anymal_b_simple_description/robots/anymal.urdf",
+    "anymal_c": "anymal_c_simple_description/urdf/anymal.urdf",
+    "borinot": "borinot_description/urdf/borinot_flying_arm_2.urdf",
+    "g1": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    "g1_with_hands": "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+    "hector": "hector_description/robots/quadrotor_base.urdf",
+    "hextilt": "hextilt_description/urdf/hextilt_flying_arm_5.urdf",
+    "hyq": "hyq_description/robots/hyq_no_sensors.urdf",
+    "talos": "talos_data/robots/talos_reduced.urdf",
+    "talos_arm": "talos_data/robots/talos_left_arm.urdf",
+    "talos_full": "talos_data/robots/talos_full_v2.urdf",
+    "ur3": "ur_description/urdf/ur3_robot.urdf",  # ur3.urdf there is a stub without links
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogEntry:
+    """A robot that ``load_model`` knows by name, its file, and the collection the file belongs to."""
+
+    name: str
+    path: Path
+    origin: str
+
+
+def catalog() -> tuple[CatalogEntry, ...]:
+    """Every robot known by name, sorted by name; the first collection that has a name wins."""
+    entries: dict[str, CatalogEntry] = {}
+    for origin, collect in _COLLECTIONS.items():
+        for name, path in collect().items():
+            entries.setdefault(name, CatalogEntry(name, path, origin))
+    return tuple(entries[name] for name in sorted(entries))
+
+
+def find(name: str) -> CatalogEntry:
+    """The entry of that name; case does not matter, nor do ``-`` for ``_`` and a final ``_description``.
+
+    Raises UnknownModel with near misses, where was looked, and what to install.
+    """
+    wanted = _normal(name)
+    for origin, collect in _COLLECTIONS.items():
+        path = collect().get(wanted)
+        if path is not None:
+            return CatalogEntry(wanted, path, origin)
+    raise _unknown(name, wanted)
+
+
+def _unknown(name: str, wanted: str) -> UnknownModel:
+    entries = catalog()
+    near = get_close_matches(wanted, [entry.name for entry in entries], n=3)
+    parts = [f"no robot is called {name!r}{_did_you_mean(near)}"]
+    counts = {origin: sum(entry.origin == origin for entry in entries) for origin in _COLLECTIONS}
+    looked = ", ".join(f"{origin} ({count} names)" for origin, count in counts.items())
+    parts.append(f"looked in {looked}; a path to a file works as well")
+    if not counts["example-robot-data"]:
+        parts.append("for many more robots, pip install 'zstate[robots]'")
+    return UnknownModel(name, near, "; ".join(parts))
+
+
+def _did_you_mean(near: Sequence[str]) -> str:
+    return f", did you mean {' or '.join(repr(name) for name in near)}?" if near else ""
+
+
+def _own() -> dict[str, Path]:
+    # Beside the package when installed, beside its folder in a checkout.
+    for folder in (_HERE.parents[1] / "models", _HERE.parents[2] / "models"):
+        if folder.is_dir():
+            return _by_stem(folder.glob("*.urdf"))
+    return {}
+
+
+@cache
+def _example_robot_data() -> dict[str, Path]:
+    robots = next((folder for folder in _example_folders() if folder.is_dir()), None)
+    if robots is None:
+        return {}
+    aliases = {name: robots / path for name, path in _ALIASES.items()}
+    found = _by_stem(robots.glob("*/*/*.urdf"))
+    return found | {name: path for name, path in aliases.items() if path.is_file()}
+
+
+def _example_folders() -> Iterator[Path]:
+    tail = Path("share", "example-robot-data", "robots")
+    try:
+        package = metadata.distribution("example-robot-data")
+    except metadata.PackageNotFoundError:
+        pass
+    else:
+        yield Path(str(package.locate_file("cmeel.prefix"))) / tail
+    yield Path(sys.prefix) / tail
+
+
+@cache
+def _robot_descriptions() -> dict[str, Path]:
+    # Its modules clone repositories when imported, so only its cache is looked at.
+    if util.find_spec("robot_descriptions") is None:
+        return {}
+    default = "~/.cache/robot_descriptions"
+    folder = Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", default)).expanduser()
+    return _by_stem(folder.rglob("*.urdf"))
+
+
+_COLLECTIONS: dict[str, Callable[[], dict[str, Path]]] = {
+    "zstate": _own,
+    "example-robot-data": _example_robot_data,
+    "robot_descriptions": _robot_descriptions,
+}
+
+
+def _by_stem(paths: Iterable[Path]) -> dict[str, Path]:
+    """Files by name; of several with one name, that with the shortest path."""
+    named: dict[str, Path] = {}
+    for path in sorted(paths, key=lambda path: (len(str(path)), str(path))):
+        named.setdefault(_normal(path.stem), path)
+    return named
+
+
+def _normal(name: str) -> str:
+    return name.strip().lower().replace("-", "_").removesuffix("_description").removesuffix("_robot")

@@ -1,0 +1,61 @@
+"""Checks of mimic joints: each follows, perhaps through others, one joint that has a position."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from zstate.model.findings import Findings, quoted
+from zstate.model.robot import POSITION_COUNTS, Joint
+
+MAX_CHAIN = 100
+
+
+def check_mimics(findings: Findings, joints: Sequence[Joint]) -> None:
+    """Masters exist, are one number each, and chains of mimics end and are at most 100 long."""
+    by_name = {joint.name: joint for joint in joints}
+    for joint in joints:
+        if joint.mimic is not None:
+            _check_master(findings, joint, joint.mimic.joint, by_name)
+    _check_chains(findings, by_name)
+
+
+def _check_master(findings: Findings, joint: Joint, name: str, by_name: Mapping[str, Joint]) -> None:
+    label = f"joint {quoted(joint.name)} mimics"
+    master = by_name.get(name)
+    if master is None:
+        near = findings.suggestion(name, (other for other in by_name if other != joint.name))
+        findings.error(joint.line, f"{label} {quoted(name)}, which does not exist{near}")
+    elif master is joint:
+        findings.error(joint.line, f"{label} itself")
+    elif POSITION_COUNTS[master.type] != 1:
+        findings.error(
+            joint.line,
+            f"{label} {quoted(name)} (line {master.line}), which is {master.type}; a mimic follows a "
+            "revolute, continuous or prismatic joint",
+        )
+
+
+def _check_chains(findings: Findings, by_name: Mapping[str, Joint]) -> None:
+    lengths: dict[str, int] = {}
+    for joint in by_name.values():
+        chain: list[str] = []
+        at: Joint | None = joint
+        while at is not None and at.mimic is not None and at.name not in lengths:
+            if at.name in chain:
+                _report_cycle(findings, by_name, chain[chain.index(at.name) :])
+                break
+            chain.append(at.name)
+            at = by_name.get(at.mimic.joint)
+        length = lengths.get(at.name, 0) if at is not None else 0
+        for name in reversed(chain):
+            length += 1
+            lengths[name] = length
+            if length == MAX_CHAIN + 1:
+                message = f"joint {quoted(name)} ends a chain of {length} mimics; the limit is {MAX_CHAIN}"
+                findings.error(by_name[name].line, message)
+
+
+def _report_cycle(findings: Findings, by_name: Mapping[str, Joint], cycle: Sequence[str]) -> None:
+    if len(cycle) > 1:  # a joint that mimics itself is named by itself
+        named = " -> ".join(quoted(name) for name in [*cycle, cycle[0]])
+        findings.error(by_name[cycle[-1]].line, f"the mimics {named} form a cycle, so no joint leads")

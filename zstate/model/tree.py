@@ -1,0 +1,127 @@
+"""Checks of links and joints as a tree: one root, one parent each, no cycle, not too deep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from zstate.model.findings import Findings, quoted
+from zstate.model.robot import Joint
+
+MAX_DEPTH = 500
+_MOST_NAMED = 8
+
+
+def check_tree(findings: Findings, links: Mapping[str, int], joints: Sequence[Joint]) -> str:
+    """The root link. Faults go to the findings; the answer counts only where there is none.
+
+    ``links`` gives the line of each link; a joint's parent or child that is no link is "".
+    """
+    _check_ends(findings, joints)
+    whole = [joint for joint in joints if joint.parent and joint.child and joint.parent != joint.child]
+    _check_pairs(findings, whole)
+    _check_parents(findings, whole)
+    _check_cycles(findings, links, whole)
+    root = _check_roots(findings, links, joints)
+    _check_depth(findings, root, whole)
+    return root
+
+
+def _check_ends(findings: Findings, joints: Sequence[Joint]) -> None:
+    for joint in joints:
+        if joint.parent and joint.parent == joint.child:
+            message = f"joint {quoted(joint.name)} joins link {quoted(joint.child)} to itself"
+            findings.error(joint.line, message)
+
+
+def _check_pairs(findings: Findings, joints: Sequence[Joint]) -> None:
+    first: dict[tuple[str, str], Joint] = {}
+    for joint in joints:
+        earlier = first.setdefault((joint.parent, joint.child), joint)
+        if earlier is not joint:
+            findings.error(
+                joint.line,
+                f"joints {quoted(earlier.name)} (line {earlier.line}) and {quoted(joint.name)} "
+                f"(line {joint.line}) join the same links {quoted(joint.parent)} and {quoted(joint.child)}",
+            )
+
+
+def _check_parents(findings: Findings, joints: Sequence[Joint]) -> None:
+    parents: dict[str, dict[str, Joint]] = {}
+    for joint in joints:
+        parents.setdefault(joint.child, {}).setdefault(joint.parent, joint)
+    for child, by_parent in parents.items():
+        if len(by_parent) > 1:
+            count = "two" if len(by_parent) == 2 else str(len(by_parent))
+            named = [f"{quoted(parent)} (line {joint.line})" for parent, joint in by_parent.items()]
+            line = list(by_parent.values())[1].line
+            findings.error(line, f"link {quoted(child)} has {count} parents: {_and(named)}")
+
+
+def _check_cycles(findings: Findings, links: Mapping[str, int], joints: Sequence[Joint]) -> None:
+    below: dict[str, list[Joint]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    done: set[str] = set()
+    for link in links:
+        for cycle, closing in _cycles_below(link, below, done):
+            named = " -> ".join(quoted(name) for name in _middle_cut([*cycle, cycle[0]]))
+            message = f"the links {named} form a cycle, closed by joint {quoted(closing.name)}"
+            findings.error(closing.line, message)
+
+
+def _cycles_below(
+    start: str, below: Mapping[str, Sequence[Joint]], done: set[str]
+) -> list[tuple[list[str], Joint]]:
+    """The cycles met on a walk down from ``start``, each with the joint that closes it."""
+    cycles: list[tuple[list[str], Joint]] = []
+    path = [] if start in done else [start]
+    open_joints = [iter(below.get(start, ()))]
+    while path:
+        joint = next(open_joints[-1], None)
+        if joint is None:
+            done.add(path.pop())
+            open_joints.pop()
+        elif joint.child in path:
+            cycles.append((path[path.index(joint.child) :], joint))
+        elif joint.child not in done:
+            path.append(joint.child)
+            open_joints.append(iter(below.get(joint.child, ())))
+    return cycles
+
+
+def _check_roots(findings: Findings, links: Mapping[str, int], joints: Sequence[Joint]) -> str:
+    children = {joint.child for joint in joints}
+    roots = [link for link in links if link not in children]
+    # A joint whose child is misspelt leaves a link alone: that is one fault, already named.
+    if len(roots) > 1 and "" not in children:
+        named = _and(_middle_cut([f"{quoted(root)} (line {links[root]})" for root in roots]))
+        count = "two" if len(roots) == 2 else str(len(roots))
+        message = f"{count} links have no parent: {named}; a robot has one root: add a joint between them"
+        findings.error(links[roots[1]], message)
+    return roots[0] if roots else ""
+
+
+def _check_depth(findings: Findings, root: str, joints: Sequence[Joint]) -> None:
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint.child)
+    levels = [[root]]
+    seen = {root}
+    while levels[-1]:
+        children = dict.fromkeys(child for link in levels[-1] for child in below.get(link, ()))
+        levels.append([child for child in children if child not in seen])
+        seen.update(children)
+    depth = len(levels) - 2
+    if depth > MAX_DEPTH:
+        deepest = quoted(levels[depth][0])
+        findings.error(None, f"link {deepest} lies {depth} joints below the root; the limit is {MAX_DEPTH}")
+
+
+def _middle_cut(names: Sequence[str]) -> list[str]:
+    if len(names) <= _MOST_NAMED:
+        return list(names)
+    return [*names[: _MOST_NAMED // 2], "...", *names[-_MOST_NAMED // 2 :]]
+
+
+def _and(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
