@@ -60,8 +60,8 @@ def _decode_as(data: bytes, encoding: str) -> str:
     except UnicodeDecodeError as error:
         line, column = _place(data, error.start)
         raise TextFault(
-            f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file "
-            'as UTF-8, or declare its encoding in the first line (<?xml version="1.0" encoding="ISO-8859-1"?>)',
+            f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file as "
+            'UTF-8, or declare its encoding in line 1 (<?xml version="1.0" encoding="ISO-8859-1"?>)',
             line,
         ) from None
 

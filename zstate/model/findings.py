@@ -12,7 +12,7 @@ from zstate.errors import ModelError
 Severity = Literal["error", "warning"]
 
 # A hostile file may hold thousands of unknown names, each compared with thousands of known ones.
-_MOST_SUGGESTIONS = 25
+_MOST_SUGGESTIONS = 12
 _LONGEST_COMPARED = 100
 _LONGEST_QUOTED = 80
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Final
 
 from zstate.model.findings import Findings, quoted
@@ -206,5 +206,5 @@ def _text(*numbers: float) -> str:
     return f"'{' '.join(f'{number:g}' for number in numbers)}'"
 
 
-def _choices(names: Iterable[str] | Sequence[str]) -> str:
+def _choices(names: Iterable[str]) -> str:
     return f"; one of {', '.join(names)}"

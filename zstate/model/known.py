@@ -16,6 +16,7 @@ from importlib import metadata, util
 from pathlib import Path
 
 from zstate.errors import UnknownModel
+from zstate.model.findings import quoted
 
 _HERE = Path(__file__).resolve()
 
@@ -72,8 +73,8 @@ def find(name: str) -> CatalogEntry:
 
 def _unknown(name: str, wanted: str) -> UnknownModel:
     entries = catalog()
-    near = get_close_matches(wanted, [entry.name for entry in entries], n=3)
-    parts = [f"no robot is called {name!r}{_did_you_mean(near)}"]
+    near = get_close_matches(wanted[:100], [entry.name for entry in entries], n=3)
+    parts = [f"no robot is called {quoted(name)}{_did_you_mean(near)}"]
     counts = {origin: sum(entry.origin == origin for entry in entries) for origin in _COLLECTIONS}
     looked = ", ".join(f"{origin} ({count} names)" for origin, count in counts.items())
     parts.append(f"looked in {looked}; a path to a file works as well")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,9 @@ def expand(text: str, source: str, *, path: Path | None, args: Mapping[str, str]
     """
     xacro = _import_expander(source, path)
     try:
-        document = xacro.parse(text, None if path is None else os.fspath(path))
-        xacro.process_doc(document, mappings=dict(args))
+        xacro.init_stacks(None if path is None else os.fspath(path))  # what includes are relative to
+        document = xacro.parse(text)
+        xacro.process_doc(document, mappings=dict(args), verbosity=0)
         return document.toprettyxml(indent="  ")
     except Exception as error:  # anything: the file's own expressions are evaluated
         raise _refusal(source, _one_line(error)) from error
@@ -33,11 +35,10 @@ def expand(text: str, source: str, *, path: Path | None, args: Mapping[str, str]
 
 def _import_expander(source: str, path: Path | None) -> Any:
     """The ``xacro`` module, with xacrodoc's way of finding packages where that is installed."""
-    try:
+    with suppress(ImportError):
+        xacrodoc = import_module("xacrodoc")  # replaces the search of xacro, which needs ROS
         if path is not None:
-            import_module("xacrodoc").packages.walk_up_from(path)
-    except ImportError:
-        pass
+            xacrodoc.packages.walk_up_from(path)
     try:
         return import_module("xacro")
     except ImportError:

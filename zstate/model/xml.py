@@ -26,7 +26,6 @@ _UNFINISHED = (
     _CODES[expat.errors.XML_ERROR_UNCLOSED_TOKEN],
 )
 _MISMATCH = _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]
-_AFTER_ROOT = _CODES[expat.errors.XML_ERROR_JUNK_AFTER_DOC_ELEMENT]
 
 
 @dataclass(slots=True)
@@ -125,12 +124,12 @@ class _Reader:
             )
 
     def _cause(self, error: expat.ExpatError) -> str:
+        if self._root is not None and not self._open:
+            return self._after_root(error, self._root)
         if error.code == _MISMATCH:
             return f"</{self._tag_at(error)}> closes {self._innermost()}"
         if error.code in _UNFINISHED and self._open:
             return f"the file ends inside {self._innermost()}; is it truncated?"
-        if error.code == _AFTER_ROOT and self._root is not None:
-            return self._after_root(error, self._root)
         return f"malformed XML: {expat.ErrorString(error.code)}"
 
     def _after_root(self, error: expat.ExpatError, root: Element) -> str:

@@ -1,0 +1,141 @@
+"""load_model and the catalog: names, paths and text, and what is said when there is nothing."""
+
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from zstate.errors import InvalidInput, ModelError, UnknownModel
+from zstate.model import known
+from zstate.model.catalog import catalog, load_model
+from zstate.model.xml import MAX_BYTES
+
+TEXT = '<robot name="one"><link name="only"/></robot>'
+
+
+def test_text_bytes_paths_and_names_are_told_apart(tmp_path: Path):
+    path = tmp_path / "one.urdf"
+    path.write_text(TEXT)
+    assert load_model(TEXT) == load_model(TEXT.encode()) == load_model(path) == load_model(str(path))
+    assert load_model("rrbot").name == "rrbot"
+
+
+def test_a_bare_file_name_is_a_path_when_the_file_exists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "onefile").write_text(TEXT)
+    monkeypatch.chdir(tmp_path)
+    assert load_model("onefile").name == "one"
+
+
+def test_a_folder_does_not_hide_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "rrbot").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_model("rrbot").name == "rrbot"
+
+
+@pytest.mark.parametrize("missing", ["gone.urdf", "gone.xacro", "./gone", Path("gone")])
+def test_a_path_without_a_file_says_so(missing: str | Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelError, match="there is no such file") as caught:
+        load_model(missing)
+    assert caught.value.source == str(missing)
+
+
+def test_the_findings_name_the_path_as_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.urdf").write_text("<robot/>")
+    with pytest.raises(ModelError, match=r"^bad.urdf cannot be used \(1 finding\)\n  line 1  "):
+        load_model("bad.urdf")
+
+
+def test_folders_and_files_beyond_the_limit_are_refused(tmp_path: Path):
+    with pytest.raises(ModelError, match=r"directory; name the .urdf file in it"):
+        load_model(tmp_path)
+    huge = tmp_path / "huge.urdf"
+    with huge.open("wb") as file:
+        file.truncate(MAX_BYTES + 1)
+    with pytest.raises(ModelError, match=f"more than {MAX_BYTES} bytes"):
+        load_model(huge)
+    with pytest.raises(ModelError, match="cannot be read"):
+        load_model("zero\0byte.urdf")
+
+
+def test_an_unknown_name_has_near_misses_and_says_where_was_looked():
+    with pytest.raises(UnknownModel) as caught:
+        load_model("rrbott")
+    assert caught.value.name == "rrbott"
+    assert caught.value.near_misses[0] == "rrbot"
+    assert "no robot is called 'rrbott', did you mean 'rrbot'" in str(caught.value)
+    assert "looked in zstate (" in str(caught.value)
+
+
+def test_without_example_robot_data_it_is_told_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    def absent(name: str) -> metadata.Distribution:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", absent)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    known._example_robot_data.cache_clear()
+    try:
+        with pytest.raises(UnknownModel, match=r"pip install 'zstate\[robots\]'"):
+            load_model("panda")
+    finally:
+        known._example_robot_data.cache_clear()
+
+
+def test_every_entry_of_the_catalog_is_a_file_of_its_name():
+    entries = catalog()
+    assert [entry.name for entry in entries] == sorted({entry.name for entry in entries})
+    assert all(entry.path.is_file() for entry in entries)
+    assert {"rrbot", "diffbot", "gripper"} <= {entry.name for entry in entries if entry.origin == "zstate"}
+
+
+@pytest.mark.robots
+@pytest.mark.parametrize(
+    ("name", "robot", "velocities"),
+    [
+        ("panda", "panda", 8),
+        ("Panda_description", "panda", 8),
+        ("ur5", "ur5", 6),
+        ("ur3", "ur3", 6),
+        ("g1", "g1_29dof_rev_1_0", 29),
+        ("talos_full", "talos", 44 - 12),
+        ("solo12", "solo", 12),
+    ],
+)
+def test_names_people_type_are_known(name: str, robot: str, velocities: int):
+    model = load_model(name)
+    assert (model.name, model.velocity_count) == (robot, velocities)
+
+
+def test_clones_of_robot_descriptions_are_found_in_its_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    package = tmp_path / "site" / "robot_descriptions"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError('importing it may clone')")
+    clone = tmp_path / "cache" / "arms" / "urdf"
+    clone.mkdir(parents=True)
+    (clone / "cached_arm.urdf").write_text(TEXT)
+    monkeypatch.syspath_prepend(str(package.parent))
+    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "cache"))
+    known._robot_descriptions.cache_clear()
+    try:
+        assert load_model("cached_arm").name == "one"
+    finally:
+        known._robot_descriptions.cache_clear()
+
+
+def test_loading_a_model_imports_neither_pinocchio_nor_zenoh():
+    code = (
+        "import sys; from zstate.model.catalog import load_model; load_model('rrbot');"
+        "print({'pinocchio', 'zenoh', 'cmeel', 'xacro'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_xacro_arguments_for_what_is_no_xacro_are_refused():
+    with pytest.raises(InvalidInput, match="'URDF text' contains no xacro"):
+        load_model(TEXT, xacro_args={"length": "1"})

@@ -1,0 +1,78 @@
+"""Xacro: expanded where a package for it is installed, otherwise an error that says which."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from zstate.errors import ModelError
+from zstate.model.catalog import load_model
+
+NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+ARM = f"""<robot name="arm" {NAMESPACE}>
+  <xacro:arg name="length" default="1"/>
+  <xacro:include filename="parts/tip.xacro"/>
+  <link name="base"/>
+  <xacro:tip length="$(arg length)"/>
+</robot>"""
+TIP = f"""<robot {NAMESPACE}><xacro:macro name="tip" params="length">
+  <link name="tip"/>
+  <joint name="end" type="fixed">
+    <parent link="base"/><child link="tip"/><origin xyz="${{2 * length}} 0 0"/>
+  </joint>
+</xacro:macro></robot>"""
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "tip.xacro").write_text(TIP)
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text(ARM)
+    return path
+
+
+def test_a_xacro_file_is_expanded_with_its_includes_and_arguments(arm: Path):
+    pytest.importorskip("xacro")
+    assert load_model(arm).joints[0].origin[0] == 2.0
+    assert load_model(arm, xacro_args={"length": "3"}).joints[0].origin[0] == 6.0
+
+
+def test_findings_of_an_expanded_file_say_that_lines_are_of_the_expansion(tmp_path: Path):
+    pytest.importorskip("xacro")
+    path = tmp_path / "empty.xacro"
+    path.write_text(f'<robot name="r" {NAMESPACE}/>')
+    with pytest.raises(ModelError, match=r"empty.xacro \(expanded\) cannot be used"):
+        load_model(path)
+
+
+@pytest.mark.parametrize(
+    ("inner", "words"),
+    [
+        ('<link name="${1/0}"/><xacro:if value="0"/>', "division by zero"),
+        ('<xacro:nosuchmacro name="x"/>', "nosuchmacro"),
+        ('<xacro:include filename="gone.xacro"/>', "gone.xacro"),
+        ('<xacro:include filename="$(find no_such_package)/a.xacro"/>', "packages are found by"),
+    ],
+)
+def test_a_failed_expansion_gives_its_cause_in_one_line(inner: str, words: str):
+    pytest.importorskip("xacro")
+    with pytest.raises(ModelError) as caught:
+        load_model(f'<robot name="r" {NAMESPACE}>{inner}</robot>')
+    (finding,) = caught.value.findings
+    assert finding.message.startswith("xacro could not expand it: ")
+    assert words in finding.message
+    assert "\n" not in finding.message
+
+
+def test_without_a_xacro_package_it_is_told_what_to_install(arm: Path):
+    code = (
+        "import sys; sys.modules['xacro'] = sys.modules['xacrodoc'] = None\n"
+        "from zstate.errors import ModelError\n"
+        "from zstate.model.catalog import load_model\n"
+        "try: load_model(sys.argv[1])\n"
+        "except ModelError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(arm)], capture_output=True, text=True, check=True)
+    assert "pip install 'zstate[xacro]'" in done.stdout
