@@ -7,7 +7,13 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Protocol
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from zstate.errors import InvalidInput
+
+_STAMP_RANGE = 2**63
 
 
 class Clock(Protocol):
@@ -59,3 +65,21 @@ class ManualClock:
             while self._now < stamp and not stop.is_set():
                 self._moved.wait(0.05)
         return not stop.is_set()
+
+
+def check_stamp(stamp: Any) -> int:
+    """A stamp as an int; integers of numpy are welcome, floats are not: they lose nanoseconds."""
+    if type(stamp) is int and -_STAMP_RANGE <= stamp < _STAMP_RANGE:
+        return stamp
+    if isinstance(stamp, np.integer):
+        return check_stamp(int(cast("np.integer[Any]", stamp)))
+    raise InvalidInput(
+        f"a stamp is a 64-bit integer count of nanoseconds since the Unix epoch, not {stamp!r}; "
+        "use time.time_ns(), or round(seconds * 1e9) when seconds is all there is"
+    )
+
+
+def stamp_text(stamp: int) -> str:
+    """A stamp as seconds with all nine digits."""
+    seconds, nanoseconds = divmod(abs(stamp), 1_000_000_000)
+    return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"

@@ -1,145 +1,20 @@
-"""Every exception of zstate, as one tree.
-
-ZStateError
-├── InvalidInput (ValueError)          an argument that cannot be used; nothing was changed
-│   ├── FrameMismatch                  ``a_from_b @ c_from_d`` with b != c
-│   ├── InsertRefused                  the buffer did not take a transform        .reason .edge
-│   └── ConfigError                    a configuration file or option             .path
-├── ModelError (ValueError)            a robot model that cannot be used          .source .findings
-│   └── UnknownModel                   no model of that name                      .name .near_misses
-├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
-├── NetworkError                       Zenoh said no
-│   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
-│   ├── PortBusy                       somebody listens there already             .endpoint
-│   └── Closed                         used after close(), or after fork
-└── LookupFailed                       .target .source .edge .requested .oldest .newest .rate_hz .writer
-    ├── UnknownFrame                   never heard of it                          .name .near_misses
-    ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
-    ├── Disconnected                   two trees                                  .roots
-    ├── NoData                         an edge without any sample
-    ├── InFuture                       asked after the newest sample of an edge
-    ├── InPast                         asked before the oldest sample of an edge
-    └── Stale                          newer data was demanded by ``max_age_s``   .age_s .max_age_s
-
-A wait that ran out raises the reason it was still waiting for, as a subclass that is also
-``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.
-"""
+"""Errors about questions that a buffer cannot answer."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Protocol
+
+from zstate.errors.base import ZStateError
 
 
-class ZStateError(Exception):
-    """What every error of zstate is."""
-
-
-class InvalidInput(ZStateError, ValueError):
-    """An argument that cannot be used. Nothing was changed by the call."""
-
-
-class FrameMismatch(InvalidInput):
-    """Two transforms were composed whose inner frames differ."""
-
-
-class InsertRefused(InvalidInput):
-    """The buffer did not take a transform; what it held before is untouched.
-
-    ``reason`` is one word or two for programs and counters ("loop", "second parent", ...);
-    ``edge`` is (parent, child) as given.
-    """
-
-    def __init__(self, message: str, *, reason: str, edge: tuple[str, str]) -> None:
-        super().__init__(message)
-        self.reason = reason
-        self.edge = edge
-
-
-class ConfigError(InvalidInput):
-    """A configuration file or option that cannot be used; ``path`` says where in it."""
-
-    def __init__(self, message: str, *, path: str = "") -> None:
-        super().__init__(message)
-        self.path = path
-
-
-class Found(Protocol):
-    """What a ModelError needs to know of a finding (see ``zstate.model.urdf.Finding``)."""
-
-    @property
-    def line(self) -> int | None: ...
-    @property
-    def message(self) -> str: ...
-    @property
-    def severity(self) -> str: ...
-
-
-class ModelError(ZStateError, ValueError):
-    """A robot model that cannot be used, with everything that is wrong with it.
-
-    ``findings`` holds errors and warnings in the order of their lines; ``source`` names the file
-    or text they were found in.
-    """
-
-    def __init__(self, source: str, findings: Sequence[Found] = (), message: str = "") -> None:
-        self.source = source
-        self.findings = tuple(findings)
-        super().__init__(message or self._summary())
-
-    def _summary(self) -> str:
-        errors = [f for f in self.findings if f.severity == "error"]
-        count = f"{len(errors)} finding{'s' if len(errors) != 1 else ''}"
-        lines = [f"{self.source} cannot be used ({count})"]
-        for finding in errors:
-            where = f"line {finding.line}" if finding.line is not None else "file"
-            lines.append(f"  {where}  {finding.message}")
-        return "\n".join(lines)
-
-
-class UnknownModel(ModelError):
-    """No file, URDF text or catalog entry answers to that name."""
-
-    def __init__(self, name: str, near_misses: Sequence[str], message: str) -> None:
-        super().__init__(name, (), message)
-        self.name = name
-        self.near_misses = tuple(near_misses)
-
-
-class MessageError(ZStateError, ValueError):
-    """Bytes that are not a message we can read.
-
-    ``reason`` is a counter's name: "foreign", "newer version", "truncated" or "malformed".
-    """
-
-    def __init__(self, message: str, *, reason: str) -> None:
-        super().__init__(message)
-        self.reason = reason
-
-
-class NetworkError(ZStateError):
-    """Zenoh refused, or the network does not do what was asked."""
-
-
-class Unreachable(NetworkError, TimeoutError):
-    """Nothing answers at the endpoints."""
-
-    def __init__(self, message: str, *, endpoints: Sequence[str]) -> None:
-        super().__init__(message)
-        self.endpoints = tuple(endpoints)
-
-
-class PortBusy(NetworkError):
-    """Somebody listens at that endpoint already."""
-
-    def __init__(self, message: str, *, endpoint: str) -> None:
-        super().__init__(message)
-        self.endpoint = endpoint
-
-
-class Closed(NetworkError):
-    """Used after ``close()``, or in a process forked from the one that opened it."""
+def duration_text(nanoseconds: int) -> str:
+    """A duration as a person says it: 85 ns, 12.0 us, 3.5 ms, 4.2 s."""
+    size = abs(nanoseconds)
+    for unit, scale in (("s", 1_000_000_000), ("ms", 1_000_000), ("us", 1_000)):
+        if size >= scale:
+            return f"{nanoseconds / scale:.1f} {unit}"
+    return f"{nanoseconds} ns"
 
 
 class LookupFailed(ZStateError):
@@ -148,7 +23,7 @@ class LookupFailed(ZStateError):
     ``target`` and ``source`` are the frames as asked, ``edge`` is the (parent, child) at fault.
     ``requested``, ``oldest`` and ``newest`` are stamps [ns], ``rate_hz`` and ``writer`` belong to
     the edge; each is None when it does not apply. The text is built when it is read: a failed
-    lookup in a control loop costs little.
+    lookup in a control loop costs little. ``note`` says what else there is to know.
     """
 
     def __init__(
@@ -172,9 +47,11 @@ class LookupFailed(ZStateError):
         self.newest = newest
         self.rate_hz = rate_hz
         self.writer = writer
+        self.note = ""
 
     def __str__(self) -> str:
-        return f"pose of {self.source!r} in {self.target!r}: {self.explanation()}"
+        note = f" ({self.note})" if self.note else ""
+        return f"pose of {self.source!r} in {self.target!r}: {self.explanation()}{note}"
 
     def explanation(self) -> str:
         """What happened, with which values, and what to do."""
@@ -262,6 +139,8 @@ class NoData(LookupFailed):
     def explanation(self) -> str:
         if self.edge is None:
             return "every edge of the path is static, so there is no newest instant; ask `lookup` instead"
+        if self.newest is not None:
+            return f"too little is known of {self._edge_text()}"
         return f"no sample of {self._edge_text()} has arrived yet; is its writer running (`zstate ls`)?"
 
 
@@ -344,15 +223,6 @@ def timed_out(reason: LookupFailed, waited_s: float) -> WaitTimeout:
     error.__dict__.update(reason.__dict__)
     error.waited_s = waited_s
     return error
-
-
-def duration_text(nanoseconds: int) -> str:
-    """A duration as a person says it: 85 ns, 12.0 us, 3.5 ms, 4.2 s."""
-    size = abs(nanoseconds)
-    for unit, scale in (("s", 1_000_000_000), ("ms", 1_000_000), ("us", 1_000)):
-        if size >= scale:
-            return f"{nanoseconds / scale:.1f} {unit}"
-    return f"{nanoseconds} ns"
 
 
 def _span(later: int | None, earlier: int | None) -> str:

@@ -1,0 +1,39 @@
+"""FrameInfo: what ``frames()`` tells of each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from zstate.buffer.tracks import coverage
+from zstate.buffer.tree import Edge
+
+
+@dataclass(frozen=True, slots=True)
+class FrameInfo:
+    """What is known of one frame and of the edge that places it.
+
+    ``kind`` is "joint" or "pose" for moving edges, "static", or "root" for a frame without a parent.
+    Stamps are nanoseconds; they, ``rate_hz`` and ``count`` tell of the samples kept.
+    """
+
+    name: str
+    parent: str | None
+    kind: Literal["joint", "pose", "static", "root"]
+    writer: str | None
+    rate_hz: float | None
+    oldest: int | None
+    newest: int | None
+    count: int
+
+
+def frame_info(name: str, edge: Edge | None) -> FrameInfo:
+    """What the tree and a track say of one frame."""
+    if edge is None:
+        return FrameInfo(name, None, "root", None, None, None, None, 0)
+    if edge.track is None:
+        return FrameInfo(name, edge.parent, "static", edge.writer, None, None, None, 0)
+    facts = coverage(edge.track)
+    return FrameInfo(
+        name, edge.parent, edge.kind, edge.writer, facts.rate_hz, facts.oldest, facts.newest, facts.count
+    )

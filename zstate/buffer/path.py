@@ -1,0 +1,252 @@
+"""Path: the way between two frames, compiled once, evaluated at any instant.
+
+A lookup searches once in each track it passes, reads only the joints on its way, and multiplies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate import se3
+from zstate.buffer.cells import Between, Cell
+from zstate.buffer.history import View
+from zstate.buffer.steps import Motion, Step, Values, chain_motion, chain_pose
+from zstate.buffer.tracks import JointTrack, Track, coverage
+from zstate.errors import InFuture, InPast, LookupFailed, NoData, Stale
+from zstate.transform import Kind
+
+Stamps: TypeAlias = NDArray[np.int64]
+ViewTaker: TypeAlias = Callable[[Sequence["TrackUse"]], list[View]]
+
+
+class TrackUse(NamedTuple):
+    """A track that the path passes: which of its cells, and the first of its edges on the way."""
+
+    track: Track
+    cells: tuple[Cell, ...]
+    edge: tuple[str, str]
+
+
+class Answer(NamedTuple):
+    """What a path says: target_from_source as seven floats, when, and how that was found."""
+
+    pose: se3.Pose
+    stamp: int | None
+    kind: Kind
+    predicted_s: float = 0.0
+
+
+class Path:
+    """From ``source`` to ``target`` by way of where their branches meet."""
+
+    def __init__(
+        self,
+        names: tuple[str, str],
+        steps_to_target: Sequence[Step],
+        steps_to_source: Sequence[Step],
+        uses: Sequence[TrackUse],
+        take_views: ViewTaker,
+    ) -> None:
+        self.target, self.source = names
+        self.steps_to_target = steps_to_target
+        self.steps_to_source = steps_to_source
+        self.uses = tuple(uses)
+        self._take_views = take_views
+
+    def latest(self) -> int:
+        """The newest instant that every moving edge knows [ns]. Raises NoData."""
+        if not self.uses:
+            raise NoData(self.target, self.source)
+        return self._latest(self._take_views(self.uses))
+
+    def answer(self, stamp: int | None, predict_ns: int = 0) -> Answer:
+        """The pose at ``stamp``, or at the latest instant. Raises NoData, InPast or InFuture."""
+        if not self.uses:
+            return Answer(self._pose((), se3.SCALARS), stamp, "static")
+        views = self._take_views(self.uses)
+        at = self._latest(views) if stamp is None else stamp
+        kind: Kind = "exact"
+        predicted_ns = 0
+        values: list[list[se3.Component]] = []
+        for use, view in zip(self.uses, views, strict=True):
+            now = _between(view, at)
+            if now is not None:
+                values.append([cell.value(now) for cell in use.cells])
+                kind = "interpolated" if now.seconds and kind == "exact" else kind
+            else:
+                ahead = self._ahead(use, view, at, predict_ns)
+                if ahead is None:
+                    raise self.blame(at, views, predict_ns)
+                kind, predicted_ns = "predicted", max(predicted_ns, at - view.newest)
+                values.append(ahead)
+        pose = se3.normalize(self._pose(values, se3.SCALARS), se3.SCALARS)
+        return Answer(pose, at, kind, predicted_ns * 1e-9)
+
+    def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
+        """Pose and velocity of the source in the target. Raises as ``answer``, and NoData without a rate."""
+        views = self._take_views(self.uses)
+        at = stamp if stamp is not None or not self.uses else self._latest(views)
+        values: list[list[se3.Component]] = []
+        rates: list[list[se3.Component]] = []
+        for use, view in zip(self.uses, views, strict=True):
+            now = None if at is None else _between(view, at, moving=True)
+            if now is None:
+                raise self.blame(at or 0, views)
+            values.append([cell.value(now) for cell in use.cells])
+            rates.append([cell.rate(now) for cell in use.cells])
+        above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
+        motion = above_target.inverse().then(chain_motion(self.steps_to_source, values, rates, se3.SCALARS))
+        if not np.isfinite((*motion.linear, *motion.angular)).all():
+            raise self._no_rate()
+        return motion, at
+
+    def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
+        views = self._take_views(self.uses)
+        valid = np.ones(len(stamps), dtype=np.bool_)
+        for view in views:
+            valid &= _within(view, stamps)
+        known = stamps[valid]
+        values = [
+            [cell.value(now) for cell in use.cells]
+            for use, now in zip(self.uses, (_between_many(view, known) for view in views), strict=True)
+        ]
+        poses = np.full((len(stamps), 7), np.nan)
+        if len(known):
+            pose = se3.normalize(self._pose(values, se3.ARRAYS), se3.ARRAYS)
+            poses[valid] = np.stack(np.broadcast_arrays(*pose, known)[:7], axis=-1)
+        return poses, valid
+
+    def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
+        """The error for an answer that is too old, naming the edge that is most behind."""
+        use = min(self.uses, key=lambda use: coverage(use.track).newest or 0)
+        facts = coverage(use.track)
+        return Stale(
+            self.target,
+            self.source,
+            age_s=age_s,
+            max_age_s=max_age_s,
+            edge=use.edge,
+            requested=stamp,
+            oldest=facts.oldest,
+            newest=facts.newest,
+            rate_hz=facts.rate_hz,
+            writer=use.track.writer,
+        )
+
+    def blame(self, at: int, views: Sequence[View], predict_ns: int = 0) -> LookupFailed:
+        """Which track cannot answer at ``at``: too young, then empty, then not there yet."""
+        numbered = list(enumerate(views))
+        too_young = [(view.oldest, n) for n, view in numbered if view.size and at < view.oldest]
+        if too_young:
+            return self._failure(InPast, self.uses[max(too_young)[1]], at)
+        empty = [n for n, view in numbered if not view.size]
+        if empty:
+            return self._failure(NoData, self.uses[empty[0]], at)
+        newest = [(view.newest, n) for n, view in numbered if at > view.newest]
+        limiting = self.uses[min(newest)[1]]
+        failure = self._failure(InFuture, limiting, at)
+        if predict_ns and at <= min(newest)[0] + predict_ns:
+            failure.note = "it cannot be predicted: no velocity is known there"
+        return failure
+
+    def _failure(self, error: type[LookupFailed], use: TrackUse, at: int | None) -> LookupFailed:
+        facts = coverage(use.track)
+        return error(
+            self.target,
+            self.source,
+            edge=use.edge,
+            requested=at,
+            oldest=facts.oldest,
+            newest=facts.newest,
+            rate_hz=facts.rate_hz,
+            writer=use.track.writer,
+        )
+
+    def _no_rate(self) -> LookupFailed:
+        lonely = [use for use in self.uses if use.track.history.view.size < 2]
+        failure = self._failure(NoData, (lonely or self.uses)[0], None)
+        failure.note = "a rate of change needs two samples, or published velocities"
+        return failure
+
+    def _latest(self, views: Sequence[View]) -> int:
+        for use, view in zip(self.uses, views, strict=True):
+            if not view.size:
+                raise self._failure(NoData, use, None)
+        return min(view.newest for view in views)
+
+    def _pose(self, values: Values, f: se3.Functions) -> se3.Pose:
+        target_from_top = chain_pose(self.steps_to_target, values, f)
+        source_from_top = chain_pose(self.steps_to_source, values, f)
+        if not self.steps_to_target:
+            return source_from_top
+        return se3.compose(se3.invert(target_from_top), source_from_top)
+
+    @staticmethod
+    def _ahead(use: TrackUse, view: View, at: int, predict_ns: int) -> list[se3.Component] | None:
+        """The cells' values beyond the newest sample, at their last rates; None where not allowed."""
+        if not view.size or not view.newest < at <= view.newest + predict_ns:
+            return None
+        now = _last_stretch(view, use)
+        seconds = (at - view.newest) * 1e-9
+        values: list[se3.Component] = [
+            cell.ahead(now.b, cell.rate(now), seconds, se3.SCALARS)  # type: ignore[arg-type]
+            for cell in use.cells
+        ]
+        return values if np.isfinite(np.hstack(values)).all() else None
+
+
+def _row(view: View, index: int) -> list[float]:
+    return view.rows[index].tolist()
+
+
+def _between(view: View, at: int, *, moving: bool = False) -> Between | None:
+    """The rows around ``at``; None outside of them. An exact hit is one row, unless ``moving``
+    asks for a stretch of time to measure a rate on."""
+    stamps, _, first, end = view
+    index = first + int(stamps[first:end].searchsorted(at))
+    if index == end:
+        return None
+    stamp = int(stamps[index])
+    if stamp == at and not (moving and view.size > 1):
+        row = _row(view, index)
+        return Between(row, row, 0.0, 0.0, se3.SCALARS)
+    if index == first:
+        if stamp != at:
+            return None
+        index += 1
+        stamp = int(stamps[index])
+    before = int(stamps[index - 1])
+    ratio = (at - before) / (stamp - before)
+    return Between(_row(view, index - 1), _row(view, index), ratio, (stamp - before) * 1e-9, se3.SCALARS)
+
+
+def _last_stretch(view: View, use: TrackUse) -> Between:
+    """What the rates of a prediction are measured on: published at the newest row, or the last two."""
+    last = _row(view, view.end - 1)
+    if isinstance(use.track, JointTrack) or view.size < 2:
+        return Between(last, last, 0.0, 0.0, se3.SCALARS)
+    span_ns = int(view.stamps[view.end - 1] - view.stamps[view.end - 2])
+    return Between(_row(view, view.end - 2), last, 1.0, span_ns * 1e-9, se3.SCALARS)
+
+
+def _within(view: View, stamps: Stamps) -> NDArray[np.bool_]:
+    if not view.size:
+        return np.zeros(len(stamps), dtype=np.bool_)
+    return (stamps >= view.oldest) & (stamps <= view.newest)
+
+
+def _between_many(view: View, stamps: Stamps) -> Between:
+    """The rows around each of ``stamps``, all of which the view covers; columns come first."""
+    kept = view.kept_stamps()
+    after = kept.searchsorted(stamps)
+    exact = kept[after] == stamps
+    before = np.where(exact, after, after - 1)
+    span_ns = kept[after] - kept[before]
+    ratio = np.where(exact, 0.0, (stamps - kept[before]) / np.where(exact, 1, span_ns))
+    rows = view.kept_rows()
+    return Between(rows[before].T, rows[after].T, ratio, span_ns * 1e-9, se3.ARRAYS)

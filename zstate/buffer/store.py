@@ -1,0 +1,249 @@
+"""Store: everything that is written into a buffer, checked at the door."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zstate.buffer.feeds import EdgeNames, Feed, Feeds, second_writer
+from zstate.buffer.frames import FrameInfo, frame_info
+from zstate.buffer.history import View
+from zstate.buffer.path import TrackUse
+from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack
+from zstate.buffer.tree import Edge, Tree
+from zstate.buffer.waiting import WaitingRoom
+from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.errors import InsertRefused, InvalidInput
+from zstate.model.robot import RobotModel
+from zstate.transform import QUATERNION_TOLERANCE, Transform
+
+Poses = NDArray[np.float64]
+
+
+class Store:
+    """The half of ``TransformBuffer`` that takes data in. A refused call leaves no trace.
+
+    Inserts may come from any thread; they take turns. Readers never wait for them.
+    """
+
+    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+        if not (math.isfinite(history_s) and 0.0 < history_s < 1e9):
+            raise InvalidInput(f"history_s is a positive number of seconds, not {history_s!r}")
+        self.history_s = history_s
+        self.clock: Clock = clock or SystemClock()
+        self.ignored = 0
+        """How many samples were older than the history reaches."""
+        self._span_ns = round(history_s * 1e9)
+        self._lock = threading.RLock()
+        self._writes = 0
+        self._tree = Tree()
+        self._room = WaitingRoom(self._tree)
+        self._feeds = Feeds(self._tree, self._span_ns)
+
+    def add_robot(
+        self, model: RobotModel, prefix: str = "", *, interpolation: Interpolation = "linear"
+    ) -> JointTrack:
+        """Know all links of ``model``; its fixed joints answer at once. Returns the track to fill.
+
+        With a ``prefix`` the links are called ``prefix/link``. ``interpolation="hermite"`` joins
+        samples that have velocities by cubic curves. Raises InsertRefused when one of the links has a
+        parent already.
+        """
+        prefix = prefix.removesuffix("/")
+        track = JointTrack(model, prefix, self._span_ns, interpolation)
+        with self._lock, self._tree.untouched_on_error():
+            if prefix and self._tree.robots.get(prefix) is not None:
+                raise InsertRefused(
+                    f"there is a robot {prefix!r} in this buffer; remove_robot first",
+                    reason="second writer",
+                    edge=(prefix, model.root),
+                )
+            self._tree.add_frame(track.frame(model.root))
+            for index in range(len(track.forms)):
+                self._attach_joint(track, index)
+            self._tree.robots[prefix] = track
+        self._room.notify()
+        return track
+
+    def _attach_joint(self, track: JointTrack, index: int) -> None:
+        form = track.forms[index]
+        parent, child = track.edge(form)
+        existing = self._tree.frames.get(child)
+        if existing is not None and existing.parent == parent:
+            raise second_writer(parent, child, existing, f"the model of {track.model.name!r}")
+        self._tree.check_edge(parent, child, f"the model of {track.model.name!r}")
+        if form.kind == "fixed":
+            edge = Edge(parent, child, "static", pose=form.origin, robot=track)
+        else:
+            edge = Edge(parent, child, "joint", track=track, index=index, robot=track)
+        self._tree.attach(edge)
+
+    def remove_robot(self, track: JointTrack) -> None:
+        """Take a robot's edges and history away. Its frames stay known, without a parent."""
+        with self._lock:
+            for name, edge in list(self._tree.frames.items()):
+                if edge is not None and edge.robot is track:
+                    self._tree.detach(name)
+            if self._tree.robots.get(track.prefix) is track:
+                self._tree.robots[track.prefix] = None
+
+    def name_robot(self, prefix: str) -> None:
+        """Let frames called ``prefix/...`` answer to their bare names in inserts, as a robot's do."""
+        with self._lock:
+            self._tree.robots.setdefault(prefix, None)
+
+    def insert_joints(
+        self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
+    ) -> bool:
+        """One instant of a robot: positions (and velocities) in the order of its ``joint_names``.
+
+        True, or False when it is older than the history reaches, which ``ignored`` counts. A second
+        sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity.
+        """
+        stamp = check_stamp(stamp)
+        numbers = track.model.check_positions(positions)
+        rates = None if velocities is None else track.model.check_velocities(velocities)
+        with self._lock:
+            had_velocities = track.has_velocities
+            taken = track.insert(stamp, numbers, rates)
+            if track.has_velocities != had_velocities:
+                self._tree.version += 1
+        return self._count(taken)
+
+    def restart(self, track: JointTrack | PoseTrack) -> None:
+        """A new epoch: forget the samples of one track, because its writer or its clock began anew."""
+        with self._lock:
+            track.history.clear()
+
+    def insert(self, transform: Transform, *, writer: str | None = None) -> bool:
+        """One sample of a moving edge: ``transform.target`` is the parent, ``source`` the child.
+
+        True, or False when it is older than the history reaches. Raises InsertRefused for a transform
+        without a stamp, a self edge, a loop, a second parent, or an edge of a robot's model.
+        """
+        edge = (transform.target, transform.source)
+        if transform.stamp is None:
+            raise InsertRefused(
+                f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for what never moves",
+                reason="no stamp",
+                edge=edge,
+            )
+        return self._insert_poses((edge,), transform.stamp, transform.pose7[None], writer)
+
+    def insert_many(
+        self, edges: Sequence[EdgeNames], stamp: int, poses: ArrayLike, *, writer: str | None = None
+    ) -> bool:
+        """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of edges[i].
+
+        ``poses`` is (N, 7), x y z [m], qx qy qz qw. Otherwise as ``insert``.
+        """
+        names = tuple((parent, child) for parent, child in edges)
+        return self._insert_poses(names, check_stamp(stamp), _check_poses(names, poses), writer)
+
+    def _insert_poses(
+        self, names: tuple[EdgeNames, ...], stamp: int, poses: Poses, writer: str | None
+    ) -> bool:
+        with self._lock:
+            feed = self._feeds.of(names, writer)
+            views = [track.history.view for track, _ in feed]
+            taken = not any(view.size and stamp < view.newest - self._span_ns for view in views)
+            if taken and len(feed) == 1:
+                track, rows = feed[0]
+                track.history.insert(stamp, poses[rows].ravel())
+            elif taken:
+                self._write_together(feed, stamp, poses)
+        return self._count(taken)
+
+    def _write_together(self, feed: Feed, stamp: int, poses: Poses) -> None:
+        # Odd while tracks disagree: a reader that sees it asks again under the lock.
+        self._writes += 1
+        for track, rows in feed:
+            track.history.insert(stamp, poses[rows].ravel())
+        self._writes += 1
+
+    def _count(self, taken: bool) -> bool:
+        if taken:
+            self._room.notify()
+        else:
+            self.ignored += 1
+        return taken
+
+    def insert_static(self, transform: Transform, *, writer: str | None = None) -> None:
+        """An edge that never moves, from now on and for every instant; a stamp is not looked at.
+
+        Replaces what placed the child on that parent before. Raises InsertRefused as ``insert``.
+        """
+        with self._lock, self._tree.untouched_on_error():
+            edge = self._feeds.admit(transform.target, transform.source, writer)
+            self._feeds.separate(edge)
+            pose = tuple(transform.pose7.tolist())
+            self._tree.attach(Edge(*edge, "static", pose=pose, own_writer=writer))  # type: ignore[arg-type]
+        self._room.notify()
+
+    def withdraw(self, child: str) -> None:
+        """Take away what places ``child``, with its history; the frame stays known.
+
+        Raises InvalidInput for a frame nobody named, InsertRefused for a link of a robot's model.
+        """
+        with self._lock:
+            name = self._tree.named_for_insert(child)
+            if name not in self._tree.frames:
+                near = self._tree.near(child)
+                hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
+                raise InvalidInput(f"there is no frame {child!r} to withdraw{hint}")
+            edge = self._tree.frames[name]
+            if edge is not None and edge.robot is not None:
+                raise InsertRefused(
+                    f"{name!r} is placed by {edge.writer}; remove_robot takes the whole robot away",
+                    reason="second writer",
+                    edge=edge.names,
+                )
+            if edge is not None:
+                self._feeds.separate(edge.names)
+            self._tree.detach(name)
+
+    def clear(self) -> None:
+        """Forget every sample. Frames, static edges and robots stay."""
+        with self._lock:
+            for edge in self._tree.frames.values():
+                if edge is not None and edge.track is not None and edge.track.history.view.size:
+                    edge.track.history.clear()
+
+    def frames(self) -> tuple[FrameInfo, ...]:
+        """Every frame ever named, in the order of their first mention."""
+        with self._lock:
+            return tuple(frame_info(name, edge) for name, edge in self._tree.frames.items())
+
+    def _take_views(self, uses: Sequence[TrackUse]) -> list[View]:
+        """The views of several tracks at one moment between writes."""
+        before = self._writes
+        views = [use.track.history.view for use in uses]
+        if len(uses) < 2 or (before == self._writes and not before & 1):
+            return views
+        with self._lock:
+            return [use.track.history.view for use in uses]
+
+
+def _check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
+    array = np.array(poses, dtype=np.float64)
+    if not edges or array.shape != (len(edges), 7):
+        raise InvalidInput(
+            f"{len(edges)} edges take poses of shape ({len(edges)}, 7), at least one; got {array.shape}"
+        )
+    norms: Poses = np.sqrt(np.square(array[:, 3:]).sum(axis=1))
+    good = np.isfinite(array).all(axis=1) & (np.abs(norms - 1.0) <= QUATERNION_TOLERANCE)
+    if not good.all():
+        worst = int(good.argmin())
+        parent, child = edges[worst]
+        raise InsertRefused(
+            f"{parent!r} -> {child!r}: a pose is seven finite numbers, the last four a quaternion x y z w of "
+            f"length 1; got {array[worst].tolist()}",
+            reason="not a pose",
+            edge=(parent, child),
+        )
+    array[:, 3:] /= norms[:, None]
+    return array

@@ -1,0 +1,122 @@
+"""Tracks: one publisher's history each, with one stamp column for everything it knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.buffer.history import History
+from zstate.model.edges import EdgeForm, edge_forms
+from zstate.model.robot import RobotModel
+
+Interpolation = Literal["linear", "hermite"]
+
+
+class JointTrack:
+    """The joint positions of one robot, and velocities from the first sample on that has them.
+
+    A row is the positions in the order of ``model.joint_names``, then the velocities; velocities
+    that were not published are NaN. ``prefix`` stands before the names of all links.
+    """
+
+    def __init__(
+        self, model: RobotModel, prefix: str, span_ns: int, interpolation: Interpolation = "linear"
+    ) -> None:
+        self.model = model
+        self.prefix = prefix
+        self.forms = edge_forms(model)
+        self.interpolation = interpolation
+        self.writer: str | None = None
+        self.history = History(model.position_count, span_ns)
+
+    def __repr__(self) -> str:
+        return f"<track of {self.prefix or self.model.name!r}, {self.history.view.size} samples>"
+
+    @property
+    def has_velocities(self) -> bool:
+        """Whether rows have columns for velocities."""
+        return self.history.width > self.model.position_count
+
+    def turns(self, index: int) -> bool:
+        """Whether the joint behind an edge is continuous: any number of turns, encoders that wrap."""
+        master = self.model.mimic_of(self.model.joints[index]).joint
+        return any(joint.name == master and joint.type == "continuous" for joint in self.model.driven_joints)
+
+    def frame(self, link: str) -> str:
+        """What a link is called in the buffer."""
+        return f"{self.prefix}/{link}" if self.prefix else link
+
+    def edge(self, form: EdgeForm) -> tuple[str, str]:
+        """(parent, child) of one of ``forms``, as named in the buffer."""
+        return (self.frame(form.parent), self.frame(form.child))
+
+    def insert(
+        self, stamp: int, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None
+    ) -> bool:
+        """Take one instant; False when it is older than the history reaches."""
+        if velocities is not None and not self.has_velocities:
+            self._make_room_for_velocities()
+        if not self.has_velocities:
+            return self.history.insert(stamp, positions)
+        if velocities is None:
+            velocities = np.full(self.model.velocity_count, np.nan)
+        return self.history.insert(stamp, np.concatenate((positions, velocities)))
+
+    def _make_room_for_velocities(self) -> None:
+        old = self.history.view
+        missing = np.full((old.size, self.model.velocity_count), np.nan)
+        wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
+        wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
+        self.history = wider
+
+
+class PoseTrack:
+    """Poses of one or several moving edges that one publisher always gives together.
+
+    Columns 7 i to 7 i + 7 of a row are ``parent_from_child`` of ``edges[i]``.
+    """
+
+    def __init__(self, edges: tuple[tuple[str, str], ...], span_ns: int, writer: str | None) -> None:
+        self.edges = edges
+        self.writer = writer
+        self.history = History(7 * len(edges), span_ns)
+
+    def __repr__(self) -> str:
+        return f"<track of {len(self.edges)} edges, {self.history.view.size} samples>"
+
+    def split(self) -> list[PoseTrack]:
+        """The same samples as one track for each edge: their publishers went separate ways."""
+        view = self.history.view
+        singles: list[PoseTrack] = []
+        for index, edge in enumerate(self.edges):
+            single = PoseTrack((edge,), self.history.span_ns, self.writer)
+            rows = view.kept_rows()[:, 7 * index : 7 * index + 7]
+            single.history.replace(view.kept_stamps(), rows)
+            singles.append(single)
+        return singles
+
+
+Track: TypeAlias = JointTrack | PoseTrack
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """What a track holds, in the words of errors and of ``frames()``."""
+
+    oldest: int | None
+    newest: int | None
+    rate_hz: float | None
+    count: int
+
+
+def coverage(track: Track) -> Coverage:
+    """How far the samples of ``track`` reach, and how many there are in a second."""
+    view = track.history.view
+    if not view.size:
+        return Coverage(None, None, None, 0)
+    oldest, newest = view.oldest, view.newest
+    rate_hz = (view.size - 1) * 1e9 / (newest - oldest) if newest > oldest else None
+    return Coverage(oldest, newest, rate_hz, view.size)

@@ -1,0 +1,82 @@
+"""Every exception of zstate, as one tree.
+
+ZStateError
+├── InvalidInput (ValueError)          an argument that cannot be used; nothing was changed
+│   ├── FrameMismatch                  ``a_from_b @ c_from_d`` with b != c
+│   ├── InsertRefused                  the buffer did not take a transform        .reason .edge
+│   └── ConfigError                    a configuration file or option             .path
+├── ModelError (ValueError)            a robot model that cannot be used          .source .findings
+│   └── UnknownModel                   no model of that name                      .name .near_misses
+├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
+├── NetworkError                       Zenoh said no
+│   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
+│   ├── PortBusy                       somebody listens there already             .endpoint
+│   └── Closed                         used after close(), or after fork
+└── LookupFailed                       .target .source .edge .requested .oldest .newest .rate_hz .writer
+    ├── UnknownFrame                   never heard of it                          .name .near_misses
+    ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
+    ├── Disconnected                   two trees                                  .roots
+    ├── NoData                         an edge without any sample
+    ├── InFuture                       asked after the newest sample of an edge
+    ├── InPast                         asked before the oldest sample of an edge
+    └── Stale                          newer data was demanded by ``max_age_s``   .age_s .max_age_s
+
+A wait that ran out raises the reason it was still waiting for, as a subclass that is also
+``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.
+"""
+
+from zstate.errors.base import (
+    Closed,
+    ConfigError,
+    Found,
+    FrameMismatch,
+    InsertRefused,
+    InvalidInput,
+    MessageError,
+    ModelError,
+    NetworkError,
+    PortBusy,
+    UnknownModel,
+    Unreachable,
+    ZStateError,
+)
+from zstate.errors.lookup import (
+    AmbiguousFrame,
+    Disconnected,
+    InFuture,
+    InPast,
+    LookupFailed,
+    NoData,
+    Stale,
+    UnknownFrame,
+    WaitTimeout,
+    duration_text,
+    timed_out,
+)
+
+__all__ = [
+    "AmbiguousFrame",
+    "Closed",
+    "ConfigError",
+    "Disconnected",
+    "Found",
+    "FrameMismatch",
+    "InFuture",
+    "InPast",
+    "InsertRefused",
+    "InvalidInput",
+    "LookupFailed",
+    "MessageError",
+    "ModelError",
+    "NetworkError",
+    "NoData",
+    "PortBusy",
+    "Stale",
+    "UnknownFrame",
+    "UnknownModel",
+    "Unreachable",
+    "WaitTimeout",
+    "ZStateError",
+    "duration_text",
+    "timed_out",
+]

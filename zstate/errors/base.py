@@ -1,0 +1,116 @@
+"""Errors about input, models, messages and the network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+
+class ZStateError(Exception):
+    """What every error of zstate is."""
+
+
+class InvalidInput(ZStateError, ValueError):
+    """An argument that cannot be used. Nothing was changed by the call."""
+
+
+class FrameMismatch(InvalidInput):
+    """Two transforms were composed whose inner frames differ."""
+
+
+class InsertRefused(InvalidInput):
+    """The buffer did not take a transform; what it held before is untouched.
+
+    ``reason`` is one word or two for programs and counters ("loop", "second parent", ...);
+    ``edge`` is (parent, child) as given.
+    """
+
+    def __init__(self, message: str, *, reason: str, edge: tuple[str, str]) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.edge = edge
+
+
+class ConfigError(InvalidInput):
+    """A configuration file or option that cannot be used; ``path`` says where in it."""
+
+    def __init__(self, message: str, *, path: str = "") -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class Found(Protocol):
+    """What a ModelError needs to know of a finding (see ``zstate.model.urdf.Finding``)."""
+
+    @property
+    def line(self) -> int | None: ...
+    @property
+    def message(self) -> str: ...
+    @property
+    def severity(self) -> str: ...
+
+
+class ModelError(ZStateError, ValueError):
+    """A robot model that cannot be used, with everything that is wrong with it.
+
+    ``findings`` holds errors and warnings in the order of their lines; ``source`` names the file
+    or text they were found in.
+    """
+
+    def __init__(self, source: str, findings: Sequence[Found] = (), message: str = "") -> None:
+        self.source = source
+        self.findings = tuple(findings)
+        super().__init__(message or self._summary())
+
+    def _summary(self) -> str:
+        errors = [f for f in self.findings if f.severity == "error"]
+        count = f"{len(errors)} finding{'s' if len(errors) != 1 else ''}"
+        lines = [f"{self.source} cannot be used ({count})"]
+        for finding in errors:
+            where = f"line {finding.line}" if finding.line is not None else "file"
+            lines.append(f"  {where}  {finding.message}")
+        return "\n".join(lines)
+
+
+class UnknownModel(ModelError):
+    """No file, URDF text or catalog entry answers to that name."""
+
+    def __init__(self, name: str, near_misses: Sequence[str], message: str) -> None:
+        super().__init__(name, (), message)
+        self.name = name
+        self.near_misses = tuple(near_misses)
+
+
+class MessageError(ZStateError, ValueError):
+    """Bytes that are not a message we can read.
+
+    ``reason`` is a counter's name: "foreign", "newer version", "truncated" or "malformed".
+    """
+
+    def __init__(self, message: str, *, reason: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class NetworkError(ZStateError):
+    """Zenoh refused, or the network does not do what was asked."""
+
+
+class Unreachable(NetworkError, TimeoutError):
+    """Nothing answers at the endpoints."""
+
+    def __init__(self, message: str, *, endpoints: Sequence[str]) -> None:
+        super().__init__(message)
+        self.endpoints = tuple(endpoints)
+
+
+class PortBusy(NetworkError):
+    """Somebody listens at that endpoint already."""
+
+    def __init__(self, message: str, *, endpoint: str) -> None:
+        super().__init__(message)
+        self.endpoint = endpoint
+
+
+class Closed(NetworkError):
+    """Used after ``close()``, or in a process forked from the one that opened it."""

@@ -1,0 +1,270 @@
+"""Transform: a pose that knows which frames it speaks of.
+
+One sentence holds it together: ``p_a = a_from_b @ p_b``. A ``Transform(target="a", source="b", ...)``
+is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in b into a.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zstate import se3
+from zstate.clock import Clock, check_stamp, stamp_text
+from zstate.errors import FrameMismatch, InvalidInput, duration_text
+
+Kind: TypeAlias = Literal["static", "exact", "interpolated", "predicted"]
+Array: TypeAlias = NDArray[np.float64]
+
+# A path is as good as its least certain part: the later kind wins.
+KINDS: tuple[Kind, ...] = ("static", "exact", "interpolated", "predicted")
+
+# Quaternions this far from length one are normalised; beyond, something is wrong with the writer.
+QUATERNION_TOLERANCE = 1e-3
+
+
+def worst_kind(*kinds: Kind) -> Kind:
+    """The kind of an answer that is made of parts of these kinds."""
+    return KINDS[max(map(KINDS.index, kinds))]
+
+
+def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
+    """x y z qx qy qz qw as seven finite floats with a quaternion of length one.
+
+    Lengths within 1e-3 of one are normalised. Raises InvalidInput saying which number is at fault.
+    """
+    array = np.asarray(numbers, dtype=np.float64)
+    if array.shape != (7,):
+        raise InvalidInput(f"{what} takes 7 numbers x y z qx qy qz qw; got shape {array.shape}")
+    values = array.tolist()
+    if not all(map(math.isfinite, values)):
+        raise InvalidInput(f"{what} must be finite; got {values}")
+    norm = math.sqrt(sum(value * value for value in values[3:]))
+    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
+        raise InvalidInput(
+            f"the quaternion of {what} has length {norm:.6g}, which is more than {QUATERNION_TOLERANCE:g} "
+            f"from 1: {values[3:]} (order x y z w)"
+        )
+    return (*values[:3], *(value / norm for value in values[3:]))
+
+
+class Transform:
+    """The pose of frame ``source`` in frame ``target``, at one instant or for ever.
+
+    ``translation`` is x y z [m] in target axes, ``rotation`` the unit quaternion x y z w, ``stamp``
+    nanoseconds since the Unix epoch or None for what holds at any time. ``kind`` tells how a buffer
+    made it: "static", "exact", "interpolated" or "predicted", the last ``predicted_s`` seconds beyond
+    the newest sample. Immutable. Raises InvalidInput for numbers that are no pose.
+    """
+
+    __slots__ = ("_pose", "kind", "predicted_s", "source", "stamp", "target")
+
+    _pose: tuple[float, ...]
+    target: str
+    source: str
+    stamp: int | None
+    kind: Kind
+    predicted_s: float
+
+    def __init__(
+        self,
+        target: str,
+        source: str,
+        translation: ArrayLike,
+        rotation: ArrayLike,
+        stamp: int | None = None,
+        *,
+        kind: Kind | None = None,
+    ) -> None:
+        position, quaternion = np.asarray(translation), np.asarray(rotation)
+        if position.shape != (3,) or quaternion.shape != (4,):
+            raise InvalidInput(
+                f"a transform takes a translation x y z and a rotation x y z w; got shapes "
+                f"{position.shape} and {quaternion.shape}"
+            )
+        pose = check_pose(np.concatenate((position, quaternion)), f"{target!r} from {source!r}")
+        stamp = None if stamp is None else check_stamp(stamp)
+        self._fill(target, source, pose, stamp, kind or ("static" if stamp is None else "exact"))
+
+    def _fill(  # noqa: PLR0917 - one call for each fact, on the hot path
+        self,
+        target: str,
+        source: str,
+        pose: tuple[float, ...],
+        stamp: int | None,
+        kind: Kind,
+        predicted_s: float = 0.0,
+    ) -> None:
+        values = zip(self.__slots__, (pose, kind, predicted_s, source, stamp, target), strict=True)
+        for name, value in values:
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def trusted(  # noqa: PLR0917 - the buffer's hot path
+        cls,
+        target: str,
+        source: str,
+        pose: tuple[float, ...],
+        stamp: int | None,
+        kind: Kind,
+        predicted_s: float = 0.0,
+    ) -> Transform:
+        """From seven floats that are known to be a pose: for the buffer, which checked at insert."""
+        transform = cls.__new__(cls)
+        transform._fill(target, source, pose, stamp, kind, predicted_s)
+        return transform
+
+    @classmethod
+    def from_pose7(cls, target: str, source: str, pose7: ArrayLike, stamp: int | None = None) -> Transform:
+        """From x y z [m], qx qy qz qw."""
+        pose = check_pose(pose7, f"{target!r} from {source!r}")
+        return cls(target, source, pose[:3], pose[3:], stamp)
+
+    @classmethod
+    def from_matrix(cls, target: str, source: str, matrix: ArrayLike, stamp: int | None = None) -> Transform:
+        """From a homogeneous (4, 4) matrix whose rotation is orthonormal within 1e-3."""
+        array = np.asarray(matrix, dtype=np.float64)
+        if array.shape != (4, 4) or not np.isfinite(array).all():
+            raise InvalidInput(f"a transform's matrix is (4, 4) and finite; got {array!r}")
+        rotation = array[:3, :3]
+        error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+        if error > QUATERNION_TOLERANCE or np.linalg.det(rotation) < 0.0:
+            raise InvalidInput(
+                f"the rotation of {target!r} from {source!r} is not a rotation: it is off orthonormal by "
+                f"{error:.3g}, its determinant is {np.linalg.det(rotation):.6g}"
+            )
+        if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+            raise InvalidInput(f"the last row of a transform's matrix is 0 0 0 1; got {array[3].tolist()}")
+        return cls(target, source, array[:3, 3], se3.quaternion_of_matrix(rotation), stamp)
+
+    @classmethod
+    def from_rpy(
+        cls, target: str, source: str, translation: ArrayLike, rpy: ArrayLike, stamp: int | None = None
+    ) -> Transform:
+        """From x y z [m] and roll pitch yaw [rad] as in URDF: about the fixed x, then y, then z."""
+        angles = np.asarray(rpy, dtype=np.float64)
+        if angles.shape != (3,) or not np.isfinite(angles).all():
+            raise InvalidInput(f"rpy is three finite angles [rad]; got {angles!r}")
+        return cls(target, source, translation, se3.quaternion_of_rpy(*angles.tolist()), stamp)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"a Transform is immutable; make a new one to change {name!r}")
+
+    __delattr__ = __setattr__  # type: ignore[assignment]
+
+    @property
+    def translation(self) -> Array:
+        """x y z [m] of the source's origin, in target axes: (3,)."""
+        return np.array(self._pose[:3])
+
+    @property
+    def rotation(self) -> Array:
+        """The unit quaternion x y z w: (4,)."""
+        return np.array(self._pose[3:])
+
+    @property
+    def pose7(self) -> Array:
+        """x y z qx qy qz qw: (7,)."""
+        return np.array(self._pose)
+
+    @property
+    def matrix(self) -> Array:
+        """The homogeneous matrix: (4, 4)."""
+        return se3.to_matrix(self._pose)
+
+    @property
+    def rpy(self) -> Array:
+        """Roll pitch yaw [rad] as in URDF: (3,)."""
+        return np.array(se3.rpy_of_quaternion(self._pose[3:]))  # type: ignore[arg-type]
+
+    def inverse(self) -> Transform:
+        """source_from_target at the same instant."""
+        pose = se3.invert(self._pose)  # type: ignore[arg-type]
+        return Transform.trusted(self.source, self.target, pose, self.stamp, self.kind, self.predicted_s)
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """``a_from_b @ b_from_c`` is a_from_c; FrameMismatch when the inner frames differ.
+
+        The stamp is the one both share or the only one there is; of two instants, None.
+        """
+        if not isinstance(other, Transform):  # pyright: ignore[reportUnnecessaryIsInstance]
+            return NotImplemented
+        if self.source != other.target:
+            raise FrameMismatch(
+                f"{self.target!r} from {self.source!r} @ {other.target!r} from {other.source!r}: the inner "
+                f"frames differ; invert one, or look up {self.source!r} from {other.target!r} between them"
+            )
+        pose = se3.compose(self._pose, other._pose)  # type: ignore[arg-type]
+        stamps = {stamp for stamp in (self.stamp, other.stamp) if stamp is not None}
+        return Transform.trusted(
+            self.target,
+            other.source,
+            se3.normalize(pose, se3.SCALARS),
+            stamps.pop() if len(stamps) == 1 else None,
+            worst_kind(self.kind, other.kind),
+            max(self.predicted_s, other.predicted_s),
+        )
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Points given in ``source``, in ``target``: (3,), (..., 3), or homogeneous (4,), (..., 4)."""
+        array = np.asarray(points, dtype=np.float64)
+        if array.ndim == 0 or array.shape[-1] not in (3, 4):
+            raise InvalidInput(f"points have 3 or 4 (homogeneous) columns; got shape {array.shape}")
+        matrix = self.matrix
+        if array.shape[-1] == 4:
+            return array @ matrix.T
+        return array @ matrix[:3, :3].T + matrix[:3, 3]
+
+    def age(self, clock: Clock) -> float:
+        """Seconds since this transform's instant by ``clock``; 0 for a static one."""
+        return 0.0 if self.stamp is None else (clock.now() - self.stamp) * 1e-9
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain names, lists and numbers, ready for JSON; ``from_dict`` reads them back."""
+        return {
+            "target": self.target,
+            "source": self.source,
+            "stamp": self.stamp,
+            "kind": self.kind,
+            "translation": list(self._pose[:3]),
+            "rotation": list(self._pose[3:]),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Transform:
+        """What ``to_dict`` gave, checked as the constructor checks."""
+        names = ("target", "source", "translation", "rotation", "stamp")
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise InvalidInput(f"a transform needs {', '.join(missing)}; got {sorted(values)}")
+        return cls(*(values[name] for name in names), kind=values.get("kind"))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        facts = (self.target, self.source, self._pose, self.stamp, self.kind, self.predicted_s)
+        return (Transform.trusted, facts)
+
+    def __eq__(self, other: object) -> bool:
+        """The same frames, instant and motion; q and -q are the same turn."""
+        if not isinstance(other, Transform):
+            return NotImplemented
+        mine, theirs = self._pose, other._pose
+        opposite = tuple(-value for value in theirs[3:])
+        names = (self.target, self.source, self.stamp) == (other.target, other.source, other.stamp)
+        return names and mine[:3] == theirs[:3] and mine[3:] in (theirs[3:], opposite)
+
+    def __hash__(self) -> int:
+        return hash((self.target, self.source, self.stamp, self._pose[:3]))
+
+    def __repr__(self) -> str:
+        when = "at any time" if self.stamp is None else f"at {stamp_text(self.stamp)}"
+        x, y, z = self._pose[:3]
+        quaternion = ", ".join(f"{value:.4f}" for value in self._pose[3:])
+        how = f"predicted {duration_text(round(self.predicted_s * 1e9))} ahead" * (self.kind == "predicted")
+        return (
+            f"<pose of {self.source} in {self.target} {when}: xyz [{x:.4f}, {y:.4f}, {z:.4f}] m, "
+            f"quaternion xyzw [{quaternion}], {how or self.kind}>"
+        )
