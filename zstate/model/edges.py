@@ -164,8 +164,8 @@ class _Slides:
         )
 
     def write(self, positions: Floats, out: Floats) -> None:
-        travelled = np.einsum("nij,...nj->...ni", self.steps, positions[..., self.columns])
-        out[..., self.rows, :3] = travelled + self.offsets
+        travelled = self.steps @ positions.take(self.columns, axis=-1)[..., None]
+        out[..., self.rows, :3] = travelled[..., 0] + self.offsets
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +205,8 @@ class _Floats:
         return unit
 
     def write(self, positions: Floats, out: Floats) -> None:
-        poses = positions[..., self.columns]
-        out[..., self.rows, :] = self.offsets + np.einsum("nij,...nj->...ni", self.origins, poses)
+        poses = self.origins @ positions.take(self.columns, axis=-1)[..., None]
+        out[..., self.rows, :] = poses[..., 0] + self.offsets
 
     def _refuse(self, norms: Floats) -> None:
         worst = int(np.abs(norms - 1.0).argmax())

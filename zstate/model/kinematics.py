@@ -214,7 +214,7 @@ def _rows_of(placements: Any, count: int) -> Floats:
     """A live view of Pinocchio's placements: (count, 12), the rotation by columns, then the translation.
 
     Pinocchio keeps them side by side, each as twelve doubles; reading them one by one from Python
-    costs forty times what computing them does. The view keeps the workspace alive.
+    costs more than ten times what computing them does. The view keeps the workspace alive.
     """
     return np.lib.stride_tricks.as_strided(placements[0].rotation, (count, 12), (96, 8))
 

@@ -1,0 +1,1 @@
+"""Measurements: each prints its recipe with its figures."""

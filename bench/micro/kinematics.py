@@ -1,0 +1,89 @@
+"""What a tick of forward kinematics costs, beside reading Pinocchio pose by pose.
+
+    python -m bench.micro.kinematics
+
+Figures are medians over rounds of CPU time of the measuring thread, per call, checks of the input
+included on our side and left out on the other; the ways take turns within each round, so that a slow
+moment hits all of them. Needs example-robot-data. A loop in C++, or one that keeps Pinocchio's matrices,
+would cost less than the loop shown here.
+"""
+
+from __future__ import annotations
+
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+
+import numpy as np
+import pinocchio as pin
+
+from zstate.model.catalog import load_model
+from zstate.model.kinematics import Kinematics
+from zstate.model.robot import RobotModel
+
+ROBOTS = ("panda", "g1", "talos_full_v2", "tiago_dual")
+ROUNDS = 41
+CALLS = 100
+
+
+def pose_by_pose(model: RobotModel) -> Callable[[], np.ndarray]:
+    """Forward kinematics by Pinocchio, and each link's pose read by its documented calls."""
+    robot = pin.buildModelFromXML(model.urdf.removeprefix("\ufeff").strip(), False)
+    data, q = robot.createData(), pin.neutral(robot)
+    frames = [robot.getFrameId(link, pin.BODY) for link in model.links]
+    poses = np.empty((len(frames), 7))
+
+    def tick() -> np.ndarray:
+        pin.framesForwardKinematics(robot, data, q)
+        for row, frame in enumerate(frames):
+            poses[row] = pin.SE3ToXYZQUAT(data.oMf[frame])
+        return poses
+
+    return tick
+
+
+def ways(model: RobotModel) -> dict[str, Callable[[], np.ndarray]]:
+    """What is compared, by name."""
+    kinematics, positions = Kinematics(model), model.neutral + 0.1
+    edges, links = np.empty((len(model.joints), 7)), np.empty((len(model.links), 7))
+    return {
+        "edge_poses": lambda: kinematics.edge_poses(positions, edges),
+        "link_poses": lambda: kinematics.link_poses(positions, links),
+        "loop": pose_by_pose(model),
+    }
+
+
+def cpu_us(call: Callable[[], np.ndarray]) -> float:
+    """CPU time of this thread per call [us]."""
+    before = time.thread_time_ns()
+    for _ in range(CALLS):
+        call()
+    return (time.thread_time_ns() - before) / CALLS / 1e3
+
+
+def measure(calls: dict[str, Callable[[], np.ndarray]]) -> dict[str, float]:
+    """The median cost of each way [us]."""
+    for call in calls.values():
+        cpu_us(call)
+    rounds = [{name: cpu_us(call) for name, call in calls.items()} for _ in range(ROUNDS)]
+    return {name: statistics.median(one[name] for one in rounds) for name in calls}
+
+
+def main() -> None:
+    """Print the table."""
+    print(f"Python {platform.python_version()}, numpy {np.__version__}, pin {version('pin')}, ", end="")
+    print(f"{platform.machine()}; median of {ROUNDS} rounds of {CALLS} calls, us of thread CPU time")
+    print(f"{'robot':<15}{'links':>6}{'numbers':>8}{'edge_poses':>12}{'link_poses':>12}{'loop':>8}", end="")
+    print(f"{'loop/edge':>11}{'loop/link':>11}")
+    for name in ROBOTS:
+        model = load_model(name)
+        cost = measure(ways(model))
+        print(f"{name:<15}{len(model.links):>6}{model.position_count:>8}", end="")
+        print(f"{cost['edge_poses']:>12.1f}{cost['link_poses']:>12.1f}{cost['loop']:>8.1f}", end="")
+        print(f"{cost['loop'] / cost['edge_poses']:>11.1f}{cost['loop'] / cost['link_poses']:>11.1f}")
+
+
+if __name__ == "__main__":
+    main()
