@@ -1,53 +1,11 @@
 """parse_urdf: what is refused, with which words and in which line; what is doubted; what is fine."""
 
 import math
-import time
 
 import pytest
+from urdf_text import ARM, errors, joint, refusal, robot, tip, warnings
 
-from zstate.errors import ModelError
-from zstate.model.urdf import MAX_LINKS, MAX_VELOCITIES, parse_urdf
-from zstate.model.xml import MAX_BYTES, MAX_NESTING
-
-# A table's bodies begin in line 2 of the document: line 1 is the <robot> tag.
-ARM = """\
-<link name="base"/>
-<link name="upper"/>
-<link name="lower"/>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
-  <axis xyz="0 0 1"/><limit lower="-1" upper="2" velocity="3" effort="4"/></joint>
-<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/></joint>
-"""
-
-
-def robot(body: str) -> str:
-    return f'<robot name="arm">\n{body}</robot>'
-
-
-def joint(
-    name: str = "more", kind: str = "fixed", parent: str = "lower", child: str = "tip", inner: str = ""
-) -> str:
-    ends = f'<parent link="{parent}"/><child link="{child}"/>'
-    return f'<joint name="{name}" type="{kind}">{ends}{inner}</joint>\n'
-
-
-def tip(kind: str, inner: str = "") -> str:
-    """The arm with one more link in line 9 and one more joint in line 8."""
-    return ARM + joint(kind=kind, inner=inner) + '<link name="tip"/>\n'
-
-
-def refusal(text: str | bytes) -> ModelError:
-    with pytest.raises(ModelError) as caught:
-        parse_urdf(text, "arm.urdf")
-    return caught.value
-
-
-def errors(text: str | bytes) -> list[tuple[int | None, str]]:
-    return [(f.line, f.message) for f in refusal(text).findings if f.severity == "error"]
-
-
-def warnings(text: str) -> list[tuple[int | None, str]]:
-    return [(f.line, f.message) for f in parse_urdf(text, "arm.urdf").findings]
+from zstate.model.urdf import parse_urdf
 
 
 def test_a_sound_robot_is_read_in_the_order_of_its_document():
@@ -185,52 +143,6 @@ def test_mimics_in_a_cycle_are_named_and_a_chain_is_fine():
     assert (leader.joint, leader.multiplier, leader.offset) == ("elbow", -2.0, 0.5)
 
 
-def test_a_mimic_chain_has_a_limit():
-    links = "".join(f'<link name="l{i}"/>' for i in range(102))
-    joints = [
-        joint(
-            f"j{i}", "continuous", "base", f"l{i}", f'<mimic joint="{"elbow" if i == 0 else f"j{i - 1}"}"/>'
-        )
-        for i in range(102)
-    ]
-    found = errors(robot(ARM + links + "".join(joints)))
-    assert [message for _, message in found] == ["joint 'j100' ends a chain of 101 mimics; the limit is 100"]
-
-
-@pytest.mark.parametrize(
-    ("inner", "words"),
-    [
-        ('<origin xyz="0 0 nan"/>', "origin xyz: 'nan' is not a finite number"),
-        ('<origin rpy="0 0 -inf"/>', "origin rpy: '-inf' is not a finite number"),
-        ('<origin xyz="0 0 Infinity"/>', "origin xyz: 'Infinity' is not a finite number"),
-        ('<origin xyz="0 0"/>', "origin xyz: '0 0' has 2 of 3 numbers"),
-        ('<origin xyz="0,0,0"/>', "separate them by blanks, not commas"),
-        ('<origin xyz="0 0 1,5"/>', "'1,5' has a decimal comma; write '1.5'"),
-        ('<origin xyz="0 0 1_000"/>', "'1_000' is a number to Python only; write 1000.0"),
-        ('<origin xyz="0 0 \u0663"/>', "'\u0663' is a number to Python only; write 3.0"),
-        ('<origin xyz="0 0 x"/>', "'x' is not a number"),
-        ('<origin xyz="0 0 1e999"/>', "'1e999' is too large"),
-        ('<axis xyz="nan 0 1"/>', "axis xyz: 'nan' is not a finite number"),
-        ('<limit velocity="fast"/>', "limit velocity: 'fast' is not a number"),
-        ('<limit effort=""/>', "limit effort: an empty text is not a number"),
-        ('<mimic joint="elbow" multiplier="1 2"/>', "mimic multiplier: '1 2' is not a number"),
-        ('<mimic joint="elbow" offset="inf"/>', "mimic offset: 'inf' is not a finite number"),
-    ],
-)
-def test_numbers_that_only_some_readers_take_are_refused(inner: str, words: str):
-    found = errors(robot(tip("continuous", inner)))
-    assert len(found) == 1
-    assert found[0][0] == 8
-    assert found[0][1].startswith("joint 'more': ")
-    assert words in found[0][1]
-
-
-@pytest.mark.parametrize("number", ["1", "+1", "1.", ".5", "-0.25e-3", "1E+2"])
-def test_plain_decimals_are_read(number: str):
-    model = parse_urdf(robot(tip("fixed", f'<origin xyz="\t{number}\n 0  0 "/>')), "arm.urdf")
-    assert model.joints[-1].origin[0] == float(number)
-
-
 def test_all_findings_come_at_once_in_the_order_of_lines():
     body = (
         ARM
@@ -351,47 +263,3 @@ def test_rpy_turns_about_fixed_axes_x_first():
     assert (x, y, z) == (1, 2, 3)
     z_axis = (2 * (qx * qz + qy * qw), 2 * (qy * qz - qx * qw), 1 - 2 * (qx * qx + qy * qy))
     assert z_axis == pytest.approx((1.0, 0.0, 0.0), abs=1e-15)
-
-
-def chain(count: int, kind: str = "fixed") -> str:
-    links = "".join(f'<link name="l{i}"/>\n' for i in range(count))
-    return robot(links + "".join(joint(f"j{i}", kind, f"l{i}", f"l{i + 1}") for i in range(count - 1)))
-
-
-def test_ten_thousand_links_are_refused_quickly():
-    text = chain(10_000)
-    started = time.thread_time()
-    found = errors(text)
-    assert time.thread_time() - started < 2.0
-    assert found == [(None, f"the robot has 10000 links; the limit is {MAX_LINKS}")]
-
-
-def test_a_deep_chain_is_refused_and_the_deepest_allowed_is_not():
-    assert len(parse_urdf(chain(501), "chain").joints) == 500
-    assert errors(chain(502)) == [(None, "link 'l501' lies 501 joints below the root; the limit is 500")]
-
-
-def test_velocities_have_a_limit_in_which_mimics_count():
-    assert parse_urdf(chain(MAX_VELOCITIES + 1, "continuous"), "chain").velocity_count == MAX_VELOCITIES
-    one_more = chain(MAX_VELOCITIES + 2, "continuous")
-    for text in (one_more, one_more.replace('child link="l1"/>', 'child link="l1"/><mimic joint="j1"/>')):
-        assert errors(text) == [(None, f"the robot has 201 velocities; the limit is {MAX_VELOCITIES}")]
-
-
-def test_xml_nesting_and_size_have_limits():
-    deep = robot(ARM + "<a>" * MAX_NESTING + "</a>" * MAX_NESTING)
-    ((line, message),) = errors(deep)
-    assert (line, message) == (8, "<a> is nested deeper than 100 levels")
-    ((line, message),) = errors(" " * (MAX_BYTES + 1))
-    assert (line, message) == (None, f"the text has {MAX_BYTES + 1} bytes; the limit is {MAX_BYTES}")
-    assert "more than 200000 elements" in errors(robot("<a/>" * 200_000))[0][1]
-
-
-def test_many_faults_do_not_make_it_slow():
-    links = "".join(f'<link name="{"arm_segment" * 5}_{i}"/>' for i in range(MAX_LINKS))
-    lost = "".join(
-        joint(f"j{i}", "fixed", "arm_segmnt" * 5, f"{'arm_segmnt' * 5}{i}") for i in range(MAX_LINKS)
-    )
-    started = time.thread_time()
-    assert len(errors(robot(links + lost))) == 2 * MAX_LINKS
-    assert time.thread_time() - started < 5.0

@@ -10,6 +10,7 @@ from zstate.model.findings import Findings, quoted
 from zstate.model.numbers import NumberFault, read_number, read_numbers
 from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic
 from zstate.model.xml import Element
+from zstate.se3 import quaternion_of_rpy
 
 Pose7 = tuple[float, float, float, float, float, float, float]
 Vector3 = tuple[float, float, float]
@@ -90,7 +91,7 @@ class JointReader:
         if "quat_xyzw" in origins[0].attributes:
             self._findings.error(origins[0].line, f"{label}: origin quat_xyzw is not read; write rpy")
         x, y, z = self._vector(origins[0], label, "xyz")
-        return (x, y, z, *quaternion_from_rpy(*self._vector(origins[0], label, "rpy")))
+        return (x, y, z, *quaternion_of_rpy(*self._vector(origins[0], label, "rpy")))
 
     def _axis(self, element: Element, label: str, kind: JointType) -> Vector3:
         axes = element.all("axis")
@@ -133,21 +134,25 @@ class JointReader:
                 message = f'{label} is {kind} and has no <limit lower="..." upper="..."/>'
                 self._findings.error(element.line, message)
             return Limits()
+        limit = limits[0]
         lower, upper, velocity, effort = (
-            self._number(limits[0], label, name) for name in ("lower", "upper", "velocity", "effort")
+            self._number(limit, label, name) for name in ("lower", "upper", "velocity", "effort")
         )
         if kind == "fixed":
             return Limits()
         rest = (math.inf if velocity is None else velocity, math.inf if effort is None else effort)
-        if kind not in {"revolute", "prismatic"}:
-            if kind == "continuous" and (lower, upper) != (None, None):
-                message = f"{label} is continuous, so its lower and upper limits are not used"
-                self._findings.warning(limits[0].line, message)
-            return Limits(-math.inf, math.inf, *rest)
-        if (lower or 0.0) > (upper or 0.0):
-            message = f"{label} has its limits reversed: lower {lower or 0.0:g}, upper {upper or 0.0:g}"
-            self._findings.error(limits[0].line, message)
-        return Limits(lower or 0.0, upper or 0.0, *rest)
+        if kind in {"revolute", "prismatic"}:
+            return Limits(*self._range(limit, label, lower or 0.0, upper or 0.0), *rest)
+        if kind == "continuous" and (lower, upper) != (None, None):
+            message = f"{label} is continuous, so its lower and upper limits are not used"
+            self._findings.warning(limit.line, message)
+        return Limits(-math.inf, math.inf, *rest)
+
+    def _range(self, limit: Element, label: str, lower: float, upper: float) -> tuple[float, float]:
+        if lower > upper:
+            message = f"{label} has its limits reversed: lower {lower:g}, upper {upper:g}"
+            self._findings.error(limit.line, message)
+        return lower, upper
 
     def _mimic(self, element: Element, label: str, kind: JointType) -> Mimic | None:
         mimics = element.all("mimic")
@@ -187,19 +192,6 @@ class JointReader:
         except NumberFault as fault:
             self._findings.error(element.line, f"{label}: {element.tag} {name}: {fault}")
             return None
-
-
-def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """x y z w of Rz(yaw) Ry(pitch) Rx(roll) [rad]: URDF's turns about fixed axes, x first."""
-    sr, cr = math.sin(roll / 2), math.cos(roll / 2)
-    sp, cp = math.sin(pitch / 2), math.cos(pitch / 2)
-    sy, cy = math.sin(yaw / 2), math.cos(yaw / 2)
-    return (
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    )
 
 
 def _text(*numbers: float) -> str:

@@ -127,14 +127,13 @@ class _Reader:
         if self._root is not None and not self._open:
             return self._after_root(error, self._root)
         if error.code == _MISMATCH:
-            return f"</{self._tag_at(error)}> closes {self._innermost()}"
+            return f"{self._markup_at(error)}> closes {self._innermost()}"
         if error.code in _UNFINISHED and self._open:
             return f"the file ends inside {self._innermost()}; is it truncated?"
         return f"malformed XML: {expat.ErrorString(error.code)}"
 
     def _after_root(self, error: expat.ExpatError, root: Element) -> str:
-        tag = self._tag_at(error)
-        if tag == root.tag == "robot":
+        if self._markup_at(error).startswith("<robot") and root.tag == "robot":
             return f"a second <robot>; the first begins in line {root.line}, and one file holds one robot"
         return f"there is something after </{_short(root.tag)}>, which must end the file"
 
@@ -142,10 +141,11 @@ class _Reader:
         element = self._open[-1]
         return f"<{_short(element.tag)}>, which was opened in line {element.line}"
 
-    def _tag_at(self, error: expat.ExpatError) -> str:
+    def _markup_at(self, error: expat.ExpatError) -> str:
+        """The tag that the parser stumbled over, as written, without its attributes."""
         line = self._text.split("\n")[error.lineno - 1]
-        found = re.match(r"</?([^\s>/]*)", line[max(0, line.rfind("<", 0, error.offset + 1)) :])
-        return _short(found[1]) if found else "?"
+        found = re.match(r"[^\s>]*", line[max(0, line.rfind("<", 0, error.offset + 1)) :])
+        return _short(found[0]) if found else ""
 
 
 def _short(tag: str) -> str:
