@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput
 from zstate.model.robot import Joint, JointType, RobotModel
+from zstate.se3 import multiply, rotate, to_matrix
 
 EdgeKind = Literal["fixed", "hinge", "slide", "planar", "floating"]
 Vector = tuple[float, float, float]
@@ -36,6 +37,8 @@ _KINDS: dict[JointType, EdgeKind] = {
     "planar": "planar",
     "floating": "floating",
 }
+
+_UNIT_QUATERNIONS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +188,8 @@ class _Floats:
             return None
         origins = np.zeros((len(floating), 7, 7))
         for matrix, (_, form) in zip(origins, floating, strict=True):
-            matrix[:3, :3] = rotation_matrix(form.q_cos)
-            matrix[3:, 3:] = _left_product(form.q_cos)
+            matrix[:3, :3] = to_matrix(form.origin)[:3, :3]
+            matrix[3:, 3:] = np.transpose([multiply(form.q_cos, unit) for unit in _UNIT_QUATERNIONS])
         return cls(
             rows=np.array([row for row, _ in floating], dtype=np.intp),
             columns=np.array([np.arange(form.column, form.column + 7) for _, form in floating]),
@@ -216,18 +219,6 @@ class _Floats:
         )
 
 
-def rotation_matrix(rotation: Quaternion) -> Floats:
-    """The 3 x 3 matrix of a unit quaternion x y z w."""
-    x, y, z, w = rotation
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _form(model: RobotModel, joint: Joint) -> EdgeForm:
     kind = _KINDS[joint.type]
     axis = _unit3((0.0, 0.0, 1.0) if kind == "planar" else joint.axis) if kind != "fixed" else joint.axis
@@ -243,9 +234,9 @@ def _form(model: RobotModel, joint: Joint) -> EdgeForm:
         scale=master.multiplier,
         shift=master.offset,
         q_cos=rotation,
-        q_sin=_times_pure(rotation, axis) if kind in ("hinge", "planar") else (*still, 0.0),
+        q_sin=multiply(rotation, (*axis, 0.0)) if kind in ("hinge", "planar") else (*still, 0.0),
         t0=joint.origin[:3],
-        t1=_as_vector(rotation_matrix(rotation) @ axis) if kind == "slide" else still,
+        t1=rotate(rotation, axis) if kind == "slide" else still,
         origin=(*joint.origin[:3], *rotation),
         axis=axis,
     )
@@ -262,28 +253,13 @@ def _rest_poses(forms: tuple[EdgeForm, ...]) -> Floats:
 def _steps(form: EdgeForm) -> Floats:
     """How the translation changes per unit of the joint's two numbers; a slide has but one."""
     if form.kind == "planar":
-        return rotation_matrix(form.q_cos)[:, :2]
+        return to_matrix(form.origin)[:3, :2]
     return np.outer(form.t1, (form.scale, 0.0))
 
 
-def _left_product(rotation: Quaternion) -> Floats:
-    """The 4 x 4 matrix that multiplies by ``rotation`` from the left."""
-    x, y, z, w = rotation
-    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
-
-
-def _times_pure(rotation: Quaternion, axis: Vector) -> Quaternion:
-    x, y, z, w = (_left_product(rotation) @ (*axis, 0.0)).tolist()
-    return (x, y, z, w)
-
-
-def _as_vector(values: Floats) -> Vector:
-    x, y, z = values.tolist()
-    return (x, y, z)
-
-
 def _unit3(values: Vector) -> Vector:
-    return _as_vector(np.array(values) / np.linalg.norm(values))
+    x, y, z = (np.array(values) / np.linalg.norm(values)).tolist()
+    return (x, y, z)
 
 
 def _unit4(values: Quaternion) -> Quaternion:
