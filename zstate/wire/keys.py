@@ -23,6 +23,9 @@ Stream = Literal["joint_states", "tf", "tf_static", "robot_description", "joint_
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
 
+MODEL_WRITER = "robot_description"
+"""The writer of the edges that a robot's own model fixes."""
+
 _RESERVED = frozenset("/*$?#")
 
 
@@ -104,3 +107,8 @@ def full_name(robot: str, frame: str) -> str:
             "write 'frame' or 'robot/frame'"
         )
     return frame if "/" in frame else f"{robot}/{frame}"
+
+
+def wire_name(robot: str, link: str) -> str:
+    """How a link of ``robot`` is named in its own messages: bare, unless a slash in it would mislead."""
+    return f"{robot}/{link}" if "/" in link else link

@@ -1,0 +1,208 @@
+"""StatePublisher: joint positions in, the state of a robot out on Zenoh."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.errors import Closed
+from zstate.model.edges import EdgeTable
+from zstate.model.robot import RobotModel
+from zstate.net.latched import LatchedPublisher
+from zstate.net.presence import Writer, announce
+from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher
+from zstate.rate import Rate, RateReport
+from zstate.sources.source import JointSource
+from zstate.wire.keys import MODEL_WRITER, Stream, check_robot, wire_name
+from zstate.wire.messages import (
+    JointState,
+    Message,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+    to_block,
+)
+from zstate.wire.wires import wire_named
+
+Positions = ArrayLike | Mapping[str, float | Sequence[float]]
+
+
+class StatePublisher:
+    """Publishes the state of one robot: each sample is the whole robot at one instant.
+
+    Whoever joins, at any time, is given the model (``robot_description``) and its fixed edges
+    (``tf_static``). Samples go out on ``joint_states``; the moving edges also on ``tf``, while somebody
+    reads that. ``robot`` is its name on the network, the model's name unless given. ``streams`` leaves
+    one of the two out, where another program writes it. A context manager; safe from any thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        model: RobotModel,
+        robot: str | None = None,
+        wires: Sequence[str] = ("native",),
+        *,
+        streams: Sequence[Stream] = ("joint_states", "tf"),
+        clock: Clock | None = None,
+    ) -> None:
+        self.model = model
+        self.robot = check_robot(robot or model.name)
+        self._clock: Clock = clock or SystemClock()
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._opened = ExitStack()
+        self._edges = _MovingEdges(model, self.robot)
+        self._session_id = secrets.randbits(32)
+        self._seq = 0
+        self._joint_order = order_digest(model.joint_names)
+        with ExitStack() as opening:
+            self._outputs = [_Output(session, self, name, streams, opening) for name in wires]
+            writer = Writer.here(self._session_id)
+            for stream in (*streams, "tf_static", "robot_description"):
+                opening.enter_context(announce(session, self.robot, stream, writer))
+            self._opened = opening.pop_all()
+
+    def __enter__(self) -> StatePublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def description(self) -> RobotDescription:
+        """What late joiners are told of the robot."""
+        model = self.model
+        return RobotDescription(
+            self._session_id, model.urdf, model.digest, model.joint_names, self._edges.names
+        )
+
+    def statics(self) -> StaticTransforms:
+        """The robot's fixed edges, for readers without its model."""
+        return self._edges.statics(self._session_id)
+
+    def publish(
+        self,
+        positions: Positions,
+        velocities: ArrayLike | None = None,
+        efforts: ArrayLike | None = None,
+        stamp: int | None = None,
+    ) -> None:
+        """Send one sample: the robot at ``stamp`` [ns], which is now unless given.
+
+        ``positions`` [rad] or [m] are in the order of ``model.joint_names``, or a mapping of joint names
+        that has all of them; ``velocities`` per second and ``efforts`` [Nm] or [N] likewise in that order
+        where they are known. Raises InvalidInput for wrong counts, unknown or missing names, NaN and
+        infinity, and Closed; then nothing was sent.
+        """
+        model = self.model
+        numbers = (
+            model.positions(positions) if isinstance(positions, Mapping) else model.check_positions(positions)
+        )
+        rates = None if velocities is None else to_block(model.check_velocities(velocities))
+        forces = None if efforts is None else to_block(model.check_efforts(efforts))
+        stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+        with self._lock:
+            if self._stop.is_set():
+                raise Closed(f"the publisher of {self.robot!r} is closed")
+            seq, self._seq = self._seq, self._seq + 1
+            head = (stamp, seq, self._session_id)
+            for output in self._outputs:
+                if output.joints is not None:
+                    output.put_joints(JointState(*head, self._joint_order, to_block(numbers), rates, forces))
+                if output.transforms is not None and output.transforms.has_readers:
+                    poses = to_block(self._edges.poses(numbers))
+                    output.put_transforms(TransformSample(*head, self._edges.order, poses))
+
+    def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
+        """Publish what ``source`` reads, at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
+
+        Each tick has an absolute deadline; one that was missed by a whole period is skipped and counted
+        in the report. A tick for which the source has nothing new sends nothing.
+        """
+        rate = Rate(rate_hz, self._clock, self._stop, seconds)
+        for now in rate:
+            reading = source.read(now)
+            if reading is not None:
+                stamp = now if reading.stamp is None else reading.stamp
+                try:
+                    self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
+                except Closed:
+                    break
+        return rate.report()
+
+    def close(self) -> None:
+        """Stop publishing; ``run`` returns. A second call does nothing."""
+        self._stop.set()
+        with self._lock:
+            self._opened.close()
+
+
+class _Output:
+    """The streams of one wire."""
+
+    def __init__(
+        self,
+        session: Session,
+        publisher: StatePublisher,
+        wire_name: str,
+        streams: Sequence[Stream],
+        opening: ExitStack,
+    ) -> None:
+        self._wire = wire_named(wire_name)
+        self._robot = publisher.robot
+        self._session = session
+        self._opening = opening
+        self._latch("robot_description", publisher.description())
+        self._latch("tf_static", publisher.statics())
+        self.joints = self._stream("joint_states") if "joint_states" in streams else None
+        self.transforms = self._stream("tf") if "tf" in streams else None
+
+    def _stream(self, stream: Stream) -> StreamPublisher:
+        key, encoding = self._wire.key(self._robot, stream), self._wire.encoding(stream)
+        return self._opening.enter_context(StreamPublisher(self._session, key, encoding))
+
+    def _latch(self, stream: Stream, message: Message) -> None:
+        key = self._wire.key(self._robot, stream, MODEL_WRITER)
+        latched = LatchedPublisher(self._session, key, self._wire.encoding(stream))
+        self._opening.enter_context(latched).set(self._wire.encode(message))
+
+    def put_joints(self, state: JointState) -> None:
+        if self.joints is not None:
+            self.joints.put(self._wire.encode(state))
+
+    def put_transforms(self, sample: TransformSample) -> None:
+        if self.transforms is not None:
+            self.transforms.put(self._wire.encode(sample))
+
+
+class _MovingEdges:
+    """The edges of a model as they are called on the network, moving and fixed apart."""
+
+    def __init__(self, model: RobotModel, robot: str) -> None:
+        self._table = EdgeTable(model)
+        forms = self._table.forms
+        names = [(wire_name(robot, form.parent), wire_name(robot, form.child)) for form in forms]
+        fixed = [form.kind == "fixed" for form in forms]
+        self._rows = np.flatnonzero(~np.array(fixed, dtype=np.bool_))
+        self.names = tuple(names[row] for row in self._rows)
+        self.order = order_digest(self.names)
+        self._fixed_names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if is_fixed)
+        self._fixed_poses = [form.origin for form in forms if form.kind == "fixed"]
+
+    def poses(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """``parent_from_child`` of each of ``names``: (n, 7)."""
+        return self._table.poses(positions).take(self._rows, axis=0)
+
+    def statics(self, session: int) -> StaticTransforms:
+        return StaticTransforms(session, self._fixed_names, to_block(self._fixed_poses))

@@ -1,0 +1,75 @@
+"""Exact rates: absolute deadlines, so that no tick's lateness is handed on to the next."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from zstate.clock import Clock
+from zstate.errors import InvalidInput
+
+
+@dataclass(frozen=True, slots=True)
+class RateReport:
+    """What became of a commanded rate.
+
+    ``rate_hz`` is what was achieved: the ticks after the first, over the time between the first and
+    the last. ``skipped`` counts ticks that were given up because the work before them took too long.
+    """
+
+    commanded_hz: float
+    rate_hz: float
+    ticks: int
+    skipped: int
+
+
+class Rate:
+    """Iterate to get the stamp [ns] of each tick; the k-th deadline is ``start + k / rate_hz``.
+
+    A deadline that has passed by more than a period is skipped and counted, never made up for in a
+    burst. Ends when ``stop`` is set, or after ``seconds``.
+    """
+
+    def __init__(
+        self, rate_hz: float, clock: Clock, stop: threading.Event, seconds: float | None = None
+    ) -> None:
+        self.rate_hz = check_rate(rate_hz)
+        if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
+            raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
+        self._ticks_wanted = math.inf if seconds is None else max(1, round(seconds * rate_hz))
+        self._clock = clock
+        self._stop = stop
+        self._ticks = 0
+        self._skipped = 0
+        self._first = self._last = 0
+
+    def __iter__(self) -> Iterator[int]:
+        start = self._clock.now()
+        tick = 0
+        while tick < self._ticks_wanted:
+            deadline = start + round(tick * 1e9 / self.rate_hz)
+            if not self._clock.wait_until(deadline, self._stop):
+                return
+            now = self._clock.now()
+            self._first = now if not self._ticks else self._first
+            self._last = now
+            self._ticks += 1
+            yield now
+            due = math.floor((self._clock.now() - start) * self.rate_hz / 1e9)
+            self._skipped += max(0, due - tick - 1)
+            tick = max(tick + 1, due)
+
+    def report(self) -> RateReport:
+        """How it went so far."""
+        span_ns = self._last - self._first
+        achieved = (self._ticks - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+        return RateReport(self.rate_hz, achieved, self._ticks, self._skipped)
+
+
+def check_rate(rate_hz: float) -> float:
+    """A rate that can be kept: above 0, at most 10 kHz. Raises InvalidInput."""
+    if not (math.isfinite(rate_hz) and 0.0 < rate_hz <= 10_000.0):
+        raise InvalidInput(f"a rate is above 0 and at most 10000 Hz; got {rate_hz!r}")
+    return rate_hz

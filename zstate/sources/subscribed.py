@@ -1,0 +1,92 @@
+"""Joint states that somebody else publishes."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+
+from zstate.errors import InvalidInput, MessageError
+from zstate.model.robot import RobotModel
+from zstate.net.session import Session
+from zstate.net.streams import Arrival, StreamSubscriber
+from zstate.sources.source import JointReading
+from zstate.wire.joint_order import JointOrder
+from zstate.wire.messages import JointState
+from zstate.wire.native import NativeWire
+
+# At most so many readings wait for a slow reader; then the oldest are dropped.
+_CAPACITY = 1024
+
+
+class SubscribedSource:
+    """The ``joint_states`` of ``robot``, as they come in: ``for reading in source: ...``
+
+    ``read`` gives the newest one that has not been read. Iteration ends with ``close()``. Samples that
+    cannot be used are counted in ``refused``, by reason.
+    """
+
+    def __init__(self, session: Session, model: RobotModel, robot: str | None = None) -> None:
+        self.refused: dict[str, int] = {}
+        self._model = model
+        self._order = JointOrder(model.joint_names)
+        self._wire = NativeWire()
+        self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
+        self._changed = threading.Condition()
+        self._closed = False
+        key = self._wire.expression(robot or model.name, "joint_states")
+        self._subscriber = StreamSubscriber(session, key, self._take)
+
+    def _take(self, arrivals: list[Arrival]) -> None:
+        readings = [reading for arrival in arrivals if (reading := self._read(arrival)) is not None]
+        with self._changed:
+            self._readings.extend(readings)
+            self._changed.notify_all()
+
+    def _read(self, arrival: Arrival) -> JointReading | None:
+        _, payload, encoding = arrival
+        try:
+            state = self._wire.decode("joint_states", payload, encoding)
+            assert isinstance(state, JointState)
+            numbers = self._order.read(state)
+            self._model.check_positions(numbers.positions)
+        except MessageError as error:
+            return self._refuse(error.reason)
+        except InvalidInput:
+            return self._refuse("bad numbers")
+        return JointReading(*numbers, stamp=state.stamp)
+
+    def _refuse(self, reason: str) -> None:
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+
+    def read(self, stamp: int) -> JointReading | None:
+        """The newest reading, whatever ``stamp`` is; None when nothing has come since the last call."""
+        with self._changed:
+            newest = self._readings[-1] if self._readings else None
+            self._readings.clear()
+        return newest
+
+    def __iter__(self) -> Iterator[JointReading]:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._readings or self._closed)
+                if not self._readings:
+                    return
+                reading = self._readings.popleft()
+            yield reading
+
+    def __enter__(self) -> SubscribedSource:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop listening; iterations end."""
+        self._subscriber.close()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()

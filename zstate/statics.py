@@ -1,0 +1,104 @@
+"""StaticPublisher: edges that never move, for everybody, whenever they join."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from contextlib import ExitStack, suppress
+from types import TracebackType
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import Closed, InvalidInput
+from zstate.net.latched import LatchedPublisher
+from zstate.net.presence import Writer, announce
+from zstate.net.session import Session
+from zstate.transform import Transform
+from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
+from zstate.wire.messages import StaticTransforms, to_block
+from zstate.wire.wires import wire_named
+
+
+class StaticPublisher:
+    """Publishes static edges under one writer's name; several writers of a robot coexist.
+
+    Bare frame names are the robot's own; other frames are named in full, ``robot/frame``. All edges
+    of a writer travel together, and a new value replaces the old one everywhere. ``close()`` withdraws
+    them. ``writer`` tells this publisher from others: the program and its process id unless given.
+    """
+
+    def __init__(self, session: Session, robot: str, writer: str | None = None, wire: str = "native") -> None:
+        identity = Writer.here(secrets.randbits(32))
+        self.robot = check_robot(robot)
+        self.writer = check_writer(writer or f"{identity.program}.{identity.pid}")
+        if self.writer == MODEL_WRITER:
+            raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
+        self._wire = wire_named(wire)
+        self._session_id = identity.session
+        self._edges: dict[str, Transform] = {}
+        # Refuses here, where the mistake is made, what every reader would refuse.
+        self._check = TransformBuffer()
+        self._lock = threading.Lock()
+        self._closed = False
+        with ExitStack() as opening:
+            key, encoding = self._wire.key(robot, "tf_static", self.writer), self._wire.encoding("tf_static")
+            self._latched = opening.enter_context(LatchedPublisher(session, key, encoding))
+            opening.enter_context(announce(session, robot, "tf_static", identity))
+            self._opened = opening.pop_all()
+
+    def __enter__(self) -> StaticPublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def set(self, transform: Transform) -> None:
+        """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
+
+        Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges,
+        InvalidInput for names that cannot be frames, and Closed.
+        """
+        parent = full_name(self.robot, transform.target)
+        child = full_name(self.robot, transform.source)
+        with self._lock:
+            self._check_open()
+            self._check.insert_static(
+                Transform(parent, child, transform.translation, transform.rotation), writer=self.writer
+            )
+            self._edges[child] = transform
+            self._send()
+
+    def withdraw(self, child: str) -> None:
+        """Take back the edge that places ``child``. Raises InvalidInput if it is not one of ours."""
+        name = full_name(self.robot, child)
+        with self._lock:
+            self._check_open()
+            if name not in self._edges:
+                ours = ", ".join(map(repr, self._edges)) or "none"
+                raise InvalidInput(
+                    f"{child!r} is not placed by the writer {self.writer!r}; its edges: {ours}"
+                )
+            self._check.withdraw(name)
+            del self._edges[name]
+            self._send()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise Closed(f"the static publisher {self.writer!r} is closed")
+
+    def _send(self) -> None:
+        edges = tuple((edge.target, edge.source) for edge in self._edges.values())
+        poses = to_block([edge.pose7 for edge in self._edges.values()])
+        self._latched.set(self._wire.encode(StaticTransforms(self._session_id, edges, poses)))
+
+    def close(self) -> None:
+        """Withdraw the edges. A second call does nothing."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            # If the session went first, everything declared on it went with it.
+            with suppress(Closed):
+                self._latched.withdraw()
+            self._opened.close()
