@@ -1,1 +1,92 @@
-"""A robot's state wherever Zenoh reaches."""
+"""A robot's state wherever Zenoh reaches: joint states, transforms, and a buffer that answers.
+
+``lookup("a", "b")`` is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in b
+into a. Quaternions are x y z w, units are SI, stamps are integer nanoseconds since the Unix epoch.
+
+Names are loaded when they are first used: a program that only reads transforms loads no kinematics.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from zstate.buffer.buffer import TransformBuffer
+    from zstate.errors import (
+        Disconnected,
+        InFuture,
+        InPast,
+        InsertRefused,
+        LookupFailed,
+        ModelError,
+        NoData,
+        Stale,
+        UnknownFrame,
+        ZStateError,
+    )
+    from zstate.listener import TransformListener
+    from zstate.model.catalog import load_model
+    from zstate.model.kinematics import Kinematics
+    from zstate.model.robot import RobotModel
+    from zstate.net.presence import discover
+    from zstate.net.session import connect
+    from zstate.publisher import StatePublisher
+    from zstate.sources import SineSource
+    from zstate.statics import StaticPublisher
+    from zstate.transform import Transform
+    from zstate.twist import Twist
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Disconnected",
+    "InFuture",
+    "InPast",
+    "InsertRefused",
+    "Kinematics",
+    "LookupFailed",
+    "ModelError",
+    "NoData",
+    "RobotModel",
+    "SineSource",
+    "Stale",
+    "StatePublisher",
+    "StaticPublisher",
+    "Transform",
+    "TransformBuffer",
+    "TransformListener",
+    "Twist",
+    "UnknownFrame",
+    "ZStateError",
+    "connect",
+    "discover",
+    "load_model",
+]
+
+_HOMES = {
+    "Kinematics": "model.kinematics",
+    "RobotModel": "model.robot",
+    "SineSource": "sources",
+    "StatePublisher": "publisher",
+    "StaticPublisher": "statics",
+    "Transform": "transform",
+    "TransformBuffer": "buffer.buffer",
+    "TransformListener": "listener",
+    "Twist": "twist",
+    "connect": "net.session",
+    "discover": "net.presence",
+    "load_model": "model.catalog",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value: object = getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

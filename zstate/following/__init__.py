@@ -1,0 +1,1 @@
+"""What the messages of one robot become in a buffer."""

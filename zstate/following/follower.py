@@ -1,0 +1,115 @@
+"""Follower: one robot's samples on their way into a buffer."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections import deque
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import InsertRefused, InvalidInput, MessageError
+from zstate.following.tally import Tally
+from zstate.wire.messages import RobotDescription, Sample
+
+# So many samples are kept that arrive before the robot is described, which takes milliseconds.
+_EARLY = 1024
+
+
+class Follower(ABC):
+    """One robot's samples on their way into a buffer, whatever they are made of."""
+
+    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally) -> None:
+        self.robot = robot
+        self.heard = False
+        self._buffer = buffer
+        self._tally = tally
+        self._writers: dict[int, str] = {}
+        self._session: int | None = None
+        self._ended_sessions: set[int] = set()
+        self._next_seq: int | None = None
+        self._early: deque[Sample] = deque(maxlen=_EARLY)
+        self._lock = threading.RLock()
+        buffer.name_robot(robot)
+
+    @property
+    def writer(self) -> str | None:
+        """Who writes the samples that are taken now, if that was announced."""
+        return None if self._session is None else self._writers.get(self._session)
+
+    def note_heard(self) -> None:
+        """Something of this robot has arrived."""
+        self.heard = True
+
+    def name_writer(self, session: int, writer: str) -> None:
+        """The writer behind a session, as announced."""
+        with self._lock:
+            self._writers[session] = writer
+            self._writer_changed()
+
+    def take(self, sample: Sample, *, overflowed: bool) -> None:
+        """Put a sample into the buffer; ``overflowed`` says that our ring lost some before it."""
+        self.heard = True
+        with self._lock:
+            if not self._follow_session(sample.session):
+                self._tally.refuse(
+                    "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
+                )
+                return
+            self._count_gap(sample.seq, overflowed)
+            if self._can_read(sample):
+                self._insert_counted(sample)
+            else:
+                self._early.append(sample)
+
+    def _insert_early(self) -> None:
+        """The samples that came before the robot was described."""
+        early, self._early = self._early, deque(maxlen=_EARLY)
+        for sample in early:
+            self._insert_counted(sample)
+
+    def _insert_counted(self, sample: Sample) -> None:
+        try:
+            taken = self._insert(sample)
+        except (InvalidInput, MessageError) as error:
+            reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
+            self._tally.refuse(reason, f"{self.robot!r}: {error}")
+        else:
+            self._tally.count("received" if taken else "late")
+
+    def _follow_session(self, session: int) -> bool:
+        """Whether samples of this session count: those of the newest writer to appear."""
+        if session in self._ended_sessions:
+            return False
+        if session != self._session:
+            if self._session is not None:
+                self._ended_sessions.add(self._session)
+                self._early.clear()
+                self._restart()
+            self._session = session
+            self._next_seq = None
+            self._writer_changed()
+        return True
+
+    def _count_gap(self, seq: int, overflowed: bool) -> None:
+        if self._next_seq is not None and seq > self._next_seq:
+            self._tally.count("dropped" if overflowed else "missed", seq - self._next_seq)
+        self._next_seq = max(seq + 1, self._next_seq or 0)
+
+    @abstractmethod
+    def describe(self, description: RobotDescription) -> None:
+        """Learn what the robot is."""
+
+    @abstractmethod
+    def _can_read(self, sample: Sample) -> bool:
+        """Whether enough is known of the robot to use a sample."""
+
+    @abstractmethod
+    def _insert(self, sample: Sample) -> bool: ...
+
+    @abstractmethod
+    def _restart(self) -> None:
+        """A new writer: what the old one said is another epoch."""
+
+    @abstractmethod
+    def _writer_changed(self) -> None:
+        """The name of the writer is known, or another one."""

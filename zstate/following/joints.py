@@ -1,0 +1,70 @@
+"""JointFollower: joint positions and a model, into a buffer."""
+
+from __future__ import annotations
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.tracks import JointTrack
+from zstate.errors import InsertRefused, ModelError
+from zstate.following.follower import Follower
+from zstate.following.tally import Tally
+from zstate.model.catalog import load_model
+from zstate.model.robot import RobotModel
+from zstate.wire.joint_order import JointOrder
+from zstate.wire.messages import JointState, RobotDescription, Sample
+
+
+class JointFollower(Follower):
+    """Follows joint states, with the robot's model."""
+
+    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally) -> None:
+        super().__init__(robot, buffer, tally)
+        self._digest = ""
+        self._track: JointTrack | None = None
+        self._order = JointOrder(())
+
+    def describe(self, description: RobotDescription) -> None:
+        self.heard = True
+        if description.digest == self._digest:
+            return
+        with self._lock:
+            try:
+                self._replace_model(load_model(description.urdf))
+            except (ModelError, InsertRefused) as error:
+                self._tally.refuse("robot description", f"{self.robot!r}: {error}")
+                return
+            self._digest = description.digest
+            self._writer_changed()
+            self._insert_early()
+
+    def _replace_model(self, model: RobotModel) -> None:
+        if self._track is not None:
+            self._buffer.remove_robot(self._track)
+            self._track = None
+        self._order = JointOrder(model.joint_names)
+        self._make_room(model)
+        self._track = self._buffer.add_robot(model, self.robot)
+
+    def _make_room(self, model: RobotModel) -> None:
+        # The robot's own model knows best: whoever else placed one of its links gives way.
+        links = {f"{self.robot}/{joint.child}" for joint in model.joints}
+        for frame in self._buffer.frames():
+            if frame.name in links and frame.parent is not None:
+                self._tally.refuse("second writer", f"{frame.writer!r} placed {frame.name!r}, a link of the model")
+                self._buffer.withdraw(frame.name)
+
+    def _can_read(self, sample: Sample) -> bool:
+        return self._track is not None
+
+    def _insert(self, sample: Sample) -> bool:
+        assert isinstance(sample, JointState)
+        assert self._track is not None
+        numbers = self._order.read(sample)
+        return self._buffer.insert_joints(self._track, sample.stamp, numbers.positions, numbers.velocities)
+
+    def _restart(self) -> None:
+        if self._track is not None:
+            self._buffer.restart(self._track)
+
+    def _writer_changed(self) -> None:
+        if self._track is not None:
+            self._track.writer = self.writer

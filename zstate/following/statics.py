@@ -1,0 +1,63 @@
+"""StaticFollower: the static edges of one writer, as they come and go."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from numpy.typing import ArrayLike
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import InsertRefused, InvalidInput
+from zstate.following.tally import Tally
+from zstate.transform import Transform
+from zstate.wire.keys import full_name
+from zstate.wire.messages import StaticTransforms, poses_from_block
+
+
+class StaticFollower:
+    """Holds in a buffer what one writer of static edges says now: no edge more, none less."""
+
+    def __init__(self, robot: str, writer: str, buffer: TransformBuffer, tally: Tally) -> None:
+        self._robot = robot
+        self._writer = writer
+        self._buffer = buffer
+        self._tally = tally
+        self._parents: dict[str, str] = {}
+
+    def replace(self, statics: StaticTransforms) -> None:
+        """Take these edges; withdraw those that are named no more, or on another parent."""
+        named = [self._named(*edge) for edge in statics.edges]
+        wanted = {edge[1]: edge[0] for edge in named if edge is not None}
+        self._withdraw([child for child, parent in self._parents.items() if wanted.get(child) != parent])
+        for edge, pose in zip(named, poses_from_block(statics.poses), strict=True):
+            if edge is not None:
+                self._insert(*edge, pose)
+
+    def withdraw(self) -> None:
+        """Take all of this writer's edges away."""
+        self._withdraw(list(self._parents))
+
+    def _named(self, parent: str, child: str) -> tuple[str, str] | None:
+        try:
+            return full_name(self._robot, parent), full_name(self._robot, child)
+        except InvalidInput as error:
+            self._refuse("frame name", error)
+            return None
+
+    def _insert(self, parent: str, child: str, pose: ArrayLike) -> None:
+        try:
+            transform = Transform.from_pose7(parent, child, pose)
+            self._buffer.insert_static(transform, writer=self._writer)
+            self._parents[child] = parent
+        except InvalidInput as error:
+            self._refuse(error.reason if isinstance(error, InsertRefused) else "bad numbers", error)
+
+    def _withdraw(self, children: list[str]) -> None:
+        for child in children:
+            del self._parents[child]
+            # A robot's model may have taken the link over meanwhile.
+            with suppress(InsertRefused):
+                self._buffer.withdraw(child)
+
+    def _refuse(self, reason: str, error: InvalidInput) -> None:
+        self._tally.refuse(reason, f"static edge of {self._writer!r}: {error}")

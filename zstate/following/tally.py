@@ -1,0 +1,53 @@
+"""Stats: what a listener received, lost and refused."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from dataclasses import dataclass
+
+_LOG = logging.getLogger("zstate")
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """Counts since the listener opened.
+
+    ``received`` samples were taken; ``dropped`` by our own full ring, ``missed`` between the writer's
+    sequence numbers; ``late`` ones were older than the history; ``refused`` says why others were not used.
+    """
+
+    received: int
+    dropped: int
+    missed: int
+    late: int
+    refused: dict[str, int]
+
+
+class Tally:
+    """The counters behind ``Stats``. Any thread may count."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._refused: Counter[str] = Counter()
+
+    def count(self, what: str, number: int = 1) -> None:
+        """Add to one of received, dropped, missed, late."""
+        with self._lock:
+            self._counts[what] += number
+
+    def refuse(self, reason: str, text: str) -> None:
+        """Count a refusal; the first of each reason is also logged."""
+        with self._lock:
+            self._refused[reason] += 1
+            first = self._refused[reason] == 1
+        if first:
+            _LOG.warning("refused (%s): %s; further ones are only counted", reason, text)
+
+    def stats(self) -> Stats:
+        """All counts now."""
+        with self._lock:
+            counts = (self._counts[what] for what in ("received", "dropped", "missed", "late"))
+            return Stats(*counts, refused=dict(self._refused))
