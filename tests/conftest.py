@@ -1,0 +1,37 @@
+"""What every test has: a rendezvous of its own, free ports and child processes that end with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pytest
+from support import Child, a_free_port
+
+
+@pytest.fixture
+def free_port() -> int:
+    return a_free_port()
+
+
+@pytest.fixture(autouse=True)
+def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each test, with the processes it starts, meets nobody else."""
+    address = f"127.0.0.1:{a_free_port()}"
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", address)
+    monkeypatch.delenv("ZENOH_CONFIG", raising=False)
+    return address
+
+
+@pytest.fixture
+def spawn() -> Iterator[Callable[..., Child]]:
+    """``spawn(code, *arguments)`` starts a Child, which does not outlive the test."""
+    children: list[Child] = []
+
+    def start(code: str, *arguments: str) -> Child:
+        children.append(Child(code, *arguments))
+        return children[-1]
+
+    yield start
+    for child in children:
+        child.kill()
+        child.wait()

@@ -1,0 +1,100 @@
+import socket
+
+import pytest
+from support import Child, until
+
+from zstate.errors import ConfigError
+from zstate.net.rendezvous import RENDEZVOUS, rendezvous_address
+from zstate.net.session import connect
+
+# Says its zid, then puts its name on k/<name> until it is told to stop; says every name it hears.
+NODE = """
+    import sys, threading
+    from zstate.net.session import connect
+    from zstate.net.streams import StreamPublisher, StreamSubscriber
+    name = sys.argv[1]
+    heard = set()
+
+    def hear(samples):
+        for _, payload, _ in samples:
+            if payload.decode() not in heard:
+                heard.add(payload.decode())
+                print(payload.decode())
+
+    stop = threading.Event()
+    threading.Thread(target=lambda: (sys.stdin.readline(), stop.set()), daemon=True).start()
+    with connect() as session, StreamSubscriber(session, "k/*", hear):
+        with StreamPublisher(session, "k/" + name, "text/plain") as out:
+            while not stop.wait(0.01):
+                out.put(name.encode())
+"""
+
+
+def hears(child: Child, *names: str) -> None:
+    waiting = set(names)
+    while waiting:
+        waiting.discard(child.line())
+
+
+def test_two_processes_find_each_other_and_data_flows_both_ways(spawn):
+    first, second = spawn(NODE, "first"), spawn(NODE, "second")
+    hears(first, "second")
+    hears(second, "first")
+    for child in (first, second):
+        child.tell()
+        assert child.wait() == 0
+        assert child.stderr == ""
+
+
+def test_a_newcomer_meets_the_old_ones_after_the_owner_was_killed(spawn):
+    owner = spawn(NODE, "owner")
+    hears(owner, "owner")  # it alone has the port before the second comes
+    second = spawn(NODE, "second")
+    hears(second, "owner")
+    owner.kill()
+    third = spawn(NODE, "third")
+    hears(third, "second")
+    hears(second, "third")
+
+
+def test_many_that_start_at_once_all_meet(spawn):
+    names = [f"n{index}" for index in range(5)]
+    children = [spawn(NODE, name) for name in names]
+    for child in children:
+        hears(child, *names)
+
+
+def test_the_lobby_passes_on_when_its_session_closes():
+    owner, heir = connect(), connect()
+    owner.close()
+    with connect() as newcomer:
+        until(lambda: heir.zid in [str(zid) for zid in newcomer.zenoh.info.peers_zid()])
+    heir.close()
+
+
+def test_a_session_that_is_told_where_to_go_leaves_the_rendezvous_alone(rendezvous: str, free_port: int):
+    host, port = rendezvous.split(":")
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    with (
+        connect(listen=endpoint),
+        connect(endpoints=endpoint),
+        socket.socket() as probe,
+        pytest.raises(ConnectionRefusedError),
+    ):
+        probe.connect((host, int(port)))
+
+
+def test_the_rendezvous_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", "box.local:1234")
+    assert rendezvous_address() == ("box.local", 1234)
+    monkeypatch.delenv("ZSTATE_RENDEZVOUS")
+    assert rendezvous_address() == ("127.0.0.1", int(RENDEZVOUS.split(":")[1]))
+
+
+@pytest.mark.parametrize("text", ["7450", "box:", "box:0", "box:70000", "tcp/box:1", ":1"])
+def test_a_rendezvous_that_is_no_address_is_refused(text: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", text)
+    with pytest.raises(ConfigError, match="host:port") as caught:
+        connect()
+    assert repr(text) in str(caught.value)
+    assert caught.value.path == "ZSTATE_RENDEZVOUS"

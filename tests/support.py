@@ -1,0 +1,84 @@
+"""What tests build with: free ports, other processes, and deadlines."""
+
+from __future__ import annotations
+
+import queue
+import socket
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Callable
+
+DEADLINE_S = 15.0
+
+
+def a_free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> None:
+    """Return as soon as ``condition()`` is true; fail when it is not within ``timeout_s``."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"not so within {timeout_s} s"
+        time.sleep(0.002)
+
+
+class Child:
+    """A Python process that runs ``code``; it says lines, and is told lines."""
+
+    def __init__(self, code: str, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-u", "-c", textwrap.dedent(code), *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._errors: list[str] = []
+        self._readers = [
+            threading.Thread(target=self._read_lines, daemon=True),
+            threading.Thread(target=self._read_errors, daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    def _read_lines(self) -> None:
+        for line in self.process.stdout or ():
+            self._lines.put(line.rstrip("\n"))
+
+    def _read_errors(self) -> None:
+        self._errors.extend(self.process.stderr or ())
+
+    def line(self, timeout_s: float = DEADLINE_S) -> str:
+        """The next line it says."""
+        try:
+            return self._lines.get(timeout=timeout_s)
+        except queue.Empty:
+            raise AssertionError(f"silent for {timeout_s} s; stderr: {self.stderr!r}") from None
+
+    def tell(self, line: str = "") -> None:
+        assert self.process.stdin
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def kill(self) -> None:
+        """As ``kill -9`` does."""
+        self.process.kill()
+        self.process.wait(DEADLINE_S)
+
+    def wait(self, timeout_s: float = DEADLINE_S) -> int:
+        """Its exit code, once it and its output have ended."""
+        code = self.process.wait(timeout_s)
+        for reader in self._readers:
+            reader.join(timeout_s)
+        return code
+
+    @property
+    def stderr(self) -> str:
+        return "".join(self._errors)

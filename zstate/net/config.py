@@ -1,0 +1,127 @@
+"""What a session is told: endpoints checked, settings chosen, one zenoh.Config out."""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal, TypeAlias, get_args
+
+import zenoh
+
+from zstate.errors import ConfigError, InvalidInput
+
+Mode = Literal["peer", "client", "router"]
+ConfigSource: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | zenoh.Config"
+
+CONFIG_VARIABLE = "ZENOH_CONFIG"
+ANY_LOOPBACK_PORT = "tcp/127.0.0.1:0"
+ROUTER_ENDPOINT = "tcp/127.0.0.1:7447"
+
+_SETTINGS: dict[str, object] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": True,
+    "scouting/delay": 200,  # how long opening waits for peers where nobody answers yet
+    "timestamping/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "transport/link/tx/lease": 3000,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+}
+
+_ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
+_LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
+_HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})")
+
+
+def endpoint_list(endpoints: str | Sequence[str]) -> tuple[str, ...]:
+    """Checked endpoints, from one or several. Raises InvalidInput saying the right form."""
+    given = [endpoints] if isinstance(endpoints, str) else endpoints
+    return tuple(_check_endpoint(endpoint) for endpoint in given)
+
+
+def _check_endpoint(endpoint: str) -> str:
+    protocol, slash, rest = endpoint.partition("/")
+    if not slash or not protocol.isascii() or protocol not in _ADDRESSED | _LOCAL:
+        raise InvalidInput(f"{endpoint!r} is not an endpoint; {_advice(endpoint)}")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if protocol in _ADDRESSED:
+        match = _HOST_PORT.fullmatch(address)
+        if not match or int(match[2]) > 65535:
+            raise InvalidInput(f"{endpoint!r} does not say host and port; {_advice(address, protocol)}")
+    elif not address:
+        raise InvalidInput(f"{endpoint!r} has no address after {protocol + '/'!r}")
+    return endpoint
+
+
+def _advice(address: str, protocol: str = "tcp") -> str:
+    if _HOST_PORT.fullmatch(address) and int(address.rpartition(":")[2]) <= 65535:
+        return f"write '{protocol}/{address}'"
+    if re.fullmatch(r"[\w.-]+", address):
+        return f"write '{protocol}/{address}:7447'"
+    return f"write '{protocol}/host:port', for instance 'tcp/192.168.1.10:7447'"
+
+
+def check_mode(mode: str) -> Mode:
+    """``mode`` if it is one. Raises InvalidInput naming all of them."""
+    for known in get_args(Mode):
+        if mode == known:
+            return known
+    raise InvalidInput(f"{mode!r} is not a mode; the modes are {', '.join(map(repr, get_args(Mode)))}")
+
+
+def our_config(
+    mode: Mode, endpoints: Sequence[str], listen: Sequence[str], timeout_s: float | None = None
+) -> zenoh.Config:
+    """Our settings. Without ``timeout_s`` connecting is tried for ever and opening never fails."""
+    settings = {
+        **_SETTINGS,
+        "mode": mode,
+        "connect/endpoints": list(endpoints),
+        "listen/endpoints": list(listen),
+        "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
+        "connect/exit_on_failure": timeout_s is not None,
+    }
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def given_config(
+    source: ConfigSource, mode: Mode, endpoints: Sequence[str], listen: Sequence[str]
+) -> zenoh.Config:
+    """The user's configuration; endpoints and a mode other than "peer" replace what it says."""
+    config = _load(source)
+    if mode != "peer":
+        config.insert_json5("mode", json.dumps(mode))
+    if endpoints:
+        config.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
+    if listen:
+        config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+    return config
+
+
+def _load(source: ConfigSource) -> zenoh.Config:
+    if isinstance(source, zenoh.Config):
+        return zenoh.Config.from_json5(str(source))
+    if isinstance(source, Mapping):
+        return _parse(json.dumps(dict(source)), "the configuration given")
+    path = Path(source)
+    try:
+        return _parse(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"the Zenoh configuration {str(path)!r} cannot be read: {error}", path=str(path)
+        ) from None
+
+
+def _parse(text: str, name: str) -> zenoh.Config:
+    try:
+        return zenoh.Config.from_json5(text)
+    except zenoh.ZError as error:
+        raise ConfigError(f"{name!r} is no Zenoh configuration: {error}", path=name) from None

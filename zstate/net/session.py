@@ -1,0 +1,202 @@
+"""The connection to the network; the only place that opens Zenoh."""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Protocol
+
+import zenoh
+
+from zstate.errors import Closed, InvalidInput, NetworkError, PortBusy, Unreachable
+from zstate.net.config import (
+    ANY_LOOPBACK_PORT,
+    CONFIG_VARIABLE,
+    ROUTER_ENDPOINT,
+    ConfigSource,
+    Mode,
+    check_mode,
+    endpoint_list,
+    given_config,
+    our_config,
+)
+from zstate.net.rendezvous import Rendezvous, rendezvous_address
+
+CLOSE_WITHIN_S = 0.8
+
+
+def connect(
+    config: ConfigSource | None = None,
+    *,
+    mode: str = "peer",
+    endpoints: str | Sequence[str] = (),
+    listen: str | Sequence[str] = (),
+    timeout_s: float = 5.0,
+) -> Session:
+    """Join the network.
+
+    Without arguments: meet every process of this host that does the same, and nobody else. Nothing
+    leaves the host. Otherwise ``mode`` is one of
+
+    - ``"peer"``: a direct link to each of ``endpoints``, kept up for ever whether or not somebody
+      answers yet, and to whoever comes to ``listen``;
+    - ``"client"``: everything goes through the first of ``endpoints`` that answers, within
+      ``timeout_s`` [s]; once lost it is sought for ever;
+    - ``"router"``: clients and peers connect to ``listen`` (tcp/127.0.0.1:7447 unless given).
+
+    ``config`` is a Zenoh configuration (a JSON5 file, a mapping or a ``zenoh.Config``), taken as it is;
+    without one, the file named by the environment variable ``ZENOH_CONFIG``. ``endpoints``, ``listen``
+    and a ``mode`` other than "peer" then replace what it says.
+
+    Raises InvalidInput or ConfigError for what cannot be used, Unreachable, PortBusy, NetworkError.
+    """
+    checked = _check(mode, endpoints, listen, timeout_s)
+    source = config if config is not None else os.environ.get(CONFIG_VARIABLE) or None
+    if source is not None:
+        return Session(_open(given_config(source, *checked), checked[1]))
+    return _connect(*checked, timeout_s)
+
+
+def _check(
+    mode: str, endpoints: str | Sequence[str], listen: str | Sequence[str], timeout_s: float
+) -> tuple[Mode, tuple[str, ...], tuple[str, ...]]:
+    if not (math.isfinite(timeout_s) and timeout_s > 0.0):
+        raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
+    return check_mode(mode), endpoint_list(endpoints), endpoint_list(listen)
+
+
+def _connect(mode: Mode, endpoints: Sequence[str], listen: Sequence[str], timeout_s: float) -> Session:
+    if mode == "client":
+        if not endpoints:
+            raise InvalidInput("mode 'client' needs endpoints=, for instance 'tcp/192.168.1.10:7447'")
+        return Session(_open(our_config(mode, endpoints, listen, timeout_s), endpoints))
+    if mode == "router":
+        return Session(_open(our_config(mode, endpoints, listen or [ROUTER_ENDPOINT]), endpoints))
+    if endpoints or listen:
+        return Session(_open(our_config(mode, endpoints, listen or [ANY_LOOPBACK_PORT]), endpoints))
+    return _connect_on_this_host()
+
+
+def _connect_on_this_host() -> Session:
+    # The lobby first: while the rendezvous is silent, opening a session takes half a second longer.
+    rendezvous = Rendezvous(rendezvous_address(), _open_lobby)
+    try:
+        raw = _open(our_config("peer", [rendezvous.endpoint], [ANY_LOOPBACK_PORT]), ())
+    except BaseException:
+        rendezvous.close()
+        raise
+    return Session(raw, rendezvous)
+
+
+def _open_lobby(endpoint: str) -> zenoh.Session:
+    return zenoh.open(our_config("peer", (), [endpoint]))
+
+
+def _open(config: zenoh.Config, endpoints: Sequence[str]) -> zenoh.Session:
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise _explained(str(error), endpoints) from None
+
+
+def _explained(text: str, endpoints: Sequence[str]) -> NetworkError:
+    """Zenoh has one error for everything; its text tells them apart."""
+    busy = re.search(r"bound to (\S+?):? .*Address already in use", text)
+    if busy:
+        return PortBusy(
+            f"somebody listens at {busy[1]!r} already; choose another port, or stop that program",
+            endpoint=busy[1],
+        )
+    if "Unable to connect" in text:
+        where = " or ".join(repr(endpoint) for endpoint in endpoints) or "the configured endpoints"
+        return Unreachable(
+            f"nothing answers at {where}; is the router running? `zstate router`", endpoints=endpoints
+        )
+    return NetworkError(f"Zenoh cannot open a session: {_without_places(text)}")
+
+
+def _without_places(text: str) -> str:
+    return re.sub(r" at /[^\s\]]*", "", text)
+
+
+class Undeclarable(Protocol):
+    """Whatever was declared on a Zenoh session."""
+
+    def undeclare(self) -> Any: ...
+
+
+class Session:
+    """A place on the network. Made by ``connect``; a context manager.
+
+    Safe to use from any thread, but not in a process forked from the one that connected.
+    """
+
+    def __init__(self, raw: zenoh.Session, rendezvous: Rendezvous | None = None) -> None:
+        self._raw = raw
+        self._rendezvous = rendezvous
+        self._pid = os.getpid()
+        self._closed = False
+        self._lock = threading.Lock()
+        self.zid = str(raw.zid())
+
+    def __repr__(self) -> str:
+        return f"Session({self.zid}{', closed' if self._closed else ''})"
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def zenoh(self) -> zenoh.Session:
+        """The Zenoh session itself, for what zstate does not do. Raises Closed."""
+        self.check()
+        return self._raw
+
+    def check(self) -> None:
+        """Raise Closed if this session cannot be used any more, or not in this process."""
+        if self._closed:
+            raise Closed("this session is closed; connect() again")
+        if os.getpid() != self._pid:
+            raise Closed(
+                f"this session belongs to process {self._pid} and does not work after fork; "
+                "connect() in the child, or start it with the 'spawn' method"
+            )
+
+    def release(self, entity: Undeclarable) -> None:
+        """Undeclare something of this session. Nothing happens if that, or the session, is gone."""
+        if self._closed or os.getpid() != self._pid:
+            return
+        with suppress(zenoh.ZError):
+            entity.undeclare()
+
+    def close(self) -> None:
+        """Leave the network within a second. A second call does nothing."""
+        with self._lock:
+            if self._closed or os.getpid() != self._pid:
+                return
+            self._closed = True
+        _run_bounded(self._leave)
+
+    def _leave(self) -> None:
+        if self._rendezvous is not None:
+            self._rendezvous.close()
+        self._raw.close()
+
+
+def _run_bounded(action: Callable[[], None]) -> None:
+    # A link to a frozen process can hold Zenoh's own close up; whoever closes does not wait for that.
+    thread = threading.Thread(target=action, name="zstate close", daemon=True)
+    thread.start()
+    thread.join(CLOSE_WITHIN_S)
