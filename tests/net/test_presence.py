@@ -1,0 +1,127 @@
+import os
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import Child, until
+
+from zstate.errors import InvalidInput
+from zstate.net.presence import RobotInfo, Writer, announce, discover, watch
+from zstate.net.session import connect
+from zstate.wire.keys import check_writer
+
+DRIVER = Writer("arm driver", "jetson", 412, 5, 7)
+CAMERA = Writer("camera", "nuc", 9, 6, 8)
+
+WRITER = """
+    import sys
+    from zstate.net.presence import Writer, announce
+    from zstate.net.session import connect
+    with connect() as session, announce(session, sys.argv[1], "joint_states", Writer.here(3, "driver")):
+        print("announced")
+        sys.stdin.readline()
+"""
+
+
+def test_a_writer_is_said_as_program_host_and_pid():
+    assert str(Writer("zstate-publish", "jetson", 412, 0, 0)) == "zstate-publish@jetson pid 412"
+
+
+@given(st.builds(Writer, *[st.text(max_size=20)] * 2, *[st.integers(0, 2**64 - 1)] * 3))
+def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: Writer):
+    assert check_writer(writer.identity) == writer.identity
+    assert Writer.parse(writer.identity) == writer
+
+
+@pytest.mark.parametrize(
+    "identity", ["", "a", "a,b,c,d,e", "a,b,1,2", "a,b,1,2,3,4", "a,b,-1,2,3", "a,b,1_0,2,3"]
+)
+def test_an_identity_that_is_not_ours_is_refused(identity: str):
+    with pytest.raises(InvalidInput):
+        Writer.parse(identity)
+
+
+def test_a_writer_here_tells_this_process():
+    before = time.time_ns()
+    writer = Writer.here(7)
+    assert (writer.pid, writer.session) == (os.getpid(), 7)
+    assert before <= writer.since <= time.time_ns()
+    assert writer.program
+    assert Writer.here(7, "driver").program == "driver"
+
+
+def test_discover_names_every_robot_with_its_writers_sorted():
+    with (
+        connect() as one,
+        connect() as two,
+        announce(one, "r2", "tf_static", CAMERA),
+        announce(one, "r1", "tf_static", CAMERA),
+        announce(two, "r1", "joint_states", DRIVER),
+        connect() as asker,
+    ):
+        assert discover(asker) == (
+            RobotInfo("r1", (("joint_states", DRIVER), ("tf_static", CAMERA))),
+            RobotInfo("r2", (("tf_static", CAMERA),)),
+        )
+
+
+def test_discover_finds_processes_that_the_session_has_not_met_yet(spawn):
+    for robot in ("r1", "r2", "r3"):
+        assert spawn(WRITER, robot).line() == "announced"
+    with connect() as asker:
+        assert [robot.name for robot in discover(asker)] == ["r1", "r2", "r3"]
+
+
+def test_discover_of_nobody_takes_its_time_and_no_more():
+    with connect() as session:
+        started = time.monotonic()
+        assert discover(session, timeout_s=0.3) == ()
+        assert 0.3 <= time.monotonic() - started < 2.0
+        for timeout_s in (0.0, -1.0, float("nan")):
+            with pytest.raises(InvalidInput, match="timeout_s"):
+                discover(session, timeout_s=timeout_s)
+
+
+def test_tokens_that_are_not_ours_are_passed_over_and_counted():
+    with connect() as stranger, connect() as session:
+        tokens = [
+            stranger.zenoh.liveliness().declare_token(f"zstate/r1/@writer/{rest}")
+            for rest in ("joint_states/nonsense", "unknown_stream/a,b,1,2,3", "tf/a,b,1,2,x")
+        ]
+        with announce(stranger, "r1", "tf", DRIVER), watch(session, "*", lambda *event: None) as follower:
+            until(lambda: follower.malformed == 3)
+            assert discover(session) == (RobotInfo("r1", (("tf", DRIVER),)),)
+        for token in tokens:
+            token.undeclare()
+
+
+def test_a_watch_hears_who_is_there_who_comes_and_who_goes():
+    events: list[tuple[str, str, Writer, bool]] = []
+    with (
+        connect() as writer,
+        connect() as reader,
+        announce(writer, "r1", "tf", CAMERA),
+        watch(reader, "r1", lambda *event: events.append(event)),
+    ):
+        until(lambda: ("r1", "tf", CAMERA, True) in events)
+        driver = announce(writer, "r1", "joint_states", DRIVER)
+        until(lambda: ("r1", "joint_states", DRIVER, True) in events)
+        with announce(writer, "r2", "tf", DRIVER):
+            driver.close()
+            driver.close()
+            until(lambda: ("r1", "joint_states", DRIVER, False) in events)
+    assert {robot for robot, *_ in events} == {"r1"}
+
+
+def test_a_killed_writer_is_heard_to_go(spawn):
+    events: list[tuple[str, str, Writer, bool]] = []
+    with connect() as reader, watch(reader, "*", lambda *event: events.append(event)):
+        child: Child = spawn(WRITER, "r1")
+        until(lambda: len(events) == 1)
+        child.kill()
+        until(lambda: len(events) == 2)
+    came, went = events
+    assert came[:3] == went[:3] == ("r1", "joint_states", came[2])
+    assert (came[3], went[3]) == (True, False)
+    assert (came[2].program, came[2].pid) == ("driver", child.process.pid)

@@ -1,0 +1,145 @@
+import threading
+import time
+
+import pytest
+from support import until
+
+from zstate.errors import Closed
+from zstate.net.session import connect
+from zstate.net.streams import Arrival, StreamPublisher, StreamSubscriber
+
+KEY = "zstate/r/joint_states"
+ENCODING = "zstate/JointState;v=1"
+
+
+@pytest.fixture
+def sessions():
+    with connect() as writer, connect() as reader:
+        yield writer, reader
+
+
+def test_samples_arrive_in_order_with_key_and_encoding(sessions):
+    got: list[Arrival] = []
+    with (
+        StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
+        StreamSubscriber(sessions[1], "zstate/*/joint_states", got.extend) as subscriber,
+    ):
+        until(lambda: publisher.has_readers)
+        for number in range(100):
+            publisher.put(bytes([number]))
+        until(lambda: len(got) == 100)
+    assert got == [(KEY, bytes([number]), ENCODING) for number in range(100)]
+    assert (subscriber.full_batches, subscriber.failures) == (0, 0)
+
+
+def test_a_writer_knows_whether_anybody_reads(sessions):
+    with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
+        assert not publisher.has_readers
+        with StreamSubscriber(sessions[1], KEY, lambda samples: None):
+            until(lambda: publisher.has_readers)
+        until(lambda: not publisher.has_readers)
+
+
+def test_a_slow_reader_gets_the_newest_samples_and_is_told_that_its_ring_was_full(sessions):
+    batches: list[list[int]] = []
+    seen: list[Arrival] = []
+    busy, go_on = threading.Event(), threading.Event()
+
+    def slow(samples: list[Arrival]) -> None:
+        batches.append([int(payload) for _, payload, _ in samples])
+        busy.set()
+        assert go_on.wait(10)
+
+    with (
+        StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
+        StreamSubscriber(sessions[1], KEY, slow, capacity=8) as subscriber,
+        StreamSubscriber(sessions[1], KEY, seen.extend),
+    ):
+        until(lambda: publisher.has_readers)
+        publisher.put(b"0")
+        assert busy.wait(10)
+        for number in range(1, 101):
+            publisher.put(str(number).encode())
+        until(lambda: len(seen) == 101)  # the other reader of the session is not held up
+        assert subscriber.full_batches == 0
+        go_on.set()
+        until(lambda: len(batches) == 2)
+        assert batches == [[0], list(range(93, 101))]
+        assert subscriber.full_batches == 1
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_reader_that_raises_is_counted_reported_once_and_goes_on(sessions, monkeypatch: pytest.MonkeyPatch):
+    reported: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: reported.append(arguments.exc_value))
+
+    def raises(samples: list[Arrival]) -> None:
+        raise RuntimeError(str(samples[0][1]))
+
+    with (
+        StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
+        StreamSubscriber(sessions[1], KEY, raises) as subscriber,
+    ):
+        until(lambda: publisher.has_readers)
+        for failures in (1, 2, 3):
+            publisher.put(b"x")
+            until(lambda count=failures: subscriber.failures == count)
+    assert [str(error) for error in reported] == ["b'x'"]
+
+
+def test_a_subscriber_may_be_closed_twice_and_from_its_own_thread(sessions):
+    closed = threading.Event()
+    got: list[Arrival] = []
+
+    def close_myself(samples: list[Arrival]) -> None:
+        got.extend(samples)
+        subscriber.close()
+        closed.set()
+
+    with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
+        subscriber = StreamSubscriber(sessions[1], KEY, close_myself)
+        until(lambda: publisher.has_readers)
+        publisher.put(b"1")
+        assert closed.wait(10)
+        until(lambda: not publisher.has_readers)
+        subscriber.close()
+    assert len(got) == 1
+
+
+def test_close_returns_within_a_second_while_the_reader_is_busy(sessions):
+    busy, go_on = threading.Event(), threading.Event()
+
+    def hold(samples: list[Arrival]) -> None:
+        busy.set()
+        go_on.wait(10)
+
+    with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
+        subscriber = StreamSubscriber(sessions[1], KEY, hold)
+        until(lambda: publisher.has_readers)
+        publisher.put(b"1")
+        assert busy.wait(10)
+        started = time.monotonic()
+        subscriber.close()
+        assert time.monotonic() - started < 1.0
+        go_on.set()
+
+
+def test_a_closed_session_ends_the_threads_of_its_subscribers():
+    session = connect()
+    subscriber = StreamSubscriber(session, KEY, lambda samples: None)
+    session.close()
+    until(lambda: "zstate receiver" not in [thread.name for thread in threading.enumerate()])
+    subscriber.close()
+
+
+def test_putting_after_close_says_so(sessions):
+    publisher = StreamPublisher(sessions[0], KEY, ENCODING)
+    publisher.close()
+    publisher.close()
+    with pytest.raises(Closed, match=KEY):
+        publisher.put(b"")
+    other = StreamPublisher(sessions[0], KEY, ENCODING)
+    sessions[0].close()
+    with pytest.raises(Closed, match="session is closed"):
+        other.put(b"")
+    other.close()

@@ -1,0 +1,112 @@
+"""Streams: each sample matters less than the next one. Newest wins, nobody waits."""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import TracebackType
+
+import zenoh
+
+from zstate.errors import Closed
+from zstate.net.receiver import Receiver, Ring
+from zstate.net.session import Session
+
+CAPACITY = 1024
+
+Arrival = tuple[str, bytes, str]
+"""Key, payload and encoding of one sample."""
+
+
+class StreamPublisher:
+    """Puts samples on one key. Under congestion samples are dropped rather than the writer delayed."""
+
+    def __init__(self, session: Session, key: str, encoding: str) -> None:
+        self._session = session
+        self._key = key
+        self._publisher = session.zenoh.declare_publisher(
+            key,
+            encoding=encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            express=False,
+        )
+
+    def __enter__(self) -> StreamPublisher:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def has_readers(self) -> bool:
+        """Whether anybody subscribes to this key now. Cheap enough to ask before each sample."""
+        # the stub says bool, but it is an object and always true
+        return bool(self._publisher.matching_status.matching)  # pyright: ignore
+
+    def put(self, payload: bytes) -> None:
+        """Hand one sample to the network. Raises Closed."""
+        self._session.check()
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError:
+            raise Closed(f"the publisher of {self._key!r} is closed") from None
+
+    def close(self) -> None:
+        """Withdraw from the key. A second call does nothing."""
+        self._session.release(self._publisher)
+
+
+class StreamSubscriber:
+    """Hears a key expression; ``on_samples`` gets all that waits as a list, oldest first.
+
+    It is called from one thread of this subscriber. See ``Receiver`` for what happens when it is
+    slow or raises.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        keyexpr: str,
+        on_samples: Callable[[list[Arrival]], None],
+        capacity: int = CAPACITY,
+    ) -> None:
+        def hand_over(batch: list[zenoh.Sample]) -> None:
+            on_samples(
+                [
+                    (str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+                    for sample in batch
+                    if sample.kind == zenoh.SampleKind.PUT
+                ]
+            )
+
+        ring: Ring = zenoh.handlers.RingChannel(capacity)
+        self._receiver = Receiver(
+            session, session.zenoh.declare_subscriber(keyexpr, ring), hand_over, capacity
+        )
+
+    def __enter__(self) -> StreamSubscriber:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def full_batches(self) -> int:
+        """How often the ring was found full: samples of ours, not of the network, were lost there."""
+        return self._receiver.full_batches
+
+    @property
+    def failures(self) -> int:
+        """How often ``on_samples`` raised."""
+        return self._receiver.failures
+
+    def close(self) -> None:
+        """Stop within a second, also from inside ``on_samples``. A second call does nothing."""
+        self._receiver.close()
