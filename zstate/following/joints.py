@@ -49,7 +49,9 @@ class JointFollower(Follower):
         links = {f"{self.robot}/{joint.child}" for joint in model.joints}
         for frame in self._buffer.frames():
             if frame.name in links and frame.parent is not None:
-                self._tally.refuse("second writer", f"{frame.writer!r} placed {frame.name!r}, a link of the model")
+                self._tally.refuse(
+                    "second writer", f"{frame.writer!r} placed {frame.name!r}, a link of the model"
+                )
                 self._buffer.withdraw(frame.name)
 
     def _can_read(self, sample: Sample) -> bool:
