@@ -127,8 +127,7 @@ class StatePublisher:
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish what ``source`` reads, at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
-        Each tick has an absolute deadline; one that was missed by a whole period is skipped and counted
-        in the report. A tick for which the source has nothing new sends nothing.
+        Each tick has an absolute deadline (see ``Rate`` for what becomes of late ones). A tick for which the source has nothing new sends nothing.
         """
         rate = Rate(rate_hz, self._clock, self._stop, seconds)
         for now in rate:

@@ -16,7 +16,7 @@ class RateReport:
     """What became of a commanded rate.
 
     ``rate_hz`` is what was achieved: the ticks after the first, over the time between the first and
-    the last. ``skipped`` counts ticks that were given up because the work before them took too long.
+    the last. ``skipped`` counts ticks that were given up after a long delay.
     """
 
     commanded_hz: float
@@ -25,11 +25,16 @@ class RateReport:
     skipped: int
 
 
+# A busy machine holds a process up for some milliseconds now and then; that is made up for. After a
+# longer pause (a debugger, a suspended laptop) a burst of old ticks would help nobody.
+_LONGEST_DELAY_NS = 100_000_000
+
+
 class Rate:
     """Iterate to get the stamp [ns] of each tick; the k-th deadline is ``start + k / rate_hz``.
 
-    A deadline that has passed by more than a period is skipped and counted, never made up for in a
-    burst. Ends when ``stop`` is set, or after ``seconds``.
+    Late ticks follow at once, so the rate stays exact; after a delay of more than 0.1 s the deadlines
+    that passed meanwhile are skipped and counted. Ends when ``stop`` is set, or after ``seconds``.
     """
 
     def __init__(
@@ -43,7 +48,8 @@ class Rate:
         self._stop = stop
         self._ticks = 0
         self._skipped = 0
-        self._first = self._last = 0
+        self._first: int | None = None
+        self._last = 0
 
     def __iter__(self) -> Iterator[int]:
         start = self._clock.now()
@@ -53,17 +59,19 @@ class Rate:
             if not self._clock.wait_until(deadline, self._stop):
                 return
             now = self._clock.now()
-            self._first = now if not self._ticks else self._first
+            if now - deadline > _LONGEST_DELAY_NS:
+                due = math.floor((now - start) * self.rate_hz / 1e9)
+                self._skipped += due - tick
+                tick = due
+            self._first = now if self._first is None else self._first
             self._last = now
             self._ticks += 1
             yield now
-            due = math.floor((self._clock.now() - start) * self.rate_hz / 1e9)
-            self._skipped += max(0, due - tick - 1)
-            tick = max(tick + 1, due)
+            tick += 1
 
     def report(self) -> RateReport:
         """How it went so far."""
-        span_ns = self._last - self._first
+        span_ns = 0 if self._first is None else self._last - self._first
         achieved = (self._ticks - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
         return RateReport(self.rate_hz, achieved, self._ticks, self._skipped)
 
