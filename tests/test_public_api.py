@@ -1,0 +1,174 @@
+"""The public surface, pinned: a change here is a change for every user, and belongs in CHANGELOG.md."""
+
+import inspect
+from importlib import metadata, resources
+
+import pytest
+
+import zstate
+
+NAMES = [
+    "Disconnected",
+    "InFuture",
+    "InPast",
+    "InsertRefused",
+    "Kinematics",
+    "LookupFailed",
+    "ModelError",
+    "NoData",
+    "RobotModel",
+    "SineSource",
+    "Stale",
+    "StatePublisher",
+    "StaticPublisher",
+    "Transform",
+    "TransformBuffer",
+    "TransformListener",
+    "Twist",
+    "UnknownFrame",
+    "ZStateError",
+    "connect",
+    "discover",
+    "load_model",
+]
+
+SIGNATURES = {
+    "load_model": "(source, *, xacro_args=None)",
+    "connect": "(config=None, *, mode='peer', endpoints=(), listen=(), timeout_s=5.0)",
+    "discover": "(session, timeout_s=1.0)",
+    "Kinematics": "(model)",
+    "Kinematics.edge_poses": "(positions, out=None)",
+    "Kinematics.link_poses": "(positions, out=None)",
+    "Kinematics.twist": "(link, positions, velocities, reference=None)",
+    "SineSource": "(model, period_s=6.0)",
+    "SineSource.read": "(stamp)",
+    "StatePublisher": (
+        "(session, model, robot=None, wires=('native',), *, streams=('joint_states', 'tf'), clock=None)"
+    ),
+    "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
+    "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",
+    "StatePublisher.close": "()",
+    "StaticPublisher": "(session, robot, writer=None, wire='native')",
+    "StaticPublisher.set": "(transform)",
+    "StaticPublisher.withdraw": "(child)",
+    "StaticPublisher.close": "()",
+    "Transform": "(target, source, translation, rotation, stamp=None, *, kind=None)",
+    "Transform.__matmul__": "(other)",
+    "Transform.inverse": "()",
+    "Transform.apply": "(points)",
+    "Transform.from_matrix": "(target, source, matrix, stamp=None)",
+    "Transform.from_pose7": "(target, source, pose7, stamp=None)",
+    "Transform.from_rpy": "(target, source, translation, rpy, stamp=None)",
+    "TransformBuffer": "(history_s=10.0, clock=None)",
+    "TransformBuffer.add_robot": "(model, prefix='', *, interpolation='linear')",
+    "TransformBuffer.insert_joints": "(track, stamp, positions, velocities=None)",
+    "TransformBuffer.insert": "(transform, *, writer=None)",
+    "TransformBuffer.insert_many": "(edges, stamp, poses, *, writer=None)",
+    "TransformBuffer.insert_static": "(transform, *, writer=None)",
+    "TransformBuffer.withdraw": "(child)",
+    "TransformBuffer.clear": "()",
+    "TransformBuffer.lookup": ("(target, source, at=None, *, timeout_s=0.0, max_age_s=None, predict_s=0.0)"),
+    "TransformBuffer.lookup_between": "(target, target_at, source, source_at, fixed)",
+    "TransformBuffer.lookup_many": "(target, source, stamps)",
+    "TransformBuffer.plan": "(target, source)",
+    "TransformBuffer.twist": "(frame, reference, at=None)",
+    "TransformBuffer.can_lookup": "(target, source, at=None)",
+    "TransformBuffer.explain": "(target, source, at=None)",
+    "TransformBuffer.latest": "(target, source)",
+    "TransformBuffer.wait": "(target, source, at=None, timeout_s=1.0)",
+    "TransformBuffer.wait_async": "(target, source, at=None, timeout_s=1.0)",
+    "TransformBuffer.frames": "()",
+    "TransformListener": (
+        "(session, robot='*', buffer=None, wire='native', follow='joint_states', history_s=10.0, "
+        "*, clock=None)"
+    ),
+    "TransformListener.robots": "()",
+    "TransformListener.close": "()",
+}
+
+ERRORS = {
+    "ZStateError": Exception,
+    "InsertRefused": ValueError,
+    "ModelError": ValueError,
+    "LookupFailed": zstate.ZStateError,
+    "Disconnected": zstate.LookupFailed,
+    "InFuture": zstate.LookupFailed,
+    "InPast": zstate.LookupFailed,
+    "NoData": zstate.LookupFailed,
+    "Stale": zstate.LookupFailed,
+    "UnknownFrame": zstate.LookupFailed,
+}
+
+
+def named(path: str) -> object:
+    found: object = zstate
+    for name in path.split("."):
+        found = getattr(found, name)
+    return found
+
+
+def signature_of(path: str) -> str:
+    """Parameters with their kinds and defaults, without ``self`` and annotations."""
+    given = inspect.signature(named(path))  # type: ignore[arg-type]
+    parameters = [
+        parameter.replace(annotation=inspect.Parameter.empty)
+        for parameter in given.parameters.values()
+        if parameter.name != "self"
+    ]
+    return str(inspect.Signature(parameters))
+
+
+def test_the_front_door_has_these_names_and_at_most_24():
+    assert sorted(zstate.__all__) == NAMES
+    assert len(NAMES) <= 24
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_is_there_listed_and_explained(name: str):
+    assert name in dir(zstate)
+    assert inspect.getdoc(getattr(zstate, name))
+
+
+@pytest.mark.parametrize("path", SIGNATURES)
+def test_the_signature_is_the_contract(path: str):
+    assert signature_of(path) == SIGNATURES[path]
+
+
+def test_every_public_callable_has_its_signature_pinned():
+    constructors = {path for path in SIGNATURES if "." not in path}
+    data = {"RobotModel", "Twist"}  # given out, seldom made by hand
+    assert set(NAMES) == constructors | set(ERRORS) | data
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_errors_derive_from_what_a_caller_would_catch(name: str):
+    assert issubclass(getattr(zstate, name), (ERRORS[name]))
+    assert issubclass(getattr(zstate, name), zstate.ZStateError)
+
+
+@pytest.mark.parametrize(
+    "name", ["name", "root", "links", "joints", "joint_names", "digest", "urdf", "findings"]
+)
+def test_a_model_tells(name: str):
+    assert hasattr(zstate.load_model("rrbot"), name)
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="'zstate' has no attribute 'Publisher'"):
+        zstate.Publisher  # noqa: B018
+
+
+def test_values_cannot_be_changed():
+    base_from_hand = zstate.Transform("base", "hand", [0, 0, 1], [0, 0, 0, 1])
+    with pytest.raises(AttributeError):
+        base_from_hand.target = "other"
+    base_from_hand.translation[0] = 1.0
+    assert base_from_hand.translation.tolist() == [0, 0, 1]
+
+
+def test_the_version_is_that_of_the_package():
+    assert zstate.__version__ == metadata.version("zstate")
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (resources.files("zstate") / "py.typed").is_file()
