@@ -1,0 +1,26 @@
+# docker build -t zstate .                              the command line; robots come as files or from models/
+# docker build -t zstate --build-arg EXTRAS=robots .    with the robots of example-robot-data, 414 MB more
+# docker build --target test .                          runs the tests
+# docker run --rm --network host zstate tf panda_link0 panda_hand
+
+FROM python:3.12-slim AS build
+WORKDIR /src
+COPY pyproject.toml README.md LICENSE ./
+COPY zstate zstate
+COPY models models
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
+
+FROM python:3.12-slim AS test
+WORKDIR /src
+COPY . .
+RUN python3 -m venv .venv && .venv/bin/pip install -q -e '.[robots,test]' && .venv/bin/python -m pytest
+
+FROM python:3.12-slim AS runtime
+ARG EXTRAS=""
+COPY --from=build /wheels /wheels
+RUN pip install --no-cache-dir "$(echo /wheels/zstate-*.whl)${EXTRAS:+[$EXTRAS]}"
+RUN useradd --create-home zstate
+USER zstate
+WORKDIR /home/zstate
+ENTRYPOINT ["zstate"]
+CMD ["--help"]

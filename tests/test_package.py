@@ -1,0 +1,85 @@
+"""What is shipped: built here with the build backend alone, so without a network."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def build(kind: str, source: Path, folder: Path) -> Path:
+    """The wheel or sdist made of ``source``."""
+    command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(folder)]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    (made,) = folder.iterdir()
+    return made
+
+
+def names_in(wheel: Path) -> set[str]:
+    return set(zipfile.ZipFile(wheel).namelist())
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+
+
+def test_the_wheel_holds_the_code_the_robots_and_nothing_else(wheel: Path):
+    code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "zstate").rglob("*.py")}
+    robots = {f"zstate/models/{path.name}" for path in (ROOT / "models").iterdir()}
+    shipped = {name for name in names_in(wheel) if ".dist-info/" not in name}
+    assert shipped == code | robots | {"zstate/py.typed"}
+
+
+def test_the_wheel_says_its_licence_and_its_command(wheel: Path):
+    with zipfile.ZipFile(wheel) as archive:
+        texts = {
+            Path(name).name: archive.read(name).decode() for name in names_in(wheel) if "dist-info" in name
+        }
+    assert "zstate = zstate.cli.main:main" in texts["entry_points.txt"]
+    assert "License-Expression: Apache-2.0" in texts["METADATA"]
+    assert texts["LICENSE"] == (ROOT / "LICENSE").read_text()
+
+
+def test_a_wheel_made_from_the_sdist_is_the_same(wheel: Path, sdist: Path, tmp_path: Path):
+    shutil.unpack_archive(sdist, tmp_path / "source")
+    (source,) = (tmp_path / "source").iterdir()
+    assert names_in(build("wheel", source, tmp_path / "wheel")) == names_in(wheel)
+
+
+def test_the_sdist_holds_what_the_tests_need(sdist: Path):
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"tests/conftest.py", "README.md", "CHANGELOG.md", "Dockerfile", "models/rrbot.urdf"} <= names
+
+
+def test_the_changelog_begins_with_this_version():
+    import zstate
+
+    versions = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert versions[0] == zstate.__version__
+
+
+def test_the_docker_test_stage_runs_the_readmes_test_command():
+    (in_docker,) = re.findall(r"^RUN (.* -m pytest)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert in_docker in (ROOT / "README.md").read_text().splitlines()
+
+
+def test_docker_sees_no_more_than_git_does():
+    ignored_by_git = {line.strip("/") for line in (ROOT / ".gitignore").read_text().splitlines()}
+    ignored_by_docker = {
+        line.removeprefix("**/") for line in (ROOT / ".dockerignore").read_text().splitlines()
+    }
+    assert ignored_by_git <= ignored_by_docker
