@@ -47,7 +47,8 @@ def connect(
     leaves the host. Otherwise ``mode`` is one of
 
     - ``"peer"``: a direct link to each of ``endpoints``, kept up for ever whether or not somebody
-      answers yet, and to whoever comes to ``listen``;
+      answers yet, and to whoever comes to ``listen``. Peers do not pass on what others say: two of them
+      that share nothing but a router hear nothing of each other, so towards routers be a client;
     - ``"client"``: everything goes through the first of ``endpoints`` that answers, within
       ``timeout_s`` [s]; once lost it is sought for ever;
     - ``"router"``: clients and peers connect to ``listen`` (tcp/127.0.0.1:7447 unless given).
