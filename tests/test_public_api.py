@@ -43,7 +43,8 @@ SIGNATURES = {
     "SineSource": "(model, period_s=6.0)",
     "SineSource.read": "(stamp)",
     "StatePublisher": (
-        "(session, model, robot=None, wires=('native',), *, streams=('joint_states', 'tf'), clock=None)"
+        "(session, model, robot=None, wires=('native',), *, "
+        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None)"
     ),
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",

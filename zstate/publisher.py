@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.clock import Clock, SystemClock, check_stamp
-from zstate.errors import Closed
+from zstate.errors import Closed, InvalidInput
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedPublisher
@@ -33,6 +33,9 @@ from zstate.wire.messages import (
 )
 from zstate.wire.wires import wire_named
 
+STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+"""What a robot's state consists of on the network."""
+
 Positions = ArrayLike | Mapping[str, float | Sequence[float]]
 
 
@@ -41,8 +44,9 @@ class StatePublisher:
 
     Whoever joins, at any time, is given the model (``robot_description``) and its fixed edges
     (``tf_static``). Samples go out on ``joint_states``; the moving edges also on ``tf``, while somebody
-    reads that. ``robot`` is its name on the network, the model's name unless given. ``streams`` leaves
-    one of the two out, where another program writes it. A context manager; safe from any thread.
+    reads that. ``robot`` is its name on the network, the model's name unless given. ``streams`` names
+    what this publisher writes, where another program writes the rest. A context manager; safe from any
+    thread.
     """
 
     def __init__(
@@ -52,7 +56,7 @@ class StatePublisher:
         robot: str | None = None,
         wires: Sequence[str] = ("native",),
         *,
-        streams: Sequence[Stream] = ("joint_states", "tf"),
+        streams: Sequence[Stream] = STREAMS,
         clock: Clock | None = None,
     ) -> None:
         self.model = model
@@ -65,10 +69,11 @@ class StatePublisher:
         self._session_id = secrets.randbits(32)
         self._seq = 0
         self._joint_order = order_digest(model.joint_names)
+        _check_streams(streams)
         with ExitStack() as opening:
             self._outputs = [_Output(session, self, name, streams, opening) for name in wires]
             writer = Writer.here(self._session_id)
-            for stream in (*streams, "tf_static", "robot_description"):
+            for stream in streams:
                 opening.enter_context(announce(session, self.robot, stream, writer))
             self._opened = opening.pop_all()
 
@@ -127,7 +132,8 @@ class StatePublisher:
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish what ``source`` reads, at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
-        Each tick has an absolute deadline (see ``Rate`` for what becomes of late ones). A tick for which the source has nothing new sends nothing.
+        Each tick has an absolute deadline (see ``Rate`` for what becomes of late ones). A tick for
+        which the source has nothing new sends nothing.
         """
         rate = Rate(rate_hz, self._clock, self._stop, seconds)
         for now in rate:
@@ -162,8 +168,10 @@ class _Output:
         self._robot = publisher.robot
         self._session = session
         self._opening = opening
-        self._latch("robot_description", publisher.description())
-        self._latch("tf_static", publisher.statics())
+        if "robot_description" in streams:
+            self._latch("robot_description", publisher.description())
+        if "tf_static" in streams:
+            self._latch("tf_static", publisher.statics())
         self.joints = self._stream("joint_states") if "joint_states" in streams else None
         self.transforms = self._stream("tf") if "tf" in streams else None
 
@@ -183,6 +191,12 @@ class _Output:
     def put_transforms(self, sample: TransformSample) -> None:
         if self.transforms is not None:
             self.transforms.put(self._wire.encode(sample))
+
+
+def _check_streams(streams: Sequence[Stream]) -> None:
+    for stream in streams:
+        if stream not in STREAMS:
+            raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")
 
 
 class _MovingEdges:
