@@ -14,7 +14,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_document, xacro_elements
 from zstate.model.xml import MAX_BYTES, read_document
 
-__all__ = ["CatalogEntry", "catalog", "load_model"]
+__all__ = ["CatalogEntry", "catalog", "is_path", "load_model"]
 
 _SUFFIXES = (".urdf", ".xacro", ".xml")
 
@@ -33,7 +33,7 @@ def load_model(
     """
     if isinstance(source, bytes) or (isinstance(source, str) and ("<" in source or not source.strip())):
         return _parse(source, "URDF text", None, xacro_args)
-    if isinstance(source, str) and not _is_path(source):
+    if isinstance(source, str) and not is_path(source):
         path = find(source).path
         return _parse(_read(path, str(path)), str(path), path, xacro_args)
     path = Path(source)
@@ -53,7 +53,8 @@ def _parse(
     return parse_document(document, source)
 
 
-def _is_path(source: str) -> bool:
+def is_path(source: str) -> bool:
+    """Whether ``load_model`` takes this for the path of a file rather than for a name or for text."""
     if "/" in source or os.sep in source or source.endswith(_SUFFIXES):
         return True
     try:

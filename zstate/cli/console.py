@@ -1,0 +1,78 @@
+"""How commands speak: lines on standard output for results, on standard error for what goes on."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+from zstate.errors import duration_text
+
+if TYPE_CHECKING:
+    from zstate.net.presence import RobotInfo
+    from zstate.rate import RateReport
+
+
+def say(text: str = "") -> None:
+    """One line of the result, there at once."""
+    click.echo(text)
+
+
+def say_json(value: Any) -> None:
+    """One JSON document on one line."""
+    click.echo(json.dumps(value))
+
+
+def note(text: str) -> None:
+    """What goes on: waiting, and the end of waiting. Not part of the result."""
+    click.echo(text, err=True)
+
+
+def fail(text: str) -> NoReturn:
+    """End the command with exit code 1 and this cause."""
+    raise click.ClickException(text)
+
+
+def is_terminal() -> bool:
+    """Whether a person looks at standard output."""
+    return sys.stdout.isatty()
+
+
+def age_text(stamp: int | None, now: int) -> str:
+    """How long ago an instant was, in words; "-" for none."""
+    return "-" if stamp is None else duration_text(now - stamp)
+
+
+def rate_text(rate_hz: float | None) -> str:
+    """A rate with the digits that mean something; "-" for none."""
+    return "-" if rate_hz is None else f"{rate_hz:.1f} Hz"
+
+
+def count_text(count: int, what: str) -> str:
+    """``count`` of ``what``: "1 joint", "7 joints"."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def report_text(report: RateReport) -> str:
+    """What became of a commanded rate."""
+    achieved = f"{count_text(report.ticks, 'sample')}; commanded {report.commanded_hz:g} Hz"
+    return f"{achieved}, achieved {report.rate_hz:.2f} Hz, skipped {report.skipped}"
+
+
+def announced_text(robots: Sequence[RobotInfo]) -> str:
+    """Which robots there are, for the end of a message about one that is not."""
+    if not robots:
+        return "no robot is announced; start one, for instance with `zstate publish panda --source sine`"
+    return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
+
+
+def unknown_robot(robot: str, robots: Sequence[RobotInfo]) -> str:
+    """The message for a robot that nobody announces, with near misses and those who are there."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(robot, [info.name for info in robots], n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"nobody announces the robot {robot!r}{hint} ({announced_text(robots)})"

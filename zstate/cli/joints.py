@@ -1,0 +1,43 @@
+"""zstate joints: something that moves."""
+
+from __future__ import annotations
+
+import click
+
+from zstate.cli.console import count_text, say
+from zstate.cli.options import (
+    Network,
+    load_robot,
+    name_option,
+    open_session,
+    rate_option,
+    seconds_option,
+    session_options,
+)
+
+
+@click.command("joints")
+@click.argument("robot")
+@rate_option
+@seconds_option
+@name_option
+@session_options
+def joints_command(
+    robot: str, rate: float, seconds: float | None, name: str | None, network: Network
+) -> None:
+    """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
+
+    ROBOT is a name such as panda, or a URDF file. `zstate publish ROBOT` makes transforms of it.
+    """
+    from zstate.cli.running import run
+    from zstate.publisher import StatePublisher
+    from zstate.sources import SineSource
+
+    model, called = load_robot(robot, name)
+    with (
+        open_session(network) as session,
+        StatePublisher(session, model, called, streams=("joint_states",)) as publisher,
+    ):
+        joints = count_text(len(model.joint_names), "joint")
+        say(f"{called}: a sine on {joints}, {rate:g} Hz, on zstate/{called}/joint_states")
+        run(publisher, SineSource(model), rate, seconds)

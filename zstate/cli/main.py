@@ -1,0 +1,124 @@
+"""zstate: one command for each thing to do, loaded when it is called for."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from difflib import get_close_matches
+from importlib import import_module
+from types import FrameType
+from typing import NoReturn
+
+import click
+
+from zstate.errors import ZStateError
+
+# name: (section of the help, what it does); the module zstate.cli.<name> holds the command <name>_command.
+_COMMANDS = {
+    "demo": ("Start here", "A robot that moves, its state over Zenoh, and a live table of it."),
+    "publish": ("Write", "Publish a robot's state: its model, fixed edges, and transforms."),
+    "joints": ("Write", "Publish a sine on every joint, and nothing else."),
+    "static": ("Write", "Publish one edge that never moves, until Ctrl-C."),
+    "tf": ("Look", "The pose of one frame in another."),
+    "tree": ("Look", "The frames of the announced robots, as a tree."),
+    "ls": ("Look", "The announced robots and who writes for them."),
+    "listen": ("Look", "Follow robots: rates, latencies, losses."),
+    "echo": ("Look", "Joint states, one document each."),
+    "hz": ("Look", "The rate at which samples come in."),
+    "check": ("Look", "What is right and wrong with a robot model."),
+    "router": ("Run", "A Zenoh router."),
+    "up": ("Run", "Start several of these from one file."),
+}
+
+
+class Commands(click.Group):
+    """The commands; ``--help`` imports none of them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        command = getattr(import_module(f"zstate.cli.{cmd_name}"), f"{cmd_name}_command")
+        assert isinstance(command, click.Command)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in _COMMANDS and not args[0].startswith("-"):
+            near = get_close_matches(args[0], _COMMANDS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"the commands are {', '.join(_COMMANDS)}"
+            ctx.fail(f"there is no command {args[0]!r}; {hint}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        width = max(map(len, _COMMANDS))
+        for section in dict.fromkeys(section for section, _ in _COMMANDS.values()):
+            rows = [
+                (name.ljust(width), text) for name, (where, text) in _COMMANDS.items() if where == section
+            ]
+            with formatter.section(section):
+                formatter.write_dl(rows)
+
+
+def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        from zstate import __version__
+
+        click.echo(f"zstate {__version__}")
+        ctx.exit()
+
+
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "auto_envvar_prefix": "ZSTATE"},
+    epilog="Try `zstate demo`, then `zstate COMMAND --help`. Ctrl-C ends every command.",
+)
+@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version)
+@click.option("--until-eof", is_flag=True, hidden=True)
+def group(until_eof: bool) -> None:
+    """A robot's state wherever Zenoh reaches, without ROS."""
+    if until_eof:
+        from zstate.cli.children import end_with_parent
+
+        end_with_parent()
+
+
+def main() -> NoReturn:
+    """Run the command line and exit: 0, 1 for what failed, 2 for wrong usage, 130 after Ctrl-C."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _end)
+    try:
+        code = group.main(prog_name="zstate", standalone_mode=False)
+    except click.UsageError as error:
+        _complain(_usage_text(error))
+        code = error.exit_code
+    except click.ClickException as error:
+        _complain(error.format_message())
+        code = error.exit_code
+    except ZStateError as error:
+        _complain(str(error))
+        code = 1
+    sys.exit(code or 0)
+
+
+def _end(number: int, _: FrameType | None) -> None:
+    # Leaving takes well under a second; whoever asks a second time does not wait for it.
+    signal.signal(number, _end_at_once)
+    raise SystemExit(128 + number)
+
+
+def _end_at_once(number: int, _: FrameType | None) -> None:
+    os._exit(128 + number)
+
+
+def _usage_text(error: click.UsageError) -> str:
+    text = error.format_message()
+    return f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text
+
+
+def _complain(text: str) -> None:
+    click.echo(f"zstate: {text}", err=True)

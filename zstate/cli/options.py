@@ -1,0 +1,136 @@
+"""What commands have in common: how they join the network, and how numbers are given."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from zstate.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """How to join the network: the session options of one command line."""
+
+    mode: str = "peer"
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    config: str | None = None
+
+
+def session_options(command: Command) -> Command:
+    """Give a command the session options; it gets them as ``network``, a Network."""
+
+    @functools.wraps(command)
+    def with_network(
+        *, mode: str, connect: tuple[str, ...], listen: tuple[str, ...], config: str | None, **options: Any
+    ) -> Any:
+        return command(network=Network(mode, connect, listen, config), **options)
+
+    for option in reversed(_SESSION_OPTIONS):
+        with_network = option(with_network)
+    return with_network  # type: ignore[return-value]
+
+
+_SESSION_OPTIONS = (
+    click.option(
+        "--mode",
+        type=click.Choice(["peer", "client", "router"]),
+        default="peer",
+        envvar="ZSTATE_MODE",
+        help="How to join the network; peer needs no router.",
+    ),
+    click.option(
+        "--connect",
+        multiple=True,
+        metavar="ENDPOINT",
+        envvar="ZSTATE_CONNECT",
+        help="Where somebody listens, such as tcp/192.168.1.10:7447; may be repeated.",
+    ),
+    click.option(
+        "--listen",
+        multiple=True,
+        metavar="ENDPOINT",
+        envvar="ZSTATE_LISTEN",
+        help="Where to listen, such as tcp/0.0.0.0:7448; may be repeated.",
+    ),
+    click.option(
+        "--config",
+        type=click.Path(exists=True, dir_okay=False),
+        metavar="FILE",
+        envvar="ZSTATE_CONFIG",
+        help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
+    ),
+)
+
+
+@contextmanager
+def open_session(network: Network) -> Generator[Session]:
+    """A session as the options say. Warnings of the library go to standard error from now on."""
+    from zstate.cli.connecting import connect_interruptibly
+
+    with connect_interruptibly(network.config, network.mode, network.connect, network.listen) as session:
+        yield session
+
+
+def load_robot(source: str, name: str | None) -> tuple[RobotModel, str]:
+    """The model behind a ROBOT argument, and the robot's name on the network.
+
+    That is ``name`` if given, else the catalog name that was asked for, else the model's own.
+    """
+    from zstate.model.catalog import is_path, load_model
+    from zstate.model.known import find
+    from zstate.wire.keys import check_robot
+
+    model = load_model(source)
+    robot = name or (model.name if is_path(source) or "<" in source else find(source).name)
+    try:
+        return model, check_robot(robot)
+    except InvalidInput as error:
+        raise InvalidInput(f"{error}; choose another name with --name") from None
+
+
+def checked_rate(_: click.Context, __: click.Parameter, rate_hz: float | None) -> float | None:
+    """The callback of a ``--rate`` option: one that can be kept, or wrong usage."""
+    from zstate.rate import check_rate
+
+    try:
+        return None if rate_hz is None else check_rate(rate_hz)
+    except InvalidInput as error:
+        raise click.BadParameter(str(error)) from None
+
+
+def checked_seconds(_: click.Context, __: click.Parameter, seconds: float | None) -> float | None:
+    """The callback of an option that is a duration: positive and finite, or wrong usage."""
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
+        raise click.BadParameter(f"a duration is a positive number of seconds; got {seconds}")
+    return seconds
+
+
+rate_option = click.option(
+    "--rate",
+    type=float,
+    default=100.0,
+    show_default=True,
+    callback=checked_rate,
+    metavar="HZ",
+    help="Samples a second.",
+)
+seconds_option = click.option(
+    "--seconds", type=float, callback=checked_seconds, metavar="N", help="End after so long [s]."
+)
+name_option = click.option(
+    "--name", metavar="NAME", help="The robot's name on the network; default: as it is called here."
+)
