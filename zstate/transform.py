@@ -37,7 +37,10 @@ def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
 
     Lengths within 1e-3 of one are normalised. Raises InvalidInput saying which number is at fault.
     """
-    array = np.asarray(numbers, dtype=np.float64)
+    try:
+        array = np.asarray(numbers, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{what} must be numbers: {error}") from None
     if array.shape != (7,):
         raise InvalidInput(f"{what} takes 7 numbers x y z qx qy qz qw; got shape {array.shape}")
     values = array.tolist()
@@ -62,6 +65,8 @@ class Transform:
     """
 
     __slots__ = ("_pose", "kind", "predicted_s", "source", "stamp", "target")
+    # numpy must not take ``transform @ array`` for a product of matrices.
+    __array_ufunc__ = None
 
     _pose: tuple[float, ...]
     target: str
@@ -88,6 +93,8 @@ class Transform:
             )
         pose = check_pose(np.concatenate((position, quaternion)), f"{target!r} from {source!r}")
         stamp = None if stamp is None else check_stamp(stamp)
+        if kind is not None and kind not in KINDS:
+            raise InvalidInput(f"a transform's kind is one of {', '.join(KINDS)}; got {kind!r}")
         self._fill(target, source, pose, stamp, kind or ("static" if stamp is None else "exact"))
 
     def _fill(  # noqa: PLR0917 - one call for each fact, on the hot path
@@ -154,7 +161,8 @@ class Transform:
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"a Transform is immutable; make a new one to change {name!r}")
 
-    __delattr__ = __setattr__  # type: ignore[assignment]
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(f"a Transform is immutable; {name!r} cannot be deleted")
 
     @property
     def translation(self) -> Array:

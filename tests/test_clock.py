@@ -1,0 +1,83 @@
+"""Clocks and stamps."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from zstate.clock import ManualClock, SystemClock, check_stamp, stamp_text
+from zstate.errors import InvalidInput
+
+
+@pytest.mark.parametrize("stamp", [0, -1, 1_790_000_000_123_456_789, -(2**63), 2**63 - 1])
+def test_every_64_bit_integer_is_an_ordinary_stamp(stamp: int) -> None:
+    assert check_stamp(stamp) == stamp
+    assert check_stamp(np.int64(stamp)) == stamp
+
+
+def test_an_integer_of_numpy_comes_back_as_an_int() -> None:
+    assert type(check_stamp(np.uint32(7))) is int
+
+
+@pytest.mark.parametrize(
+    "stamp", [1.0, np.float64(1.0), True, "1", None, 2**63, -(2**63) - 1, np.uint64(2**63)]
+)
+def test_what_is_no_64_bit_integer_is_refused_with_the_way_out(stamp: object) -> None:
+    with pytest.raises(InvalidInput, match=r"time\.time_ns\(\)"):
+        check_stamp(stamp)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "text"),
+    [(0, "0.000000000"), (1, "0.000000001"), (1_500_000_000, "1.500000000"), (-1, "-0.000000001")],
+)
+def test_a_stamp_reads_as_seconds_with_all_nine_digits(stamp: int, text: str) -> None:
+    assert stamp_text(stamp) == text
+
+
+def test_the_system_clock_tells_the_time_of_the_system() -> None:
+    before = time.time_ns()
+    assert before <= SystemClock().now() <= time.time_ns()
+
+
+def test_the_system_clock_reaches_an_instant_and_not_before() -> None:
+    instant = SystemClock().now() + 5_000_000
+    assert SystemClock().wait_until(instant, threading.Event())
+    assert SystemClock().now() >= instant
+
+
+def test_a_wait_for_an_instant_ends_when_it_is_stopped() -> None:
+    stop = threading.Event()
+    stop.set()
+    far = 2**62
+    assert not SystemClock().wait_until(far, stop)
+    assert not ManualClock().wait_until(far, stop)
+    assert not SystemClock().wait_until(0, stop)
+
+
+def test_a_manual_clock_moves_only_when_told_to() -> None:
+    clock = ManualClock(5)
+    assert clock.now() == 5
+    clock.advance(1e-9)
+    assert clock.now() == 6
+    clock.set(-3)
+    assert clock.now() == -3
+
+
+def test_whoever_waits_for_a_manual_clock_wakes_when_it_gets_there() -> None:
+    clock, reached = ManualClock(), threading.Event()
+
+    def wait() -> None:
+        assert clock.wait_until(1_000_000_000, threading.Event())
+        reached.set()
+
+    waiter = threading.Thread(target=wait)
+    waiter.start()
+    clock.advance(0.5)
+    assert not reached.is_set()
+    clock.advance(0.5)
+    assert reached.wait(10.0)
+    waiter.join()

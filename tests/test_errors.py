@@ -1,0 +1,119 @@
+"""Errors: one tree, facts as attributes, sentences that say what to do."""
+
+from __future__ import annotations
+
+import pytest
+
+from zstate import errors
+from zstate.errors import (
+    AmbiguousFrame,
+    Disconnected,
+    InFuture,
+    InPast,
+    InsertRefused,
+    LookupFailed,
+    NoData,
+    Stale,
+    UnknownFrame,
+    WaitTimeout,
+    ZStateError,
+    duration_text,
+    timed_out,
+)
+
+S = 1_000_000_000
+
+
+def test_every_exception_is_a_zstate_error() -> None:
+    classes = [thing for thing in vars(errors).values() if isinstance(thing, type)]
+    exceptions = [thing for thing in classes if issubclass(thing, BaseException)]
+    assert len(exceptions) > 15
+    assert all(issubclass(thing, ZStateError) for thing in exceptions)
+
+
+def test_bad_input_is_a_value_error_and_a_failed_question_is_not() -> None:
+    assert issubclass(InsertRefused, ValueError)
+    assert not issubclass(LookupFailed, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("nanoseconds", "text"),
+    [
+        (85, "85 ns"),
+        (1_500, "1.5 us"),
+        (12_000_000, "12.0 ms"),
+        (4_200_000_000, "4.2 s"),
+        (-3_000_000, "-3.0 ms"),
+    ],
+)
+def test_durations_read_as_a_person_says_them(nanoseconds: int, text: str) -> None:
+    assert duration_text(nanoseconds) == text
+
+
+def in_future() -> InFuture:
+    return InFuture(
+        "map",
+        "hand",
+        edge=("map", "base"),
+        requested=5 * S,
+        oldest=S,
+        newest=4 * S,
+        rate_hz=50.0,
+        writer="odom",
+    )
+
+
+def test_in_future_says_how_far_after_whose_newest_sample_and_what_to_do() -> None:
+    text = str(in_future())
+    assert text.startswith("pose of 'hand' in 'map': asked 1.0 s after the newest sample of 'map' -> 'base'")
+    for part in ("writer odom", "50 Hz", "timeout_s", "at=None", "predict_s"):
+        assert part in text
+
+
+def test_in_past_says_how_far_before_and_how_long_the_history_is() -> None:
+    error = InPast("map", "hand", edge=("map", "base"), requested=S, oldest=3 * S, newest=7 * S)
+    assert "asked 2.0 s before the oldest sample of 'map' -> 'base'" in str(error)
+    assert "the history there spans 4.0 s" in str(error)
+
+
+def test_an_unknown_frame_comes_with_near_misses_or_with_what_lists_the_frames() -> None:
+    assert "did you mean 'hand'?" in str(
+        UnknownFrame("a", "hnd", name="hnd", near_misses=["hand"], frame_count=3)
+    )
+    assert "unknown among 3 frames" in str(UnknownFrame("a", "q", name="q", frame_count=3))
+    assert "is a publisher running" in str(UnknownFrame("a", "q", name="q"))
+    assert "write 'q'" in str(UnknownFrame("a", "/q", name="/q", frame_count=3))
+    assert "is empty" in str(UnknownFrame("a", "", name="", frame_count=3))
+
+
+def test_the_other_reasons_name_what_is_at_fault() -> None:
+    assert "'r1/hand' or 'r2/hand'" in str(
+        AmbiguousFrame("a", "hand", name="hand", candidates=["r1/hand", "r2/hand"])
+    )
+    disconnected = str(Disconnected("a", "b", roots=("map", "base")))
+    assert "'a' is under root 'map', 'b' under root 'base'" in disconnected
+    assert "zstate static map base" in disconnected
+    assert "no sample of 'a' -> 'b'" in str(NoData("a", "b", edge=("a", "b")))
+    assert "every edge of the path is static" in str(NoData("a", "b"))
+    stale = Stale("a", "b", age_s=2.0, max_age_s=0.5, edge=("a", "b"))
+    assert "2.0 s old, 0.5 s are allowed" in str(stale)
+
+
+def test_a_note_stands_behind_the_sentence() -> None:
+    error = in_future()
+    error.note = "one thing more"
+    assert str(error).endswith("(one thing more)")
+
+
+def test_a_wait_that_ran_out_keeps_its_reasons_class_and_facts_and_is_a_timeout() -> None:
+    error = timed_out(in_future(), 0.25)
+    assert isinstance(error, InFuture)
+    assert isinstance(error, TimeoutError)
+    assert isinstance(error, WaitTimeout)
+    assert (error.edge, error.requested, error.newest) == (("map", "base"), 5 * S, 4 * S)
+    assert error.waited_s == 0.25
+    assert str(error).startswith("after waiting 0.25 s, pose of 'hand'")
+
+
+def test_each_reason_has_one_class_of_timeouts() -> None:
+    assert type(timed_out(in_future(), 1.0)) is type(timed_out(in_future(), 2.0))

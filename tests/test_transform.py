@@ -1,0 +1,224 @@
+"""Transform and Twist as values: which frames, which way, which numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zstate.clock import ManualClock
+from zstate.errors import FrameMismatch, InvalidInput
+from zstate.transform import Transform, worst_kind
+from zstate.twist import Twist
+
+NAN, INF = math.nan, math.inf
+TURN = (0.5, -0.5, 0.5, 0.5)
+
+angles = st.floats(-3.0, 3.0)
+numbers = st.floats(-100.0, 100.0)
+
+
+def transforms(target: str, source: str) -> st.SearchStrategy[Transform]:
+    triples = st.tuples(numbers, numbers, numbers), st.tuples(angles, angles, angles)
+    return st.builds(lambda xyz, rpy: Transform.from_rpy(target, source, xyz, rpy), *triples)
+
+
+def assert_close(a: Transform, b: Transform, atol: float = 1e-12) -> None:
+    assert (a.target, a.source, a.stamp) == (b.target, b.source, b.stamp)
+    np.testing.assert_allclose(a.matrix, b.matrix, atol=atol)
+
+
+@given(transforms("a", "b"))
+def test_the_inverse_undoes_a_transform(a_from_b: Transform) -> None:
+    b_from_a = a_from_b.inverse()
+    assert (b_from_a.target, b_from_a.source) == ("b", "a")
+    np.testing.assert_allclose((a_from_b @ b_from_a).matrix, np.eye(4), atol=1e-12)
+    assert_close(b_from_a.inverse(), a_from_b)
+
+
+@given(transforms("a", "b"), transforms("b", "c"), transforms("c", "d"))
+def test_composition_is_associative(a_from_b: Transform, b_from_c: Transform, c_from_d: Transform) -> None:
+    assert_close((a_from_b @ b_from_c) @ c_from_d, a_from_b @ (b_from_c @ c_from_d))
+
+
+@given(transforms("a", "b"), st.tuples(numbers, numbers, numbers))
+def test_points_of_the_source_come_out_in_the_target(a_from_b: Transform, p_b) -> None:
+    expected = (a_from_b.matrix @ (*p_b, 1.0))[:3]
+    np.testing.assert_allclose(a_from_b.apply(p_b), expected, atol=1e-12)
+    np.testing.assert_allclose(a_from_b.apply([p_b, p_b])[1], expected, atol=1e-12)
+    np.testing.assert_allclose(a_from_b.apply((*p_b, 1.0)), (*expected, 1.0), atol=1e-12)
+    np.testing.assert_allclose(a_from_b.apply(np.full((2, 3, 3), p_b))[1, 2], expected, atol=1e-12)
+
+
+def test_a_homogeneous_direction_is_turned_and_not_moved() -> None:
+    a_from_b = Transform("a", "b", (1, 2, 3), (0, 0, 1, 0))
+    np.testing.assert_allclose(a_from_b.apply((1, 0, 0, 0)), (-1, 0, 0, 0), atol=1e-15)
+
+
+@pytest.mark.parametrize("points", [1.0, (1.0, 2.0), np.zeros((3, 5))])
+def test_points_of_another_width_are_refused(points) -> None:
+    with pytest.raises(InvalidInput, match="columns"):
+        Transform("a", "b", (0, 0, 0), (0, 0, 0, 1)).apply(points)
+
+
+def test_inner_frames_that_differ_are_refused_with_both_named() -> None:
+    a_from_b = Transform("a", "b", (0, 0, 0), (0, 0, 0, 1))
+    c_from_d = Transform("c", "d", (0, 0, 0), (0, 0, 0, 1))
+    with pytest.raises(FrameMismatch, match=r"'a' from 'b' @ 'c' from 'd'.*look up 'b' from 'c'"):
+        _ = a_from_b @ c_from_d
+    with pytest.raises(TypeError):
+        _ = a_from_b @ np.eye(4)
+
+
+def test_a_product_has_the_stamp_that_both_share_or_the_only_one() -> None:
+    def stamped(target: str, source: str, stamp: int | None) -> Transform:
+        return Transform(target, source, (0, 0, 0), (0, 0, 0, 1), stamp)
+
+    assert (stamped("a", "b", 5) @ stamped("b", "c", 5)).stamp == 5
+    assert (stamped("a", "b", 0) @ stamped("b", "c", None)).stamp == 0
+    assert (stamped("a", "b", 5) @ stamped("b", "c", 6)).stamp is None
+
+
+def test_a_product_is_of_the_less_certain_kind() -> None:
+    assert worst_kind("static", "exact") == "exact"
+    assert worst_kind("exact", "interpolated") == "interpolated"
+    assert worst_kind("predicted", "interpolated", "static") == "predicted"
+    exact = Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 5)
+    predicted = Transform("b", "c", (0, 0, 0), (0, 0, 0, 1), 5, kind="predicted")
+    assert (exact @ predicted).kind == "predicted"
+
+
+def test_what_has_no_stamp_is_static_and_what_has_one_exact() -> None:
+    assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1)).kind == "static"
+    assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 0).kind == "exact"
+
+
+def test_the_constructors_agree_on_one_pose() -> None:
+    # A yaw of a quarter turn.
+    half = math.sqrt(0.5)
+    matrix = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    expected = Transform("a", "b", (1, 2, 3), (0, 0, half, half), 7)
+    for other in (
+        Transform.from_matrix("a", "b", matrix, 7),
+        Transform.from_pose7("a", "b", (1, 2, 3, 0, 0, half, half), 7),
+        Transform.from_rpy("a", "b", (1, 2, 3), (0, 0, math.pi / 2), 7),
+    ):
+        assert_close(other, expected)
+        np.testing.assert_allclose(other.rpy, (0, 0, math.pi / 2), atol=1e-15)
+        np.testing.assert_allclose(other.pose7, (1, 2, 3, 0, 0, half, half), atol=1e-15)
+
+
+@pytest.mark.parametrize("norm", [0.9991, 1.0, 1.0009])
+def test_a_quaternion_within_a_thousandth_of_unit_length_is_normalised(norm: float) -> None:
+    q = np.multiply(TURN, norm)
+    np.testing.assert_allclose(Transform("a", "b", (0, 0, 0), q).rotation, TURN, atol=1e-15)
+
+
+@pytest.mark.parametrize("norm", [0.0, 0.9989, 1.0011, 2.0, 1e200])
+def test_a_quaternion_farther_from_unit_length_is_refused_with_its_length(norm: float) -> None:
+    with pytest.raises(InvalidInput, match=r"quaternion of 'a' from 'b'|finite"):
+        Transform("a", "b", (0, 0, 0), np.multiply(TURN, norm))
+
+
+@pytest.mark.parametrize("place", range(7))
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_nan_and_infinity_are_refused_in_each_number(place: int, value: float) -> None:
+    pose7 = [0.0, 0.0, 0.0, *TURN]
+    pose7[place] = value
+    with pytest.raises(InvalidInput, match="must be finite"):
+        Transform.from_pose7("a", "b", pose7)
+
+
+@pytest.mark.parametrize("pose7", [[0.0] * 6, [[0.0] * 7], "not a pose", ["x"] * 7, None])
+def test_what_is_no_seven_numbers_is_refused(pose7) -> None:
+    with pytest.raises(InvalidInput):
+        Transform.from_pose7("a", "b", pose7)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.eye(3),
+        np.full((4, 4), NAN),
+        np.diag([1.0, 1.0, -1.0, 1.0]),
+        np.diag([1.01, 1.0, 1.0, 1.0]),
+        np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 1e-3,
+    ],
+)
+def test_what_is_no_homogeneous_matrix_is_refused(matrix) -> None:
+    with pytest.raises(InvalidInput):
+        Transform.from_matrix("a", "b", matrix)
+
+
+def test_shapes_stamps_and_kinds_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InvalidInput, match="shapes"):
+        Transform("a", "b", (0, 0), (0, 0, 0, 1))
+    with pytest.raises(InvalidInput, match="rpy"):
+        Transform.from_rpy("a", "b", (0, 0, 0), (0, 0))
+    with pytest.raises(InvalidInput, match="stamp"):
+        Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 1.5)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match="'guessed'"):
+        Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), kind="guessed")  # type: ignore[arg-type]
+
+
+def test_a_transform_cannot_be_changed_not_even_through_its_arrays() -> None:
+    transform = Transform("a", "b", (1, 2, 3), TURN, 5)
+    with pytest.raises(AttributeError, match="immutable"):
+        transform.stamp = 6
+    with pytest.raises(AttributeError, match="immutable"):
+        del transform.stamp
+    transform.pose7[0] = transform.translation[0] = transform.matrix[0, 3] = 9.0
+    assert transform.pose7[0] == 1.0
+
+
+def test_equality_knows_that_q_and_minus_q_are_one_turn() -> None:
+    transform = Transform("a", "b", (1, 2, 3), TURN, 5)
+    opposite = Transform("a", "b", (1, 2, 3), np.negative(TURN), 5)
+    assert transform == opposite
+    assert hash(transform) == hash(opposite)
+    for other in (
+        Transform("x", "b", (1, 2, 3), TURN, 5),
+        Transform("a", "x", (1, 2, 3), TURN, 5),
+        Transform("a", "b", (1, 2, 4), TURN, 5),
+        Transform("a", "b", (1, 2, 3), (0, 0, 0, 1), 5),
+        Transform("a", "b", (1, 2, 3), TURN),
+        "something else",
+    ):
+        assert transform != other
+
+
+def test_a_transform_reads_as_the_pose_of_one_frame_in_another() -> None:
+    text = repr(Transform("world", "hand", (1, 2, 3), (0, 0, 0, 1), 1_500_000_000))
+    assert text.startswith("<pose of hand in world at 1.500000000: xyz [1.0000, 2.0000, 3.0000] m")
+    assert "at any time" in repr(Transform("world", "hand", (1, 2, 3), (0, 0, 0, 1)))
+
+
+def test_a_transform_survives_json_and_pickle() -> None:
+    transform = Transform("a", "b", (0.1, 0.2, 0.3), TURN, 1_790_000_000_123_456_789, kind="interpolated")
+    for again in (
+        Transform.from_dict(json.loads(json.dumps(transform.to_dict()))),
+        pickle.loads(pickle.dumps(transform)),
+    ):
+        assert again == transform
+        assert again.kind == "interpolated"
+    with pytest.raises(InvalidInput, match="needs target"):
+        Transform.from_dict({"source": "b"})
+
+
+def test_age_is_counted_by_the_clock_given_and_static_never_ages() -> None:
+    clock = ManualClock(3_500_000_000)
+    assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 1_000_000_000).age(clock) == 2.5
+    assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1)).age(clock) == 0.0
+
+
+def test_a_twist_says_whose_motion_it_is_and_in_whose_axes() -> None:
+    twist = Twist("hand", "map", (1, 2, 3), (4, 5, 6), None)
+    assert (twist.about, twist.expressed_in) == ("hand", "map")
+    assert repr(twist).startswith("<twist of hand in map: linear [1.0000, 2.0000, 3.0000] m/s")
+    with pytest.raises(ValueError, match="read-only"):
+        twist.linear[0] = 9.0
