@@ -6,6 +6,7 @@ import asyncio
 import math
 import threading
 import time
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from zstate.buffer.waiting import Waiter
 from zstate.clock import Clock, check_stamp
 from zstate.errors import (
     AmbiguousFrame,
-    Disconnected,
+    InFuture,
     InPast,
     InvalidInput,
     LookupFailed,
@@ -90,6 +91,8 @@ class TransformBuffer(Store):
         Both are joined through ``fixed``, which is taken not to have moved meanwhile (tf2's advanced
         form). None for an instant is the newest of that side. The answer has the target side's stamp.
         """
+        # A missing connection is blamed before a bad time, on either side.
+        self._path(fixed, source)
         target_from_fixed = self.lookup(target, fixed, target_at)
         both = target_from_fixed @ self.lookup(fixed, source, source_at)
         pose = tuple(both.pose7.tolist())
@@ -142,8 +145,8 @@ class TransformBuffer(Store):
     def wait(self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0) -> Transform:
         """``lookup`` as soon as it has an answer; unknown and unconnected frames are waited for, too.
 
-        Raises InPast at once, since waiting cannot mend it; after ``timeout_s`` the reason of the last
-        try, as an error that is also a TimeoutError.
+        Raises at once what waiting cannot mend: InPast for an ``at`` before all samples kept. After
+        ``timeout_s`` raises the reason of the last try, as an error that is also a TimeoutError.
         """
         return self._wait(self._question(target, source, at), _seconds("timeout_s", timeout_s))
 
@@ -156,7 +159,9 @@ class TransformBuffer(Store):
         deadline = loop.time() + _seconds("timeout_s", timeout_s)
 
         def wake() -> None:
-            loop.call_soon_threadsafe(event.set)
+            # The loop may be closed by the time an insert wakes those who waited in it.
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(event.set)
 
         with self._room.seat(wake) as waiter:
             while True:
@@ -178,31 +183,41 @@ class TransformBuffer(Store):
                 outcome = self._try(question, waiter)
                 if isinstance(outcome, Transform):
                     return outcome
-                if not event.wait(max(0.0, deadline - time.monotonic())):
+                left_s = min(deadline - time.monotonic(), threading.TIMEOUT_MAX)
+                if left_s <= 0.0 or not event.wait(left_s):
                     raise timed_out(outcome, timeout_s)
 
     def _try(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
         """An answer; or the reason against it, with ``waiter`` told what would change that."""
-        while True:
-            version = self._tree.version
-            waiter.expect(version, ())
-            try:
-                return self._answer(question)
-            except LookupFailed as reason:
-                if _is_final(reason):
-                    raise
-                waiter.expect(version, self._marks(question, reason))
-                # What arrived between the question and the expectation woke nobody.
-                if not waiter.is_met(self._tree.version):
-                    return reason
+        version = self._tree.version
+        waiter.expect(version, ())
+        try:
+            return self._answer(question)
+        except LookupFailed as reason:
+            if _is_final(question, reason):
+                raise
+            waiter.expect(version, self._marks(question, reason), question.at)
+            # What arrived between the question and the expectation woke nobody.
+            if waiter.is_met(self._tree.version):
+                waiter.wake()
+            return reason
 
     def _marks(self, question: Question, reason: LookupFailed) -> list[tuple[Track, int | None]]:
-        if isinstance(reason, UnknownFrame | Disconnected):
+        """How new each track of the path must be before asking again may help."""
+        try:
+            uses = self._path(question.target, question.source).uses
+        except LookupFailed:
             return []
         at = None if question.at is None else question.at - question.predict_ns
-        if isinstance(reason, Stale) and reason.newest is not None:
-            at = reason.newest + 1
-        return [(use.track, at) for use in self._path(question.target, question.source).uses]
+        if isinstance(reason, InPast):
+            at = reason.oldest
+        if isinstance(reason, Stale):
+            at = _after(reason.requested)
+        marks: list[tuple[Track, int | None]] = [(use.track, at) for use in uses]
+        if isinstance(reason, InFuture) and at is not None:
+            # Where prediction is not possible from the samples there are, only a newer one helps.
+            marks += [(use.track, _after(reason.newest)) for use in uses if use.edge == reason.edge]
+        return marks
 
     def _question(
         self,
@@ -247,11 +262,18 @@ class TransformBuffer(Store):
         return path
 
 
-def _is_final(reason: LookupFailed) -> bool:
+def _is_final(question: Question, reason: LookupFailed) -> bool:
     """Whether no amount of waiting would turn the reason into an answer."""
     if isinstance(reason, UnknownFrame):
         return not reason.name or reason.name.startswith("/")
-    return isinstance(reason, InPast | AmbiguousFrame)
+    if isinstance(reason, InPast | Stale):
+        return question.at is not None
+    return isinstance(reason, AmbiguousFrame)
+
+
+def _after(stamp: int | None) -> int | None:
+    """The first stamp that would be news to what reached ``stamp``."""
+    return None if stamp is None else stamp + 1
 
 
 def _seconds(name: str, value: float) -> float:

@@ -39,6 +39,12 @@ class Between:
     f: Functions
 
 
+def _published(va: Component, vb: Component, now: Between) -> Component:
+    """A velocity between those of two rows; at a row itself its own, though the other have none."""
+    between = va + now.ratio * (vb - va)
+    return now.f.select(now.ratio == 0.0, va, now.f.select(now.ratio == 1.0, vb, between))
+
+
 @dataclass(frozen=True, slots=True)
 class Line:
     """A number that goes straight from row to row: revolute and prismatic joints, x and y.
@@ -75,7 +81,7 @@ class Line:
         if self.velocity < 0:
             return slope
         r, va, vb = now.ratio, now.a[self.velocity], now.b[self.velocity]
-        published = va + r * (vb - va)
+        published = _published(va, vb, now)
         if self.cubic:
             bent = va + r * (6.0 * slope - 4.0 * va - 2.0 * vb + r * (3.0 * (va + vb) - 6.0 * slope))
             published = now.f.select(bent == bent, bent, published)  # noqa: PLR0124 - a test for NaN
@@ -127,8 +133,8 @@ class Pose7:
         slope = self._slope(now)
         if self.velocity < 0:
             return slope
-        r, v = now.ratio, self.velocity
-        published = [now.a[v + k] + r * (now.b[v + k] - now.a[v + k]) for k in range(6)]
+        columns = range(self.velocity, self.velocity + 6)
+        published = [_published(now.a[k], now.b[k], now) for k in columns]
         known = sum(published) == sum(published)
         chosen = [
             now.f.select(known, mine, theirs)

@@ -6,7 +6,7 @@ them is fed alone, or withdrawn, the track is split: an edge is one history whoe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from zstate.buffer.tracks import PoseTrack
 from zstate.buffer.tree import Edge, Tree
@@ -15,6 +15,10 @@ from zstate.errors import InsertRefused
 EdgeNames = tuple[str, str]
 # Each track with the rows of a sample that it takes, in the order of the track's edges.
 Feed = list[tuple[PoseTrack, list[int]]]
+
+
+class TooOld(Exception):
+    """A sample is older than the history of one of its edges reaches; nothing was changed."""
 
 
 class Feeds:
@@ -26,25 +30,33 @@ class Feeds:
         self._known: dict[tuple[EdgeNames, ...], Feed] = {}
         self._version = -1
 
-    def of(self, names: tuple[EdgeNames, ...], writer: str | None) -> Feed:
-        """Where a sample of these edges goes. Raises InsertRefused for an edge that cannot be."""
+    def of(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> Feed:
+        """Where a sample of these edges goes.
+
+        Raises InsertRefused for an edge that cannot be, TooOld for a stamp beyond a history.
+        """
         if self._version != self._tree.version:
             self._known.clear()
         feed = self._known.get(names)
         if feed is None:
             with self._tree.untouched_on_error():
-                feed = self._make(names, writer)
+                feed = self._make(names, stamp, writer)
             if self._version != self._tree.version:
                 self._known.clear()
             self._known[names] = feed
             self._version = self._tree.version
+        _refuse_old((track for track, _ in feed), stamp)
+        if writer is not None:
+            for track, _ in feed:
+                track.writer = writer
         return feed
 
-    def _make(self, names: tuple[EdgeNames, ...], writer: str | None) -> Feed:
+    def _make(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> Feed:
         edges = [self.admit(parent, child, writer) for parent, child in names]
         if len({child for _, child in edges}) < len(edges):
             raise InsertRefused(f"one child stands twice in {edges}", reason="second parent", edge=edges[0])
         owners = {id(track): track for track in map(self._track, edges) if track is not None}
+        _refuse_old(owners.values(), stamp)
         for track in owners.values():
             if sorted(track.edges) == sorted(edges):
                 return [(track, [edges.index(edge) for edge in track.edges])]
@@ -86,6 +98,11 @@ class Feeds:
     def _attach(self, track: PoseTrack) -> None:
         for index, (parent, child) in enumerate(track.edges):
             self._tree.attach(Edge(parent, child, "pose", track=track, index=index))
+
+
+def _refuse_old(tracks: Iterable[PoseTrack], stamp: int) -> None:
+    if not all(track.history.reaches(stamp) for track in tracks):
+        raise TooOld
 
 
 def second_writer(parent: str, child: str, existing: Edge, writer: str | None) -> InsertRefused:

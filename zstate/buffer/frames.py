@@ -33,7 +33,7 @@ def frame_info(name: str, edge: Edge | None) -> FrameInfo:
         return FrameInfo(name, None, "root", None, None, None, None, 0)
     if edge.track is None:
         return FrameInfo(name, edge.parent, "static", edge.writer, None, None, None, 0)
-    facts = coverage(edge.track)
+    facts = coverage(edge.track.history.view)
     return FrameInfo(
         name, edge.parent, edge.kind, edge.writer, facts.rate_hz, facts.oldest, facts.newest, facts.count
     )

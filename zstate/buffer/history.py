@@ -73,12 +73,16 @@ class History:
         """Forget every sample."""
         self.view = self._empty(_SMALLEST_CAPACITY)
 
+    def reaches(self, stamp: int) -> bool:
+        """Whether a sample of that stamp would be kept: at most ``span_ns`` older than the newest."""
+        return not self.view.size or stamp >= self.view.newest - self.span_ns
+
     def insert(self, stamp: int, row: NDArray[np.float64]) -> bool:
         """Take a sample; False when it is older than the history reaches."""
         view = self.view
         if view.end == view.first or stamp > view.stamps[view.end - 1]:
             self._append(stamp, row)
-        elif stamp < view.newest - self.span_ns:
+        elif not self.reaches(stamp):
             return False
         else:
             self._splice(stamp, row)

@@ -101,7 +101,7 @@ class Path:
         above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
         motion = above_target.inverse().then(chain_motion(self.steps_to_source, values, rates, se3.SCALARS))
         if not np.isfinite((*motion.linear, *motion.angular)).all():
-            raise self._no_rate()
+            raise self._no_rate(views)
         return motion, at
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -123,8 +123,8 @@ class Path:
 
     def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
         """The error for an answer that is too old, naming the edge that is most behind."""
-        use = min(self.uses, key=lambda use: coverage(use.track).newest or 0)
-        facts = coverage(use.track)
+        use = min(self.uses, key=lambda use: coverage(use.track.history.view).newest or 0)
+        facts = coverage(use.track.history.view)
         return Stale(
             self.target,
             self.source,
@@ -143,19 +143,24 @@ class Path:
         numbered = list(enumerate(views))
         too_young = [(view.oldest, n) for n, view in numbered if view.size and at < view.oldest]
         if too_young:
-            return self._failure(InPast, self.uses[max(too_young)[1]], at)
+            return self._failure(InPast, max(too_young)[1], views, at)
         empty = [n for n, view in numbered if not view.size]
         if empty:
-            return self._failure(NoData, self.uses[empty[0]], at)
-        newest = [(view.newest, n) for n, view in numbered if at > view.newest]
-        limiting = self.uses[min(newest)[1]]
-        failure = self._failure(InFuture, limiting, at)
+            return self._failure(NoData, empty[0], views, at)
+        newest = [
+            (view.newest, n)
+            for n, view in numbered
+            if at > view.newest and self._ahead(self.uses[n], view, at, predict_ns) is None
+        ]
+        failure = self._failure(InFuture, min(newest)[1], views, at)
         if predict_ns and at <= min(newest)[0] + predict_ns:
             failure.note = "it cannot be predicted: no velocity is known there"
         return failure
 
-    def _failure(self, error: type[LookupFailed], use: TrackUse, at: int | None) -> LookupFailed:
-        facts = coverage(use.track)
+    def _failure(
+        self, error: type[LookupFailed], number: int, views: Sequence[View], at: int | None
+    ) -> LookupFailed:
+        use, facts = self.uses[number], coverage(views[number])
         return error(
             self.target,
             self.source,
@@ -167,16 +172,16 @@ class Path:
             writer=use.track.writer,
         )
 
-    def _no_rate(self) -> LookupFailed:
-        lonely = [use for use in self.uses if use.track.history.view.size < 2]
-        failure = self._failure(NoData, (lonely or self.uses)[0], None)
+    def _no_rate(self, views: Sequence[View]) -> LookupFailed:
+        lonely = [number for number, view in enumerate(views) if view.size < 2]
+        failure = self._failure(NoData, lonely[0] if lonely else 0, views, None)
         failure.note = "a rate of change needs two samples, or published velocities"
         return failure
 
     def _latest(self, views: Sequence[View]) -> int:
-        for use, view in zip(self.uses, views, strict=True):
+        for number, view in enumerate(views):
             if not view.size:
-                raise self._failure(NoData, use, None)
+                raise self._failure(NoData, number, views, None)
         return min(view.newest for view in views)
 
     def _pose(self, values: Values, f: se3.Functions) -> se3.Pose:

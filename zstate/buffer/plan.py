@@ -50,9 +50,11 @@ class Plan:
             raise InvalidInput(f"out must be ({len(instants)}, 7) float64; got {out.shape} {out.dtype}")
         path = self._current_path()
         poses, valid = path.poses(instants)
-        if not valid.all():
-            # Asked again alone, the first stamp without an answer raises its own reason.
+        while not valid.all():
+            # Asked alone, the first stamp without an answer raises its own reason, unless that has
+            # arrived meanwhile.
             path.answer(int(instants[valid.argmin()]))
+            poses, valid = path.poses(instants)
         if out is None:
             return poses
         out[...] = poses

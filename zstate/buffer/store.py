@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.feeds import EdgeNames, Feed, Feeds, second_writer
+from zstate.buffer.feeds import EdgeNames, Feed, Feeds, TooOld, second_writer
 from zstate.buffer.frames import FrameInfo, frame_info
 from zstate.buffer.history import View
 from zstate.buffer.path import TrackUse
@@ -102,17 +102,18 @@ class Store:
         """One instant of a robot: positions (and velocities) in the order of its ``joint_names``.
 
         True, or False when it is older than the history reaches, which ``ignored`` counts. A second
-        sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity.
+        sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity,
+        and for a floating joint's quaternion that is not of length one.
         """
         stamp = check_stamp(stamp)
-        numbers = track.model.check_positions(positions)
+        numbers = track.check_positions(positions)
         rates = None if velocities is None else track.model.check_velocities(velocities)
         with self._lock:
             had_velocities = track.has_velocities
             taken = track.insert(stamp, numbers, rates)
             if track.has_velocities != had_velocities:
                 self._tree.version += 1
-        return self._count(taken)
+        return self._count(taken=taken)
 
     def restart(self, track: JointTrack | PoseTrack) -> None:
         """A new epoch: forget the samples of one track, because its writer or its clock began anew."""
@@ -148,15 +149,16 @@ class Store:
         self, names: tuple[EdgeNames, ...], stamp: int, poses: Poses, writer: str | None
     ) -> bool:
         with self._lock:
-            feed = self._feeds.of(names, writer)
-            views = [track.history.view for track, _ in feed]
-            taken = not any(view.size and stamp < view.newest - self._span_ns for view in views)
-            if taken and len(feed) == 1:
+            try:
+                feed = self._feeds.of(names, stamp, writer)
+            except TooOld:
+                return self._count(taken=False)
+            if len(feed) == 1:
                 track, rows = feed[0]
                 track.history.insert(stamp, poses[rows].ravel())
-            elif taken:
+            else:
                 self._write_together(feed, stamp, poses)
-        return self._count(taken)
+        return self._count(taken=True)
 
     def _write_together(self, feed: Feed, stamp: int, poses: Poses) -> None:
         # Odd while tracks disagree: a reader that sees it asks again under the lock.
@@ -165,11 +167,12 @@ class Store:
             track.history.insert(stamp, poses[rows].ravel())
         self._writes += 1
 
-    def _count(self, taken: bool) -> bool:
+    def _count(self, *, taken: bool) -> bool:
         if taken:
             self._room.notify()
         else:
-            self.ignored += 1
+            with self._lock:
+                self.ignored += 1
         return taken
 
     def insert_static(self, transform: Transform, *, writer: str | None = None) -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.history import History
-from zstate.model.edges import EdgeForm, edge_forms
+from zstate.buffer.history import History, View
+from zstate.model.edges import EdgeForm, EdgeTable
 from zstate.model.robot import RobotModel
 
 Interpolation = Literal["linear", "hermite"]
@@ -27,7 +27,8 @@ class JointTrack:
     ) -> None:
         self.model = model
         self.prefix = prefix
-        self.forms = edge_forms(model)
+        self._table = EdgeTable(model)
+        self.forms = self._table.forms
         self.interpolation = interpolation
         self.writer: str | None = None
         self.history = History(model.position_count, span_ns)
@@ -52,6 +53,10 @@ class JointTrack:
     def edge(self, form: EdgeForm) -> tuple[str, str]:
         """(parent, child) of one of ``forms``, as named in the buffer."""
         return (self.frame(form.parent), self.frame(form.child))
+
+    def check_positions(self, positions: ArrayLike) -> NDArray[np.float64]:
+        """As ``RobotModel.check_positions``, and quaternions of floating joints at length one."""
+        return self._table.normalised(self.model.check_positions(positions))
 
     def insert(
         self, stamp: int, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None
@@ -112,9 +117,8 @@ class Coverage:
     count: int
 
 
-def coverage(track: Track) -> Coverage:
-    """How far the samples of ``track`` reach, and how many there are in a second."""
-    view = track.history.view
+def coverage(view: View) -> Coverage:
+    """How far the samples of a track reach, and how many there are in a second."""
     if not view.size:
         return Coverage(None, None, None, 0)
     oldest, newest = view.oldest, view.newest

@@ -63,7 +63,7 @@ class Tree:
         if name not in self.frames:
             self.frames[name] = None
             _, slash, bare = name.partition("/")
-            if slash:
+            if slash and not _name_problem(bare):
                 self._bare[bare].append(name)
             self.version += 1
 

@@ -11,24 +11,37 @@ from zstate.buffer.tree import Tree
 
 
 class Waiter:
-    """What somebody waits for: every one of ``tracks`` newer than its mark, or another tree."""
+    """What somebody waits for: every track as new as its mark, one of them beyond hope, or another tree."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self.wake = wake
         self._marks: Sequence[tuple[Track, int | None]] = ()
+        self._instant: int | None = None
         self._version = -1
 
-    def expect(self, version: int, marks: Sequence[tuple[Track, int | None]]) -> None:
+    def expect(
+        self, version: int, marks: Sequence[tuple[Track, int | None]], instant: int | None = None
+    ) -> None:
         """Sleep until the tree is of another version, or each track has reached its stamp.
 
-        A track's mark of None is reached by any sample at all.
+        A track's mark of None is reached by any sample at all. A track whose samples all lie after
+        ``instant`` ends the sleep too, for then there will never be an answer.
         """
         self._marks = marks
+        self._instant = instant
         self._version = version
 
     def is_met(self, version: int) -> bool:
         """Whether it is worth looking again."""
-        return version != self._version or (bool(self._marks) and all(map(self._reached, self._marks)))
+        if version != self._version:
+            return True
+        return bool(self._marks) and (all(map(self._reached, self._marks)) or self._is_hopeless())
+
+    def _is_hopeless(self) -> bool:
+        if self._instant is None:
+            return False
+        views = [track.history.view for track, _ in self._marks]
+        return any(view.size and view.oldest > self._instant for view in views)
 
     @staticmethod
     def _reached(mark: tuple[Track, int | None]) -> bool:

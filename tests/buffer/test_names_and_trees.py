@@ -1,0 +1,257 @@
+"""Frames: names, parents, loops, robots, and what becomes of them."""
+
+from __future__ import annotations
+
+import pytest
+from worlds import NOW, S, failure, filled, moving, static, x_of
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import AmbiguousFrame, Disconnected, InsertRefused, InvalidInput, NoData, UnknownFrame
+from zstate.model.catalog import load_model
+
+
+def refusal(buffer: TransformBuffer, parent: str, child: str, writer: str | None = None) -> InsertRefused:
+    """Why neither insert takes the edge; the buffer stays as it was."""
+    before = buffer.frames()
+    with pytest.raises(InsertRefused) as caught:
+        buffer.insert(moving(parent, child, NOW), writer=writer)
+    with pytest.raises(InsertRefused) as again:
+        buffer.insert_static(static(parent, child), writer=writer)
+    assert again.value.reason == caught.value.reason
+    assert buffer.frames() == before
+    return caught.value
+
+
+@pytest.mark.parametrize(("parent", "child"), [("", "b"), ("a", ""), ("/a", "b"), ("a", "/b"), ("a", "/")])
+def test_empty_names_and_leading_slashes_are_refused_at_insert(parent: str, child: str) -> None:
+    assert refusal(TransformBuffer(), parent, child).reason == "frame name"
+
+
+@pytest.mark.parametrize("name", ["", "/a", "/"])
+def test_empty_names_and_leading_slashes_are_unknown_to_questions(name: str) -> None:
+    buffer = filled(static("a", "b"), static("r/", "x"), static("r//a", "y"))
+    for target, source in ((name, "b"), ("b", name), (name, name)):
+        error = failure(buffer, target, source)
+        assert isinstance(error, UnknownFrame)
+        assert error.name == name
+        assert "slash" in str(error) or "empty" in str(error)
+
+
+def test_a_frame_cannot_be_placed_on_itself() -> None:
+    assert refusal(TransformBuffer(), "a", "a").reason == "self edge"
+
+
+def test_a_second_parent_is_refused_with_both_writers_named() -> None:
+    buffer = TransformBuffer()
+    buffer.insert(moving("a", "c", 0), writer="odom")
+    error = refusal(buffer, "b", "c", writer="slam")
+    assert (error.reason, error.edge) == ("second parent", ("b", "c"))
+    for part in ("'a' by odom", "'b' by slam", "withdraw('c')"):
+        assert part in str(error)
+
+
+def test_a_loop_is_refused_with_its_ring_and_both_writers_named() -> None:
+    buffer = TransformBuffer()
+    buffer.insert(moving("a", "b", 0), writer="odom")
+    buffer.insert(moving("b", "c", 0))
+    error = refusal(buffer, "c", "a", writer="slam")
+    assert (error.reason, error.edge) == ("loop", ("c", "a"))
+    for part in ("'a' -> 'b' -> 'c' -> 'a'", "by slam", "by odom"):
+        assert part in str(error)
+
+
+def test_a_frame_changes_its_parent_by_withdraw_and_insert() -> None:
+    buffer = filled(moving("a", "c", 0), static("r", "a"), static("r", "b"))
+    buffer.withdraw("c")
+    assert isinstance(failure(buffer, "a", "c"), Disconnected)
+    buffer.insert(moving("b", "c", S, x=2.0))
+    assert x_of(buffer.lookup("r", "c")) == 2.0
+
+
+def test_withdraw_takes_the_history_and_leaves_the_frame_known() -> None:
+    buffer = filled(moving("a", "b", 0), moving("b", "c", 0, x=3.0))
+    buffer.withdraw("b")
+    assert [frame.name for frame in buffer.frames()] == ["a", "b", "c"]
+    assert x_of(buffer.lookup("b", "c")) == 3.0
+    assert isinstance(failure(buffer, "a", "b"), Disconnected)
+    buffer.insert(moving("a", "b", S))
+    assert buffer.frames()[1].oldest == S
+
+
+def test_withdraw_leaves_edges_that_were_fed_together_with_it() -> None:
+    buffer = TransformBuffer()
+    turn = (0, 0, 0, 1)
+    buffer.insert_many([("a", "b"), ("a", "c")], 0, [(1, 0, 0, *turn), (2, 0, 0, *turn)])
+    buffer.withdraw("b")
+    assert x_of(buffer.lookup("a", "c", 0)) == 2.0
+    buffer.insert_many([("a", "b"), ("a", "c")], S, [(3, 0, 0, *turn), (4, 0, 0, *turn)])
+    assert x_of(buffer.lookup("b", "c", S)) == 1.0
+    assert buffer.frames()[1].count == 1
+
+
+def test_withdraw_of_what_nobody_named_is_an_error_with_near_misses() -> None:
+    with pytest.raises(InvalidInput, match="did you mean 'camera'"):
+        filled(static("base", "camera")).withdraw("camra")
+
+
+def test_withdraw_of_a_robots_link_points_to_remove_robot() -> None:
+    buffer = TransformBuffer()
+    buffer.add_robot(load_model("rrbot"))
+    with pytest.raises(InsertRefused, match="remove_robot"):
+        buffer.withdraw("tool")
+
+
+def test_clear_forgets_samples_and_keeps_frames_statics_and_robots() -> None:
+    buffer = filled(moving("map", "world", 0), static("tool", "screw", x=1.0))
+    track = buffer.add_robot(load_model("rrbot"))
+    buffer.insert_joints(track, 0, [0.0, 0.0])
+    names = [frame.name for frame in buffer.frames()]
+    buffer.clear()
+    assert [frame.name for frame in buffer.frames()] == names
+    assert x_of(buffer.lookup("tool", "screw")) == 1.0
+    assert buffer.lookup("lower", "tool").translation[2] == pytest.approx(0.6)
+    for target, source in (("map", "world"), ("base", "upper")):
+        assert isinstance(failure(buffer, target, source), NoData)
+    assert buffer.insert_joints(track, -50 * S, [0.0, 0.0])
+
+
+def test_unknown_frames_come_with_near_misses() -> None:
+    buffer = filled(static("base", "left_camera"), static("base", "right_wheel"))
+    error = failure(buffer, "base", "left_camra", 5)
+    assert isinstance(error, UnknownFrame)
+    assert error.name == "left_camra"
+    assert "left_camera" in error.near_misses
+    assert "right_wheel" not in error.near_misses
+    assert error.requested == 5
+    assert isinstance(failure(TransformBuffer(), "x", "x"), UnknownFrame)
+
+
+def test_frames_in_two_trees_are_disconnected_with_both_roots() -> None:
+    buffer = filled(static("a", "b"), static("b", "c"), static("x", "y"))
+    error = failure(buffer, "c", "y")
+    assert isinstance(error, Disconnected)
+    assert error.roots == ("a", "x")
+
+
+def test_a_missing_connection_is_blamed_before_a_bad_time() -> None:
+    buffer = filled(moving("a", "b", 0), moving("x", "y", 0))
+    for stamp in (-S, S):
+        assert isinstance(failure(buffer, "b", "y", stamp), Disconnected)
+        with pytest.raises(Disconnected):
+            buffer.lookup_between("b", stamp, "y", 0, "a")
+        with pytest.raises(UnknownFrame):
+            buffer.lookup_between("b", stamp, "nobody", 0, "a")
+
+
+def two_robots() -> TransformBuffer:
+    buffer = TransformBuffer()
+    for prefix in ("r1", "r2"):
+        track = buffer.add_robot(load_model("rrbot"), prefix)
+        buffer.insert_joints(track, 0, [0.0, 0.0])
+    return buffer
+
+
+def test_a_bare_name_stands_for_the_only_robots_frame() -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(load_model("rrbot"), "r1")
+    buffer.insert_joints(track, 0, [0.5, 0.0])
+    bare, full = buffer.lookup("base", "tool"), buffer.lookup("r1/base", "r1/tool")
+    assert (bare.target, bare.source) == ("base", "tool")
+    assert bare.pose7.tolist() == full.pose7.tolist()
+    buffer.insert_static(static("tool", "screw", x=1.0))
+    assert "r1/tool" in {frame.parent for frame in buffer.frames()}
+    assert x_of(buffer.lookup("r1/tool", "screw")) == 1.0
+
+
+def test_a_bare_name_that_two_robots_have_is_an_error_that_lists_both() -> None:
+    buffer = two_robots()
+    for target, source in (("tool", "r1/base"), ("r1/base", "tool")):
+        error = failure(buffer, target, source)
+        assert isinstance(error, AmbiguousFrame)
+        assert error.candidates == ("r1/tool", "r2/tool")
+    with pytest.raises(InsertRefused, match="r1/tool, r2/tool"):
+        buffer.insert_static(static("tool", "screw"))
+
+
+def test_an_edge_between_robots_joins_them() -> None:
+    buffer = two_robots()
+    assert isinstance(failure(buffer, "r1/base", "r2/base"), Disconnected)
+    buffer.insert_static(static("fleet/map", "r1/world", x=1.0))
+    buffer.insert_static(static("fleet/map", "r2/world", x=3.0))
+    assert x_of(buffer.lookup("r1/base", "r2/base")) == 2.0
+
+
+def test_a_full_name_goes_before_a_bare_one() -> None:
+    buffer = two_robots()
+    buffer.insert_static(static("fleet/map", "r1/world", x=1.0))
+    buffer.insert_static(static("fleet/map", "pole", x=5.0))
+    assert x_of(buffer.lookup("map", "pole")) == 5.0
+    assert x_of(buffer.lookup("fleet/map", "pole")) == 5.0
+
+
+@pytest.mark.parametrize("edge", [("base", "upper"), ("lower", "tool")])
+def test_a_robots_own_edges_take_no_second_writer(edge: tuple[str, str]) -> None:
+    buffer = TransformBuffer()
+    buffer.add_robot(load_model("rrbot"))
+    error = refusal(buffer, *edge, writer="intruder")
+    assert error.reason == "second writer"
+    assert "the model of 'rrbot'" in str(error)
+    assert "intruder" in str(error)
+    assert refusal(buffer, "elsewhere", edge[1]).reason == "second parent"
+
+
+def test_a_robot_whose_link_has_a_parent_already_is_refused_whole() -> None:
+    for edge in (("floor", "tool"), ("base", "upper")):
+        buffer = filled(moving(*edge, 0))
+        before = buffer.frames()
+        with pytest.raises(InsertRefused):
+            buffer.add_robot(load_model("rrbot"))
+        assert buffer.frames() == before
+        assert isinstance(failure(buffer, edge[0], "laser_link"), UnknownFrame)
+
+
+def test_one_prefix_is_one_robot_until_it_is_removed() -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(load_model("rrbot"), "r1")
+    with pytest.raises(InsertRefused, match="remove_robot"):
+        buffer.add_robot(load_model("gripper"), "r1")
+    buffer.remove_robot(track)
+    buffer.add_robot(load_model("rrbot"), "r1")
+    assert buffer.lookup("r1/lower", "r1/tool").kind == "static"
+
+
+def test_a_removed_robot_leaves_its_frames_known_and_its_neighbours_alone() -> None:
+    buffer = two_robots()
+    track = buffer.add_robot(load_model("diffbot"), "r3")
+    names = [frame.name for frame in buffer.frames()]
+    buffer.remove_robot(track)
+    assert [frame.name for frame in buffer.frames()] == names
+    assert all(frame.kind == "root" for frame in buffer.frames() if frame.name.startswith("r3/"))
+    assert isinstance(failure(buffer, "r3/base_link", "r3/imu_link"), Disconnected)
+    assert buffer.can_lookup("r1/base", "r1/tool")
+
+
+def test_fixed_joints_answer_before_any_sample() -> None:
+    buffer = TransformBuffer()
+    buffer.add_robot(load_model("rrbot"))
+    answer = buffer.lookup("lower", "tool", NOW)
+    assert (answer.kind, answer.stamp) == ("static", NOW)
+    assert isinstance(failure(buffer, "base", "tool"), NoData)
+
+
+def test_frames_are_told_in_order_of_first_mention_with_what_places_them() -> None:
+    buffer = TransformBuffer()
+    buffer.insert_static(static("map", "odom"), writer="survey")
+    for n in range(5):
+        buffer.insert(moving("odom", "base", n * S), writer="wheels")
+    map_, odom, base = buffer.frames()
+    assert (map_.name, map_.parent, map_.kind, map_.count) == ("map", None, "root", 0)
+    assert (odom.name, odom.parent, odom.kind, odom.writer) == ("odom", "map", "static", "survey")
+    assert (base.kind, base.writer, base.rate_hz, base.oldest, base.newest, base.count) == (
+        "pose",
+        "wheels",
+        1.0,
+        0,
+        4 * S,
+        5,
+    )

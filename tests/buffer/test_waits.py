@@ -1,0 +1,252 @@
+"""Waiting: woken by what arrives, ended at once by what can never come."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+from worlds import MS, S, every_joint, filled, moving, pose_of_every, static, x_of
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import ManualClock
+from zstate.errors import (
+    Disconnected,
+    InFuture,
+    InPast,
+    LookupFailed,
+    NoData,
+    Stale,
+    UnknownFrame,
+    WaitTimeout,
+)
+from zstate.transform import Transform
+
+LONG_S = 20.0
+"""Longer than any test may take: a wait that needs it has failed."""
+
+
+class Waiting:
+    """A call in a thread of its own, and what became of it."""
+
+    def __init__(self, buffer: TransformBuffer, call: Callable[[], Transform]) -> None:
+        self._buffer = buffer
+        self.outcome: Transform | LookupFailed | None = None
+        seats = len(buffer._room._waiters)
+        self._thread = threading.Thread(target=self._run, args=(call,), daemon=True)
+        self._thread.start()
+        deadline = time.monotonic() + LONG_S
+        while len(buffer._room._waiters) == seats and self._thread.is_alive():
+            assert time.monotonic() < deadline
+            time.sleep(0.0005)
+
+    def _run(self, call: Callable[[], Transform]) -> None:
+        try:
+            self.outcome = call()
+        except LookupFailed as reason:
+            self.outcome = reason
+
+    def result(self) -> Transform | LookupFailed:
+        self._thread.join(LONG_S / 2)
+        assert self.outcome is not None, "still waiting"
+        return self.outcome
+
+
+def by_thread(buffer: TransformBuffer, *question) -> Waiting:
+    return Waiting(buffer, lambda: buffer.wait(*question, timeout_s=LONG_S))
+
+
+def by_lookup(buffer: TransformBuffer, *question) -> Waiting:
+    return Waiting(buffer, lambda: buffer.lookup(*question, timeout_s=LONG_S))
+
+
+def by_asyncio(buffer: TransformBuffer, *question) -> Waiting:
+    return Waiting(buffer, lambda: asyncio.run(buffer.wait_async(*question, timeout_s=LONG_S)))
+
+
+@pytest.fixture(params=[by_thread, by_lookup, by_asyncio])
+def waiting(request: pytest.FixtureRequest) -> Callable[..., Waiting]:
+    return request.param
+
+
+def test_what_is_there_is_answered_at_once(waiting) -> None:
+    buffer = filled(moving("a", "b", 5, x=2.0))
+    assert x_of(waiting(buffer, "a", "b", 5).result()) == 2.0
+
+
+def test_a_wait_ends_with_the_sample_that_makes_the_answer(waiting) -> None:
+    buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
+    wait = waiting(buffer, "a", "c", S)
+    buffer.insert(moving("a", "b", 2 * S, x=2.0))
+    buffer.insert(moving("b", "c", S - 1))
+    buffer.insert(moving("b", "c", S, x=10.0))
+    assert x_of(wait.result()) == 11.0
+
+
+def test_a_wait_for_unknown_unconnected_and_empty_frames_ends_with_the_last_of_them(waiting) -> None:
+    buffer = TransformBuffer()
+    wait = waiting(buffer, "a", "c")
+    buffer.insert_static(static("a", "b", x=1.0))
+    buffer.insert_static(static("x", "c"))
+    buffer.withdraw("c")
+    buffer.insert(moving("b", "c", S, x=2.0))
+    assert x_of(wait.result()) == 3.0
+
+
+def test_a_wait_for_a_robot_ends_with_its_first_sample(waiting) -> None:
+    buffer, track = every_joint()
+    wait = waiting(buffer, "body", "arm")
+    buffer.insert_joints(track, S, pose_of_every(track, bend=0.5))
+    assert wait.result().rpy[2] == pytest.approx(0.5)
+
+
+def test_a_wait_for_what_lies_before_all_samples_fails_at_once(waiting) -> None:
+    outcome = waiting(filled(moving("a", "b", S)), "a", "b", 0).result()
+    assert type(outcome) is InPast
+
+
+def test_a_wait_fails_at_once_when_a_jump_makes_it_hopeless(waiting) -> None:
+    buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
+    wait = waiting(buffer, "a", "c", S)
+    buffer.insert(moving("b", "c", 100 * S))
+    outcome = wait.result()
+    assert (type(outcome), outcome.edge) == (InPast, ("b", "c"))
+
+
+def test_a_wait_for_the_newest_instant_outlasts_an_edge_that_lags_behind_the_others_history(waiting) -> None:
+    buffer = filled(moving("a", "b", 0), moving("b", "c", 100 * S, x=1.0))
+    wait = waiting(buffer, "a", "c")
+    buffer.insert(moving("a", "b", 100 * S, x=5.0))
+    assert x_of(wait.result()) == 6.0
+
+
+@pytest.mark.parametrize("name", ["", "/a"])
+def test_a_wait_for_a_name_that_can_never_be_fails_at_once(waiting, name: str) -> None:
+    assert type(waiting(TransformBuffer(), name, "b").result()) is UnknownFrame
+
+
+def cases() -> list:
+    one = filled(moving("a", "b", 0), static("x", "y"))
+    empty, _ = every_joint()
+    return [
+        (TransformBuffer(), ("a", "b"), UnknownFrame),
+        (one, ("a", "y"), Disconnected),
+        (one, ("a", "b", 1), InFuture),
+        (empty, ("root", "body"), NoData),
+    ]
+
+
+@pytest.mark.parametrize(("buffer", "question", "reason"), cases())
+def test_a_wait_that_runs_out_raises_its_reason_as_a_timeout(buffer, question, reason) -> None:
+    def check(call: Callable[[], object]) -> None:
+        with pytest.raises(reason) as caught:
+            call()
+        assert isinstance(caught.value, TimeoutError)
+        assert isinstance(caught.value, WaitTimeout)
+        assert caught.value.waited_s == 0.01
+        assert str(caught.value).startswith("after waiting 0.01 s")
+
+    check(lambda: buffer.wait(*question, timeout_s=0.01))
+    check(lambda: buffer.lookup(*question, timeout_s=0.01))
+    check(lambda: asyncio.run(buffer.wait_async(*question, timeout_s=0.01)))
+
+
+def test_a_wait_with_prediction_ends_as_soon_as_prediction_reaches() -> None:
+    buffer = filled(moving("a", "b", 0), moving("a", "b", 10 * MS, x=1.0))
+    wait = Waiting(buffer, lambda: buffer.lookup("a", "b", 40 * MS, predict_s=0.02, timeout_s=LONG_S))
+    buffer.insert(moving("a", "b", 20 * MS, x=2.0))
+    outcome = wait.result()
+    assert (outcome.kind, x_of(outcome)) == ("predicted", pytest.approx(4.0))
+
+
+def test_a_wait_for_what_cannot_be_predicted_runs_out_or_ends_with_the_sample() -> None:
+    buffer, track = every_joint()
+    buffer.insert_joints(track, 0, pose_of_every(track))
+    with pytest.raises(InFuture) as caught:
+        buffer.lookup("body", "arm", MS, predict_s=1.0, timeout_s=0.01)
+    assert isinstance(caught.value, TimeoutError)
+    wait = Waiting(buffer, lambda: buffer.lookup("body", "arm", MS, predict_s=1.0, timeout_s=LONG_S))
+    buffer.insert_joints(track, 2 * MS, pose_of_every(track, bend=0.5))
+    assert wait.result().rpy[2] == pytest.approx(0.25)
+
+
+def test_a_wait_for_something_fresher_ends_with_it() -> None:
+    clock = ManualClock(10 * S)
+    buffer = TransformBuffer(clock=clock)
+    buffer.insert(moving("a", "b", 8 * S))
+    wait = Waiting(buffer, lambda: buffer.lookup("a", "b", max_age_s=1.0, timeout_s=LONG_S))
+    buffer.insert(moving("a", "b", 8 * S + MS))
+    buffer.insert(moving("a", "b", 9 * S, x=3.0))
+    assert x_of(wait.result()) == 3.0
+
+
+def test_a_given_instant_that_is_too_old_grows_no_younger_by_waiting() -> None:
+    buffer = TransformBuffer(clock=ManualClock(10 * S))
+    buffer.insert(moving("a", "b", 8 * S))
+    with pytest.raises(Stale) as caught:
+        buffer.lookup("a", "b", 8 * S, max_age_s=1.0, timeout_s=LONG_S)
+    assert not isinstance(caught.value, TimeoutError)
+
+
+def test_a_wait_ends_in_time_though_data_pours_in() -> None:
+    buffer = TransformBuffer(clock=ManualClock(2**62))
+    buffer.insert(moving("a", "b", 0))
+    stop = threading.Event()
+
+    def pour() -> None:
+        stamp = 0
+        while not stop.is_set():
+            stamp += 1
+            buffer.insert(moving("a", "b", stamp))
+
+    writer = threading.Thread(target=pour)
+    writer.start()
+    try:
+        with pytest.raises(Stale) as caught:
+            buffer.lookup("a", "b", max_age_s=1.0, timeout_s=0.05)
+        assert isinstance(caught.value, TimeoutError)
+    finally:
+        stop.set()
+        writer.join()
+
+
+def test_a_wait_of_asyncio_can_be_cancelled_and_leaves_no_waiter() -> None:
+    buffer = TransformBuffer()
+
+    async def cancel() -> None:
+        task = asyncio.create_task(buffer.wait_async("a", "b", timeout_s=LONG_S))
+        await asyncio.sleep(0)
+        assert len(buffer._room._waiters) == 1
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(cancel())
+    assert buffer._room._waiters == ()
+
+
+def test_waits_of_asyncio_share_one_loop() -> None:
+    buffer = TransformBuffer()
+
+    async def both() -> list[Transform]:
+        waits = [asyncio.create_task(buffer.wait_async("a", "b", n * S, timeout_s=LONG_S)) for n in range(3)]
+        await asyncio.sleep(0)
+        for n in range(3):
+            buffer.insert(moving("a", "b", n * S, x=n))
+        return await asyncio.gather(*waits)
+
+    assert [x_of(answer) for answer in asyncio.run(both())] == [0.0, 1.0, 2.0]
+
+
+def test_an_insert_survives_a_waiter_whose_loop_is_closed() -> None:
+    buffer = TransformBuffer()
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(buffer.wait_async("a", "b", timeout_s=LONG_S))
+    loop.run_until_complete(asyncio.sleep(0))
+    (waiter,) = buffer._room._waiters
+    task.cancel()
+    loop.run_until_complete(asyncio.gather(task, return_exceptions=True))
+    loop.close()
+    waiter.wake()
