@@ -26,6 +26,7 @@ FLOORS = (
     {"publisher", "statics", "listener"},
     {"zstate"},
     {"view", "cli"},
+    {"__main__"},
 )
 NEIGHBOURS = {
     ("buffer", "model"),  # joint tracks are kept as positions, and become poses in a lookup
@@ -42,10 +43,16 @@ HOMES = {
     "viser": "view",
     "click": "cli",
     "rich": "cli",
-    "tomli": "cli",  # `zstate up FILE.toml`; a part of Python from 3.11 on, as tomllib
+    "tomli": "cli",  # a part of Python from 3.11 on, as tomllib
     "tomllib": "cli",
 }
 EVERYWHERE = {"numpy"}
+GUESTS = {
+    (
+        "cli/config_file.py",
+        "msgspec",
+    ),  # `zstate up FILE.toml`: a file is read into frozen types as a message is
+}
 
 PURE = {"model", "buffer", "wire"}
 # The catalog and the expander are where a model comes from: they look for files and read them.
@@ -117,7 +124,8 @@ def imports_that_look_up(source: Source) -> Iterator[str]:
 def libraries_out_of_place(source: Source) -> Iterator[str]:
     for top, *_ in source.imports():
         is_foreign = top not in sys.stdlib_module_names | EVERYWHERE | {"zstate"}
-        if (is_foreign or top in HOMES) and HOMES.get(top) != source.room:
+        is_at_home = HOMES.get(top) == source.room or (source.path, top) in GUESTS
+        if (is_foreign or top in HOMES) and not is_at_home:
             yield f"{source.path} imports {top!r}, at home in {HOMES.get(top, 'no room yet')!r}"
 
 
