@@ -93,8 +93,8 @@ class _Solver:
     """
 
     def __init__(self, model: RobotModel, forms: tuple[EdgeForm, ...]) -> None:
-        # Imported here because edge_poses needs none of it; its wheel hides it from type checkers.
-        import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+        # Imported here because edge_poses needs none of it; it comes without types.
+        import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
 
         self._pin: Any = pinocchio
         self._model: Any = self._pin.Model()
