@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from zstate.cli.console import count_text, say, say_json
 from zstate.cli.tree_lines import in_columns, tree_lines
 from zstate.errors import Found, ModelError
 
@@ -31,13 +32,16 @@ def check_command(file: str, as_json: bool) -> None:
     name = "standard input" if file == "-" else file
     model, findings = None, ()
     try:
-        model = load_model(click.get_binary_stream("stdin").read() if file == "-" else file)
+        model = load_model(sys.stdin.buffer.read() if file == "-" else file)
         findings = model.findings
     except ModelError as error:
         if not error.findings:
             raise
         findings = error.findings
-    click.echo(json.dumps(_facts(name, model, findings)) if as_json else _report(name, model, findings))
+    if as_json:
+        say_json(_facts(name, model, findings))
+    else:
+        say(_report(name, model, findings))
     raise SystemExit(0 if model else 1)
 
 
@@ -52,10 +56,10 @@ def _report(name: str, model: RobotModel | None, findings: Sequence[Found]) -> s
 def _headline(name: str, model: RobotModel | None, findings: Sequence[Found]) -> str:
     if model is None:
         errors = sum(finding.severity == "error" for finding in findings)
-        return f"{name} cannot be used ({errors} error{'s' * (errors != 1)})"
+        return f"{name} cannot be used ({count_text(errors, 'error')})"
     return (
-        f"{name}: robot {model.name!r} with {len(model.links)} links and {len(model.joints)} joints, "
-        f"{len(model.joint_names)} of them driven"
+        f"{name}: robot {model.name!r}, {count_text(len(model.links), 'link')}, "
+        f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict
 from datetime import datetime
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.announced import NOBODY
+from zstate.cli.console import announced_text, note, say, say_json
 from zstate.cli.options import Network, open_session, session_options
 from zstate.cli.tree_lines import in_columns
 from zstate.errors import duration_text
@@ -29,20 +28,16 @@ def ls_command(network: Network, as_json: bool) -> None:
     with open_session(network) as session:
         robots = discover(session)
     if as_json:
-        click.echo(json.dumps([_facts(robot) for robot in robots]))
+        say_json([_facts(robot) for robot in robots])
     elif robots:
-        click.echo("\n".join(_lines(robots)))
+        say("\n".join(_lines(robots)))
     else:
-        click.echo(NOBODY, err=True)
+        note(announced_text(robots))
 
 
 def _lines(robots: tuple[RobotInfo, ...]) -> list[str]:
     rows = in_columns(
-        [
-            (f"  {stream}", str(writer), _since(writer))
-            for robot in robots
-            for stream, writer in robot.writers
-        ]
+        [(f"  {stream}", str(writer), _since(writer)) for robot in robots for stream, writer in robot.writers]
     )
     lines: list[str] = []
     for robot in robots:

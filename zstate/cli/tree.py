@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from zstate.cli.console import age_text, note, rate_text, say, say_json
 from zstate.cli.options import Network, open_session, session_options
 from zstate.cli.tree_lines import in_columns, tree_lines
-from zstate.errors import duration_text
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -32,18 +32,18 @@ def tree_command(network: Network, robot: str, form: str | None) -> None:
 
     For each edge: its kind, the rate of its samples, the age of the newest one, and who writes it.
     """
-    from zstate.cli.heard import heard_frames
+    from zstate.cli.gathering import gathered_frames
 
     with open_session(network) as session:
-        frames = heard_frames(session, robot)
+        frames = gathered_frames(session, robot)
         now = time.time_ns()
     if not frames:
-        click.echo(_NO_FRAMES, err=True)
+        note(_NO_FRAMES)
     if form == "json":
-        click.echo(json.dumps([_facts(frame, now) for frame in frames]))
+        say_json([_facts(frame, now) for frame in frames])
     elif frames:
         drawing = {"dot": _dot, "mermaid": _mermaid}.get(form or "")
-        click.echo(drawing(frames) if drawing else _text(frames, now))
+        say(drawing(frames) if drawing else _text(frames, now))
 
 
 def _text(frames: Sequence[FrameInfo], now: int) -> str:
@@ -52,7 +52,7 @@ def _text(frames: Sequence[FrameInfo], now: int) -> str:
     for frame in frames:
         if frame.parent is not None:
             children.setdefault(frame.parent, []).append(frame.name)
-    rows = [_HEADINGS]
+    rows: list[tuple[str, ...]] = [_HEADINGS]
     for root in (frame.name for frame in frames if frame.parent is None):
         for guide, name in tree_lines(root, children):
             rows.append((guide + _short(by_name[name]), *_cells(by_name[name], now)))
@@ -66,11 +66,10 @@ def _short(frame: FrameInfo) -> str:
 
 
 def _cells(frame: FrameInfo, now: int) -> tuple[str, str, str, str]:
-    rate = "" if frame.rate_hz is None else f"{frame.rate_hz:.1f} Hz"
-    age = "" if frame.newest is None else duration_text(now - frame.newest)
-    if frame.kind in ("joint", "pose") and frame.newest is None:
-        age = "no sample"
-    return frame.kind, rate, age, frame.writer or ""
+    if frame.kind not in ("joint", "pose"):
+        return frame.kind, "", "", frame.writer or ""
+    age = "no sample" if frame.newest is None else age_text(frame.newest, now)
+    return frame.kind, rate_text(frame.rate_hz), age, frame.writer or ""
 
 
 def _facts(frame: FrameInfo, now: int) -> dict[str, Any]:
@@ -78,7 +77,7 @@ def _facts(frame: FrameInfo, now: int) -> dict[str, Any]:
 
 
 def _edge_label(frame: FrameInfo) -> str:
-    return frame.kind if frame.rate_hz is None else f"{frame.kind} {frame.rate_hz:.1f} Hz"
+    return frame.kind if frame.rate_hz is None else f"{frame.kind} {rate_text(frame.rate_hz)}"
 
 
 def _dot(frames: Sequence[FrameInfo]) -> str:

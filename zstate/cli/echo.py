@@ -1,0 +1,125 @@
+"""zstate echo: joint states, one document each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from threading import Event
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from zstate.cli.console import note, say
+from zstate.cli.options import Network, checked_seconds, open_session, session_options
+from zstate.errors import MessageError
+
+if TYPE_CHECKING:
+    from zstate.cli.tap import Tapped
+    from zstate.net.session import Session
+
+# A robot's description comes within milliseconds, if there is one.
+_NAMES_WITHIN_S = 1.0
+
+
+@click.command("echo")
+@click.argument("robot")
+@click.option("--once", is_flag=True, help="Print one; give up after --timeout with the reason.")
+@click.option("--timeout", type=float, callback=checked_seconds, default=10.0, metavar="S", show_default=True)
+@click.option("--field", metavar="NAME", help="Only this: stamp, positions, positions.JOINT, or just JOINT.")
+@click.option("--csv", "form", flag_value="csv", help="Comma-separated values below one line of names.")
+@click.option("--json", "form", flag_value="json", help="One JSON value a line.")
+@session_options
+def echo_command(
+    *, network: Network, robot: str, once: bool, timeout: float, field: str | None, form: str | None
+) -> None:
+    """Print the joint states of ROBOT as they come in, as YAML documents."""
+    from zstate.cli.tap import Tap
+
+    with (
+        open_session(network) as session,
+        Named(session, robot) as named,
+        Tap(session, robot, "joint_states") as tap,
+    ):
+        show = _printer(form, field)
+        tapped = tap.first(timeout if once else None)
+        show(named.document(tapped))
+        while not once:
+            tapped = tap.next(_FOREVER_S)
+            if tapped is not None:
+                show(named.document(tapped))
+
+
+_FOREVER_S = 3600.0
+
+
+class Named(AbstractContextManager["Named"]):
+    """Names the joints in samples of ``robot``, once it has been described."""
+
+    def __init__(self, session: Session, robot: str) -> None:
+        from zstate.cli.documents import DocumentWriter
+        from zstate.net.latched import LatchedSubscriber
+        from zstate.wire.native import NativeWire
+
+        self._robot = robot
+        self._wire = NativeWire()
+        self._writer = DocumentWriter()
+        self._described = Event()
+        self._warned = False
+        key = self._wire.expression(robot, "robot_description")
+        self._subscriber = LatchedSubscriber(session, key, self._describe)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._subscriber.close()
+
+    def _describe(self, key: str, payload: bytes | None, encoding: str) -> None:
+        from zstate.wire.messages import RobotDescription
+
+        if payload is None:
+            return
+        try:
+            description = self._wire.decode("robot_description", payload, encoding)
+        except MessageError as error:
+            note(f"{key}: {error}")
+            return
+        assert isinstance(description, RobotDescription)
+        self._writer.describe(description)
+        self._described.set()
+
+    def document(self, tapped: Tapped) -> Any:
+        """What a sample says, with the names of its joints if they can be known."""
+        from zstate.wire.messages import JointState
+
+        assert isinstance(tapped.sample, JointState)
+        if not self._writer.knows(tapped.sample) and not self._warned:
+            self._described.wait(_NAMES_WITHIN_S)
+        if not self._writer.knows(tapped.sample) and not self._warned:
+            self._warned = True
+            why = "is of another model" if self._described.is_set() else "is missing"
+            note(
+                f"the description of {self._robot!r} {why}, so its joints have no names here; "
+                f"`zstate publish {self._robot}` publishes it"
+            )
+        return self._writer.document(tapped.sample)
+
+
+def _printer(form: str | None, field: str | None) -> Callable[[Any], None]:
+    from zstate.cli.fields import Columns, field_of, yaml_text
+
+    table = Columns()
+
+    def show(document: Any) -> None:
+        value = document if field is None else field_of(document, field)
+        if form == "json":
+            say(json.dumps(value))
+        elif form == "csv":
+            say("\n".join(table.lines(value, field or "")))
+        elif field is not None and not isinstance(value, dict):
+            say(yaml_text(value))
+        else:
+            say(f"{yaml_text(value)}\n---")
+
+    return show

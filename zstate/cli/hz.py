@@ -1,0 +1,148 @@
+"""zstate hz: the rate at which samples come in."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from statistics import pstdev
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from zstate.cli.console import fail, note, say, say_json
+from zstate.cli.options import Network, checked_seconds, open_session, session_options
+
+if TYPE_CHECKING:
+    from zstate.cli.tap import Tap, Tapped
+    from zstate.wire.keys import Stream
+
+
+@dataclass(frozen=True, slots=True)
+class Intervals:
+    """What the arrivals in a window say; ``window`` counts samples, times are in seconds.
+
+    ``missed`` counts gaps in the writer's sequence numbers since the start.
+    """
+
+    rate_hz: float
+    min_s: float
+    max_s: float
+    std_dev_s: float
+    window: int
+    missed: int
+
+
+class Meter:
+    """Measures the last ``window`` arrivals."""
+
+    def __init__(self, window: int) -> None:
+        self._came: deque[int] = deque(maxlen=window)
+        self._missed = 0
+        self._last: tuple[int, int] | None = None
+
+    def note(self, tapped: Tapped) -> None:
+        """Another arrival. A writer that started anew begins a new window."""
+        session, seq = tapped.sample.session, tapped.sample.seq
+        if self._last is not None and self._last[0] != session:
+            self._came.clear()
+        elif self._last is not None:
+            self._missed += max(0, seq - self._last[1] - 1)
+        self._last = session, seq
+        self._came.append(tapped.came)
+
+    def intervals(self) -> Intervals | None:
+        """None before there are two samples."""
+        if len(self._came) < 2:
+            return None
+        steps = [(later - earlier) * 1e-9 for earlier, later in pairwise(self._came)]
+        rate_hz = len(steps) / sum(steps) if sum(steps) else float("inf")
+        return Intervals(rate_hz, min(steps), max(steps), pstdev(steps), len(self._came), self._missed)
+
+
+@click.command("hz")
+@click.argument("robot")
+@click.option(
+    "--stream", type=click.Choice(["joint_states", "tf"]), default="joint_states", show_default=True
+)
+@click.option(
+    "--window",
+    type=click.IntRange(min=2),
+    default=10_000,
+    metavar="N",
+    show_default=True,
+    help="Measure the last N samples.",
+)
+@click.option("--once", is_flag=True, help="Print one measurement, of the first second.")
+@click.option(
+    "--timeout",
+    type=float,
+    callback=checked_seconds,
+    default=10.0,
+    metavar="S",
+    show_default=True,
+    help="How long --once waits for the first sample.",
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@session_options
+def hz_command(
+    *, network: Network, robot: str, stream: Stream, window: int, once: bool, timeout: float, as_json: bool
+) -> None:
+    """Measure, once a second, the rate at which samples of ROBOT arrive here."""
+    from zstate.cli.tap import Tap
+
+    with open_session(network) as session, Tap(session, robot, stream) as tap:
+        meter = Meter(window)
+        if once:
+            _show(_measured_once(tap, meter, timeout), as_json=as_json)
+        else:
+            _follow(tap, meter, as_json=as_json)
+
+
+def _measured_once(tap: Tap, meter: Meter, timeout_s: float) -> Intervals:
+    meter.note(tap.first(timeout_s))
+    deadline = time.monotonic() + timeout_s
+    measured = None
+    while measured is None:
+        if time.monotonic() > deadline:
+            fail(f"gave up after {timeout_s:g} s: one sample came, and no second one")
+        _listen(tap, meter, 1.0)
+        measured = meter.intervals()
+    return measured
+
+
+def _follow(tap: Tap, meter: Meter, *, as_json: bool) -> NoReturn:
+    meter.note(tap.first())
+    silent = False
+    while True:
+        came = _listen(tap, meter, 1.0)
+        measured = meter.intervals()
+        if came and measured is not None:
+            _show(measured, as_json=as_json)
+        elif not came and not silent:
+            note(tap.silence())
+        silent = not came
+
+
+def _listen(tap: Tap, meter: Meter, seconds: float) -> int:
+    """Note what comes within ``seconds``; how many samples that were."""
+    deadline, count = time.monotonic() + seconds, 0
+    while (left_s := deadline - time.monotonic()) > 0.0:
+        tapped = tap.next(left_s)
+        if tapped is not None:
+            meter.note(tapped)
+            count += 1
+    return count
+
+
+def _show(measured: Intervals, *, as_json: bool) -> None:
+    if as_json:
+        say_json(asdict(measured))
+        return
+    say(f"average rate: {measured.rate_hz:.3f}")
+    missed = f" missed: {measured.missed}" if measured.missed else ""
+    say(
+        f"\tmin: {measured.min_s:.3f}s max: {measured.max_s:.3f}s "
+        f"std dev: {measured.std_dev_s:.5f}s window: {measured.window}{missed}"
+    )

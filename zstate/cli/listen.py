@@ -1,0 +1,122 @@
+"""zstate listen: how the samples of robots come in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import asdict
+from threading import Event
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli.announced import Roster
+from zstate.cli.console import announced_text, note, say, say_json
+from zstate.cli.options import Network, open_session, session_options
+from zstate.errors import duration_text
+
+if TYPE_CHECKING:
+    from zstate.cli.metered import Measure, MeteredBuffer
+    from zstate.following.tally import Stats
+    from zstate.listener import TransformListener
+    from zstate.net.session import Session
+    from zstate.wire.keys import Stream
+
+# Meeting everybody takes less.
+_MEETING_S = 0.3
+
+
+@click.command("listen")
+@click.argument("robot", default="*", metavar="[ROBOT]")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@session_options
+def listen_command(network: Network, robot: str, as_json: bool) -> None:
+    """Follow ROBOT, or all robots, and say once a second how their samples come in.
+
+    Rate and age are measured here, latency is the median time from a sample's stamp until it can be
+    looked up. The counts are those since the start: received, dropped here, missed on the way, late
+    (older than the history) and refused.
+    """
+    from zstate.clock import SystemClock
+    from zstate.rate import Rate
+
+    with open_session(network) as session, Roster(session) as roster, Ears(session, roster, robot) as ears:
+        forever = Event()
+        forever.wait(_MEETING_S)
+        for _ in Rate(1.0, SystemClock(), forever):
+            for name, measure, stats in ears.measures():
+                _show(name, measure, stats, as_json=as_json)
+            ears.open_new()
+
+
+class Ears(AbstractContextManager["Ears"]):
+    """A listener for each robot that is wanted and announced, opened when it appears."""
+
+    def __init__(self, session: Session, roster: Roster, robot: str) -> None:
+        from zstate.wire.keys import ANY, check_robot
+
+        self._robot = None if robot == ANY else check_robot(robot)
+        self._session = session
+        self._roster = roster
+        self._said = ""
+        self._ears: dict[str, tuple[TransformListener, MeteredBuffer]] = {}
+        self._opened = ExitStack()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._opened.close()
+
+    def open_new(self) -> None:
+        """Listen to robots that have appeared; says what is waited for while there is none."""
+        for info in self._roster.robots():
+            if self._robot in (None, info.name) and info.name not in self._ears:
+                self._open(info.name, self._roster.streams(info.name))
+        reason = "" if self._ears else self._reason()
+        if reason and reason != self._said:
+            note(f"waiting: {reason}")
+        self._said = reason
+
+    def _open(self, robot: str, streams: frozenset[Stream]) -> None:
+        from zstate.cli.metered import MeteredBuffer
+        from zstate.listener import TransformListener
+
+        follow = "joint_states" if "joint_states" in streams else "tf"
+        if follow in streams:
+            buffer = MeteredBuffer()
+            listener = TransformListener(self._session, robot, buffer, follow=follow)
+            self._ears[robot] = self._opened.enter_context(listener), buffer
+            note(f"following {robot}: {follow}")
+
+    def _reason(self) -> str:
+        if self._robot is not None:
+            return self._roster.silence(self._robot, "joint_states")
+        return announced_text(self._roster.robots()) + ", but nothing that moves" * bool(
+            self._roster.robots()
+        )
+
+    def measures(self) -> Iterator[tuple[str, Measure, Stats]]:
+        """How the samples of each robot came in since the last call."""
+        for robot, (listener, buffer) in sorted(self._ears.items()):
+            yield robot, buffer.measure(), listener.stats
+
+
+def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:
+    if as_json:
+        say_json({"robot": robot, **asdict(measure), **asdict(stats)})
+        return
+    say(
+        f"{robot}  {measure.rate_hz:.1f} Hz  age {_time_text(measure.age_s)}  "
+        f"latency {_time_text(measure.latency_s)}  received {stats.received}  dropped {stats.dropped}  "
+        f"missed {stats.missed}  late {stats.late}  refused {_refused_text(stats.refused)}"
+    )
+
+
+def _time_text(seconds: float | None) -> str:
+    return "-" if seconds is None else duration_text(round(seconds * 1e9))
+
+
+def _refused_text(refused: dict[str, int]) -> str:
+    reasons = ", ".join(f"{reason} {count}" for reason, count in refused.items())
+    return f"{sum(refused.values())}{f' ({reasons})' if reasons else ''}"

@@ -1,0 +1,100 @@
+"""Tap: one stream of one robot, sample by sample, as it comes in."""
+
+from __future__ import annotations
+
+import queue
+import time
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import TYPE_CHECKING, NamedTuple
+
+from zstate.cli.announced import Roster
+from zstate.cli.console import fail, note
+from zstate.errors import MessageError
+from zstate.net.streams import Arrival, StreamSubscriber
+from zstate.wire.keys import Stream, check_robot
+from zstate.wire.messages import Sample
+from zstate.wire.native import NativeWire
+
+if TYPE_CHECKING:
+    from zstate.net.session import Session
+
+# Waiting is mentioned when it lasts longer than meeting everybody does.
+_GRACE_S = 0.5
+
+
+class Tapped(NamedTuple):
+    """A sample, and when it came [ns], by a clock that never jumps."""
+
+    came: int
+    sample: Sample
+
+
+class Tap(AbstractContextManager["Tap"]):
+    """Hears ``stream`` of ``robot``. Messages that are not ours are noted, the first of each kind."""
+
+    def __init__(self, session: Session, robot: str, stream: Stream) -> None:
+        self.robot = check_robot(robot)
+        self._stream: Stream = stream
+        self._wire = NativeWire()
+        self._refused: set[str] = set()
+        self._samples: queue.SimpleQueue[Tapped] = queue.SimpleQueue()
+        self._roster = Roster(session)
+        key = self._wire.expression(robot, stream)
+        self._subscriber = StreamSubscriber(session, key, self._take)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._subscriber.close()
+        self._roster.__exit__(None, None, None)
+
+    def _take(self, arrivals: list[Arrival]) -> None:
+        came = time.monotonic_ns()
+        for arrival in arrivals:
+            sample = self._decode(*arrival)
+            if sample is not None:
+                self._samples.put(Tapped(came, sample))
+
+    def _decode(self, key: str, payload: bytes, encoding: str) -> Sample | None:
+        try:
+            sample = self._wire.decode(self._stream, payload, encoding)
+        except MessageError as error:
+            self._refuse(key, error)
+            return None
+        assert isinstance(sample, Sample)
+        return sample
+
+    def _refuse(self, key: str, error: MessageError) -> None:
+        if error.reason not in self._refused:
+            self._refused.add(error.reason)
+            note(f"{key}: {error}; further ones are passed over in silence")
+
+    def next(self, timeout_s: float) -> Tapped | None:
+        """The next sample, or None when none comes within ``timeout_s``."""
+        try:
+            return self._samples.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def silence(self) -> str:
+        """Why nothing more comes."""
+        return self._roster.silence(self.robot, self._stream, ended=True)
+
+    def first(self, timeout_s: float | None = None) -> Tapped:
+        """The first sample, whenever it comes; says what it waits for. Fails after ``timeout_s``."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        said = ""
+        while True:
+            left_s = _GRACE_S if deadline is None else max(0.0, deadline - time.monotonic())
+            tapped = self.next(min(left_s, _GRACE_S))
+            if tapped is not None:
+                if said:
+                    note(f"heard {self.robot}: {self._stream}")
+                return tapped
+            reason = self._roster.silence(self.robot, self._stream)
+            if deadline is not None and left_s <= _GRACE_S:
+                fail(f"gave up after {timeout_s:g} s: {reason}")
+            if reason != said:
+                said = reason
+                note(f"waiting: {reason}")

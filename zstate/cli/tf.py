@@ -1,0 +1,151 @@
+"""zstate tf: the pose of one frame in another, as it comes in."""
+
+from __future__ import annotations
+
+import time
+from decimal import Decimal, InvalidOperation
+from threading import Event
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from zstate.cli.announced import Roster
+from zstate.cli.console import note, say, say_json
+from zstate.cli.options import Network, checked_rate, checked_seconds, open_session, session_options
+
+if TYPE_CHECKING:
+    from zstate.cli.patience import Patience
+    from zstate.transform import Transform
+
+# So long without a newer answer is worth a word.
+_SILENCE_S = 2.0
+
+
+def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | None:
+    """Nanoseconds, or seconds with a point as they are printed here; exact either way."""
+    if text is None:
+        return None
+    try:
+        number = Decimal(text) * (1_000_000_000 if "." in text else 1)
+        stamp = int(number)
+    except (InvalidOperation, ValueError, OverflowError):
+        number, stamp = Decimal(), None
+    if stamp is None or stamp != number or abs(stamp) >= 2**63:
+        raise click.BadParameter(
+            f"{text!r} is no stamp: give nanoseconds since the Unix epoch, or seconds with a point and at "
+            "most nine digits behind it"
+        )
+    return stamp
+
+
+@click.command("tf")
+@click.argument("target", metavar="A")
+@click.argument("source", metavar="B")
+@click.option("--once", is_flag=True, help="Print one answer; give up after --timeout with the reason.")
+@click.option("--at", callback=_stamp, metavar="STAMP", help="One answer, for this instant.")
+@click.option(
+    "--timeout",
+    type=float,
+    callback=checked_seconds,
+    default=10.0,
+    metavar="S",
+    help="With --once and --at; default 10.",
+)
+@click.option(
+    "--rate",
+    type=float,
+    callback=checked_rate,
+    default=1.0,
+    metavar="HZ",
+    help="At most so many answers a second.",
+)
+@click.option("--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@session_options
+def tf_command(
+    *,
+    network: Network,
+    target: str,
+    source: str,
+    once: bool,
+    at: int | None,
+    timeout: float,
+    rate: float,
+    robot: str,
+    as_json: bool,
+) -> None:
+    """The pose of frame B in frame A, until Ctrl-C.
+
+    Says what it waits for, and prints each new answer. Frames are called by their bare names while these
+    are unique, or ROBOT/FRAME. STAMP is in nanoseconds, or in seconds as printed.
+    """
+    from zstate.cli.patience import Patience
+    from zstate.listener import TransformListener
+
+    show = _show_json if as_json else _show_text
+    with (
+        open_session(network) as session,
+        Roster(session) as roster,
+        TransformListener(session, robot) as listener,
+    ):
+        patience = Patience(listener, roster, target, source)
+        if not as_json:
+            say(f"pose of {source} in {target}")
+        if once or at is not None:
+            show(patience.answer(at, timeout_s=timeout))
+        else:
+            _follow(patience, rate, show)
+
+
+def _follow(patience: Patience, rate_hz: float, show: Any) -> None:
+    """Show each answer that is new. Never returns."""
+    from zstate.clock import SystemClock
+    from zstate.rate import Rate
+
+    shown: Transform | None = None
+    news_at, silent = time.monotonic(), False
+    for _ in Rate(rate_hz, SystemClock(), Event()):
+        transform = patience.answer()
+        if transform != shown:
+            show(transform)
+            shown, news_at, silent = transform, time.monotonic(), False
+        elif not silent and transform.stamp is not None and time.monotonic() - news_at > _SILENCE_S:
+            silent = True
+            note(patience.silence())
+
+
+def _show_json(transform: Transform) -> None:
+    age_s = None if transform.stamp is None else (time.time_ns() - transform.stamp) * 1e-9
+    say_json({**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s})
+
+
+def _show_text(transform: Transform) -> None:
+    say(transform_text(transform))
+
+
+def transform_text(transform: Transform) -> str:
+    """A transform as tf2_echo prints it, with all nine digits of the stamp."""
+    from math import degrees
+
+    from zstate.clock import stamp_text
+
+    pose, rpy = transform.pose7.tolist(), transform.rpy.tolist()
+    when = "At any time (static)" if transform.stamp is None else f"At time {stamp_text(transform.stamp)}"
+    lines = [
+        when,
+        f"- Translation: {_listed(pose[:3])}",
+        f"- Rotation: in Quaternion (xyzw) {_listed(pose[3:])}",
+        f"- Rotation: in RPY (radian) {_listed(rpy)}",
+        f"- Rotation: in RPY (degree) {_listed([degrees(angle) for angle in rpy])}",
+        "- Matrix:",
+        *(" " + " ".join(f"{_digits(value):>6}" for value in row) for row in transform.matrix.tolist()),
+    ]
+    return "\n".join(lines)
+
+
+def _listed(values: list[float]) -> str:
+    return f"[{', '.join(map(_digits, values))}]"
+
+
+def _digits(value: float) -> str:
+    return f"{round(value, 3) + 0.0:.3f}"  # adding 0.0 takes the sign off a negative zero
