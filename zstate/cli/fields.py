@@ -81,10 +81,12 @@ def field_of(document: Document, field: str) -> Any:
     for name in (field, f"positions.{field}"):
         if name in known:
             return known[name]
-    near = get_close_matches(field, [*known, *(name.partition(".")[2] for name in known)], n=1)
+    joints = list(dict.fromkeys(name.partition(".")[2] for name in known if "." in name))
+    near = get_close_matches(field, [*known, *joints], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InvalidInput(
-        f"this joint state has no field {field!r}{hint} (it has {', '.join(map(repr, known))})"
+        f"a joint state of this robot has no field {field!r}{hint} (fields: {', '.join(document)}; "
+        f"joints: {', '.join(joints) or 'without names'})"
     )
 
 

@@ -99,7 +99,7 @@ class Ears(AbstractContextManager["Ears"]):
     def measures(self) -> Iterator[tuple[str, Measure, Stats]]:
         """How the samples of each robot came in since the last call."""
         for robot, (listener, buffer) in sorted(self._ears.items()):
-            yield robot, buffer.measure(), listener.stats
+            yield robot, buffer.meter.measure(), listener.stats
 
 
 def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:

@@ -31,31 +31,17 @@ class Measure:
     age_s: float | None
 
 
-class MeteredBuffer(TransformBuffer):
-    """A TransformBuffer that notes when each sample of a robot could be looked up."""
+class Meter:
+    """Measures what comes in. One thread notes, another one measures."""
 
     def __init__(self) -> None:
-        super().__init__()
         self._delays: deque[int] = deque(maxlen=_KEPT)
-        self._count = 0
+        self._count = self._measured = 0
         self._newest: int | None = None
         self._measured_at = time.monotonic()
 
-    def insert_joints(
-        self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
-    ) -> bool:
-        taken = super().insert_joints(track, stamp, positions, velocities)
-        self._note(stamp)
-        return taken
-
-    def insert_many(
-        self, edges: Sequence[tuple[str, str]], stamp: int, poses: ArrayLike, *, writer: str | None = None
-    ) -> bool:
-        taken = super().insert_many(edges, stamp, poses, writer=writer)
-        self._note(stamp)
-        return taken
-
-    def _note(self, stamp: int) -> None:
+    def note(self, stamp: int) -> None:
+        """A sample of this stamp [ns] can be looked up now."""
         self._delays.append(time.time_ns() - stamp)
         self._newest = stamp
         self._count += 1
@@ -63,11 +49,34 @@ class MeteredBuffer(TransformBuffer):
     def measure(self) -> Measure:
         """What came since the last call."""
         delays, self._delays = self._delays, deque(maxlen=_KEPT)
-        count, self._count = self._count, 0
-        now = time.monotonic()
-        passed_s, self._measured_at = now - self._measured_at, now
+        count, now = self._count, time.monotonic()
+        fresh, passed_s = count - self._measured, now - self._measured_at
+        self._measured, self._measured_at = count, now
+        newest = self._newest
         return Measure(
-            count / passed_s,
+            fresh / passed_s,
             median(delays) * 1e-9 if delays else None,
-            None if self._newest is None else (time.time_ns() - self._newest) * 1e-9,
+            None if newest is None else (time.time_ns() - newest) * 1e-9,
         )
+
+
+class MeteredBuffer(TransformBuffer):
+    """A TransformBuffer whose ``meter`` notes when each sample of a robot can be looked up."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.meter = Meter()
+
+    def insert_joints(
+        self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
+    ) -> bool:
+        taken = super().insert_joints(track, stamp, positions, velocities)
+        self.meter.note(stamp)
+        return taken
+
+    def insert_many(
+        self, edges: Sequence[tuple[str, str]], stamp: int, poses: ArrayLike, *, writer: str | None = None
+    ) -> bool:
+        taken = super().insert_many(edges, stamp, poses, writer=writer)
+        self.meter.note(stamp)
+        return taken

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from zstate.cli.announced import Roster
@@ -11,7 +12,9 @@ from zstate.errors import InPast, LookupFailed, NoData, UnknownFrame, WaitTimeou
 
 if TYPE_CHECKING:
     from zstate.listener import TransformListener
+    from zstate.net.presence import RobotInfo
     from zstate.transform import Transform
+    from zstate.wire.keys import Stream
 
 # Whoever has answers usually gives the first one sooner; waiting is mentioned only afterwards.
 _GRACE_S = 0.5
@@ -85,18 +88,20 @@ class Patience:
 
     def _hint(self, reason: LookupFailed) -> str:
         """What the roster of robots adds to the buffer's reason."""
-        robots, robot = self._roster.robots(), self._listener.robot
-        if isinstance(reason, UnknownFrame) and robot != "*" and not self._roster.streams(robot):
-            return unknown_robot(robot, robots)
+        robots = self._roster.robots()
+        if self._listener.robot != "*":
+            robots = tuple(info for info in robots if info.name == self._listener.robot)
         if isinstance(reason, UnknownFrame):
-            return "" if reason.near_misses else announced_text(robots)
-        if isinstance(reason, NoData):
-            return "; ".join(
-                self._roster.silence(info.name, "joint_states")
-                for info in robots
-                if "joint_states" not in self._roster.streams(info.name)
-            )
-        return ""
+            return "" if reason.near_misses else self._who_lacks("robot_description", robots)
+        return self._who_lacks("joint_states", robots) if isinstance(reason, NoData) else ""
+
+    def _who_lacks(self, stream: Stream, robots: Sequence[RobotInfo]) -> str:
+        everybody = self._roster.robots()
+        if not robots:
+            robot = self._listener.robot
+            return announced_text(everybody) if robot == "*" else unknown_robot(robot, everybody)
+        lacking = [info.name for info in robots if stream not in self._roster.streams(info.name)]
+        return "; ".join(self._roster.silence(robot, stream) for robot in lacking) or announced_text(robots)
 
     def _end(self) -> None:
         """Say that the wait is over, if it was said to have begun."""
