@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import json
+
+from looking import Spawn, failure, interrupted, standing, started
+from support import until
+
+
+def test_each_robot_has_a_line_a_second(spawn: Spawn):
+    command = started(spawn, "listen")
+    with standing("left"), standing("right"):
+        heard = {command.line().split()[0] for _ in range(6)}
+    assert heard == {"left", "right"}
+    assert "following left: joint_states" in command.stderr
+    interrupted(command)
+
+
+def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
+    command = started(spawn, "listen", "rrbot", "--json")
+    with standing():
+        command.line()
+        facts = json.loads(command.line())
+    assert facts["robot"] == "rrbot"
+    assert 10.0 < facts["rate_hz"] < 110.0
+    assert facts["received"] > 0
+    assert 0.0 < facts["latency_s"] < 1.0
+    assert facts["latency_s"] <= facts["age_s"] + 1.0
+    assert (facts["dropped"], facts["missed"], facts["late"], facts["refused"]) == (0, 0, 0, {})
+    interrupted(command)
+
+
+def test_a_robot_that_writes_only_transforms_is_heard_all_the_same(spawn: Spawn):
+    command = started(spawn, "listen", "--json")
+    with standing(streams=("tf", "tf_static", "robot_description")):
+        until(lambda: json.loads(command.line())["received"] > 0)
+    assert "following rrbot: tf" in command.stderr
+
+
+def test_it_says_what_it_waits_for(spawn: Spawn):
+    command = started(spawn, "listen", "rrbot")
+    until(lambda: "waiting: nobody announces the robot 'rrbot'" in command.stderr)
+    with standing():
+        assert command.line().startswith("rrbot  ")
+    interrupted(command)
+
+
+def test_a_name_that_no_robot_can_have_is_refused():
+    assert "'a/b'" in failure("listen", "a/b")

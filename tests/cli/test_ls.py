@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import json
+import os
+import socket
+
+from looking import EVERYTHING, failure, standing, zstate
+
+
+def test_each_stream_stands_with_its_writer():
+    with standing():
+        robot, *streams = zstate("ls").stdout.decode().splitlines()
+    assert robot == "rrbot"
+    assert sorted(line.split()[0] for line in streams) == sorted(EVERYTHING)
+    for line in streams:
+        assert f"@{socket.gethostname()} pid {os.getpid()}" in line
+        assert "since 20" in line
+
+
+def test_json_names_robots_and_writers():
+    with standing("left", streams=("joint_states",)), standing("right"):
+        robots = json.loads(zstate("ls", "--json").stdout)
+    assert [robot["robot"] for robot in robots] == ["left", "right"]
+    (writer,) = robots[0]["writers"]
+    assert (writer["stream"], writer["pid"]) == ("joint_states", os.getpid())
+
+
+def test_nobody_is_no_error():
+    ended = zstate("ls")
+    assert (ended.returncode, ended.stdout) == (0, b"")
+    assert b"no robot is announced" in ended.stderr
+    assert json.loads(zstate("ls", "--json").stdout) == []
+
+
+def test_an_endpoint_that_cannot_be_is_named():
+    assert "nonsense" in failure("ls", "--connect", "nonsense")
