@@ -3,49 +3,30 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 import time
+from collections.abc import AsyncIterable, Callable
 from contextlib import suppress
-from typing import NamedTuple
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.path import Path
-from zstate.buffer.plan import Plan, check_stamps, compile_path, transform_of
-from zstate.buffer.store import Store
-from zstate.buffer.tracks import Track
+from zstate.buffer.join import Join, frame_of, stamp_of
+from zstate.buffer.plan import Plan, check_stamps, joints_path
+from zstate.buffer.questions import Question, Questions, seconds
+from zstate.buffer.tracks import JointTrack
 from zstate.buffer.waiting import Waiter
-from zstate.clock import Clock, check_stamp
-from zstate.errors import (
-    AmbiguousFrame,
-    InFuture,
-    InPast,
-    InvalidInput,
-    LookupFailed,
-    Stale,
-    UnknownFrame,
-    timed_out,
-)
+from zstate.buffer.watch import Watch
+from zstate.clock import check_stamp
+from zstate.errors import LookupFailed, timed_out
 from zstate.transform import Transform
 from zstate.twist import Twist
 
-# So many pairs of frames are remembered compiled; more than any program asks for on purpose.
-_MOST_PATHS = 4096
+S = TypeVar("S")
 
 
-class Question(NamedTuple):
-    """What is asked, checked."""
-
-    target: str
-    source: str
-    at: int | None
-    predict_ns: int = 0
-    max_age_s: float | None = None
-
-
-class TransformBuffer(Store):
+class TransformBuffer(Questions):
     """The recent past of every frame it is told of, and exact answers about it.
 
     ``lookup("a", "b")`` is ``a_from_b``: the pose of b in a, which maps coordinates in b into a.
@@ -53,10 +34,6 @@ class TransformBuffer(Store):
     asked for the present only by ``max_age_s`` (default: the system's). Any method may be called
     from any thread.
     """
-
-    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
-        super().__init__(history_s, clock)
-        self._paths: dict[tuple[str, str], tuple[int, Path]] = {}
 
     def lookup(
         self,
@@ -79,7 +56,7 @@ class TransformBuffer(Store):
         them LookupFailed; after a wait also a TimeoutError.
         """
         question = self._question(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
-        if _seconds("timeout_s", timeout_s) > 0.0:
+        if seconds("timeout_s", timeout_s) > 0.0:
             return self._wait(question, timeout_s)
         return self._answer(question)
 
@@ -148,7 +125,7 @@ class TransformBuffer(Store):
         Raises at once what waiting cannot mend: InPast for an ``at`` before all samples kept. After
         ``timeout_s`` raises the reason of the last try, as an error that is also a TimeoutError.
         """
-        return self._wait(self._question(target, source, at), _seconds("timeout_s", timeout_s))
+        return self._wait(self._question(target, source, at), seconds("timeout_s", timeout_s))
 
     async def wait_async(
         self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0
@@ -156,7 +133,7 @@ class TransformBuffer(Store):
         """``wait`` for asyncio: nothing blocks, and cancelling the task ends it."""
         question = self._question(target, source, at)
         loop, event = asyncio.get_running_loop(), asyncio.Event()
-        deadline = loop.time() + _seconds("timeout_s", timeout_s)
+        deadline = loop.time() + seconds("timeout_s", timeout_s)
 
         def wake() -> None:
             # The loop may be closed by the time an insert wakes those who waited in it.
@@ -187,96 +164,62 @@ class TransformBuffer(Store):
                 if left_s <= 0.0 or not event.wait(left_s):
                     raise timed_out(outcome, timeout_s)
 
-    def _try(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
-        """An answer; or the reason against it, with ``waiter`` told what would change that."""
-        version = self._tree.version
-        waiter.expect(version, ())
-        try:
-            return self._answer(question)
-        except LookupFailed as reason:
-            if _is_final(question, reason):
-                raise
-            waiter.expect(version, self._marks(question, reason), question.at)
-            # What arrived between the question and the expectation woke nobody.
-            if waiter.is_met(self._tree.version):
-                waiter.wake()
-            return reason
-
-    def _marks(self, question: Question, reason: LookupFailed) -> list[tuple[Track, int | None]]:
-        """How new each track of the path must be before asking again may help."""
-        try:
-            uses = self._path(question.target, question.source).uses
-        except LookupFailed:
-            return []
-        at = None if question.at is None else question.at - question.predict_ns
-        if isinstance(reason, InPast):
-            at = reason.oldest
-        if isinstance(reason, Stale):
-            at = _after(reason.requested)
-        marks: list[tuple[Track, int | None]] = [(use.track, at) for use in uses]
-        if isinstance(reason, InFuture) and at is not None:
-            # Where prediction is not possible from the samples there are, only a newer one helps.
-            marks += [(use.track, _after(reason.newest)) for use in uses if use.edge == reason.edge]
-        return marks
-
-    def _question(
+    def watch(
         self,
         target: str,
         source: str,
-        at: int | None,
+        callback: Callable[[Transform], object],
         *,
-        predict_s: float = 0.0,
-        max_age_s: float | None = None,
-    ) -> Question:
-        if max_age_s is not None:
-            _seconds("max_age_s", max_age_s)
-        predict_ns = round(_seconds("predict_s", predict_s) * 1e9)
-        return Question(target, source, None if at is None else check_stamp(at), predict_ns, max_age_s)
+        translation_m: float | None = None,
+        rotation_rad: float | None = None,
+    ) -> Watch:
+        """Call ``callback(transform)`` with each newest ``target_from_source``, until the watch is closed.
 
-    def _answer(self, question: Question) -> Transform:
-        try:
-            path = self._path(question.target, question.source)
-            transform = transform_of(path, question.at, question.predict_ns)
-        except LookupFailed as reason:
-            if reason.requested is None:
-                reason.requested = question.at
-            raise
-        if question.max_age_s is not None:
-            self._refuse_stale(path, transform, question.max_age_s)
-        return transform
+        With thresholds, only once the source has moved or turned so far since the last call. Frames may
+        still be unknown. The callback runs on the thread that inserts: keep it short.
+        """
 
-    def _refuse_stale(self, path: Path, transform: Transform, max_age_s: float) -> None:
-        age_s = transform.age(self.clock)
-        if path.uses and age_s > max_age_s:
-            raise path.stale(transform.stamp, age_s, max_age_s)
+        def look(waiter: Waiter) -> Transform | LookupFailed:
+            outcome = self._try(question, waiter)
+            if isinstance(outcome, Transform):
+                self._expect_newer(question, outcome, waiter)
+            return outcome
 
-    def _path(self, target: str, source: str) -> Path:
-        cached = self._paths.get((target, source))
-        if cached is not None and cached[0] == self._tree.version:
-            return cached[1]
-        with self._lock:
-            path = compile_path(self._tree, target, source, self._take_views)
-            if len(self._paths) >= _MOST_PATHS:
-                self._paths = {}
-            self._paths[target, source] = (self._tree.version, path)
-        return path
+        question = self._question(target, source, None)
+        return Watch(self._room, look, callback, translation_m, rotation_rad)
 
+    def join(
+        self,
+        samples: AsyncIterable[S],
+        target: str,
+        *,
+        frame: Callable[[S], str] = frame_of,
+        stamp: Callable[[S], int] = stamp_of,
+        timeout_s: float = 1.0,
+    ) -> Join[S]:
+        """``async for sample, transform in buffer.join(samples, target)``: each with its own transform.
 
-def _is_final(question: Question, reason: LookupFailed) -> bool:
-    """Whether no amount of waiting would turn the reason into an answer."""
-    if isinstance(reason, UnknownFrame):
-        return not reason.name or reason.name.startswith("/")
-    if isinstance(reason, InPast | Stale):
-        return question.at is not None
-    return isinstance(reason, AmbiguousFrame)
+        ``transform`` is ``target_from_frame`` at the sample's stamp; ``frame`` and ``stamp`` say where to
+        find both (default: the attributes of those names). A sample that gets no transform within
+        ``timeout_s`` is left out, counted by its reason in ``dropped``.
+        """
+        seconds("timeout_s", timeout_s)
+        return Join(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
 
+    def joint_positions(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
+        """All joints of one robot at a stamp, and that stamp: (nq,) as ``track.model.joint_names``.
 
-def _after(stamp: int | None) -> int | None:
-    """The first stamp that would be news to what reached ``stamp``."""
-    return None if stamp is None else stamp + 1
+        ``at=None`` is the robot's newest sample. Between samples joints are interpolated as in lookups.
+        Raises NoData, InPast or InFuture.
+        """
+        path = joints_path(track, self._take_views)
+        reading = path.read(None if at is None else check_stamp(at))
+        return np.hstack([np.empty(0), *reading.values[0]]), reading.stamp
 
+    def link_poses(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
+        """Every link of one robot at a stamp, and that stamp: (L, 7), rows as ``track.model.links``.
 
-def _seconds(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise InvalidInput(f"{name} is a number of seconds, zero or more; got {value!r}")
-    return value
+        Row i is ``root_from_link``: x y z [m], qx qy qz qw. Raises as ``joint_positions``.
+        """
+        positions, stamp = self.joint_positions(track, at)
+        return track.kinematics.link_poses(positions), stamp

@@ -101,8 +101,11 @@ class History:
         self.view = View(stamps, rows, first, end + 1)
 
     def _with_room(self, view: View) -> View:
-        """The same samples at the front of arrays with room for as many again, half at least."""
-        fresh = self._empty(max(_SMALLEST_CAPACITY, view.size + view.size // 2))
+        """The same samples at the front of arrays with room for an eighth more.
+
+        Both copies live for a moment, and a long history of a large robot is megabytes.
+        """
+        fresh = self._empty(_SMALLEST_CAPACITY + view.size + view.size // 8)
         fresh.stamps[: view.size] = view.kept_stamps()
         fresh.rows[: view.size] = view.kept_rows()
         return fresh._replace(end=view.size)

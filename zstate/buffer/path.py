@@ -40,6 +40,15 @@ class Answer(NamedTuple):
     predicted_s: float = 0.0
 
 
+class Reading(NamedTuple):
+    """The values of all cells of a path at an instant, and how they were found."""
+
+    values: list[list[se3.Component]]
+    stamp: int
+    kind: Kind
+    predicted_ns: int
+
+
 class Path:
     """From ``source`` to ``target`` by way of where their branches meet."""
 
@@ -67,6 +76,12 @@ class Path:
         """The pose at ``stamp``, or at the latest instant. Raises NoData, InPast or InFuture."""
         if not self.uses:
             return Answer(self._pose((), se3.SCALARS), stamp, "static")
+        reading = self.read(stamp, predict_ns)
+        pose = se3.normalize(self._pose(reading.values, se3.SCALARS), se3.SCALARS)
+        return Answer(pose, reading.stamp, reading.kind, reading.predicted_ns * 1e-9)
+
+    def read(self, stamp: int | None, predict_ns: int = 0) -> Reading:
+        """What the cells of each track say at ``stamp``, or at the latest instant. Raises as ``answer``."""
         views = self._take_views(self.uses)
         at = self._latest(views) if stamp is None else stamp
         kind: Kind = "exact"
@@ -83,8 +98,7 @@ class Path:
                     raise self.blame(at, views, predict_ns)
                 kind, predicted_ns = "predicted", max(predicted_ns, at - view.newest)
                 values.append(ahead)
-        pose = se3.normalize(self._pose(values, se3.SCALARS), se3.SCALARS)
-        return Answer(pose, at, kind, predicted_ns * 1e-9)
+        return Reading(values, at, kind, predicted_ns)
 
     def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
         """Pose and velocity of the source in the target. Raises as ``answer``, and NoData without a rate."""

@@ -88,6 +88,15 @@ def compile_path(tree: Tree, target: str, source: str, take_views: ViewTaker) ->
     return Path((target, source), steps_to_target, steps_to_source, uses.done(), take_views)
 
 
+def joints_path(track: JointTrack, take_views: ViewTaker) -> Path:
+    """A path of no steps that reads every joint of a robot, for questions about all of it."""
+    joints = list(enumerate(track.model.joints))
+    cells = [cell for index, joint in joints if joint.driven for cell in _joint_cells(track, index)]
+    edge = next((track.edge(track.forms[index]) for index, joint in joints if joint.driven), None)
+    root = track.frame(track.model.root)
+    return Path((root, root), (), (), [TrackUse(track, tuple(cells), edge or (root, root))], take_views)
+
+
 class _Uses:
     """The tracks of a path and the cells it reads of each, in the order they are met."""
 

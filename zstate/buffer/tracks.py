@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import History, View
 from zstate.model.edges import EdgeForm, EdgeTable
+from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 
 Interpolation = Literal["linear", "hermite"]
@@ -40,6 +42,11 @@ class JointTrack:
     def has_velocities(self) -> bool:
         """Whether rows have columns for velocities."""
         return self.history.width > self.model.position_count
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """What gives the poses of all links at once."""
+        return Kinematics(self.model)
 
     def turns(self, index: int) -> bool:
         """Whether the joint behind an edge is continuous: any number of turns, encoders that wrap."""

@@ -1,0 +1,74 @@
+"""Join: sensor samples, each with the transform of its own instant."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable
+from typing import Any, Generic, TypeVar
+
+from zstate.errors import LookupFailed
+from zstate.transform import Transform
+
+S = TypeVar("S")
+
+Wait = Callable[[str, str, int, float], Awaitable[Transform]]
+"""``wait_async`` of a buffer: target, source, stamp, timeout_s."""
+
+
+def frame_of(sample: Any) -> str:
+    """The frame a sample is given in: its attribute ``frame``."""
+    return sample.frame
+
+
+def stamp_of(sample: Any) -> int:
+    """When a sample was taken [ns]: its attribute ``stamp``."""
+    return sample.stamp
+
+
+class Join(Generic[S]):
+    """``async for sample, transform in join``: samples in their order, each with ``target_from_frame``.
+
+    A sample waits up to ``timeout_s`` for the transform of its stamp. One that gets none is left out
+    and counted in ``dropped`` by the name of the reason; ``last_reason`` tells of the latest in full.
+    """
+
+    def __init__(
+        self,
+        wait: Wait,
+        samples: AsyncIterable[S],
+        target: str,
+        *,
+        frame: Callable[[S], str] = frame_of,
+        stamp: Callable[[S], int] = stamp_of,
+        timeout_s: float = 1.0,
+    ) -> None:
+        self.target = target
+        self.joined = 0
+        self.dropped: Counter[str] = Counter()
+        self.last_reason: LookupFailed | None = None
+        self._wait = wait
+        # One iterator for all, so that a join can be left and taken up again.
+        self._samples = samples.__aiter__()
+        self._frame = frame
+        self._stamp = stamp
+        self._timeout_s = timeout_s
+
+    def __aiter__(self) -> AsyncIterator[tuple[S, Transform]]:
+        return self
+
+    async def __anext__(self) -> tuple[S, Transform]:
+        async for sample in self._samples:
+            frame, stamp = self._frame(sample), self._stamp(sample)
+            try:
+                transform = await self._wait(self.target, frame, stamp, self._timeout_s)
+            except LookupFailed as reason:
+                self._drop(reason)
+            else:
+                self.joined += 1
+                return sample, transform
+        raise StopAsyncIteration
+
+    def _drop(self, reason: LookupFailed) -> None:
+        self.last_reason = reason
+        # A timeout is counted as what it still waited for.
+        self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1
