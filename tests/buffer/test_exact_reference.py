@@ -122,8 +122,6 @@ def random_positions(rng: random.Random, track: JointTrack) -> np.ndarray:
     "name", ["rrbot", "diffbot", "gripper", EVERY_JOINT, pytest.param("panda", marks=pytest.mark.robots)]
 )
 def test_joint_tracks_agree_with_the_reference(name: str) -> None:
-    if name == "panda":
-        pytest.importorskip("example_robot_data")
     rng = random.Random(name)
     buffer = TransformBuffer()
     track = buffer.add_robot(load_model(name))

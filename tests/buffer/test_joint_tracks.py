@@ -112,7 +112,9 @@ def test_floating_joints_are_interpolated_as_poses_behind_their_origin() -> None
     assert yaw_of(answer) == pytest.approx(0.5 * PI + 0.25)
 
 
-@pytest.mark.parametrize("name", ["rrbot", "diffbot", "gripper"])
+@pytest.mark.parametrize(
+    "name", ["rrbot", "diffbot", "gripper", pytest.param("panda", marks=pytest.mark.robots)]
+)
 def test_at_a_sample_every_link_is_where_kinematics_puts_it(name: str) -> None:
     model = load_model(name)
     buffer = TransformBuffer()
@@ -122,12 +124,6 @@ def test_at_a_sample_every_link_is_where_kinematics_puts_it(name: str) -> None:
     for link, pose in zip(model.links, Kinematics(model).link_poses(positions), strict=True):
         q = pose[3:] * np.sign(pose[3:] @ buffer.lookup(model.root, link).rotation)
         np.testing.assert_allclose(buffer.lookup(model.root, link).pose7, (*pose[:3], *q), atol=1e-12)
-
-
-@pytest.mark.robots
-def test_every_link_of_a_panda_is_where_kinematics_puts_it() -> None:
-    pytest.importorskip("example_robot_data")
-    test_at_a_sample_every_link_is_where_kinematics_puts_it("panda")
 
 
 @pytest.mark.parametrize(
