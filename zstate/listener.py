@@ -133,5 +133,9 @@ class TransformListener:
             return None
 
     def _on_writer(self, robot: str, stream: Stream, writer: Writer, alive: bool) -> None:
-        if alive and stream == self._follow:
+        if stream != self._follow:
+            return
+        if alive:
             self._follower(robot).name_writer(writer.session, str(writer))
+        else:
+            self._follower(robot).writer_left(writer.session)

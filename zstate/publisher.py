@@ -108,12 +108,13 @@ class StatePublisher:
         ``positions`` [rad] or [m] are in the order of ``model.joint_names``, or a mapping of joint names
         that has all of them; ``velocities`` per second and ``efforts`` [Nm] or [N] likewise in that order
         where they are known. Raises InvalidInput for wrong counts, unknown or missing names, NaN and
-        infinity, and Closed; then nothing was sent.
+        infinity, a floating joint without a unit quaternion, and Closed; then nothing was sent.
         """
         model = self.model
         numbers = (
             model.positions(positions) if isinstance(positions, Mapping) else model.check_positions(positions)
         )
+        self._edges.check(numbers)
         rates = None if velocities is None else to_block(model.check_velocities(velocities))
         forces = None if efforts is None else to_block(model.check_efforts(efforts))
         stamp = self._clock.now() if stamp is None else check_stamp(stamp)
@@ -212,6 +213,10 @@ class _MovingEdges:
         self.order = order_digest(self.names)
         self._fixed_names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if is_fixed)
         self._fixed_poses = [form.origin for form in forms if form.kind == "fixed"]
+
+    def check(self, positions: NDArray[np.float64]) -> None:
+        """Raise InvalidInput for a floating joint's quaternion that is not of unit length."""
+        self._table.normalised(positions)
 
     def poses(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """``parent_from_child`` of each of ``names``: (n, 7)."""

@@ -34,7 +34,8 @@ class Rate:
     """Iterate to get the stamp [ns] of each tick; the k-th deadline is ``start + k / rate_hz``.
 
     Late ticks follow at once, so the rate stays exact; after a delay of more than 0.1 s the deadlines
-    that passed meanwhile are skipped and counted. Ends when ``stop`` is set, or after ``seconds``.
+    that passed meanwhile are skipped and counted. A clock that is set back is followed. Ends when
+    ``stop`` is set, or after ``seconds``.
     """
 
     def __init__(
@@ -55,12 +56,16 @@ class Rate:
         start = self._clock.now()
         tick = 0
         while tick < self._ticks_wanted:
+            # No deadline is further away than one period, unless the clock was set back.
+            set_back = start + round((tick - 1) * 1e9 / self.rate_hz) - self._clock.now()
+            if set_back > _LONGEST_DELAY_NS:
+                start -= set_back
             deadline = start + round(tick * 1e9 / self.rate_hz)
             if not self._clock.wait_until(deadline, self._stop):
                 return
             now = self._clock.now()
             if now - deadline > _LONGEST_DELAY_NS:
-                due = math.floor((now - start) * self.rate_hz / 1e9)
+                due = int(min((now - start) * self.rate_hz / 1e9, self._ticks_wanted - 1))
                 self._skipped += due - tick
                 tick = due
             self._first = now if self._first is None else self._first

@@ -6,6 +6,7 @@ import secrets
 import threading
 from contextlib import ExitStack, suppress
 from types import TracebackType
+from urllib.parse import quote
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Closed, InvalidInput
@@ -23,13 +24,14 @@ class StaticPublisher:
 
     Bare frame names are the robot's own; other frames are named in full, ``robot/frame``. All edges
     of a writer travel together, and a new value replaces the old one everywhere. ``close()`` withdraws
-    them. ``writer`` tells this publisher from others: the program and its process id unless given.
+    them. ``writer`` tells this publisher from others: unless given, the program, its process id and a
+    random number.
     """
 
     def __init__(self, session: Session, robot: str, writer: str | None = None, wire: str = "native") -> None:
         identity = Writer.here(secrets.randbits(32))
         self.robot = check_robot(robot)
-        self.writer = check_writer(writer or f"{identity.program}.{identity.pid}")
+        self.writer = check_writer(_default_writer(identity) if writer is None else writer)
         if self.writer == MODEL_WRITER:
             raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
         self._wire = wire_named(wire)
@@ -102,3 +104,8 @@ class StaticPublisher:
             with suppress(Closed):
                 self._latched.withdraw()
             self._opened.close()
+
+
+def _default_writer(identity: Writer) -> str:
+    # The name of a script may have blanks, which no key has.
+    return f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import InvalidInput
 from zstate.following.follower import Follower
 from zstate.following.tally import Tally
 from zstate.wire.keys import full_name
@@ -23,6 +24,7 @@ class EdgeFollower(Follower):
         super().__init__(robot, buffer, tally)
         self._edges: Edges = ()
         self._order = b""
+        self._undescribed: set[str] = set()
 
     def describe(self, description: RobotDescription) -> None:
         self.heard = True
@@ -30,9 +32,13 @@ class EdgeFollower(Follower):
             order = order_digest(description.moving_edges)
             if order == self._order:
                 return
+            try:
+                edges = self._named(description.moving_edges)
+            except InvalidInput as error:
+                self._tally.refuse("robot description", str(error))
+                return
             self._restart()
-            self._edges = self._named(description.moving_edges)
-            self._order = order
+            self._edges, self._order = edges, order
             self._insert_early()
 
     def _named(self, edges: Edges) -> Edges:
@@ -40,7 +46,12 @@ class EdgeFollower(Follower):
 
     def _insert(self, sample: Sample) -> bool:
         assert isinstance(sample, TransformSample)
-        edges = self._edges if sample.edges is None else self._named(sample.edges)
+        edges = self._edges
+        if sample.edges is not None:
+            edges = self._named(sample.edges)
+            self._undescribed.update(child for _, child in edges)
+        if not edges:
+            return True  # a robot without moving parts
         poses = poses_from_block(sample.poses)
         return self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
 
@@ -49,8 +60,12 @@ class EdgeFollower(Follower):
         return sample.edges is not None or sample.order == self._order
 
     def _restart(self) -> None:
-        for _, child in self._edges:
-            self._buffer.withdraw(child)
+        children = {child for _, child in self._edges} | self._undescribed
+        self._undescribed = set()
+        for frame in self._buffer.frames():
+            # What a model or a static writer places by now is theirs.
+            if frame.kind == "pose" and frame.name in children:
+                self._buffer.withdraw(frame.name)
 
     def _writer_changed(self) -> None:
         pass  # each sample is inserted under its writer's name

@@ -46,6 +46,12 @@ class Follower(ABC):
             self._writers[session] = writer
             self._writer_changed()
 
+    def writer_left(self, session: int) -> None:
+        """The writer behind a session is gone: one that had to give way to it may be followed again."""
+        with self._lock:
+            if session == self._session:
+                self._ended_sessions.clear()
+
     def take(self, sample: Sample, *, overflowed: bool) -> None:
         """Put a sample into the buffer; ``overflowed`` says that our ring lost some before it."""
         self.heard = True
@@ -59,13 +65,24 @@ class Follower(ABC):
             if self._can_read(sample):
                 self._insert_counted(sample)
             else:
-                self._early.append(sample)
+                self._keep_early(sample)
+
+    def _keep_early(self, sample: Sample) -> None:
+        if len(self._early) == _EARLY:
+            self._refuse_undescribed()
+        self._early.append(sample)
 
     def _insert_early(self) -> None:
         """The samples that came before the robot was described."""
         early, self._early = self._early, deque(maxlen=_EARLY)
         for sample in early:
-            self._insert_counted(sample)
+            if self._can_read(sample):
+                self._insert_counted(sample)
+            else:
+                self._refuse_undescribed()
+
+    def _refuse_undescribed(self) -> None:
+        self._tally.refuse("no description", f"{self.robot!r}: no robot_description fits its samples")
 
     def _insert_counted(self, sample: Sample) -> None:
         try:

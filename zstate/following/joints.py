@@ -7,8 +7,8 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
 from zstate.following.follower import Follower
 from zstate.following.tally import Tally
-from zstate.model.catalog import load_model
 from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
 
@@ -28,7 +28,8 @@ class JointFollower(Follower):
             return
         with self._lock:
             try:
-                self._replace_model(load_model(description.urdf))
+                # Text and nothing else: what comes over the network opens no files and runs no xacro.
+                self._replace_model(parse_urdf(description.urdf, "its URDF"))
             except (ModelError, InsertRefused) as error:
                 self._tally.refuse("robot description", f"{self.robot!r}: {error}")
                 return

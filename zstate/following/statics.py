@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-
 from numpy.typing import ArrayLike
 
 from zstate.buffer.buffer import TransformBuffer
@@ -55,8 +53,10 @@ class StaticFollower:
     def _withdraw(self, children: list[str]) -> None:
         for child in children:
             del self._parents[child]
-            # A robot's model may have taken the link over meanwhile.
-            with suppress(InsertRefused):
+        # A model or another writer may have taken an edge over meanwhile: then it is theirs.
+        ours = {frame.name for frame in self._buffer.frames() if frame.writer == self._writer}
+        for child in children:
+            if child in ours:
                 self._buffer.withdraw(child)
 
     def _refuse(self, reason: str, error: InvalidInput) -> None:

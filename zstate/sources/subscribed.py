@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
 from collections.abc import Iterator
 from types import TracebackType
 
-from zstate.errors import InvalidInput, MessageError
+from zstate.errors import InvalidInput, MessageError, ZStateError
+from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.net.streams import Arrival, StreamSubscriber
 from zstate.sources.source import JointReading
-from zstate.wire.joint_order import JointOrder
+from zstate.wire.joint_order import JointNumbers, JointOrder
 from zstate.wire.messages import JointState
 from zstate.wire.native import NativeWire
+
+_LOG = logging.getLogger("zstate")
 
 # At most so many readings wait for a slow reader; then the oldest are dropped.
 _CAPACITY = 1024
@@ -24,12 +28,13 @@ class SubscribedSource:
     """The ``joint_states`` of ``robot``, as they come in: ``for reading in source: ...``
 
     ``read`` gives the newest one that has not been read. Iteration ends with ``close()``. Samples that
-    cannot be used are counted in ``refused``, by reason.
+    cannot be used are counted in ``refused``, by reason; the first of each is also logged.
     """
 
     def __init__(self, session: Session, model: RobotModel, robot: str | None = None) -> None:
         self.refused: dict[str, int] = {}
         self._model = model
+        self._table = EdgeTable(model)
         self._order = JointOrder(model.joint_names)
         self._wire = NativeWire()
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
@@ -50,14 +55,24 @@ class SubscribedSource:
             state = self._wire.decode("joint_states", payload, encoding)
             assert isinstance(state, JointState)
             numbers = self._order.read(state)
-            self._model.check_positions(numbers.positions)
+            self._check(numbers)
         except MessageError as error:
-            return self._refuse(error.reason)
-        except InvalidInput:
-            return self._refuse("bad numbers")
+            return self._refuse(error.reason, error)
+        except InvalidInput as error:
+            return self._refuse("bad numbers", error)
         return JointReading(*numbers, stamp=state.stamp)
 
-    def _refuse(self, reason: str) -> None:
+    def _check(self, numbers: JointNumbers) -> None:
+        # All that ``StatePublisher.publish`` would refuse, for that would end its ``run``.
+        self._table.normalised(self._model.check_positions(numbers.positions))
+        if numbers.velocities is not None:
+            self._model.check_velocities(numbers.velocities)
+        if numbers.efforts is not None:
+            self._model.check_efforts(numbers.efforts)
+
+    def _refuse(self, reason: str, error: ZStateError) -> None:
+        if reason not in self.refused:
+            _LOG.warning("joint_states refused (%s): %s; further ones are only counted", reason, error)
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def read(self, stamp: int) -> JointReading | None:

@@ -1,0 +1,56 @@
+"""What the tests of publishers and listeners share: writers, readers, and answers derived apart."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from support import DEADLINE_S, until
+
+from zstate.model.catalog import load_model
+from zstate.model.kinematics import Kinematics
+from zstate.model.robot import RobotModel
+from zstate.net.session import Session
+from zstate.net.streams import Arrival, StreamPublisher, StreamSubscriber
+from zstate.se3 import to_matrix
+from zstate.transform import Transform
+
+RRBOT = load_model("rrbot")
+"""World, base, two links on continuous joints (shoulder, elbow), and a tool."""
+
+SECOND = 1_000_000_000
+
+
+def await_reader(session: Session, key: str) -> None:
+    """Return when ``session`` knows that somebody reads ``key``: what it puts from now on arrives."""
+    with StreamPublisher(session, key, "") as probe:
+        until(lambda: probe.has_readers)
+
+
+class Tap:
+    """Everything that was heard on one key, as it came."""
+
+    def __init__(self, session: Session, key: str) -> None:
+        self.arrivals: list[Arrival] = []
+        self._subscriber = StreamSubscriber(session, key, self.arrivals.extend)
+
+    def payloads(self, count: int) -> list[bytes]:
+        """The first ``count`` payloads, once they are there."""
+        until(lambda: len(self.arrivals) >= count)
+        return [payload for _, payload, _ in self.arrivals]
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+
+def kinematic_pose(model: RobotModel, positions: ArrayLike, target: str, source: str) -> NDArray[np.float64]:
+    """``target_from_source`` as a matrix, from poses in the root."""
+    poses = dict(zip(model.links, Kinematics(model).link_poses(positions), strict=True))
+    root_from_target, root_from_source = (to_matrix(tuple(poses[link])) for link in (target, source))
+    return np.linalg.solve(root_from_target, root_from_source)
+
+
+def assert_pose(transform: Transform, matrix: ArrayLike) -> None:
+    assert np.allclose(transform.matrix, matrix, rtol=0.0, atol=1e-12), transform
+
+
+__all__ = ["DEADLINE_S", "RRBOT", "SECOND", "Tap", "assert_pose", "await_reader", "kinematic_pose"]

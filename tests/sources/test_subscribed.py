@@ -1,0 +1,147 @@
+import logging
+import threading
+
+import pytest
+from live import RRBOT, await_reader
+from support import until
+
+from zstate.model.catalog import load_model
+from zstate.net.session import Session, connect
+from zstate.net.streams import StreamPublisher
+from zstate.publisher import StatePublisher
+from zstate.sources import SubscribedSource
+from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+KEY = "zstate/r1/joint_states"
+NAN = float("nan")
+FLOATING = load_model(
+    '<robot name="drone"><link name="map"/><link name="body"/>'
+    '<joint name="free" type="floating"><parent link="map"/><child link="body"/></joint></robot>'
+)
+
+
+@pytest.fixture
+def sessions():
+    with connect() as writer, connect() as reader:
+        yield writer, reader
+
+
+def put(session: Session, payload: bytes, encoding: str = ENCODINGS[JointState]) -> None:
+    await_reader(session, KEY)
+    with StreamPublisher(session, KEY, encoding) as stream:
+        stream.put(payload)
+
+
+def joint_state(*blocks: list[float], model=RRBOT) -> bytes:
+    return encode(JointState(7, 0, 1, order_digest(model.joint_names), *map(to_block, blocks)))
+
+
+def test_every_sample_is_read_in_order_with_its_stamp(sessions):
+    writer, reader = sessions
+    with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
+        await_reader(writer, KEY)
+        for number in range(5):
+            publisher.publish([number, -number], [1.0, 2.0], [3.0, 4.0], stamp=number)
+        readings = [reading for _, reading in zip(range(5), source, strict=False)]
+    assert [reading.stamp for reading in readings] == [0, 1, 2, 3, 4]
+    assert [reading.positions.tolist() for reading in readings] == [[n, -n] for n in range(5)]
+    assert all(reading.velocities.tolist() == [1.0, 2.0] for reading in readings)
+    assert all(reading.efforts.tolist() == [3.0, 4.0] for reading in readings)
+
+
+def test_read_gives_the_newest_once(sessions):
+    writer, reader = sessions
+    with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
+        await_reader(writer, KEY)
+        assert source.read(0) is None
+        publisher.publish([1.0, 2.0], stamp=1)
+        publisher.publish([3.0, 4.0], stamp=2)
+        seen = []
+        until(
+            lambda: (
+                (reading := source.read(0)) is not None
+                and seen.append(reading) is None
+                and reading.stamp == 2
+            )
+        )
+        assert seen[-1].positions.tolist() == [3.0, 4.0]
+        assert seen[-1].velocities is None
+        assert source.read(0) is None
+
+
+def test_the_robot_is_the_models_name_unless_given(sessions):
+    writer, reader = sessions
+    with SubscribedSource(reader, RRBOT) as source, StatePublisher(writer, RRBOT) as publisher:
+        await_reader(writer, "zstate/rrbot/joint_states")
+        publisher.publish([1.0, 2.0], stamp=1)
+        assert next(iter(source)).stamp == 1
+
+
+@pytest.mark.parametrize(
+    ("payload", "encoding", "reason"),
+    [
+        (b"\x98", ENCODINGS[JointState], "truncated"),
+        (joint_state([1, 2])[:-3], ENCODINGS[JointState], "truncated"),
+        (b"\x00\xff\xfe", ENCODINGS[JointState], "malformed"),
+        (joint_state([1, 2]), "zstate/JointState;v=2", "newer version"),
+        (joint_state([1, 2]), "text/plain", "foreign"),
+        (joint_state([1, 2, 3]), ENCODINGS[JointState], "bad numbers"),
+        (joint_state([1, NAN]), ENCODINGS[JointState], "bad numbers"),
+        (joint_state([1, 2], [1, NAN]), ENCODINGS[JointState], "bad numbers"),
+        (joint_state([1, 2], [1]), ENCODINGS[JointState], "bad numbers"),
+        (joint_state([1, 2], [1, 2], [float("inf"), 2]), ENCODINGS[JointState], "bad numbers"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[:9].hex(),
+)
+def test_what_cannot_be_used_is_counted_and_logged_once_and_the_next_is_read(
+    sessions, caplog, payload: bytes, encoding: str, reason: str
+):
+    writer, reader = sessions
+    with caplog.at_level(logging.WARNING), SubscribedSource(reader, RRBOT, "r1") as source:
+        put(writer, payload, encoding)
+        put(writer, payload, encoding)
+        until(lambda: source.refused == {reason: 2})
+        put(writer, joint_state([1.0, 2.0]))
+        assert next(iter(source)).stamp == 7
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert reason in caplog.text
+
+
+def test_a_floating_joint_without_a_unit_quaternion_is_refused_here_and_not_by_who_republishes(sessions):
+    writer, reader = sessions
+    with SubscribedSource(reader, FLOATING, "r1") as source:
+        put(writer, joint_state([0, 0, 0, 0, 0, 0, 0.5], model=FLOATING))
+        until(lambda: source.refused == {"bad numbers": 1})
+
+
+def test_close_ends_an_iteration_that_waits(sessions):
+    source = SubscribedSource(sessions[1], RRBOT, "r1")
+    readings: list[object] = []
+    thread = threading.Thread(target=lambda: readings.extend(source))
+    thread.start()
+    source.close()
+    source.close()
+    thread.join(1.0)
+    assert not thread.is_alive()
+    assert readings == []
+
+
+def test_a_publisher_runs_on_what_another_publishes(sessions):
+    writer, reader = sessions
+    with (
+        SubscribedSource(reader, RRBOT, "r1") as source,
+        StatePublisher(writer, RRBOT, "r1", streams=["joint_states"]) as driver,
+        StatePublisher(reader, RRBOT, "r2") as echo,
+        SubscribedSource(writer, RRBOT, "r2") as heard,
+    ):
+        await_reader(writer, KEY)
+        await_reader(reader, "zstate/r2/joint_states")
+        runner = threading.Thread(target=echo.run, args=(source, 200.0))
+        runner.start()
+        driver.publish([0.25, 0.5], stamp=11)
+        reading = next(iter(heard))
+        assert (reading.stamp, reading.positions.tolist()) == (11, [0.25, 0.5])
+        echo.close()
+        runner.join(1.0)
+        assert not runner.is_alive()

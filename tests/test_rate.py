@@ -1,0 +1,112 @@
+import threading
+
+import pytest
+
+from zstate.clock import SystemClock
+from zstate.errors import InvalidInput
+from zstate.rate import Rate, check_rate
+
+SECOND = 1_000_000_000
+
+
+class Stepping:
+    """A clock that goes at once to where it is waited for, plus the lateness of that wait."""
+
+    def __init__(self, start: int = 5, lateness: dict[int, int] | None = None) -> None:
+        self.stamp = start
+        self.waits: list[int] = []
+        self._lateness = lateness or {}
+
+    def now(self) -> int:
+        return self.stamp
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        self.stamp = max(self.stamp, stamp) + self._lateness.get(len(self.waits), 0)
+        self.waits.append(stamp)
+        return not stop.is_set()
+
+
+@pytest.mark.parametrize("rate_hz", [0, 0.0, -1.0, float("nan"), float("inf"), 10_000.1])
+def test_a_rate_that_cannot_be_kept_is_refused_with_its_value(rate_hz: float):
+    with pytest.raises(InvalidInput, match=f"at most 10000 Hz; got {rate_hz!r}"):
+        check_rate(rate_hz)
+
+
+@pytest.mark.parametrize("rate_hz", [1e-3, 1, 10_000.0])
+def test_a_rate_between_nothing_and_ten_kilohertz_is_taken(rate_hz: float):
+    assert check_rate(rate_hz) == rate_hz
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_duration_is_a_positive_number(seconds: float):
+    with pytest.raises(InvalidInput, match="seconds is a positive number"):
+        Rate(10.0, SystemClock(), threading.Event(), seconds)
+
+
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(3.0, 7.0), (1000.0, 2.5), (0.3, 100.0), (10_000.0, 0.01)])
+def test_the_kth_tick_is_k_periods_after_the_first_to_the_nanosecond(rate_hz: float, seconds: float):
+    clock = Stepping()
+    rate = Rate(rate_hz, clock, threading.Event(), seconds)
+    stamps = list(rate)
+    assert stamps == [5 + round(tick * SECOND / rate_hz) for tick in range(round(seconds * rate_hz))]
+    assert rate.report().rate_hz == pytest.approx(rate_hz, rel=1e-9)
+    assert (rate.report().ticks, rate.report().skipped) == (len(stamps), 0)
+
+
+def test_lateness_is_not_handed_on():
+    late = 30_000_000
+    clock = Stepping(0, lateness={2: late})
+    stamps = list(Rate(100.0, clock, threading.Event(), 0.08))
+    period = SECOND // 100
+    # The third tick is 30 ms late; the next three follow it at once; then all is as planned.
+    assert stamps == [0, period, *[2 * period + late] * 4, 6 * period, 7 * period]
+
+
+def test_after_a_long_delay_the_ticks_that_passed_are_skipped_and_counted():
+    clock = Stepping(0, lateness={1: SECOND})
+    rate = Rate(10.0, clock, threading.Event(), 3.0)
+    stamps = list(rate)
+    # The tick of 0.1 s came at 1.1 s: those of 0.1 to 1.0 s are given up, that of 1.1 s is due now.
+    assert stamps == [0, *(tick * SECOND // 10 for tick in range(11, 30))]
+    assert (rate.report().ticks, rate.report().skipped) == (20, 10)
+
+
+def test_ticks_and_skipped_ticks_are_all_there_were_to_be():
+    rate = Rate(10.0, Stepping(0, lateness={1: 100 * SECOND}), threading.Event(), 3.0)
+    list(rate)
+    assert rate.report().ticks + rate.report().skipped == 30
+
+
+def test_a_clock_that_is_set_back_is_followed_at_the_same_rate():
+    clock = Stepping(1000 * SECOND)
+    stamps = []
+    for stamp in Rate(10.0, clock, threading.Event(), 1.0):
+        stamps.append(stamp)
+        if len(stamps) == 3:
+            clock.stamp = 400 * SECOND
+    period = SECOND // 10
+    assert stamps[3:] == [400 * SECOND + tick * period for tick in range(1, 8)]
+
+
+def test_stop_ends_it_and_the_report_tells_what_was_done():
+    stop = threading.Event()
+    rate = Rate(10.0, Stepping(), stop)
+    for number, _ in enumerate(rate, 1):
+        if number == 4:
+            stop.set()
+    assert rate.report().ticks == 4
+
+
+def test_a_report_before_the_second_tick_claims_no_rate():
+    rate = Rate(10.0, Stepping(), threading.Event(), 0.1)
+    assert rate.report().rate_hz == 0.0
+    list(rate)
+    assert (rate.report().rate_hz, rate.report().ticks) == (0.0, 1)
+
+
+def test_stop_ends_a_wait_at_the_systems_clock_at_once():
+    stop = threading.Event()
+    ticks = iter(Rate(0.001, SystemClock(), stop))
+    next(ticks)
+    threading.Timer(0.05, stop.set).start()
+    assert next(ticks, None) is None
