@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 
 from zstate import errors
@@ -117,3 +119,31 @@ def test_a_wait_that_ran_out_keeps_its_reasons_class_and_facts_and_is_a_timeout(
 
 def test_each_reason_has_one_class_of_timeouts() -> None:
     assert type(timed_out(in_future(), 1.0)) is type(timed_out(in_future(), 2.0))
+
+
+def one_of_each() -> list[errors.ZStateError]:
+    late = errors.InFuture(
+        "a", "b", edge=("a", "b"), requested=5, oldest=1, newest=3, rate_hz=2.0, writer="w"
+    )
+    return [
+        errors.InvalidInput("text"),
+        errors.InsertRefused("text", reason="loop", edge=("a", "b")),
+        errors.ConfigError("text", path="robots[0]"),
+        errors.ModelError("arm.urdf", (), "text"),
+        errors.UnknownModel("pand", ("panda",), "text"),
+        errors.MessageError("text", reason="foreign"),
+        errors.Unreachable("text", endpoints=("tcp/127.0.0.1:1",)),
+        errors.PortBusy("text", endpoint="tcp/127.0.0.1:1"),
+        errors.UnknownFrame("a", "b", name="b", near_misses=("bb",)),
+        errors.Stale("a", "b", age_s=2.0, max_age_s=1.0, edge=("a", "b")),
+        late,
+        errors.timed_out(late, 0.5),
+    ]
+
+
+@pytest.mark.parametrize("error", one_of_each(), ids=lambda error: type(error).__name__)
+def test_every_error_crosses_processes_whole(error: errors.ZStateError) -> None:
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is type(error)
+    assert str(copy) == str(error)
+    assert vars(copy) == vars(error)

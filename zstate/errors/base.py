@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class ZStateError(Exception):
-    """What every error of zstate is."""
+    """What every error of zstate is. Survives pickling, so that it can cross processes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[ZStateError], texts: tuple[Any, ...], facts: dict[str, Any]) -> ZStateError:
+    # Not by the constructor, whose keyword-only facts pickle would not give it.
+    error = kind.__new__(kind)
+    error.args = texts
+    error.__dict__.update(facts)
+    return error
 
 
 class InvalidInput(ZStateError, ValueError):

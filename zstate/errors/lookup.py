@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 from zstate.errors.base import ZStateError
 
@@ -211,18 +212,25 @@ class WaitTimeout(LookupFailed, TimeoutError):
     def __str__(self) -> str:
         return f"after waiting {self.waited_s:g} s, {super().__str__()}"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        reason = next(kind for kind in type(self).__mro__ if not issubclass(kind, WaitTimeout))
+        return _restored_timeout, (reason, self.__dict__)
+
 
 @cache
 def _timeout_class(reason: type[LookupFailed]) -> type[WaitTimeout]:
     return type(f"{reason.__name__}Timeout", (WaitTimeout, reason), {"__doc__": WaitTimeout.__doc__})
 
 
+def _restored_timeout(reason: type[LookupFailed], facts: dict[str, Any]) -> WaitTimeout:
+    error = _timeout_class(reason).__new__(_timeout_class(reason))
+    error.__dict__.update(facts)
+    return error
+
+
 def timed_out(reason: LookupFailed, waited_s: float) -> WaitTimeout:
     """The same facts as ``reason``, as an error that is also a TimeoutError."""
-    error = _timeout_class(type(reason)).__new__(_timeout_class(type(reason)))
-    error.__dict__.update(reason.__dict__)
-    error.waited_s = waited_s
-    return error
+    return _restored_timeout(type(reason), {**reason.__dict__, "waited_s": waited_s})
 
 
 def _span(later: int | None, earlier: int | None) -> str:
