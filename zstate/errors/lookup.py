@@ -207,19 +207,20 @@ class Stale(LookupFailed):
 class WaitTimeout(LookupFailed, TimeoutError):
     """A wait that ran out. Always raised as a subclass of the reason it still waited for."""
 
+    reason: type[LookupFailed] = LookupFailed
     waited_s: float = 0.0
 
     def __str__(self) -> str:
         return f"after waiting {self.waited_s:g} s, {super().__str__()}"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        reason = next(kind for kind in type(self).__mro__ if not issubclass(kind, WaitTimeout))
-        return _restored_timeout, (reason, self.__dict__)
+        return _restored_timeout, (self.reason, self.__dict__)
 
 
 @cache
 def _timeout_class(reason: type[LookupFailed]) -> type[WaitTimeout]:
-    return type(f"{reason.__name__}Timeout", (WaitTimeout, reason), {"__doc__": WaitTimeout.__doc__})
+    facts = {"reason": reason, "__doc__": WaitTimeout.__doc__}
+    return type(f"{reason.__name__}Timeout", (WaitTimeout, reason), facts)
 
 
 def _restored_timeout(reason: type[LookupFailed], facts: dict[str, Any]) -> WaitTimeout:
