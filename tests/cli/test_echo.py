@@ -11,6 +11,8 @@ import pytest
 from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
 from support import DEADLINE_S, until
 
+from zstate import connect
+
 FLOATING = """
 <robot name="drone">
   <link name="world"/> <link name="body"/> <link name="arm"/>
@@ -128,6 +130,18 @@ def test_a_reader_that_leaves_ends_it_quietly():
         process.stdout.close()
         process.wait(DEADLINE_S)
         assert process.stderr.read() == b""
+
+
+def test_messages_that_are_not_ours_are_told_once_and_the_stream_goes_on(spawn: Spawn):
+    command = started(spawn, "echo", "rrbot", "--field", "elbow")
+    with standing(), connect() as stranger:
+        command.line()
+        for _ in range(3):
+            stranger.zenoh.put("zstate/rrbot/joint_states", b"hello", encoding="text/plain")
+        until(lambda: "text/plain" in command.stderr)
+        assert [command.line() for _ in range(50)] == [str(ELBOW)] * 50
+    assert command.stderr.count("text/plain") == 1
+    interrupted(command)
 
 
 def test_a_name_that_no_robot_can_have_is_refused():

@@ -9,6 +9,7 @@ from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, star
 from support import until
 
 from zstate import StaticPublisher, Transform, connect
+from zstate.cli.tf import transform_text
 
 # From the model: the shoulder stands 1.05 m above the base, the elbow 0.7 m further along the upper
 # link, each a little to the side; both turn about y, which is pitch.
@@ -38,6 +39,11 @@ def test_it_looks_as_tf2_echo_does():
         f" {-s:.3f}  0.000  {c:.3f}  {z:.3f}",
         "  0.000  0.000  0.000  1.000",
     ]
+
+
+def test_stamps_have_nine_digits_and_zeros_no_sign():
+    lines = transform_text(Transform("a", "b", (-1e-9, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 5)).splitlines()
+    assert lines[:2] == ["At time 0.000000005", "- Translation: [0.000, 0.000, 0.000]"]
 
 
 def test_json_is_one_object_for_a_program():

@@ -21,12 +21,21 @@ if TYPE_CHECKING:
 
 # A robot's description comes within milliseconds, if there is one.
 _NAMES_WITHIN_S = 1.0
+_FOREVER_S = 3600.0
 
 
 @click.command("echo")
 @click.argument("robot")
 @click.option("--once", is_flag=True, help="Print one; give up after --timeout with the reason.")
-@click.option("--timeout", type=float, callback=checked_seconds, default=10.0, metavar="S", show_default=True)
+@click.option(
+    "--timeout",
+    type=float,
+    callback=checked_seconds,
+    default=10.0,
+    metavar="S",
+    show_default=True,
+    help="How long --once waits.",
+)
 @click.option("--field", metavar="NAME", help="Only this: stamp, positions, positions.JOINT, or just JOINT.")
 @click.option("--csv", "form", flag_value="csv", help="Comma-separated values below one line of names.")
 @click.option("--json", "form", flag_value="json", help="One JSON value a line.")
@@ -49,9 +58,6 @@ def echo_command(
             tapped = tap.next(_FOREVER_S)
             if tapped is not None:
                 show(named.document(tapped))
-
-
-_FOREVER_S = 3600.0
 
 
 class Named(AbstractContextManager["Named"]):

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from zstate.cli.tap import Tap, Tapped
     from zstate.wire.keys import Stream
 
+_SETTLING_S = 0.1
+
 
 @dataclass(frozen=True, slots=True)
 class Intervals:
@@ -100,20 +102,26 @@ def hz_command(
             _follow(tap, meter, as_json=as_json)
 
 
+def _begin(tap: Tap, timeout_s: float | None) -> None:
+    """Wait for samples, and let those pass that queued up while this process was starting."""
+    tap.first(timeout_s)
+    _listen(tap, Meter(2), _SETTLING_S)
+
+
 def _measured_once(tap: Tap, meter: Meter, timeout_s: float) -> Intervals:
-    meter.note(tap.first(timeout_s))
+    _begin(tap, timeout_s)
     deadline = time.monotonic() + timeout_s
     measured = None
     while measured is None:
         if time.monotonic() > deadline:
-            fail(f"gave up after {timeout_s:g} s: one sample came, and no second one")
+            fail(f"gave up after {timeout_s:g} s: samples came, but no two to measure between")
         _listen(tap, meter, 1.0)
         measured = meter.intervals()
     return measured
 
 
 def _follow(tap: Tap, meter: Meter, *, as_json: bool) -> NoReturn:
-    meter.note(tap.first())
+    _begin(tap, None)
     silent = False
     while True:
         came = _listen(tap, meter, 1.0)
