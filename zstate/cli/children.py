@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 
 END_WITHIN_S = 0.8
@@ -17,7 +17,7 @@ class ChildCommand:
     """``zstate ARGUMENTS`` in a process of its own, which ends with this one, however that ends.
 
     Each line it says goes to ``on_line``, from a thread; ``on_end`` is called once it is gone and all
-    its lines are heard. ``last_error`` is the last line on its standard error.
+    its lines are heard. ``last_error`` is what it said last on its standard error.
     """
 
     def __init__(
@@ -25,9 +25,8 @@ class ChildCommand:
         name: str,
         arguments: Sequence[str],
         *,
-        on_line: Callable[[str], None],
         on_end: Callable[[ChildCommand], None],
-        environment: Mapping[str, str] | None = None,
+        on_line: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.name = name
         self.last_error = ""
@@ -40,8 +39,8 @@ class ChildCommand:
             text=True,
             errors="replace",
             start_new_session=True,
-            env={**os.environ, **(environment or {})},
         )
+        self.pid = self._process.pid
         self._on_line = on_line
         self._on_end = on_end
         threading.Thread(target=self._follow, name=f"zstate {name}", daemon=True).start()

@@ -41,9 +41,14 @@ def is_terminal() -> bool:
     return sys.stdout.isatty()
 
 
+def duration_or_dash(nanoseconds: int | None) -> str:
+    """A duration in words; "-" for none."""
+    return "-" if nanoseconds is None else duration_text(nanoseconds)
+
+
 def age_text(stamp: int | None, now: int) -> str:
     """How long ago an instant was, in words; "-" for none."""
-    return "-" if stamp is None else duration_text(now - stamp)
+    return duration_or_dash(None if stamp is None else now - stamp)
 
 
 def rate_text(rate_hz: float | None) -> str:

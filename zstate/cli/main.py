@@ -79,8 +79,11 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 )
 @click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version)
 @click.option("--until-eof", is_flag=True, hidden=True)
-def group(until_eof: bool) -> None:
+@click.pass_context
+def group(ctx: click.Context, until_eof: bool) -> None:
     """A robot's state wherever Zenoh reaches, without ROS."""
+    # The name under which others see what this process writes.
+    sys.argv[0] = f"zstate-{ctx.invoked_subcommand}"
     if until_eof:
         from zstate.cli.children import end_with_parent
 

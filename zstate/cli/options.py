@@ -44,6 +44,14 @@ def session_options(command: Command) -> Command:
     return with_network  # type: ignore[return-value]
 
 
+config_option = click.option(
+    "--config",
+    type=click.Path(exists=True, dir_okay=False),
+    metavar="FILE",
+    envvar="ZSTATE_CONFIG",
+    help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
+)
+
 _SESSION_OPTIONS = (
     click.option(
         "--mode",
@@ -66,13 +74,7 @@ _SESSION_OPTIONS = (
         envvar="ZSTATE_LISTEN",
         help="Where to listen, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
-    click.option(
-        "--config",
-        type=click.Path(exists=True, dir_okay=False),
-        metavar="FILE",
-        envvar="ZSTATE_CONFIG",
-        help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
-    ),
+    config_option,
 )
 
 

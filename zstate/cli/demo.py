@@ -1,0 +1,109 @@
+"""zstate demo: the whole chain, publisher process to lookup, in one command."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli.console import count_text, fail, note, say
+from zstate.cli.options import Network, load_robot, open_session, rate_option, seconds_option
+from zstate.errors import UnknownModel
+
+if TYPE_CHECKING:
+    from zstate.cli.meter import Meter
+    from zstate.model.robot import RobotModel
+
+_DEFAULT = "panda"
+_START_WITHIN_S = 20.0
+_USERS_NETWORK = ("ZENOH_CONFIG", "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG")
+
+
+@click.command("demo")
+@click.argument("robot", required=False)
+@click.option("--robot", "robot_option", metavar="ROBOT", help="The same as the argument.")
+@rate_option
+@seconds_option
+def demo_command(robot: str | None, robot_option: str | None, rate: float, seconds: float | None) -> None:
+    """Publish ROBOT (default: panda) in one process and look its transforms up in another, over Zenoh.
+
+    ROBOT is a name such as panda, or a URDF file. The two processes meet on a port of their own and
+    disturb nobody.
+    """
+    from zstate.cli.children import ChildCommand
+
+    if robot and robot_option and robot != robot_option:
+        raise click.UsageError(f"which robot, {robot!r} or {robot_option!r}?")
+    wanted = robot or robot_option or _DEFAULT
+    model, called = _load(wanted)
+    for variable in _USERS_NETWORK:
+        os.environ.pop(variable, None)
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    ended = threading.Event()
+    arguments = ["publish", wanted, "--source", "sine", "--name", called, "--rate", repr(rate)]
+    with ChildCommand(
+        "publisher", [*arguments, "--connect", endpoint], on_end=lambda _: ended.set()
+    ) as publisher:
+        size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"
+        say(f"{called} ({size}): process {publisher.pid} publishes it at {rate:g} Hz, this one looks it up")
+        _look(endpoint, model, called, ended, seconds)
+        if ended.is_set():
+            fail(f"the publisher ended with exit code {publisher.exit_code}: {publisher.last_error}")
+
+
+def _load(robot: str) -> tuple[RobotModel, str]:
+    from zstate.cli.showcase import telling_links
+
+    try:
+        model, called = load_robot(robot, None)
+    except UnknownModel as error:
+        fail(f"{error}; `zstate demo rrbot` works with what is here")
+    if not telling_links(model):
+        fail(f"no link of {called!r} moves: there is nothing to show; `zstate check` shows its links")
+    return model, called
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _look(
+    endpoint: str, model: RobotModel, robot: str, ended: threading.Event, seconds: float | None
+) -> None:
+    from zstate.cli.demo_table import DemoTable
+    from zstate.cli.meter import Meter
+    from zstate.cli.showcase import telling_links
+    from zstate.listener import TransformListener
+
+    links = telling_links(model)
+    with (
+        open_session(Network(listen=(endpoint,))) as session,
+        TransformListener(session, robot) as listener,
+        Meter(listener.buffer, f"{robot}/{model.root}", f"{robot}/{links[0]}") as meter,
+    ):
+        note(f"waiting for {robot!r} ...")
+        if not _has_begun(meter, ended):
+            return
+        note(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
+        table = DemoTable(listener, meter, robot, model.root, links)
+        try:
+            table.show(ended, seconds)
+        finally:
+            say(table.summary())
+
+
+def _has_begun(meter: Meter, ended: threading.Event) -> bool:
+    """Wait for the first answer; False when the publisher ended instead."""
+    deadline = time.monotonic() + _START_WITHIN_S
+    while not meter.has_begun.wait(0.1):
+        if ended.is_set():
+            return False
+        if time.monotonic() > deadline:
+            fail(f"nothing of the publisher was heard in {_START_WITHIN_S:g} s")
+    return True

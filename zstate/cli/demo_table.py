@@ -1,0 +1,147 @@
+"""What the demo shows: a live table for a person, a line a second for a file."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from math import degrees
+from typing import TYPE_CHECKING, NamedTuple
+
+from zstate.cli.console import count_text, duration_or_dash, is_terminal, say
+from zstate.cli.meter import Meter
+from zstate.errors import LookupFailed, duration_text
+from zstate.listener import TransformListener
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from zstate.transform import Transform
+
+_REFRESH_S = 0.1
+# The rate shown is that of so many refreshes.
+_WINDOW = 10
+
+
+class Row(NamedTuple):
+    """One transform and how fresh it is [ns]."""
+
+    transform: Transform
+    age: int
+
+
+class Count(NamedTuple):
+    """How many samples had come at a time of the monotonic clock [s]."""
+
+    time_s: float
+    received: int
+
+
+class DemoTable:
+    """A few transforms of ``robot`` with their rate, latency and age."""
+
+    def __init__(
+        self, listener: TransformListener, meter: Meter, robot: str, root: str, links: Sequence[str]
+    ) -> None:
+        self._listener = listener
+        self._meter = meter
+        self._robot = robot
+        self._root = root
+        self._links = links
+        self._counts = deque([self._count()], maxlen=_WINDOW + 1)
+        self._begun = self._counts[0]
+
+    def show(self, ended: threading.Event, seconds: float | None) -> None:
+        """Until ``ended``, or for ``seconds``."""
+        from rich.live import Live
+
+        until = float("inf") if seconds is None else time.monotonic() + seconds
+        if not is_terminal():
+            while not _is_over(ended, until, 1.0):
+                self._counts.append(self._count())
+                say(self.line())
+            return
+        with Live(self.table(), auto_refresh=False) as live:
+            while not _is_over(ended, until, _REFRESH_S):
+                self._counts.append(self._count())
+                live.update(self.table(), refresh=True)
+
+    def summary(self) -> str:
+        """What was received since the beginning."""
+        stats, now = self._listener.stats, self._count()
+        received = count_text(now.received - self._begun.received, "sample")
+        seconds = now.time_s - self._begun.time_s
+        latency = duration_or_dash(self._meter.latency_ns(recent=False))
+        return (
+            f"{received} received in {seconds:.1f} s: {_rate(self._begun, now):.2f} Hz, "
+            f"{stats.missed + stats.dropped} missed, median latency {latency} from stamp to lookup"
+        )
+
+    @property
+    def _freshness(self) -> str:
+        latency = duration_or_dash(self._meter.latency_ns(recent=True))
+        return f"{_rate(self._counts[0], self._counts[-1]):.1f} Hz, {latency} from stamp to lookup"
+
+    def _count(self) -> Count:
+        return Count(time.monotonic(), self._listener.stats.received)
+
+    def rows(self) -> list[Row]:
+        """The transforms now; those that have no answer yet are left out."""
+        rows: list[Row] = []
+        for link in self._links:
+            try:
+                transform = self._listener.buffer.lookup(
+                    f"{self._robot}/{self._root}", f"{self._robot}/{link}"
+                )
+            except LookupFailed:
+                continue
+            assert transform.stamp is not None
+            rows.append(Row(transform, time.time_ns() - transform.stamp))
+        return rows
+
+    def table(self) -> Table:
+        """For a terminal."""
+        from rich import box
+        from rich.table import Table
+
+        # Narrow enough for 80 columns; what holds for all rows stands below them.
+        table = Table(
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
+            caption=self._freshness,
+            caption_style="",
+            caption_justify="left",
+        )
+        table.add_column(f"pose in {self._root}", style="bold", overflow="fold")
+        for title in (r"x       y       z \[m]", r"roll   pitch  yaw \[deg]", "age"):
+            table.add_column(title, justify="right", no_wrap=True)
+        for row in self.rows():
+            xyz = " ".join(f"{value:7.3f}" for value in row.transform.translation)
+            rpy = " ".join(f"{degrees(angle):6.1f}" for angle in row.transform.rpy)
+            table.add_row(_link(row), xyz, rpy, duration_text(row.age))
+        return table
+
+    def line(self) -> str:
+        """The first transform on one line."""
+        text = self._freshness
+        for row in self.rows()[:1]:
+            xyz = ", ".join(f"{value:.3f}" for value in row.transform.translation)
+            rpy = ", ".join(f"{degrees(angle):.1f}" for angle in row.transform.rpy)
+            text += f"; {_link(row)} in {self._root}: xyz [{xyz}] m, rpy [{rpy}] deg"
+        return text
+
+
+def _link(row: Row) -> str:
+    return row.transform.source.partition("/")[2]
+
+
+def _rate(then: Count, now: Count) -> float:
+    span_s = now.time_s - then.time_s
+    return (now.received - then.received) / span_s if span_s > 0.0 else 0.0
+
+
+def _is_over(ended: threading.Event, until: float, pause_s: float) -> bool:
+    """Pause, then tell whether that was it."""
+    pause_s = min(pause_s, max(0.0, until - time.monotonic()))
+    return ended.wait(pause_s) or time.monotonic() >= until

@@ -1,0 +1,37 @@
+"""zstate router: a place where clients and other routers meet."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import click
+
+from zstate.cli.console import note, say
+from zstate.cli.options import Network, config_option, open_session
+
+
+@click.command("router")
+@click.option(
+    "--listen",
+    multiple=True,
+    metavar="ENDPOINT",
+    help="Where clients come to; default: tcp/127.0.0.1:7447. May be repeated.",
+)
+@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router to join; may be repeated.")
+@config_option
+def router_command(listen: tuple[str, ...], connect: tuple[str, ...], config: str | None) -> None:
+    """Run a Zenoh router until Ctrl-C.
+
+    By default it serves this host alone; `--listen tcp/0.0.0.0:7447` opens it to the network. Other
+    commands reach it with `--mode client --connect tcp/HOST:7447`.
+    """
+    from zstate.net.config import CONFIG_VARIABLE, ROUTER_ENDPOINT
+
+    file = config or os.environ.get(CONFIG_VARIABLE)
+    where = listen or (() if file else (ROUTER_ENDPOINT,))
+    with open_session(Network("router", connect, where, config)) as session:
+        say(f"router {session.zid} listens at {', '.join(where) or f'what {file!r} says'}")
+        if where == (ROUTER_ENDPOINT,):
+            note("it serves this host alone; --listen tcp/0.0.0.0:7447 opens it to the network")
+        threading.Event().wait()
