@@ -3,6 +3,10 @@
 # docker build --target test .                          runs the tests
 # docker run --rm --network host zstate tf panda_link0 panda_hand
 
+FROM python:3.12-slim AS base
+# Pinocchio's wheel takes OpenMP from the system, and slim images have none.
+RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
+
 FROM python:3.12-slim AS build
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
@@ -10,12 +14,12 @@ COPY zstate zstate
 COPY models models
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
 
-FROM python:3.12-slim AS test
+FROM base AS test
 WORKDIR /src
 COPY . .
 RUN python3 -m venv .venv && .venv/bin/pip install -q -e '.[robots,test]' && .venv/bin/python -m pytest
 
-FROM python:3.12-slim AS runtime
+FROM base AS runtime
 ARG EXTRAS=""
 COPY --from=build /wheels /wheels
 RUN pip install --no-cache-dir "$(echo /wheels/zstate-*.whl)${EXTRAS:+[$EXTRAS]}"
