@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Literal
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import Clock
+from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.following.edges import EdgeFollower
 from zstate.following.follower import Follower
@@ -25,7 +25,7 @@ from zstate.wire.wires import wire_named
 Follow = Literal["joint_states", "tf"]
 
 
-class TransformListener:
+class TransformListener(Closing):
     """Fills ``buffer`` with what a robot's publishers say; ``robot="*"`` follows every robot.
 
     Frames are called ``robot/frame`` in the buffer, and answer to their bare names while those are
@@ -69,14 +69,6 @@ class TransformListener:
         opening.enter_context(watch(session, robot, self._on_writer))
         key = expression(robot, self._follow)
         opening.enter_context(StreamSubscriber(session, key, self._on_samples))
-
-    def __enter__(self) -> TransformListener:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def stats(self) -> Stats:

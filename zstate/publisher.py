@@ -6,12 +6,12 @@ import secrets
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
@@ -39,7 +39,7 @@ STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_descrip
 Positions = ArrayLike | Mapping[str, float | Sequence[float]]
 
 
-class StatePublisher:
+class StatePublisher(Closing):
     """Publishes the state of one robot: each sample is the whole robot at one instant.
 
     Whoever joins, at any time, is given the model (``robot_description``) and its fixed edges
@@ -76,14 +76,6 @@ class StatePublisher:
             for stream in streams:
                 opening.enter_context(announce(session, self.robot, stream, writer))
             self._opened = opening.pop_all()
-
-    def __enter__(self) -> StatePublisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def description(self) -> RobotDescription:
         """What late joiners are told of the robot."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import secrets
 import threading
 from contextlib import ExitStack, suppress
-from types import TracebackType
 from urllib.parse import quote
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import Writer, announce
@@ -19,7 +19,7 @@ from zstate.wire.messages import StaticTransforms, to_block
 from zstate.wire.wires import wire_named
 
 
-class StaticPublisher:
+class StaticPublisher(Closing):
     """Publishes static edges under one writer's name; several writers of a robot coexist.
 
     Bare frame names are the robot's own; other frames are named in full, ``robot/frame``. All edges
@@ -46,14 +46,6 @@ class StaticPublisher:
             self._latched = opening.enter_context(LatchedPublisher(session, key, encoding))
             opening.enter_context(announce(session, robot, "tf_static", identity))
             self._opened = opening.pop_all()
-
-    def __enter__(self) -> StaticPublisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.

@@ -6,10 +6,10 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
 
 from zstate import se3
 from zstate.buffer.waiting import Waiter, WaitingRoom
+from zstate.closing import Closing
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.transform import Transform
 
@@ -17,7 +17,7 @@ Look = Callable[[Waiter], Transform | LookupFailed]
 """The newest answer, the waiter told what would be newer; or why there is none."""
 
 
-class Watch:
+class Watch(Closing):
     """Calls ``callback(transform)`` with each newest transform of a pair, until closed.
 
     With ``translation_m`` or ``rotation_rad``, only once the source has moved so far or turned so far in
@@ -47,14 +47,6 @@ class Watch:
         self._seat = ExitStack()
         self._waiter = self._seat.enter_context(room.seat(self._look))
         self._look()
-
-    def __enter__(self) -> Watch:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """No more calls. A second call does nothing."""

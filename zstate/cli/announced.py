@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import announced_text, fail, unknown_robot
+from zstate.closing import Closing
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo, Writer
@@ -28,7 +27,7 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     return wanted
 
 
-class Roster(AbstractContextManager["Roster"]):
+class Roster(Closing):
     """The robots that are announced now, kept up to date."""
 
     def __init__(self, session: Session) -> None:
@@ -37,9 +36,7 @@ class Roster(AbstractContextManager["Roster"]):
         self._writers: set[tuple[str, Stream, Writer]] = set()
         self._watch = watch(session, "*", self._note)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._watch.close()
 
     def _note(self, robot: str, stream: Stream, writer: Writer, alive: bool) -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from threading import Event
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from zstate.cli.console import note, say
 from zstate.cli.options import Network, checked_seconds, open_session, session_options
+from zstate.closing import Closing
 from zstate.errors import MessageError
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def echo_command(
                 show(named.document(tapped))
 
 
-class Named(AbstractContextManager["Named"]):
+class Named(Closing):
     """Names the joints in samples of ``robot``, once it has been described."""
 
     def __init__(self, session: Session, robot: str) -> None:
@@ -76,9 +75,7 @@ class Named(AbstractContextManager["Named"]):
         key = self._wire.expression(robot, "robot_description")
         self._subscriber = LatchedSubscriber(session, key, self._describe)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._subscriber.close()
 
     def _describe(self, key: str, payload: bytes | None, encoding: str) -> None:

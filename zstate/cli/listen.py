@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import asdict
 from threading import Event
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import click
@@ -14,6 +13,7 @@ import click
 from zstate.cli.announced import Roster
 from zstate.cli.console import announced_text, note, say, say_json
 from zstate.cli.options import Network, open_session, session_options
+from zstate.closing import Closing
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def listen_command(network: Network, robot: str, as_json: bool) -> None:
             ears.open_new()
 
 
-class Ears(AbstractContextManager["Ears"]):
+class Ears(Closing):
     """A listener for each robot that is wanted and announced, opened when it appears."""
 
     def __init__(self, session: Session, roster: Roster, robot: str) -> None:
@@ -63,9 +63,7 @@ class Ears(AbstractContextManager["Ears"]):
         self._ears: dict[str, tuple[TransformListener, MeteredBuffer]] = {}
         self._opened = ExitStack()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._opened.close()
 
     def open_new(self) -> None:

@@ -35,9 +35,16 @@ def session_options(command: Command) -> Command:
 
     @functools.wraps(command)
     def with_network(
-        *, mode: str, connect: tuple[str, ...], listen: tuple[str, ...], config: str | None, **options: Any
+        *,
+        mode: str | None,
+        connect: tuple[str, ...],
+        listen: tuple[str, ...],
+        config: str | None,
+        **options: Any,
     ) -> Any:
-        return command(network=Network(mode, connect, listen, config), **options)
+        # Whoever only says where to connect means a router, and peers do not pass on what others say.
+        chosen = mode or ("client" if connect and not listen and not config else "peer")
+        return command(network=Network(chosen, connect, listen, config), **options)
 
     for option in reversed(_SESSION_OPTIONS):
         with_network = option(with_network)
@@ -56,9 +63,8 @@ _SESSION_OPTIONS = (
     click.option(
         "--mode",
         type=click.Choice(["peer", "client", "router"]),
-        default="peer",
         envvar="ZSTATE_MODE",
-        help="How to join the network; peer needs no router.",
+        help="How to join the network; default: client with --connect alone, else peer.",
     ),
     click.option(
         "--connect",

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import queue
 import time
-from contextlib import AbstractContextManager
-from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.cli.announced import Roster
 from zstate.cli.console import fail, note
+from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.net.streams import Arrival, StreamSubscriber
 from zstate.wire.keys import Stream, check_robot
@@ -30,7 +29,7 @@ class Tapped(NamedTuple):
     sample: Sample
 
 
-class Tap(AbstractContextManager["Tap"]):
+class Tap(Closing):
     """Hears ``stream`` of ``robot``. Messages that are not ours are noted, the first of each kind."""
 
     def __init__(self, session: Session, robot: str, stream: Stream) -> None:
@@ -43,11 +42,9 @@ class Tap(AbstractContextManager["Tap"]):
         key = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, key, self._take)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._subscriber.close()
-        self._roster.__exit__(None, None, None)
+        self._roster.close()
 
     def _take(self, arrivals: list[Arrival]) -> None:
         came = time.monotonic_ns()

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import TracebackType
 
 import zenoh
 
+from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
@@ -18,7 +18,7 @@ CAPACITY = 4096
 HEARTBEAT_S = 0.5
 
 
-class LatchedPublisher:
+class LatchedPublisher(Closing):
     """Keeps one value on one key for everybody, now and later, as long as this publisher lives.
 
     When it closes or dies, later joiners do not get the value any more; those who have it keep it,
@@ -39,14 +39,6 @@ class LatchedPublisher:
             ),
             publisher_detection=True,
         )
-
-    def __enter__(self) -> LatchedPublisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def set(self, payload: bytes) -> None:
         """Replace the value, for everybody. An empty one is InvalidInput. Raises Closed."""
@@ -71,7 +63,7 @@ class LatchedPublisher:
         self._session.release(self._publisher)
 
 
-class LatchedSubscriber:
+class LatchedSubscriber(Closing):
     """Hears the present value of every matching key, then each change.
 
     ``on_value(key, payload, encoding)`` is called from one thread of this subscriber; the payload is
@@ -95,14 +87,6 @@ class LatchedSubscriber:
             recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
         self._receiver = Receiver(session, subscriber, hand_over, CAPACITY)
-
-    def __enter__(self) -> LatchedSubscriber:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def failures(self) -> int:

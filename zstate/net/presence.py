@@ -9,12 +9,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import get_args
 from urllib.parse import quote, unquote
 
 import zenoh
 
+from zstate.closing import Closing
 from zstate.errors import InvalidInput
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
@@ -67,20 +67,12 @@ class RobotInfo:
     writers: tuple[tuple[Stream, Writer], ...]
 
 
-class Announcement:
+class Announcement(Closing):
     """The token of one writer, there until closed or until its process ends."""
 
     def __init__(self, session: Session, token: zenoh.LivelinessToken) -> None:
         self._session = session
         self._token = token
-
-    def __enter__(self) -> Announcement:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Say that this writer is gone. A second call does nothing."""
@@ -127,7 +119,7 @@ def _by_robot(found: set[tuple[str, Stream, Writer]]) -> tuple[RobotInfo, ...]:
     )
 
 
-class Watch:
+class Watch(Closing):
     """Follows the writers of ``robot`` ("*": of all robots), those already there included.
 
     ``callback(robot, stream, writer, alive)`` is called from one thread. Losing the last router takes
@@ -142,14 +134,6 @@ class Watch:
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         tokens = session.zenoh.liveliness().declare_subscriber(writer_expression(robot), ring, history=True)
         self._receiver = Receiver(session, tokens, self._hand_over, CAPACITY)
-
-    def __enter__(self) -> Watch:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _hand_over(self, batch: list[zenoh.Sample]) -> None:
         for sample in batch:

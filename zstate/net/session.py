@@ -11,11 +11,11 @@ import re
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from types import TracebackType
 from typing import Any, Protocol
 
 import zenoh
 
+from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, NetworkError, PortBusy, Unreachable
 from zstate.net.config import (
     ANY_LOOPBACK_PORT,
@@ -134,7 +134,7 @@ class Undeclarable(Protocol):
     def undeclare(self) -> Any: ...
 
 
-class Session:
+class Session(Closing):
     """A place on the network. Made by ``connect``; a context manager.
 
     Safe to use from any thread, but not in a process forked from the one that connected.
@@ -150,14 +150,6 @@ class Session:
 
     def __repr__(self) -> str:
         return f"Session({self.zid}{', closed' if self._closed else ''})"
-
-    def __enter__(self) -> Session:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def zenoh(self) -> zenoh.Session:

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import TracebackType
 
 import zenoh
 
+from zstate.closing import Closing
 from zstate.errors import Closed
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
@@ -20,7 +20,7 @@ Arrival = tuple[str, bytes, str]
 """Key, payload and encoding of one sample."""
 
 
-class StreamPublisher:
+class StreamPublisher(Closing):
     """Puts samples on one key. Under congestion samples are dropped rather than the writer delayed."""
 
     def __init__(self, session: Session, key: str, encoding: str) -> None:
@@ -33,14 +33,6 @@ class StreamPublisher:
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=False,
         )
-
-    def __enter__(self) -> StreamPublisher:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def has_readers(self) -> bool:
@@ -61,7 +53,7 @@ class StreamPublisher:
         self._session.release(self._publisher)
 
 
-class StreamSubscriber:
+class StreamSubscriber(Closing):
     """Hears a key expression; ``on_samples`` gets all that waits as a list, oldest first.
 
     It is called from one thread of this subscriber. See ``Receiver`` for what happens when it is
@@ -88,14 +80,6 @@ class StreamSubscriber:
         self._receiver = Receiver(
             session, session.zenoh.declare_subscriber(keyexpr, ring), hand_over, capacity
         )
-
-    def __enter__(self) -> StreamSubscriber:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     @property
     def full_batches(self) -> int:

@@ -6,8 +6,8 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Iterator
-from types import TracebackType
 
+from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ZStateError
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
@@ -24,7 +24,7 @@ _LOG = logging.getLogger("zstate")
 _CAPACITY = 1024
 
 
-class SubscribedSource:
+class SubscribedSource(Closing):
     """The ``joint_states`` of ``robot``, as they come in: ``for reading in source: ...``
 
     ``read`` gives the newest one that has not been read. Iteration ends with ``close()``. Samples that
@@ -90,14 +90,6 @@ class SubscribedSource:
                     return
                 reading = self._readings.popleft()
             yield reading
-
-    def __enter__(self) -> SubscribedSource:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop listening; iterations end."""

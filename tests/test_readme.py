@@ -1,0 +1,122 @@
+"""The README is executed: each of its blocks runs here, or in .ci/run."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from support import DEADLINE_S, Child
+
+README = Path(__file__).parent.parent / "README.md"
+TEXT = README.read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+
+
+PROGRAMS = {block.split("\n", 1)[0].removeprefix("# "): block for block in blocks("python")}
+
+
+def commands() -> list[list[str]]:
+    """Every ``$ zstate ...`` line, without its comment."""
+    lines = [line for block in blocks("console") for line in block.splitlines()]
+    return [line.split("#")[0].split()[1:] for line in lines]
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[[list[str]], subprocess.Popen[str]]]:
+    started: list[subprocess.Popen[str]] = []
+
+    def run(command: list[str]) -> subprocess.Popen[str]:
+        assert command[0] == "zstate"
+        arguments = [sys.executable, "-u", "-m", "zstate", *command[1:]]
+        started.append(subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def test_every_python_block_is_a_named_program_that_is_run_below() -> None:
+    assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py"}
+
+
+def test_the_publisher_and_the_lookup_find_each_other_in_two_processes(
+    spawn: Callable[..., Child],
+) -> None:
+    spawn(PROGRAMS["publish.py"])
+    lookup = spawn(PROGRAMS["lookup.py"])
+    assert lookup.line().startswith("<pose of tool in world at ")
+    assert lookup.wait() == 0, lookup.stderr
+
+
+def test_the_publisher_has_twelve_lines_and_the_lookup_five() -> None:
+    def lines_of(name: str) -> int:
+        return sum(1 for line in PROGRAMS[name].splitlines() if line.strip() and not line.startswith("#"))
+
+    assert lines_of("publish.py") <= 12
+    assert lines_of("lookup.py") <= 5
+
+
+def test_the_driver_keeps_its_rate(spawn: Callable[..., Child]) -> None:
+    driver = spawn(PROGRAMS["driver.py"])
+    assert "commanded_hz=500.0" in driver.line()
+    assert driver.wait() == 0, driver.stderr
+
+
+def test_the_buffer_answers_without_a_network(spawn: Callable[..., Child]) -> None:
+    buffer = spawn(PROGRAMS["buffer.py"])
+    assert "500.0 ms after the newest sample of 'map' -> 'base'" in buffer.line()
+    assert buffer.wait() == 0, buffer.stderr
+
+
+@pytest.mark.robots
+def test_the_three_terminals_show_the_hand(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
+    joints, publish, tf = commands()[:3]
+    first, second, third = start(joints), start(publish), start(tf)
+    lines: list[str] = []
+    assert third.stdout
+    for line in third.stdout:
+        lines.append(line)
+        if "Translation" in line:
+            break
+    assert any(line.startswith("At time ") for line in lines), lines
+    for process in (third, second, first):
+        process.send_signal(signal.SIGINT)
+        process.wait(DEADLINE_S)
+        assert "Traceback" not in process.communicate()[1]
+
+
+@pytest.mark.robots
+def test_the_commands_for_routers_work_with_this_host_in_place_of_another(
+    start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
+) -> None:
+    router, publish, tf = (
+        [re.sub(r"tcp/[\d.]+:\d+", f"tcp/127.0.0.1:{free_port}", word) for word in command]
+        for command in commands()[3:6]
+    )
+    running = start(router)
+    assert running.stdout
+    assert str(free_port) in running.stdout.readline()
+    start(publish)
+    once = start([*tf, "--once"])
+    output, errors = once.communicate(timeout=DEADLINE_S)
+    assert once.returncode == 0, errors
+    assert "At time " in output
+
+
+def test_every_command_of_the_table_exists() -> None:
+    named = set(re.findall(r"`zstate (\w+)", TEXT))
+    listed = subprocess.run(
+        [sys.executable, "-m", "zstate", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    known = set(re.findall(r"^  (\w+) ", listed, re.MULTILINE))
+    assert named <= known, named - known
