@@ -7,6 +7,7 @@ ZStateError
 │   └── ConfigError                    a configuration file or option             .path
 ├── ModelError (ValueError)            a robot model that cannot be used          .source .findings
 │   └── UnknownModel                   no model of that name                      .name .near_misses
+├── LibraryMissing (ImportError)       something to install first
 ├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
 ├── NetworkError                       Zenoh said no
 │   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
@@ -32,6 +33,7 @@ from zstate.errors.base import (
     FrameMismatch,
     InsertRefused,
     InvalidInput,
+    LibraryMissing,
     MessageError,
     ModelError,
     NetworkError,
@@ -65,6 +67,7 @@ __all__ = [
     "InPast",
     "InsertRefused",
     "InvalidInput",
+    "LibraryMissing",
     "LookupFailed",
     "MessageError",
     "ModelError",

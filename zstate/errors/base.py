@@ -92,6 +92,10 @@ class UnknownModel(ModelError):
         self.near_misses = tuple(near_misses)
 
 
+class LibraryMissing(ZStateError, ImportError):
+    """A library that this call needs cannot be loaded; the text says what to install."""
+
+
 class MessageError(ZStateError, ValueError):
     """Bytes that are not a message we can read.
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, LibraryMissing
 from zstate.model.edges import EdgeForm, EdgeTable, Floats
 from zstate.model.robot import RobotModel
 
@@ -93,10 +93,7 @@ class _Solver:
     """
 
     def __init__(self, model: RobotModel, forms: tuple[EdgeForm, ...]) -> None:
-        # Imported here because edge_poses needs none of it; it comes without types.
-        import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
-
-        self._pin: Any = pinocchio
+        self._pin = _pinocchio()
         self._model: Any = self._pin.Model()
         self._joint_ids: dict[EdgeForm, int] = {}
         self._add_links(model, forms)
@@ -245,3 +242,15 @@ def _quaternions(rotations: Floats) -> Floats:
     largest: NDArray[np.intp] = products[:, ::5].argmax(axis=1)
     rows = products.reshape(-1, 4, 4)[np.arange(len(largest)), largest]
     return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]
+
+
+def _pinocchio() -> Any:
+    # Imported here because edge_poses needs none of it; it comes without types.
+    try:
+        import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
+    except ImportError as error:
+        raise LibraryMissing(
+            f"link poses and twists need Pinocchio, which cannot be loaded: {error}; "
+            "its wheel wants the system's OpenMP: apt-get install libgomp1"
+        ) from error
+    return pinocchio
