@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -89,6 +90,9 @@ def open_session(network: Network) -> Generator[Session]:
     """A session as the options say. Warnings of the library go to standard error from now on."""
     from zstate.cli.connecting import connect_interruptibly
 
+    configured = network.config or os.environ.get("ZENOH_CONFIG")
+    if network.mode == "client" and not network.connect and not configured:
+        raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
     with connect_interruptibly(network.config, network.mode, network.connect, network.listen) as session:
         yield session
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from zstate.buffer.buffer import TransformBuffer
 from zstate.cli.config_file import ConfigFile, NetworkSection, RobotSection, RouterSection
 from zstate.cli.options import load_robot
 from zstate.errors import ConfigError, InvalidInput, ModelError
 from zstate.model.catalog import is_path
-from zstate.wire.keys import check_robot
+from zstate.transform import Transform
+from zstate.wire.keys import check_robot, full_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +57,27 @@ def _checked(robot: RobotSection, place: str, file: Path) -> tuple[str, str]:
 
 
 def _static_options(config: ConfigFile, names: list[str], file: Path) -> tuple[str, ...]:
+    known = ", ".join(map(repr, names)) or "none"
+    default = names[0] if len(names) == 1 else None
+    check = TransformBuffer()
     for number, static in enumerate(config.static):
         place = f"static[{number}]"
-        if static.owner is None and len(names) != 1:
-            known = ", ".join(map(repr, names)) or "none"
+        owner = static.owner or default
+        if owner is None:
             raise ConfigError(
                 f"{file}: {place}: whose edge is this? Add robot = (in this file: {known})", path=place
             )
         try:
-            check_robot(static.owner or names[0])
+            check.insert_static(_in_full(check_robot(owner), static.transform()))
         except InvalidInput as error:
             raise ConfigError(f"{file}: {place}: {error}", path=place) from None
-    return ("--robot", names[0]) if len(names) == 1 else ()
+    return () if default is None else ("--robot", default)
+
+
+def _in_full(robot: str, edge: Transform) -> Transform:
+    return Transform(
+        full_name(robot, edge.target), full_name(robot, edge.source), edge.translation, edge.rotation
+    )
 
 
 def _router_arguments(router: RouterSection) -> tuple[str, ...]:

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import os
+import re
+import signal
+
+import pytest
+from looking import RRBOT, Spawn, failure, interrupted, started, zstate
+from support import Child, until
+
+from zstate import load_model
+from zstate.cli.showcase import telling_links
+
+
+def publisher_of(demo: Child) -> int:
+    match = re.search(r"process (\d+) publishes it", demo.line())
+    assert match
+    return int(match[1])
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def test_it_shows_transforms_and_ends_with_a_summary():
+    said = zstate("demo", RRBOT, "--seconds", "1.5", "--rate", "50").stdout.decode()
+    first, *lines, summary = said.splitlines()
+    assert first.startswith("rrbot (2 joints, 7 links): process ")
+    assert "lower in world: xyz [" in lines[0]
+    assert re.fullmatch(
+        r"\d+ samples received in 1\.5 s: [\d.]+ Hz, \d+ missed, "
+        r"median latency [\d.]+ [mu]s from stamp to lookup",
+        summary,
+    )
+    assert "\x1b" not in said
+
+
+def test_ctrl_c_ends_both_processes_with_the_summary(spawn: Spawn):
+    demo = started(spawn, "demo", "--robot", RRBOT)
+    publisher = publisher_of(demo)
+    demo.line()
+    interrupted(demo)
+    assert "received in" in demo.line()
+    until(lambda: is_gone(publisher))
+
+
+def test_a_publisher_that_dies_ends_the_demo(spawn: Spawn):
+    demo = started(spawn, "demo", RRBOT)
+    publisher = publisher_of(demo)
+    demo.line()
+    os.kill(publisher, signal.SIGKILL)
+    assert demo.wait() == 1
+    assert "the publisher ended with exit code -9" in demo.stderr
+
+
+def test_a_publisher_does_not_outlive_a_demo_that_is_killed(spawn: Spawn):
+    demo = started(spawn, "demo", RRBOT)
+    publisher = publisher_of(demo)
+    demo.line()
+    demo.kill()
+    until(lambda: is_gone(publisher))
+
+
+def test_it_is_alone_with_its_publisher_wherever_the_user_is(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZENOH_CONFIG", "/nowhere.json5")
+    monkeypatch.setenv("ZSTATE_MODE", "client")
+    assert zstate("demo", RRBOT, "--seconds", "0.5").returncode == 0
+
+
+def test_an_unknown_robot_is_told_with_one_that_always_works():
+    assert "`zstate demo rrbot`" in failure("demo", "no_such_robot")
+
+
+def test_the_links_shown_are_ends_of_branches_and_links_on_the_way():
+    # Both wheels turn on the base; the camera and the laser are fixed on the lower link.
+    assert telling_links(load_model("diffbot")) == ("left_wheel", "right_wheel")
+    assert telling_links(load_model("rrbot")) == ("lower", "upper")
+
+
+def test_a_robot_without_joints_has_nothing_to_show():
+    assert telling_links(load_model("<robot name='stone'><link name='stone'/></robot>")) == ()

@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from looking import RRBOT, Spawn, failure, interrupted, started, zstate
+
+from zstate import connect, load_model
+from zstate.cli.main import group
+from zstate.sources import SubscribedSource
+
+COMMANDS = [
+    "demo",
+    "publish",
+    "joints",
+    "static",
+    "tf",
+    "tree",
+    "ls",
+    "listen",
+    "echo",
+    "hz",
+    "check",
+    "router",
+    "up",
+]
+
+
+def await_samples() -> None:
+    """Until two samples of the RRBot have come in."""
+    with connect() as session, SubscribedSource(session, load_model(RRBOT)) as source:
+        readings = iter(source)
+        assert next(readings).stamp != next(readings).stamp
+
+
+def test_help_names_every_command_and_imports_nothing_heavy():
+    code = (
+        "import sys, contextlib\n"
+        "from zstate.cli.main import group\n"
+        "group.main(['--help'], standalone_mode=False)\n"
+        "print({'numpy', 'zenoh', 'pinocchio', 'rich', 'msgspec'} & set(sys.modules))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines()[-1] == "set()"
+    for command in COMMANDS:
+        assert f"  {command} " in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help(command: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", sys.argv.copy())
+    outcome = CliRunner().invoke(group, [command, "--help"])
+    assert outcome.exit_code == 0
+    assert "--help" in outcome.output
+
+
+def test_a_mistyped_command_is_met_with_the_nearest():
+    message = failure("jonts", code=2)
+    assert "there is no command 'jonts'; did you mean 'joints'?" in message
+
+
+def test_wrong_usage_is_told_in_words_with_code_2():
+    assert "--rate" in failure("joints", RRBOT, "--rate", "0", code=2)
+    assert "nan" in failure("joints", RRBOT, "--rate", "nan", code=2)
+    assert "-1" in failure("publish", RRBOT, "--rate", "-1", code=2)
+    assert "-2" in failure("joints", RRBOT, "--seconds", "-2", code=2)
+    assert "--connect" in failure("joints", RRBOT, "--mode", "client", code=2)
+
+
+def test_an_unknown_robot_is_told_with_near_misses():
+    message = failure("joints", "rrbott")
+    assert message.startswith("zstate: ")
+    assert "did you mean 'rrbot'" in message
+
+
+def test_an_endpoint_that_is_none_is_told_with_the_right_form():
+    assert "tcp/10.0.0.1:7447" in failure("joints", RRBOT, "--connect", "10.0.0.1")
+
+
+def test_a_name_that_cannot_be_a_key_is_told_with_the_option_to_change_it():
+    message = failure("joints", RRBOT, "--name", "left/arm")
+    assert "'/'" in message
+    assert "--name" in message
+
+
+def test_a_router_that_does_not_answer_is_named(free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    assert endpoint in failure("joints", RRBOT, "--mode", "client", "--connect", endpoint)
+
+
+def test_ctrl_c_ends_also_the_wait_for_a_router(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    child = spawn(
+        "import zstate.cli.connecting as c\n"
+        "connect = c.connect\n"
+        "def told(*given, **named):\n"
+        "    print('connecting', flush=True)\n"
+        "    return connect(*given, **named)\n"
+        "c.connect = told\n"
+        "from zstate.cli.main import main; main()",
+        *("joints", RRBOT, "--mode", "client", "--connect", endpoint),
+    )
+    assert child.line() == "connecting"
+    interrupted(child)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_being_asked_to_end_is_in_order_too(spawn: Spawn, number: signal.Signals):
+    child = started(spawn, "joints", RRBOT)
+    child.line()
+    await_samples()
+    began = time.monotonic()
+    child.process.send_signal(number)
+    assert child.wait() == 128 + number
+    assert time.monotonic() - began < 1.0
+    assert " samples; commanded 100 Hz" in child.line()
+    assert "Traceback" not in child.stderr
+
+
+def test_the_session_options_are_read_from_the_environment(monkeypatch: pytest.MonkeyPatch, free_port: int):
+    monkeypatch.setenv("ZSTATE_MODE", "client")
+    monkeypatch.setenv("ZSTATE_CONNECT", f"tcp/127.0.0.1:{free_port}")
+    assert str(free_port) in failure("joints", RRBOT)
+
+
+def test_a_reader_that_goes_away_ends_a_command_quietly():
+    command = [sys.executable, "-m", "zstate", "check", RRBOT]
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    ended = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write_end)
+    assert ended.stderr == ""
+
+
+def test_the_version_is_the_packages():
+    from zstate import __version__
+
+    assert zstate("--version").stdout.decode() == f"zstate {__version__}\n"
+
+
+def test_ctrl_c_while_joints_are_published_tells_what_was_achieved(spawn: Spawn):
+    child = started(spawn, "joints", RRBOT, "--rate", "50")
+    assert child.line() == "rrbot: a sine on 2 joints, 50 Hz, on zstate/rrbot/joint_states"
+    await_samples()
+    interrupted(child)
+    assert "commanded 50 Hz, achieved " in child.line()
+
+
+def test_a_robot_of_the_catalog_is_called_as_it_was_asked_for():
+    from zstate.cli.options import load_robot
+
+    assert load_robot("RRbot", None)[1] == "rrbot"
+    assert load_robot(str(Path(RRBOT)), None)[1] == load_robot(RRBOT, None)[0].name
+    assert load_robot("rrbot", "left")[1] == "left"

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import math
+
+from looking import RRBOT, Spawn, failure, interrupted, started, zstate
+from support import until
+
+from zstate import StatePublisher, TransformListener, connect, discover, load_model
+
+DERIVED = {"robot_description", "tf_static", "tf"}
+
+
+def streams_of(robot: str) -> set[str]:
+    with connect() as session:
+        return {stream for info in discover(session) if info.name == robot for stream, _ in info.writers}
+
+
+def test_joints_writes_joint_states_and_nothing_else(spawn: Spawn):
+    started(spawn, "joints", RRBOT).line()
+    assert streams_of("rrbot") == {"joint_states"}
+
+
+def test_publish_follows_joint_states_and_writes_the_rest(spawn: Spawn):
+    assert started(spawn, "publish", RRBOT).line() == (
+        "publishing 'rrbot' (7 links, 2 joints) on zstate/rrbot/{robot_description,tf_static,tf}"
+    )
+    assert streams_of("rrbot") == DERIVED
+
+
+def test_with_a_source_of_its_own_publish_writes_joint_states_too(spawn: Spawn):
+    started(spawn, "publish", RRBOT, "--source", "sine").line()
+    assert streams_of("rrbot") == DERIVED | {"joint_states"}
+
+
+def test_writers_are_known_by_the_command_that_they_are(spawn: Spawn):
+    child = started(spawn, "joints", RRBOT)
+    child.line()
+    with connect() as session:
+        ((_, writer),) = discover(session)[0].writers
+    assert (writer.program, writer.pid) == ("zstate-joints", child.process.pid)
+
+
+def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
+    child = started(spawn, "publish", RRBOT)
+    child.line()
+    model = load_model(RRBOT)
+    with (
+        connect() as session,
+        StatePublisher(session, model, "rrbot", streams=("joint_states",)) as joints,
+        TransformListener(session, "rrbot", follow="tf") as listener,
+    ):
+        stamp = 0
+
+        def moved() -> bool:
+            nonlocal stamp
+            stamp += 1_000
+            joints.publish([0.5, 0.0], stamp=stamp)
+            return listener.buffer.can_lookup("base", "upper")
+
+        until(moved)
+        newest = listener.buffer.lookup("base", "upper")
+        assert newest.stamp is not None
+        assert newest.stamp % 1_000 == 0
+        # The shoulder turns about y.
+        assert math.isclose(newest.rpy[1], 0.5, abs_tol=1e-12)
+    interrupted(child)
+    assert " published, " in child.line()
+    assert "heard joint_states of 'rrbot': 2 positions" in child.stderr
+
+
+def test_at_a_rate_publish_tells_what_became_of_it():
+    said = zstate("publish", RRBOT, "--source", "sine", "--rate", "50", "--seconds", "0.2").stdout.decode()
+    # Ten ticks, 20 ms apart; a busy machine may skip some, which are then counted.
+    assert "; commanded 50 Hz, achieved " in said.splitlines()[-1]
+
+
+def test_joint_states_that_never_come_are_a_failure_with_a_hint():
+    message = failure("publish", RRBOT, "--seconds", "0.3")
+    assert "waiting for joint_states of 'rrbot'" in message
+    assert "heard no joint_states of 'rrbot' in 0.3 s; `zstate ls`" in message
+
+
+def test_joint_states_of_another_model_are_told(spawn: Spawn):
+    child = started(spawn, "publish", RRBOT)
+    child.line()
+    gripper = load_model("gripper")
+    with connect() as session, StatePublisher(session, gripper, "rrbot", streams=("joint_states",)) as other:
+
+        def refused() -> bool:
+            other.publish(gripper.neutral)
+            return "joint_states refused" in child.stderr
+
+        until(refused)
+
+
+def test_an_unknown_wire_is_told_with_those_there_are():
+    message = failure("publish", RRBOT, "--source", "sine", "--wire", "carrier-pigeon")
+    assert "'carrier-pigeon'" in message
+    assert "'native'" in message

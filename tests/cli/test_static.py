@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from looking import Spawn, failure, interrupted, standing, started
+from support import until
+
+from zstate import TransformListener, connect
+
+POSE = ("--xyz", "0.1", "0", "-0.2", "--rpy-deg", "0", "0", "90")
+
+
+def test_an_edge_is_there_until_ctrl_c_and_withdrawn_then(spawn: Spawn):
+    with standing(), connect() as session, TransformListener(session, "rrbot") as listener:
+        child = started(spawn, "static", "lower", "flange", *POSE)
+        sentence = child.line()
+        assert sentence.startswith(
+            "pose of flange in lower: xyz [0.1, 0, -0.2] m, rpy [0, 0, 90] deg, until Ctrl-C (robot 'rrbot'"
+        )
+        placed = listener.buffer.wait("lower", "flange", timeout_s=10.0)
+        # A quarter turn about z takes x to y: half the angle is 45 degrees.
+        assert placed.translation.tolist() == [0.1, 0.0, -0.2]
+        assert abs(placed.rotation - [0.0, 0.0, 0.5**0.5, 0.5**0.5]).max() < 1e-12
+        interrupted(child)
+        until(lambda: not listener.buffer.can_lookup("lower", "flange"))
+
+
+def test_several_writers_coexist_and_a_full_name_needs_no_robot(spawn: Spawn):
+    started(spawn, "static", "fleet/map", "r1/odom", *POSE).line()
+    started(spawn, "static", "r1/odom", "beacon", *POSE).line()
+    with connect() as session, TransformListener(session) as listener:
+        both = listener.buffer.wait("fleet/map", "r1/beacon", timeout_s=10.0)
+    # The second offset is turned by the first: x goes to y.
+    assert abs(both.translation - [0.1, 0.1, -0.4]).max() < 1e-12
+
+
+def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        """
+        [[static]]
+        target = "r1/base"
+        source = "camera"
+        xyz = [1, 0, 0]
+        quat_xyzw = [0, 0, 0, 1]
+        [[static]]
+        robot = "r1"
+        target = "camera"
+        source = "lens"
+        xyz = [0, 0, 2]
+        rpy = [0, 0, 0]
+        """
+    )
+    child = started(spawn, "static", "--file", str(file))
+    child.line()
+    child.line()
+    with connect() as session, TransformListener(session) as listener:
+        lens = listener.buffer.wait("r1/base", "r1/lens", timeout_s=10.0)
+    assert lens.translation.tolist() == [1.0, 0.0, 2.0]
+
+
+def test_without_a_robot_to_belong_to_it_asks_which():
+    message = failure("static", "a", "b", *POSE)
+    assert "--robot NAME (no robot is announced" in message
+
+
+def test_with_two_robots_it_asks_which_and_names_them():
+    with standing("left"), standing("right"):
+        message = failure("static", "lower", "flange", *POSE)
+    assert "--robot NAME (announced: 'left', 'right')" in message
+
+
+def test_what_is_no_pose_is_told():
+    xyz = ("--xyz", "0", "0", "0")
+    assert "0 rotations" in failure("static", "r/a", "b", *xyz)
+    assert "2 rotations" in failure("static", "r/a", "b", *POSE, "--rpy", "0", "0", "0")
+    assert "length 2" in failure("static", "r/a", "b", *xyz, "--quat-xyzw", "0", "0", "0", "2")
+    assert "finite" in failure("static", "r/a", "b", "--xyz", "nan", "0", "0", "--rpy", "0", "0", "0")
+    assert "itself" in failure("static", "r/a", "r/a", *POSE)
+
+
+def test_half_an_edge_is_wrong_usage():
+    assert "--xyz" in failure("static", "a", "b", code=2)
+    assert "TARGET" in failure("static", "--xyz", "0", "0", "0", code=2)
