@@ -91,9 +91,12 @@ class ChildCommand:
 def end_with_parent() -> None:
     """End this process when its standard input does: whoever started it is gone."""
 
+    main = threading.get_ident()
+
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 1024):
             pass
-        os.kill(os.getpid(), signal.SIGTERM)
+        # To the process, it could reach this thread, and the main thread would go on waiting.
+        signal.pthread_kill(main, signal.SIGTERM)
 
     threading.Thread(target=watch, name="zstate parent", daemon=True).start()
