@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from zstate.clock import ManualClock, SystemClock, check_stamp, stamp_text
+from zstate.clock import ManualClock, SystemClock, check_stamp, stamp_text, wait_in_slices
 from zstate.errors import InvalidInput
 
 
@@ -81,3 +81,12 @@ def test_whoever_waits_for_a_manual_clock_wakes_when_it_gets_there() -> None:
     clock.advance(0.5)
     assert reached.wait(10.0)
     waiter.join()
+
+
+def test_waiting_in_slices_ends_when_the_event_is_set_or_the_time_is_up() -> None:
+    event = threading.Event()
+    assert not wait_in_slices(event, 0.0)
+    assert not wait_in_slices(event, 0.01)
+    threading.Timer(0.01, event.set).start()
+    assert wait_in_slices(event)
+    assert wait_in_slices(event, -1.0)

@@ -15,6 +15,9 @@ from zstate.errors import InvalidInput
 
 _STAMP_RANGE = 2**63
 
+# A signal that arrives just as a lock is being waited for is not seen before that wait ends.
+LONGEST_WAIT_S = 0.5
+
 
 class Clock(Protocol):
     """Two questions about time. Stamps are integer nanoseconds since the Unix epoch."""
@@ -36,7 +39,7 @@ class SystemClock:
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
         remaining_s = (stamp - time.time_ns()) * 1e-9
-        return not stop.wait(remaining_s) if remaining_s > 0.0 else not stop.is_set()
+        return not (wait_in_slices(stop, remaining_s) if remaining_s > 0.0 else stop.is_set())
 
 
 class ManualClock:
@@ -65,6 +68,17 @@ class ManualClock:
             while self._now < stamp and not stop.is_set():
                 self._moved.wait(0.05)
         return not stop.is_set()
+
+
+def wait_in_slices(event: threading.Event, timeout_s: float | None = None) -> bool:
+    """``event.wait(timeout_s)`` that Ctrl-C ends within half a second, whenever it comes."""
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    while True:
+        left_s = LONGEST_WAIT_S if deadline is None else deadline - time.monotonic()
+        if event.wait(min(max(left_s, 0.0), LONGEST_WAIT_S)):
+            return True
+        if left_s <= LONGEST_WAIT_S and deadline is not None:
+            return False
 
 
 def check_stamp(stamp: Any) -> int:

@@ -18,7 +18,7 @@ from zstate.buffer.questions import Question, Questions, seconds
 from zstate.buffer.tracks import JointTrack
 from zstate.buffer.waiting import Waiter
 from zstate.buffer.watch import Watch
-from zstate.clock import check_stamp
+from zstate.clock import check_stamp, wait_in_slices
 from zstate.errors import LookupFailed, timed_out
 from zstate.transform import Transform
 from zstate.twist import Twist
@@ -160,8 +160,7 @@ class TransformBuffer(Questions):
                 outcome = self._try(question, waiter)
                 if isinstance(outcome, Transform):
                     return outcome
-                left_s = min(deadline - time.monotonic(), threading.TIMEOUT_MAX)
-                if left_s <= 0.0 or not event.wait(left_s):
+                if not wait_in_slices(event, deadline - time.monotonic()):
                     raise timed_out(outcome, timeout_s)
 
     def watch(

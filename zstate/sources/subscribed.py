@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 
+from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ZStateError
 from zstate.model.edges import EdgeTable
@@ -85,7 +86,8 @@ class SubscribedSource(Closing):
     def __iter__(self) -> Iterator[JointReading]:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._readings or self._closed)
+                if not self._changed.wait_for(lambda: self._readings or self._closed, LONGEST_WAIT_S):
+                    continue
                 if not self._readings:
                     return
                 reading = self._readings.popleft()
