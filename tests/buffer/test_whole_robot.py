@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from zstate import InFuture, InPast, Kinematics, NoData, TransformBuffer, load_model
+from zstate import InFuture, InPast, Kinematics, NoData, Stale, Transform, TransformBuffer, load_model
 
 MS = 1_000_000
 
@@ -51,3 +51,20 @@ def test_outside_the_history_the_error_is_that_of_a_lookup() -> None:
     assert past.value.edge == ("base", "upper")
     with pytest.raises(InFuture):
         buffer.link_poses(track, 11)
+
+
+def test_an_error_names_the_track_at_fault() -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(load_model("rrbot"), "left")
+    buffer.insert_joints(track, 10, np.zeros(2))
+    for stamp in (8, 20):
+        buffer.insert(Transform("map", "left/world", (0, 0, 0), (0, 0, 0, 1), stamp=stamp))
+    with pytest.raises(InFuture) as robot:
+        buffer.lookup("map", "tool", 15)
+    assert robot.value.track == "left"
+    with pytest.raises(InPast) as map_edge:
+        buffer.lookup("map", "world", 5)
+    assert map_edge.value.track == "map -> left/world"
+    with pytest.raises(Stale) as stale:
+        buffer.lookup("base", "tool", max_age_s=1.0)
+    assert stale.value.track == "left"

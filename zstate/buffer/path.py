@@ -139,7 +139,7 @@ class Path:
         """The error for an answer that is too old, naming the edge that is most behind."""
         use = min(self.uses, key=lambda use: coverage(use.track.history.view).newest or 0)
         facts = coverage(use.track.history.view)
-        return Stale(
+        failure = Stale(
             self.target,
             self.source,
             age_s=age_s,
@@ -151,6 +151,8 @@ class Path:
             rate_hz=facts.rate_hz,
             writer=use.track.writer,
         )
+        failure.track = use.track.name
+        return failure
 
     def blame(self, at: int, views: Sequence[View], predict_ns: int = 0) -> LookupFailed:
         """Which track cannot answer at ``at``: too young, then empty, then not there yet."""
@@ -175,7 +177,7 @@ class Path:
         self, error: type[LookupFailed], number: int, views: Sequence[View], at: int | None
     ) -> LookupFailed:
         use, facts = self.uses[number], coverage(views[number])
-        return error(
+        failure = error(
             self.target,
             self.source,
             edge=use.edge,
@@ -185,6 +187,8 @@ class Path:
             rate_hz=facts.rate_hz,
             writer=use.track.writer,
         )
+        failure.track = use.track.name
+        return failure
 
     def _no_rate(self, views: Sequence[View]) -> LookupFailed:
         lonely = [number for number, view in enumerate(views) if view.size < 2]

@@ -36,7 +36,12 @@ class JointTrack:
         self.history = History(model.position_count, span_ns)
 
     def __repr__(self) -> str:
-        return f"<track of {self.prefix or self.model.name!r}, {self.history.view.size} samples>"
+        return f"<track of {self.name!r}, {self.history.view.size} samples>"
+
+    @property
+    def name(self) -> str:
+        """The robot."""
+        return self.prefix or self.model.name
 
     @property
     def has_velocities(self) -> bool:
@@ -98,6 +103,12 @@ class PoseTrack:
 
     def __repr__(self) -> str:
         return f"<track of {len(self.edges)} edges, {self.history.view.size} samples>"
+
+    @property
+    def name(self) -> str:
+        """Its edges, the first of them by name."""
+        first, more = " -> ".join(self.edges[0]), len(self.edges) - 1
+        return f"{first} and {more} more" if more else first
 
     def split(self) -> list[PoseTrack]:
         """The same samples as one track for each edge: their publishers went separate ways."""

@@ -13,7 +13,7 @@ ZStateError
 │   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
 │   ├── PortBusy                       somebody listens there already             .endpoint
 │   └── Closed                         used after close(), or after fork
-└── LookupFailed                       .target .source .edge .requested .oldest .newest .rate_hz .writer
+└── LookupFailed                       .target .source .edge .requested .oldest .newest .track .rate_hz ...
     ├── UnknownFrame                   never heard of it                          .name .near_misses
     ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
     ├── Disconnected                   two trees                                  .roots

@@ -22,9 +22,9 @@ class LookupFailed(ZStateError):
     """A question the buffer cannot answer, with what it knows.
 
     ``target`` and ``source`` are the frames as asked, ``edge`` is the (parent, child) at fault.
-    ``requested``, ``oldest`` and ``newest`` are stamps [ns], ``rate_hz`` and ``writer`` belong to
-    the edge; each is None when it does not apply. The text is built when it is read: a failed
-    lookup in a control loop costs little. ``note`` says what else there is to know.
+    ``requested``, ``oldest`` and ``newest`` are stamps [ns]; ``track`` (whose history it is), ``rate_hz``
+    and ``writer`` belong to the edge; each is None when it does not apply. The text is built when it is
+    read: a failed lookup in a control loop costs little. ``note`` says what else there is to know.
     """
 
     def __init__(
@@ -48,6 +48,7 @@ class LookupFailed(ZStateError):
         self.newest = newest
         self.rate_hz = rate_hz
         self.writer = writer
+        self.track: str | None = None
         self.note = ""
 
     def __str__(self) -> str:
