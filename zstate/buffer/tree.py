@@ -176,8 +176,10 @@ class Tree:
         )
 
     def near(self, name: str) -> list[str]:
-        """Known names that look like ``name``, best first."""
-        return get_close_matches(name, [*self.frames, *self._bare], n=3, cutoff=0.7)
+        """Names a question could use that look like ``name``, best first; bare ones where those do."""
+        unique = {full[0]: bare for bare, full in self._bare.items() if len(full) == 1}
+        known = [unique.get(frame, frame) if "/" not in name else frame for frame in self.frames]
+        return get_close_matches(name, known, n=3, cutoff=0.7)
 
     def path(self, target: str, source: str) -> tuple[list[Edge], list[Edge]]:
         """The edges down to the target and down to the source, from where their ways up meet.
