@@ -18,6 +18,8 @@ from zstate.model.kinematics import Kinematics
 from zstate.net.session import connect
 from zstate.sources import SineSource
 
+pytestmark = pytest.mark.processes
+
 PUBLISHER = """
     import sys
     from zstate import SineSource, StatePublisher, connect, load_model

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from support import DEADLINE_S, Child
 
+pytestmark = pytest.mark.processes
+
 README = Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
 
