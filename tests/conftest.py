@@ -1,4 +1,4 @@
-"""What every test has: a rendezvous of its own, free ports and child processes that end with it."""
+"""What every test has: a rendezvous of its own, free ports, sessions and child processes that end with it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from support import Child, a_free_port
+
+from zstate.net.session import Session, connect
 
 
 @pytest.fixture
@@ -20,6 +22,13 @@ def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", address)
     monkeypatch.delenv("ZENOH_CONFIG", raising=False)
     return address
+
+
+@pytest.fixture
+def sessions() -> Iterator[tuple[Session, Session]]:
+    """One to write with and one to read with."""
+    with connect() as writer, connect() as reader:
+        yield writer, reader
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from support import DEADLINE_S, until
+from support import until
 
 from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
@@ -13,17 +13,27 @@ from zstate.net.session import Session
 from zstate.net.streams import Arrival, StreamPublisher, StreamSubscriber
 from zstate.se3 import to_matrix
 from zstate.transform import Transform
+from zstate.wire.messages import JointState
+from zstate.wire.native import ENCODINGS, decode
 
 RRBOT = load_model("rrbot")
 """World, base, two links on continuous joints (shoulder, elbow), and a tool."""
 
 SECOND = 1_000_000_000
+STAMP = 1_789_012_345_678_901_234
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 def await_reader(session: Session, key: str) -> None:
     """Return when ``session`` knows that somebody reads ``key``: what it puts from now on arrives."""
     with StreamPublisher(session, key, "") as probe:
         until(lambda: probe.has_readers)
+
+
+def settle(session: Session, robot: str, *streams: str) -> None:
+    """Return when somebody hears ``streams`` of ``robot``, by default its joint states."""
+    for stream in streams or ("joint_states",):
+        await_reader(session, f"zstate/{robot}/{stream}")
 
 
 class Tap:
@@ -38,6 +48,10 @@ class Tap:
         until(lambda: len(self.arrivals) >= count)
         return [payload for _, payload, _ in self.arrivals]
 
+    def joint_states(self, count: int) -> list[JointState]:
+        """The first ``count`` payloads, as joint states."""
+        return [decode(payload, ENCODINGS[JointState], JointState) for payload in self.payloads(count)]
+
     def close(self) -> None:
         self._subscriber.close()
 
@@ -51,6 +65,3 @@ def kinematic_pose(model: RobotModel, positions: ArrayLike, target: str, source:
 
 def assert_pose(transform: Transform, matrix: ArrayLike) -> None:
     assert np.allclose(transform.matrix, matrix, rtol=0.0, atol=1e-12), transform
-
-
-__all__ = ["DEADLINE_S", "RRBOT", "SECOND", "Tap", "assert_pose", "await_reader", "kinematic_pose"]

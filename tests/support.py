@@ -28,6 +28,23 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
         time.sleep(0.002)
 
 
+class Stepping:
+    """A clock that goes at once to where it is waited for, plus the lateness of that wait."""
+
+    def __init__(self, start: int = 5, lateness: dict[int, int] | None = None) -> None:
+        self.stamp = start
+        self.waits: list[int] = []
+        self._lateness = lateness or {}
+
+    def now(self) -> int:
+        return self.stamp
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        self.stamp = max(self.stamp, stamp) + self._lateness.get(len(self.waits), 0)
+        self.waits.append(stamp)
+        return not stop.is_set()
+
+
 class Child:
     """A Python process that runs ``code``; it says lines, and is told lines."""
 

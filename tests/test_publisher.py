@@ -3,10 +3,10 @@ import time
 
 import numpy as np
 import pytest
-from live import RRBOT, Tap, await_reader
+from live import RRBOT, STAMP, Tap, await_reader
 from support import until
 
-from zstate.clock import ManualClock, SystemClock
+from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput
 from zstate.model.catalog import load_model
 from zstate.model.edges import EdgeTable
@@ -15,8 +15,7 @@ from zstate.net.presence import discover
 from zstate.net.session import connect
 from zstate.net.streams import StreamPublisher
 from zstate.publisher import STREAMS, StatePublisher
-from zstate.sources import JointReading, SineSource
-from zstate.wire.messages import JointState, TransformSample, from_block, poses_from_block
+from zstate.wire.messages import TransformSample, from_block, poses_from_block
 from zstate.wire.native import ENCODINGS, decode
 
 NAN, INF = float("nan"), float("inf")
@@ -25,48 +24,11 @@ JOINTS, TF = "zstate/r1/joint_states", "zstate/r1/tf"
 POSITIONS = [0.1 + 0.2, -1.0 / 3.0]
 VELOCITIES = [5e-324, 1.2345678901234567e150]
 EFFORTS = [-0.0, 2.0**-1022]
-STAMP = 1_789_012_345_678_901_234
 DRONE = load_model(
     '<robot name="drone"><link name="map"/><link name="body"/><link name="eye"/>'
     '<joint name="free" type="floating"><parent link="map"/><child link="body"/></joint>'
     '<joint name="fix" type="fixed"><parent link="body"/><child link="eye"/></joint></robot>'
 )
-
-
-@pytest.fixture
-def sessions():
-    with connect() as writer, connect() as reader:
-        yield writer, reader
-
-
-def joint_states(tap: Tap, count: int) -> list[JointState]:
-    return [decode(payload, ENCODINGS[JointState], JointState) for payload in tap.payloads(count)]
-
-
-class Held:
-    """Positions that stay, or nothing on every second tick."""
-
-    def __init__(self, every: int = 1, stamp: int | None = None) -> None:
-        self._every, self._stamp = every, stamp
-        self.reads = 0
-
-    def read(self, stamp: int) -> JointReading | None:
-        self.reads += 1
-        return None if self.reads % self._every else JointReading(np.zeros(2), stamp=self._stamp)
-
-
-class Stepping:
-    """A clock that goes at once to where it is waited for."""
-
-    def __init__(self) -> None:
-        self.stamp = STAMP
-
-    def now(self) -> int:
-        return self.stamp
-
-    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
-        self.stamp = stamp
-        return not stop.is_set()
 
 
 def test_every_number_arrives_bit_for_bit(sessions):
@@ -76,7 +38,7 @@ def test_every_number_arrives_bit_for_bit(sessions):
         await_reader(writer, JOINTS)
         publisher.publish(POSITIONS, VELOCITIES, EFFORTS, STAMP)
         publisher.publish(np.array(POSITIONS), stamp=np.int64(-STAMP))
-    full, bare = joint_states(tap, 2)
+    full, bare = tap.joint_states(2)
     assert [full.positions, full.velocities, full.efforts] == [
         np.array(numbers).tobytes() for numbers in (POSITIONS, VELOCITIES, EFFORTS)
     ]
@@ -91,7 +53,7 @@ def test_positions_may_come_by_name_in_any_order(sessions):
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         await_reader(writer, JOINTS)
         publisher.publish({"elbow": 2.0, "shoulder": 1.0})
-    assert from_block(joint_states(tap, 1)[0].positions).tolist() == [1.0, 2.0]
+    assert from_block(tap.joint_states(1)[0].positions).tolist() == [1.0, 2.0]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +84,7 @@ def test_what_cannot_be_published_is_refused_with_nothing_sent_and_no_gap(sessio
         with pytest.raises(InvalidInput, match=said):
             publisher.publish(*arguments)
         publisher.publish([0.0, 0.0], stamp=2)
-    assert [(state.stamp, state.seq) for state in joint_states(tap, 2)] == [(1, 0), (2, 1)]
+    assert [(state.stamp, state.seq) for state in tap.joint_states(2)] == [(1, 0), (2, 1)]
 
 
 def test_a_floating_joint_without_a_unit_quaternion_is_refused_on_every_stream(sessions):
@@ -146,7 +108,7 @@ def test_both_streams_say_the_same_instant_and_agree_with_kinematics(sessions):
             await_reader(writer, key)
         publisher.publish([0.03, 0.4], stamp=STAMP)
         named = publisher.description().moving_edges
-    state = joint_states(joints, 1)[0]
+    state = joints.joint_states(1)[0]
     sample = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
     assert (sample.stamp, sample.seq, sample.session) == (state.stamp, state.seq, state.session)
     kinematics = Kinematics(model)
@@ -193,7 +155,7 @@ def test_the_stamp_is_the_clocks_unless_given(sessions):
         await_reader(writer, JOINTS)
         publisher.publish([0.0, 0.0])
         publisher.publish([0.0, 0.0], stamp=0)
-    assert [state.stamp for state in joint_states(tap, 2)] == [STAMP, 0]
+    assert [state.stamp for state in tap.joint_states(2)] == [STAMP, 0]
 
 
 def test_after_close_publishing_says_closed_and_a_second_close_nothing(sessions):
@@ -239,49 +201,6 @@ def test_a_publisher_announces_the_streams_it_writes_until_it_closes(sessions, s
     assert discover(reader, timeout_s=0.3) == ()
 
 
-@pytest.mark.parametrize("rate_hz", [0.0, -5.0, NAN, INF, 20_000.0])
-def test_running_at_an_impossible_rate_is_refused(sessions, rate_hz: float):
-    with (
-        StatePublisher(sessions[0], RRBOT) as publisher,
-        pytest.raises(InvalidInput, match="a rate is above 0"),
-    ):
-        publisher.run(Held(), rate_hz)
-
-
-def test_a_run_sends_one_sample_for_each_tick_with_the_ticks_stamp(sessions):
-    writer, reader = sessions
-    tap = Tap(reader, JOINTS)
-    with StatePublisher(writer, RRBOT, "r1", clock=Stepping()) as publisher:
-        await_reader(writer, JOINTS)
-        report = publisher.run(Held(), 30.0, seconds=2.0)
-    assert (report.ticks, report.skipped, report.commanded_hz) == (60, 0, 30.0)
-    assert report.rate_hz == pytest.approx(30.0, rel=1e-8)
-    states = joint_states(tap, 60)
-    assert [state.stamp for state in states] == [STAMP + round(k * 1e9 / 30.0) for k in range(60)]
-    assert [state.seq for state in states] == list(range(60))
-
-
-def test_a_tick_without_news_sends_nothing_and_a_readings_own_stamp_is_kept(sessions):
-    writer, reader = sessions
-    tap = Tap(reader, JOINTS)
-    with StatePublisher(writer, RRBOT, "r1", clock=Stepping()) as publisher:
-        await_reader(writer, JOINTS)
-        assert publisher.run(Held(every=2, stamp=77), 10.0, seconds=1.0).ticks == 10
-        publisher.publish([0.0, 0.0], stamp=78)
-    assert [state.stamp for state in joint_states(tap, 6)] == [77] * 5 + [78]
-
-
-def test_close_from_another_thread_ends_a_run(sessions):
-    publisher = StatePublisher(sessions[0], RRBOT, clock=SystemClock())
-    reports = []
-    runner = threading.Thread(target=lambda: reports.append(publisher.run(SineSource(RRBOT), 0.01)))
-    runner.start()
-    publisher.close()
-    runner.join(1.0)
-    assert not runner.is_alive()
-    assert reports[0].ticks <= 1
-
-
 def test_a_robot_without_a_moving_joint_can_be_published(sessions):
     writer, reader = sessions
     model = load_model('<robot name="stone"><link name="only"/></robot>')
@@ -289,7 +208,7 @@ def test_a_robot_without_a_moving_joint_can_be_published(sessions):
     with StatePublisher(writer, model, "r1") as publisher:
         await_reader(writer, JOINTS)
         publisher.publish([], stamp=3)
-    assert joint_states(tap, 1)[0].positions == b""
+    assert tap.joint_states(1)[0].positions == b""
 
 
 def test_samples_of_several_threads_all_go_out_numbered_without_a_gap(sessions):
@@ -307,4 +226,4 @@ def test_samples_of_several_threads_all_go_out_numbered_without_a_gap(sessions):
             thread.start()
         for thread in threads:
             thread.join()
-        assert [state.seq for state in joint_states(tap, 200)] == list(range(200))
+        assert [state.seq for state in tap.joint_states(200)] == list(range(200))

@@ -1,29 +1,13 @@
 import threading
 
 import pytest
+from support import Stepping
 
 from zstate.clock import SystemClock
 from zstate.errors import InvalidInput
 from zstate.rate import Rate, check_rate
 
 SECOND = 1_000_000_000
-
-
-class Stepping:
-    """A clock that goes at once to where it is waited for, plus the lateness of that wait."""
-
-    def __init__(self, start: int = 5, lateness: dict[int, int] | None = None) -> None:
-        self.stamp = start
-        self.waits: list[int] = []
-        self._lateness = lateness or {}
-
-    def now(self) -> int:
-        return self.stamp
-
-    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
-        self.stamp = max(self.stamp, stamp) + self._lateness.get(len(self.waits), 0)
-        self.waits.append(stamp)
-        return not stop.is_set()
 
 
 @pytest.mark.parametrize("rate_hz", [0, 0.0, -1.0, float("nan"), float("inf"), 10_000.1])

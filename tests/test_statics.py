@@ -15,12 +15,6 @@ from zstate.transform import Transform
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-@pytest.fixture
-def sessions():
-    with connect() as writer, connect() as reader:
-        yield writer, reader
-
-
 def edge(parent: str, child: str, x: float = 0.0) -> Transform:
     return Transform(parent, child, (x, 0.0, 0.0), UPRIGHT)
 

@@ -12,12 +12,6 @@ KEY = "zstate/r/joint_states"
 ENCODING = "zstate/JointState;v=1"
 
 
-@pytest.fixture
-def sessions():
-    with connect() as writer, connect() as reader:
-        yield writer, reader
-
-
 def test_samples_arrive_in_order_with_key_and_encoding(sessions):
     got: list[Arrival] = []
     with (

@@ -6,7 +6,7 @@ from live import RRBOT, await_reader
 from support import until
 
 from zstate.model.catalog import load_model
-from zstate.net.session import Session, connect
+from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.publisher import StatePublisher
 from zstate.sources import SubscribedSource
@@ -19,12 +19,6 @@ FLOATING = load_model(
     '<robot name="drone"><link name="map"/><link name="body"/>'
     '<joint name="free" type="floating"><parent link="map"/><child link="body"/></joint></robot>'
 )
-
-
-@pytest.fixture
-def sessions():
-    with connect() as writer, connect() as reader:
-        yield writer, reader
 
 
 def put(session: Session, payload: bytes, encoding: str = ENCODINGS[JointState]) -> None:
