@@ -8,8 +8,7 @@ import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import Child, until
 
-from zstate import load_model
-from zstate.cli.showcase import telling_links
+pytestmark = pytest.mark.processes
 
 
 def publisher_of(demo: Child) -> int:
@@ -73,13 +72,3 @@ def test_it_is_alone_with_its_publisher_wherever_the_user_is(monkeypatch: pytest
 
 def test_an_unknown_robot_is_told_with_one_that_always_works():
     assert "`zstate demo rrbot`" in failure("demo", "no_such_robot")
-
-
-def test_the_links_shown_are_ends_of_branches_and_links_on_the_way():
-    # Both wheels turn on the base; the camera and the laser are fixed on the lower link.
-    assert telling_links(load_model("diffbot")) == ("left_wheel", "right_wheel")
-    assert telling_links(load_model("rrbot")) == ("lower", "upper")
-
-
-def test_a_robot_without_joints_has_nothing_to_show():
-    assert telling_links(load_model("<robot name='stone'><link name='stone'/></robot>")) == ()

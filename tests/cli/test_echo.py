@@ -13,6 +13,8 @@ from support import DEADLINE_S, until
 
 from zstate import connect
 
+pytestmark = pytest.mark.processes
+
 FLOATING = """
 <robot name="drone">
   <link name="world"/> <link name="body"/> <link name="arm"/>

@@ -4,7 +4,10 @@ import json
 import os
 import socket
 
+import pytest
 from looking import EVERYTHING, failure, standing, zstate
+
+pytestmark = pytest.mark.processes
 
 
 def test_each_stream_stands_with_its_writer():

@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import math
 
+import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import until
 
 from zstate import StatePublisher, TransformListener, connect, discover, load_model
+
+pytestmark = pytest.mark.processes
 
 DERIVED = {"robot_description", "tf_static", "tf"}
 

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started
 
 from zstate import TransformListener, connect
+
+pytestmark = pytest.mark.processes
 
 
 def test_clients_meet_at_it(spawn: Spawn, free_port: int):

@@ -9,7 +9,9 @@ from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, star
 from support import until
 
 from zstate import StaticPublisher, Transform, connect
-from zstate.cli.tf import transform_text
+from zstate.cli.commands.tf import transform_text
+
+pytestmark = pytest.mark.processes
 
 # From the model: the shoulder stands 1.05 m above the base, the elbow 0.7 m further along the upper
 # link, each a little to the side; both turn about y, which is pitch.

@@ -2,9 +2,12 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from looking import failure, standing, zstate
 
 from zstate import StaticPublisher, Transform, connect
+
+pytestmark = pytest.mark.processes
 
 
 def drawn(*arguments: str) -> list[str]:

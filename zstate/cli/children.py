@@ -8,12 +8,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from types import TracebackType
+
+from zstate.closing import Closing
 
 END_WITHIN_S = 0.8
 
 
-class ChildCommand:
+class ChildCommand(Closing):
     """``zstate ARGUMENTS`` in a process of its own, which ends with this one, however that ends.
 
     Each line it says goes to ``on_line``, from a thread; ``on_end`` is called once it is gone and all
@@ -45,20 +46,12 @@ class ChildCommand:
         self._on_end = on_end
         threading.Thread(target=self._follow, name=f"zstate {name}", daemon=True).start()
 
-    def __enter__(self) -> ChildCommand:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.end()
-
     @property
     def exit_code(self) -> int | None:
         """None while it runs."""
         return self._process.poll()
 
-    def end(self) -> None:
+    def close(self) -> None:
         """End it and wait for that, less than a second. A second call does nothing."""
         self.ask_to_end()
         try:

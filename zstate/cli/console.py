@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
@@ -12,7 +11,6 @@ import click
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
-    from zstate.net.presence import RobotInfo
     from zstate.rate import RateReport
 
 
@@ -65,19 +63,3 @@ def report_text(report: RateReport) -> str:
     """What became of a commanded rate."""
     achieved = f"{count_text(report.ticks, 'sample')}; commanded {report.commanded_hz:g} Hz"
     return f"{achieved}, achieved {report.rate_hz:.2f} Hz, skipped {report.skipped}"
-
-
-def announced_text(robots: Sequence[RobotInfo]) -> str:
-    """Which robots there are, for the end of a message about one that is not."""
-    if not robots:
-        return "no robot is announced; start one, for instance with `zstate publish panda --source sine`"
-    return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
-
-
-def unknown_robot(robot: str, robots: Sequence[RobotInfo]) -> str:
-    """The message for a robot that nobody announces, with near misses and those who are there."""
-    from difflib import get_close_matches
-
-    near = get_close_matches(robot, [info.name for info in robots], n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"nobody announces the robot {robot!r}{hint} ({announced_text(robots)})"

@@ -10,7 +10,8 @@ from math import degrees
 from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.cli.console import count_text, duration_or_dash, is_terminal, say
-from zstate.cli.meter import Meter
+from zstate.cli.metered_buffer import Measure, MeteredBuffer
+from zstate.clock import wait_in_slices
 from zstate.errors import LookupFailed, duration_text
 from zstate.listener import TransformListener
 
@@ -31,26 +32,20 @@ class Row(NamedTuple):
     age: int
 
 
-class Count(NamedTuple):
-    """How many samples had come at a time of the monotonic clock [s]."""
-
-    time_s: float
-    received: int
-
-
 class DemoTable:
     """A few transforms of ``robot`` with their rate, latency and age."""
 
     def __init__(
-        self, listener: TransformListener, meter: Meter, robot: str, root: str, links: Sequence[str]
+        self, listener: TransformListener, buffer: MeteredBuffer, robot: str, root: str, links: Sequence[str]
     ) -> None:
         self._listener = listener
-        self._meter = meter
+        self._buffer = buffer
+        self._meter = buffer.meter
         self._robot = robot
         self._root = root
         self._links = links
-        self._counts = deque([self._count()], maxlen=_WINDOW + 1)
-        self._begun = self._counts[0]
+        self._begun = self._meter.mark()
+        self._marks = deque([self._begun], maxlen=_WINDOW + 1)
 
     def show(self, ended: threading.Event, seconds: float | None) -> None:
         """Until ``ended``, or for ``seconds``."""
@@ -59,41 +54,35 @@ class DemoTable:
         until = float("inf") if seconds is None else time.monotonic() + seconds
         if not is_terminal():
             while not _is_over(ended, until, 1.0):
-                self._counts.append(self._count())
+                self._marks.append(self._meter.mark())
                 say(self.line())
             return
         with Live(self.table(), auto_refresh=False) as live:
             while not _is_over(ended, until, _REFRESH_S):
-                self._counts.append(self._count())
+                self._marks.append(self._meter.mark())
                 live.update(self.table(), refresh=True)
 
     def summary(self) -> str:
         """What was received since the beginning."""
-        stats, now = self._listener.stats, self._count()
-        received = count_text(now.received - self._begun.received, "sample")
-        seconds = now.time_s - self._begun.time_s
-        latency = duration_or_dash(self._meter.latency_ns(recent=False))
+        stats, now = self._listener.stats, self._meter.mark()
+        measure = self._meter.measure(self._begun, now)
+        received = count_text(now.count - self._begun.count, "sample")
         return (
-            f"{received} received in {seconds:.1f} s: {_rate(self._begun, now):.2f} Hz, "
-            f"{stats.missed + stats.dropped} missed, median latency {latency} from stamp to lookup"
+            f"{received} received in {now.time_s - self._begun.time_s:.1f} s: {measure.rate_hz:.2f} Hz, "
+            f"{stats.missed + stats.dropped} missed, median latency {_latency(measure)}"
         )
 
     @property
     def _freshness(self) -> str:
-        latency = duration_or_dash(self._meter.latency_ns(recent=True))
-        return f"{_rate(self._counts[0], self._counts[-1]):.1f} Hz, {latency} from stamp to lookup"
-
-    def _count(self) -> Count:
-        return Count(time.monotonic(), self._listener.stats.received)
+        measure = self._meter.measure(self._marks[0], self._marks[-1])
+        return f"{measure.rate_hz:.1f} Hz, {_latency(measure)}"
 
     def rows(self) -> list[Row]:
         """The transforms now; those that have no answer yet are left out."""
         rows: list[Row] = []
         for link in self._links:
             try:
-                transform = self._listener.buffer.lookup(
-                    f"{self._robot}/{self._root}", f"{self._robot}/{link}"
-                )
+                transform = self._buffer.lookup(f"{self._robot}/{self._root}", f"{self._robot}/{link}")
             except LookupFailed:
                 continue
             assert transform.stamp is not None
@@ -136,12 +125,13 @@ def _link(row: Row) -> str:
     return row.transform.source.partition("/")[2]
 
 
-def _rate(then: Count, now: Count) -> float:
-    span_s = now.time_s - then.time_s
-    return (now.received - then.received) / span_s if span_s > 0.0 else 0.0
+def _latency(measure: Measure) -> str:
+    """The median, in words."""
+    latency_s = measure.latency_s
+    return f"{duration_or_dash(None if latency_s is None else round(latency_s * 1e9))} from stamp to lookup"
 
 
 def _is_over(ended: threading.Event, until: float, pause_s: float) -> bool:
     """Pause, then tell whether that was it."""
     pause_s = min(pause_s, max(0.0, until - time.monotonic()))
-    return ended.wait(pause_s) or time.monotonic() >= until
+    return wait_in_slices(ended, pause_s) or time.monotonic() >= until

@@ -14,7 +14,7 @@ import click
 
 from zstate.errors import ZStateError
 
-# name: (section of the help, what it does); the module zstate.cli.<name> holds the command <name>_command.
+# name: (section of the help, what it does); zstate.cli.commands.<name> holds the command <name>_command.
 _COMMANDS = {
     "demo": ("Start here", "A robot that moves, its state over Zenoh, and a live table of it."),
     "publish": ("Write", "Publish a robot's state: its model, fixed edges, and transforms."),
@@ -41,7 +41,7 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _COMMANDS:
             return None
-        command = getattr(import_module(f"zstate.cli.{cmd_name}"), f"{cmd_name}_command")
+        command = getattr(import_module(f"zstate.cli.commands.{cmd_name}"), f"{cmd_name}_command")
         assert isinstance(command, click.Command)
         return command
 

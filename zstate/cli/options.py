@@ -4,31 +4,18 @@ from __future__ import annotations
 
 import functools
 import math
-import os
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from zstate.cli.network import Network
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
-    from zstate.net.session import Session
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-
-
-@dataclass(frozen=True, slots=True)
-class Network:
-    """How to join the network: the session options of one command line."""
-
-    mode: str = "peer"
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
-    config: str | None = None
 
 
 def session_options(command: Command) -> Command:
@@ -83,18 +70,6 @@ _SESSION_OPTIONS = (
     ),
     config_option,
 )
-
-
-@contextmanager
-def open_session(network: Network) -> Generator[Session]:
-    """A session as the options say. Warnings of the library go to standard error from now on."""
-    from zstate.cli.connecting import connect_interruptibly
-
-    configured = network.config or os.environ.get("ZENOH_CONFIG")
-    if network.mode == "client" and not network.connect and not configured:
-        raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
-    with connect_interruptibly(network.config, network.mode, network.connect, network.listen) as session:
-        yield session
 
 
 def load_robot(source: str, name: str | None) -> tuple[RobotModel, str]:

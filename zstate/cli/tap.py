@@ -6,8 +6,9 @@ import queue
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.announced import Roster
 from zstate.cli.console import fail, note
+from zstate.cli.roster import Roster
+from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.net.streams import Arrival, StreamSubscriber
@@ -68,9 +69,9 @@ class Tap(Closing):
             note(f"{key}: {error}; further ones are passed over in silence")
 
     def next(self, timeout_s: float) -> Tapped | None:
-        """The next sample, or None when none comes within ``timeout_s``."""
+        """The next sample, or None when none comes within ``timeout_s``, or half a second if that is less."""
         try:
-            return self._samples.get(timeout=timeout_s)
+            return self._samples.get(timeout=min(timeout_s, LONGEST_WAIT_S))
         except queue.Empty:
             return None
 

@@ -1,4 +1,4 @@
-"""Patience: waiting for an answer of a buffer, and saying what for."""
+"""AwaitedPose: waiting for an answer of a buffer, and telling a person what for."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from zstate.cli.announced import Roster
-from zstate.cli.console import announced_text, count_text, fail, note, unknown_robot
+from zstate.cli.console import count_text, fail, note
+from zstate.cli.roster import Roster, announced_text, unknown_robot
 from zstate.errors import InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _GRACE_S = 0.5
 
 
-class Patience:
+class AwaitedPose:
     """Asks ``listener`` for one pose, again and again, and tells a person what it waits for."""
 
     def __init__(self, listener: TransformListener, roster: Roster, target: str, source: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zstate.cli.console import count_text, say, say_json
-from zstate.cli.tree_lines import in_columns, tree_lines
+from zstate.cli.layout import in_columns, tree_lines
 from zstate.errors import Found, ModelError
 
 if TYPE_CHECKING:

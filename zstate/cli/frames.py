@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from zstate.cli.announced import announced_robots
 from zstate.cli.console import note
+from zstate.cli.roster import announced_robots
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import count_text, fail, note, say
-from zstate.cli.options import Network, load_robot, open_session, rate_option, seconds_option
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import load_robot, rate_option, seconds_option
 from zstate.errors import UnknownModel
 
 if TYPE_CHECKING:
-    from zstate.cli.meter import Meter
+    from zstate.cli.metered_buffer import Meter
     from zstate.model.robot import RobotModel
 
 _DEFAULT = "panda"
@@ -56,7 +57,7 @@ def demo_command(robot: str | None, robot_option: str | None, rate: float, secon
 
 
 def _load(robot: str) -> tuple[RobotModel, str]:
-    from zstate.cli.showcase import telling_links
+    from zstate.cli.telling_links import telling_links
 
     try:
         model, called = load_robot(robot, None)
@@ -77,21 +78,20 @@ def _look(
     endpoint: str, model: RobotModel, robot: str, ended: threading.Event, seconds: float | None
 ) -> None:
     from zstate.cli.demo_table import DemoTable
-    from zstate.cli.meter import Meter
-    from zstate.cli.showcase import telling_links
+    from zstate.cli.metered_buffer import MeteredBuffer
+    from zstate.cli.telling_links import telling_links
     from zstate.listener import TransformListener
 
-    links = telling_links(model)
+    buffer = MeteredBuffer()
     with (
         open_session(Network(listen=(endpoint,))) as session,
-        TransformListener(session, robot) as listener,
-        Meter(listener.buffer, f"{robot}/{model.root}", f"{robot}/{links[0]}") as meter,
+        TransformListener(session, robot, buffer) as listener,
     ):
         note(f"waiting for {robot!r} ...")
-        if not _has_begun(meter, ended):
+        if not _has_begun(buffer.meter, ended):
             return
         note(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
-        table = DemoTable(listener, meter, robot, model.root, links)
+        table = DemoTable(listener, buffer, robot, model.root, telling_links(model))
         try:
             table.show(ended, seconds)
         finally:
@@ -99,7 +99,7 @@ def _look(
 
 
 def _has_begun(meter: Meter, ended: threading.Event) -> bool:
-    """Wait for the first answer; False when the publisher ended instead."""
+    """Wait for the first sample; False when the publisher ended instead."""
     deadline = time.monotonic() + _START_WITHIN_S
     while not meter.has_begun.wait(0.1):
         if ended.is_set():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from statistics import median
 
 from numpy.typing import ArrayLike
@@ -13,13 +15,21 @@ from numpy.typing import ArrayLike
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 
-# A second of the fastest robot; older ones say nothing about now.
-_KEPT = 1000
+# Enough for a median, bounded for a demo that runs for days.
+_KEPT = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A moment to measure from: how many samples had come at a time of the monotonic clock [s]."""
+
+    time_s: float
+    count: int
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """How samples came in since the last measure.
+    """How samples came in between two marks.
 
     ``rate_hz`` counts arrivals here; ``latency_s`` is the median time from a sample's stamp until it
     could be looked up, by the clocks of both machines; ``age_s`` is that of the newest sample now. None
@@ -32,29 +42,35 @@ class Measure:
 
 
 class Meter:
-    """Measures what comes in. One thread notes, another one measures."""
+    """Measures what comes in. One thread notes, another one measures. ``has_begun`` is set at the first."""
 
     def __init__(self) -> None:
+        self.has_begun = threading.Event()
+        self._lock = threading.Lock()
         self._delays: deque[int] = deque(maxlen=_KEPT)
-        self._count = self._measured = 0
+        self._count = 0
         self._newest: int | None = None
-        self._measured_at = time.monotonic()
 
     def note(self, stamp: int) -> None:
         """A sample of this stamp [ns] can be looked up now."""
-        self._delays.append(time.time_ns() - stamp)
-        self._newest = stamp
-        self._count += 1
+        with self._lock:
+            self._delays.append(time.time_ns() - stamp)
+            self._newest = stamp
+            self._count += 1
+        self.has_begun.set()
 
-    def measure(self) -> Measure:
-        """What came since the last call."""
-        delays, self._delays = self._delays, deque(maxlen=_KEPT)
-        count, now = self._count, time.monotonic()
-        fresh, passed_s = count - self._measured, now - self._measured_at
-        self._measured, self._measured_at = count, now
-        newest = self._newest
+    def mark(self) -> Mark:
+        """This moment."""
+        return Mark(time.monotonic(), self._count)
+
+    def measure(self, since: Mark, until: Mark) -> Measure:
+        """What came between two marks, as far as the last 100 000 samples tell."""
+        with self._lock:
+            newest, after = self._newest, self._count - until.count
+            delays = list(islice(reversed(self._delays), after, self._count - since.count))
+        passed_s = until.time_s - since.time_s
         return Measure(
-            fresh / passed_s,
+            (until.count - since.count) / passed_s if passed_s > 0.0 else 0.0,
             median(delays) * 1e-9 if delays else None,
             None if newest is None else (time.time_ns() - newest) * 1e-9,
         )

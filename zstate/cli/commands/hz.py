@@ -3,64 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from dataclasses import asdict, dataclass
-from itertools import pairwise
-from statistics import pstdev
+from dataclasses import asdict
 from typing import TYPE_CHECKING, NoReturn
 
 import click
 
 from zstate.cli.console import fail, note, say, say_json
-from zstate.cli.options import Network, checked_seconds, open_session, session_options
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_seconds, session_options
 
 if TYPE_CHECKING:
-    from zstate.cli.tap import Tap, Tapped
+    from zstate.cli.arrivals import Arrivals, Intervals
+    from zstate.cli.tap import Tap
     from zstate.wire.keys import Stream
 
 _SETTLING_S = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class Intervals:
-    """What the arrivals in a window say; ``window`` counts samples, times are in seconds.
-
-    ``missed`` counts gaps in the writer's sequence numbers since the start.
-    """
-
-    rate_hz: float
-    min_s: float
-    max_s: float
-    std_dev_s: float
-    window: int
-    missed: int
-
-
-class Meter:
-    """Measures the last ``window`` arrivals."""
-
-    def __init__(self, window: int) -> None:
-        self._came: deque[int] = deque(maxlen=window)
-        self._missed = 0
-        self._last: tuple[int, int] | None = None
-
-    def note(self, tapped: Tapped) -> None:
-        """Another arrival. A writer that started anew begins a new window."""
-        session, seq = tapped.sample.session, tapped.sample.seq
-        if self._last is not None and self._last[0] != session:
-            self._came.clear()
-        elif self._last is not None:
-            self._missed += max(0, seq - self._last[1] - 1)
-        self._last = session, seq
-        self._came.append(tapped.came)
-
-    def intervals(self) -> Intervals | None:
-        """None before there are two samples."""
-        if len(self._came) < 2:
-            return None
-        steps = [(later - earlier) * 1e-9 for earlier, later in pairwise(self._came)]
-        rate_hz = len(steps) / sum(steps) if sum(steps) else float("inf")
-        return Intervals(rate_hz, min(steps), max(steps), pstdev(steps), len(self._came), self._missed)
 
 
 @click.command("hz")
@@ -92,40 +49,43 @@ def hz_command(
     *, network: Network, robot: str, stream: Stream, window: int, once: bool, timeout: float, as_json: bool
 ) -> None:
     """Measure, once a second, the rate at which samples of ROBOT arrive here."""
+    from zstate.cli.arrivals import Arrivals
     from zstate.cli.tap import Tap
 
     with open_session(network) as session, Tap(session, robot, stream) as tap:
-        meter = Meter(window)
+        arrivals = Arrivals(window)
         if once:
-            _show(_measured_once(tap, meter, timeout), as_json=as_json)
+            _show(_measured_once(tap, arrivals, timeout), as_json=as_json)
         else:
-            _follow(tap, meter, as_json=as_json)
+            _follow(tap, arrivals, as_json=as_json)
 
 
 def _begin(tap: Tap, timeout_s: float | None) -> None:
     """Wait for samples, and let those pass that queued up while this process was starting."""
+    from zstate.cli.arrivals import Arrivals
+
     tap.first(timeout_s)
-    _listen(tap, Meter(2), _SETTLING_S)
+    _listen(tap, Arrivals(2), _SETTLING_S)
 
 
-def _measured_once(tap: Tap, meter: Meter, timeout_s: float) -> Intervals:
+def _measured_once(tap: Tap, arrivals: Arrivals, timeout_s: float) -> Intervals:
     _begin(tap, timeout_s)
     deadline = time.monotonic() + timeout_s
     measured = None
     while measured is None:
         if time.monotonic() > deadline:
             fail(f"gave up after {timeout_s:g} s: samples came, but no two to measure between")
-        _listen(tap, meter, 1.0)
-        measured = meter.intervals()
+        _listen(tap, arrivals, 1.0)
+        measured = arrivals.intervals()
     return measured
 
 
-def _follow(tap: Tap, meter: Meter, *, as_json: bool) -> NoReturn:
+def _follow(tap: Tap, arrivals: Arrivals, *, as_json: bool) -> NoReturn:
     _begin(tap, None)
     silent = False
     while True:
-        came = _listen(tap, meter, 1.0)
-        measured = meter.intervals()
+        came = _listen(tap, arrivals, 1.0)
+        measured = arrivals.intervals()
         if came and measured is not None:
             _show(measured, as_json=as_json)
         elif not came and not silent:
@@ -133,13 +93,13 @@ def _follow(tap: Tap, meter: Meter, *, as_json: bool) -> NoReturn:
         silent = not came
 
 
-def _listen(tap: Tap, meter: Meter, seconds: float) -> int:
+def _listen(tap: Tap, arrivals: Arrivals, seconds: float) -> int:
     """Note what comes within ``seconds``; how many samples that were."""
     deadline, count = time.monotonic() + seconds, 0
     while (left_s := deadline - time.monotonic()) > 0.0:
         tapped = tap.next(left_s)
         if tapped is not None:
-            meter.note(tapped)
+            arrivals.note(tapped)
             count += 1
     return count
 

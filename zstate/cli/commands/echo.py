@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zstate.cli.console import note, say
-from zstate.cli.options import Network, checked_seconds, open_session, session_options
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_seconds, session_options
 from zstate.closing import Closing
 from zstate.errors import MessageError
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 # A robot's description comes within milliseconds, if there is one.
 _NAMES_WITHIN_S = 1.0
-_FOREVER_S = 3600.0
 
 
 @click.command("echo")
@@ -44,6 +44,7 @@ def echo_command(
 ) -> None:
     """Print the joint states of ROBOT as they come in, as YAML documents."""
     from zstate.cli.tap import Tap
+    from zstate.clock import LONGEST_WAIT_S
 
     with (
         open_session(network) as session,
@@ -54,7 +55,7 @@ def echo_command(
         tapped = tap.first(timeout if once else None)
         show(named.document(tapped))
         while not once:
-            tapped = tap.next(_FOREVER_S)
+            tapped = tap.next(LONGEST_WAIT_S)
             if tapped is not None:
                 show(named.document(tapped))
 
@@ -94,11 +95,12 @@ class Named(Closing):
 
     def document(self, tapped: Tapped) -> Any:
         """What a sample says, with the names of its joints if they can be known."""
+        from zstate.clock import wait_in_slices
         from zstate.wire.messages import JointState
 
         assert isinstance(tapped.sample, JointState)
         if not self._writer.knows(tapped.sample) and not self._warned:
-            self._described.wait(_NAMES_WITHIN_S)
+            wait_in_slices(self._described, _NAMES_WITHIN_S)
         if not self._writer.knows(tapped.sample) and not self._warned:
             self._warned = True
             why = "is of another model" if self._described.is_set() else "is missing"
@@ -110,7 +112,7 @@ class Named(Closing):
 
 
 def _printer(form: str | None, field: str | None) -> Callable[[Any], None]:
-    from zstate.cli.fields import Columns, field_of, yaml_text
+    from zstate.cli.document_text import Columns, field_of, yaml_text
 
     table = Columns()
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zstate.cli.console import age_text, note, rate_text, say, say_json
-from zstate.cli.options import Network, open_session, session_options
-from zstate.cli.tree_lines import in_columns, tree_lines
+from zstate.cli.layout import in_columns, tree_lines
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import session_options
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -32,7 +33,7 @@ def tree_command(network: Network, robot: str, form: str | None) -> None:
 
     For each edge: its kind, the rate of its samples, the age of the newest one, and who writes it.
     """
-    from zstate.cli.gathering import gathered_frames
+    from zstate.cli.frames import gathered_frames
 
     with open_session(network) as session:
         frames = gathered_frames(session, robot)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import queue
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +14,7 @@ from zstate.cli.console import fail, say
 
 if TYPE_CHECKING:
     from zstate.cli.children import ChildCommand
-    from zstate.cli.plan_up import Start
+    from zstate.cli.starts import Start
 
 _COLORS = ("cyan", "green", "magenta", "yellow", "blue")
 
@@ -46,24 +46,32 @@ def up_command(file: str) -> None:
     rpy_deg = [0.0, -90.0, 0.0]        # or rpy, or quat_xyzw
     """
     from zstate.cli.config_file import read_config
-    from zstate.cli.plan_up import planned
+    from zstate.cli.starts import planned
 
     _run(planned(read_config(file), Path(file)))
 
 
 def _run(starts: Sequence[Start]) -> NoReturn:
     from zstate.cli.children import ChildCommand
+    from zstate.clock import wait_in_slices
 
     width = max(len(start.name) for start in starts)
-    ended: queue.SimpleQueue[ChildCommand] = queue.SimpleQueue()
+    ended: list[ChildCommand] = []
+    is_over = threading.Event()
+
+    def note_end(child: ChildCommand) -> None:
+        ended.append(child)
+        is_over.set()
+
     with ExitStack() as children:
         running: list[ChildCommand] = []
         try:
             for number, start in enumerate(starts):
                 prefix = click.style(f"{start.name:<{width}} | ", fg=_COLORS[number % len(_COLORS)])
-                child = ChildCommand(start.name, start.arguments, on_end=ended.put, on_line=_prefixed(prefix))
+                child = ChildCommand(start.name, start.arguments, on_end=note_end, on_line=_prefixed(prefix))
                 running.append(children.enter_context(child))
-            first = ended.get()
+            wait_in_slices(is_over)
+            first = ended[0]
         finally:
             # Asked all at once, they end in the time of one.
             for child in running:

@@ -8,7 +8,8 @@ import threading
 import click
 
 from zstate.cli.console import note, say
-from zstate.cli.options import Network, config_option, open_session
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import config_option
 
 
 @click.command("router")
@@ -26,6 +27,7 @@ def router_command(listen: tuple[str, ...], connect: tuple[str, ...], config: st
     By default it serves this host alone; `--listen tcp/0.0.0.0:7447` opens it to the network. Other
     commands reach it with `--mode client --connect tcp/HOST:7447`.
     """
+    from zstate.clock import wait_in_slices
     from zstate.net.config import CONFIG_VARIABLE, ROUTER_ENDPOINT
 
     file = config or os.environ.get(CONFIG_VARIABLE)
@@ -34,4 +36,4 @@ def router_command(listen: tuple[str, ...], connect: tuple[str, ...], config: st
         say(f"router {session.zid} listens at {', '.join(where) or f'what {file!r} says'}")
         if where == (ROUTER_ENDPOINT,):
             note("it serves this host alone; --listen tcp/0.0.0.0:7447 opens it to the network")
-        threading.Event().wait()
+        wait_in_slices(threading.Event())

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.announced import Roster
 from zstate.cli.console import note, say, say_json
-from zstate.cli.options import Network, checked_rate, checked_seconds, open_session, session_options
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_rate, checked_seconds, session_options
+from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
-    from zstate.cli.patience import Patience
+    from zstate.cli.awaited_pose import AwaitedPose
     from zstate.transform import Transform
 
 # So long without a newer answer is worth a word.
@@ -79,7 +80,7 @@ def tf_command(
     Says what it waits for, and prints each new answer. Frames are called by their bare names while these
     are unique, or ROBOT/FRAME. STAMP is in nanoseconds, or in seconds as printed.
     """
-    from zstate.cli.patience import Patience
+    from zstate.cli.awaited_pose import AwaitedPose
     from zstate.listener import TransformListener
 
     show = _show_json if as_json else _show_text
@@ -88,16 +89,16 @@ def tf_command(
         Roster(session) as roster,
         TransformListener(session, robot) as listener,
     ):
-        patience = Patience(listener, roster, target, source)
+        awaited = AwaitedPose(listener, roster, target, source)
         if not as_json:
             say(f"pose of {source} in {target}")
         if once or at is not None:
-            show(patience.answer(at, timeout_s=timeout))
+            show(awaited.answer(at, timeout_s=timeout))
         else:
-            _follow(patience, rate, show)
+            _follow(awaited, rate, show)
 
 
-def _follow(patience: Patience, rate_hz: float, show: Any) -> None:
+def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
     """Show each answer that is new. Never returns."""
     from zstate.clock import SystemClock
     from zstate.rate import Rate
@@ -105,13 +106,13 @@ def _follow(patience: Patience, rate_hz: float, show: Any) -> None:
     shown: Transform | None = None
     news_at, silent = time.monotonic(), False
     for _ in Rate(rate_hz, SystemClock(), Event()):
-        transform = patience.answer()
+        transform = awaited.answer()
         if transform != shown:
             show(transform)
             shown, news_at, silent = transform, time.monotonic(), False
         elif not silent and transform.stamp is not None and time.monotonic() - news_at > _SILENCE_S:
             silent = True
-            note(patience.silence())
+            note(awaited.silence())
 
 
 def _show_json(transform: Transform) -> None:

@@ -19,9 +19,6 @@ class HeardSource(SubscribedSource):
         self._robot = robot
         self._first = self._last = 0
 
-    def __enter__(self) -> HeardSource:
-        return self
-
     @property
     def rate_hz(self) -> float:
         """The rate of the readings so far, by their stamps; 0 for fewer than two."""

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.announced import Roster
-from zstate.cli.console import announced_text, note, say, say_json
-from zstate.cli.options import Network, open_session, session_options
+from zstate.cli.console import note, say, say_json
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import session_options
+from zstate.cli.roster import Roster, announced_text
 from zstate.closing import Closing
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
-    from zstate.cli.metered import Measure, MeteredBuffer
+    from zstate.cli.metered_buffer import Mark, Measure, MeteredBuffer
     from zstate.following.tally import Stats
     from zstate.listener import TransformListener
     from zstate.net.session import Session
@@ -60,7 +61,7 @@ class Ears(Closing):
         self._session = session
         self._roster = roster
         self._said = ""
-        self._ears: dict[str, tuple[TransformListener, MeteredBuffer]] = {}
+        self._ears: dict[str, tuple[TransformListener, MeteredBuffer, Mark]] = {}
         self._opened = ExitStack()
 
     def close(self) -> None:
@@ -77,14 +78,14 @@ class Ears(Closing):
         self._said = reason
 
     def _open(self, robot: str, streams: frozenset[Stream]) -> None:
-        from zstate.cli.metered import MeteredBuffer
+        from zstate.cli.metered_buffer import MeteredBuffer
         from zstate.listener import TransformListener
 
         follow = "joint_states" if "joint_states" in streams else "tf"
         if follow in streams:
             buffer = MeteredBuffer()
             listener = TransformListener(self._session, robot, buffer, follow=follow)
-            self._ears[robot] = self._opened.enter_context(listener), buffer
+            self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
             note(f"following {robot}: {follow}")
 
     def _reason(self) -> str:
@@ -96,8 +97,10 @@ class Ears(Closing):
 
     def measures(self) -> Iterator[tuple[str, Measure, Stats]]:
         """How the samples of each robot came in since the last call."""
-        for robot, (listener, buffer) in sorted(self._ears.items()):
-            yield robot, buffer.meter.measure(), listener.stats
+        for robot, (listener, buffer, since) in sorted(self._ears.items()):
+            now = buffer.meter.mark()
+            self._ears[robot] = listener, buffer, now
+            yield robot, buffer.meter.measure(since, now), listener.stats
 
 
 def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:

@@ -8,18 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import count_text, fail, note, say
-from zstate.cli.options import (
-    Network,
-    checked_rate,
-    load_robot,
-    name_option,
-    open_session,
-    seconds_option,
-    session_options,
-)
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_rate, load_robot, name_option, seconds_option, session_options
 
 if TYPE_CHECKING:
-    from zstate.cli.heard import HeardSource
+    from zstate.cli.heard_source import HeardSource
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.publisher import StatePublisher
@@ -83,7 +76,7 @@ def publish_command(
     ):
         _introduce(publisher, streams)
         if source == "sine":
-            from zstate.cli.running import run
+            from zstate.cli.publishing import run
 
             run(publisher, SineSource(model), rate or _SINE_RATE_HZ, seconds)
         else:
@@ -103,8 +96,8 @@ def _mention_warnings(model: RobotModel) -> None:
 
 
 def _follow(session: Session, publisher: StatePublisher, rate: float | None, seconds: float | None) -> None:
-    from zstate.cli.heard import HeardSource
-    from zstate.cli.running import run
+    from zstate.cli.heard_source import HeardSource
+    from zstate.cli.publishing import run
 
     robot = publisher.robot
     note(f"waiting for joint_states of {robot!r} ...")

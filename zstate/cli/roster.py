@@ -1,10 +1,12 @@
-"""Which robots are announced, and what to say of one that is not."""
+"""Roster: which robots are announced, and what to say of one that is not."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import announced_text, fail, unknown_robot
+from zstate.cli.console import fail
 from zstate.closing import Closing
 
 if TYPE_CHECKING:
@@ -25,6 +27,20 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     if not wanted:
         fail(announced_text(robots) if robot == ANY else unknown_robot(robot, robots))
     return wanted
+
+
+def announced_text(robots: Sequence[RobotInfo]) -> str:
+    """Which robots there are, for the end of a message about one that is not."""
+    if not robots:
+        return "no robot is announced; start one, for instance with `zstate publish panda --source sine`"
+    return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
+
+
+def unknown_robot(robot: str, robots: Sequence[RobotInfo]) -> str:
+    """The message for a robot that nobody announces, with near misses and those who are there."""
+    near = get_close_matches(robot, [info.name for info in robots], n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"nobody announces the robot {robot!r}{hint} ({announced_text(robots)})"
 
 
 class Roster(Closing):

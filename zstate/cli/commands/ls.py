@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import announced_text, note, say, say_json
-from zstate.cli.options import Network, open_session, session_options
-from zstate.cli.tree_lines import in_columns
+from zstate.cli.console import note, say, say_json
+from zstate.cli.layout import in_columns
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import session_options
+from zstate.cli.roster import announced_text
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:

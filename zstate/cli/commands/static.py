@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import announced_text, fail, note, say
-from zstate.cli.options import Network, open_session, session_options
+from zstate.cli.console import fail, note, say
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import session_options
+from zstate.cli.roster import announced_text
 
 if TYPE_CHECKING:
     from zstate.cli.config_file import Quaternion, StaticSection, Vector3
@@ -23,7 +25,13 @@ if TYPE_CHECKING:
 @click.argument("target", required=False)
 @click.argument("source", required=False)
 @click.option("--xyz", type=float, nargs=3, metavar="X Y Z", help="Where SOURCE is in TARGET [m].")
-@click.option("--rpy-deg", type=float, nargs=3, metavar="R P Y", help="How it is turned, as in URDF [deg].")
+@click.option(
+    "--rpy-deg",
+    type=float,
+    nargs=3,
+    metavar="R P Y",
+    help="How it is turned, as in URDF [deg].",
+)
 @click.option("--rpy", type=float, nargs=3, metavar="R P Y", help="The same in radians.")
 @click.option("--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="The same as a unit quaternion.")
 @click.option("--file", type=click.Path(exists=True, dir_okay=False), help="All [[static]] of a TOML file.")
@@ -54,6 +62,7 @@ def static_command(
     zstate static --file cell.toml
     """
     from zstate.cli.config_file import StaticSection
+    from zstate.clock import wait_in_slices
     from zstate.statics import StaticPublisher
 
     if file is not None:
@@ -74,7 +83,7 @@ def static_command(
             for edge in edges:
                 publisher.set(edge)
                 say(_sentence(edge, publisher))
-        threading.Event().wait()
+        wait_in_slices(threading.Event())
 
 
 def _by_owner(

@@ -5,15 +5,8 @@ from __future__ import annotations
 import click
 
 from zstate.cli.console import count_text, say
-from zstate.cli.options import (
-    Network,
-    load_robot,
-    name_option,
-    open_session,
-    rate_option,
-    seconds_option,
-    session_options,
-)
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import load_robot, name_option, rate_option, seconds_option, session_options
 
 
 @click.command("joints")
@@ -29,7 +22,7 @@ def joints_command(
 
     ROBOT is a name such as panda, or a URDF file. `zstate publish ROBOT` makes transforms of it.
     """
-    from zstate.cli.running import run
+    from zstate.cli.publishing import run
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 

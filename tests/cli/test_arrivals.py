@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import pytest
+
+from zstate.cli.arrivals import Arrivals
+from zstate.cli.tap import Tapped
+from zstate.wire.messages import JointState, order_digest
+
+
+def arrival(came_ms: int, seq: int, session: int = 1) -> Tapped:
+    return Tapped(came_ms * 1_000_000, JointState(0, seq, session, order_digest(()), b""))
+
+
+def test_rate_spread_and_gaps_are_those_of_the_arrivals():
+    arrivals = Arrivals(10)
+    assert arrivals.intervals() is None
+    for tapped in (arrival(0, 5), arrival(100, 6), arrival(300, 9)):
+        arrivals.note(tapped)
+    measured = arrivals.intervals()
+    assert measured is not None
+    assert measured.rate_hz == pytest.approx(2 / 0.3)
+    assert (measured.min_s, measured.max_s) == pytest.approx((0.1, 0.2))
+    assert measured.std_dev_s == pytest.approx(0.05)  # 0.1 and 0.2 are each half of 0.1 off their mean
+    assert (measured.window, measured.missed) == (3, 2)  # 7 and 8 are missing
+
+
+def test_a_writer_that_starts_anew_begins_a_new_window():
+    arrivals = Arrivals(10)
+    arrivals.note(arrival(0, 100))
+    arrivals.note(arrival(5000, 0, session=2))
+    assert arrivals.intervals() is None
+    arrivals.note(arrival(5100, 1, session=2))
+    measured = arrivals.intervals()
+    assert measured is not None
+    assert (measured.rate_hz, measured.missed) == (pytest.approx(10.0), 0)

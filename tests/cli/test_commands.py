@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from zstate.cli.main import group
+
+COMMANDS = sorted(path.stem for path in (Path(__file__).parents[2] / "zstate/cli/commands").glob("[a-z]*.py"))
+
+
+def test_help_names_every_command_and_imports_nothing_heavy():
+    code = (
+        "import sys, contextlib\n"
+        "from zstate.cli.main import group\n"
+        "group.main(['--help'], standalone_mode=False)\n"
+        "print({'numpy', 'zenoh', 'pinocchio', 'rich', 'msgspec'} & set(sys.modules))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines()[-1] == "set()"
+    for command in COMMANDS:
+        assert f"  {command} " in said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_help(command: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", sys.argv.copy())
+    outcome = CliRunner().invoke(group, [command, "--help"])
+    assert outcome.exit_code == 0
+    assert "--help" in outcome.output

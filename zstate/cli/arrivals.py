@@ -1,0 +1,52 @@
+"""Arrivals: when the last samples came, and what their spacing says."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+from statistics import pstdev
+
+from zstate.cli.tap import Tapped
+
+
+@dataclass(frozen=True, slots=True)
+class Intervals:
+    """What the arrivals in a window say; ``window`` counts samples, times are in seconds.
+
+    ``missed`` counts gaps in the writer's sequence numbers since the start.
+    """
+
+    rate_hz: float
+    min_s: float
+    max_s: float
+    std_dev_s: float
+    window: int
+    missed: int
+
+
+class Arrivals:
+    """The last ``window`` arrivals."""
+
+    def __init__(self, window: int) -> None:
+        self._came: deque[int] = deque(maxlen=window)
+        self._missed = 0
+        self._last: tuple[int, int] | None = None
+
+    def note(self, tapped: Tapped) -> None:
+        """Another arrival. A writer that started anew begins a new window."""
+        session, seq = tapped.sample.session, tapped.sample.seq
+        if self._last is not None and self._last[0] != session:
+            self._came.clear()
+        elif self._last is not None:
+            self._missed += max(0, seq - self._last[1] - 1)
+        self._last = session, seq
+        self._came.append(tapped.came)
+
+    def intervals(self) -> Intervals | None:
+        """None before there are two samples."""
+        if len(self._came) < 2:
+            return None
+        steps = [(later - earlier) * 1e-9 for earlier, later in pairwise(self._came)]
+        rate_hz = len(steps) / sum(steps) if sum(steps) else float("inf")
+        return Intervals(rate_hz, min(steps), max(steps), pstdev(steps), len(self._came), self._missed)

@@ -1,0 +1,23 @@
+"""A publisher at work, until its time is over or a signal comes, and what it achieved."""
+
+from __future__ import annotations
+
+from zstate.cli.console import report_text, say
+from zstate.cli.worker import Worker
+from zstate.publisher import StatePublisher
+from zstate.sources.source import JointSource
+
+
+def run(publisher: StatePublisher, source: JointSource, rate_hz: float, seconds: float | None) -> None:
+    """``publisher.run``, with its report at the end even when a signal ends it.
+
+    The signal interrupts this thread, which only waits, so that the publisher's loop ends in order.
+    """
+    worker = Worker("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
+    try:
+        report = worker.result()
+    except SystemExit:
+        publisher.close()
+        say(report_text(worker.result(1.0)))
+        raise
+    say(report_text(report))
