@@ -2,10 +2,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from looking import Spawn, failure, interrupted, standing, started
 from support import until
 
 from zstate import TransformListener, connect
+
+pytestmark = pytest.mark.processes
 
 POSE = ("--xyz", "0.1", "0", "-0.2", "--rpy-deg", "0", "0", "90")
 
@@ -48,7 +51,6 @@ def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
         target = "camera"
         source = "lens"
         xyz = [0, 0, 2]
-        rpy = [0, 0, 0]
         """
     )
     child = started(spawn, "static", "--file", str(file))
@@ -72,11 +74,18 @@ def test_with_two_robots_it_asks_which_and_names_them():
 
 def test_what_is_no_pose_is_told():
     xyz = ("--xyz", "0", "0", "0")
-    assert "0 rotations" in failure("static", "r/a", "b", *xyz)
     assert "2 rotations" in failure("static", "r/a", "b", *POSE, "--rpy", "0", "0", "0")
     assert "length 2" in failure("static", "r/a", "b", *xyz, "--quat-xyzw", "0", "0", "0", "2")
     assert "finite" in failure("static", "r/a", "b", "--xyz", "nan", "0", "0", "--rpy", "0", "0", "0")
     assert "itself" in failure("static", "r/a", "r/a", *POSE)
+
+
+def test_a_rotation_left_out_is_none_and_so_is_a_translation(spawn: Spawn):
+    placed, turned = "r/a", "r/b"
+    sentence = started(spawn, "static", "r/base", placed, "--xyz", "1", "2", "3").line()
+    assert "xyz [1, 2, 3] m, rpy [0, 0, 0] deg" in sentence
+    sentence = started(spawn, "static", "r/base", turned, "--rpy-deg", "0", "0", "90").line()
+    assert "xyz [0, 0, 0] m, rpy [0, 0, 90] deg" in sentence
 
 
 def test_half_an_edge_is_wrong_usage():

@@ -10,6 +10,8 @@ from support import Child
 
 from zstate import TransformListener, connect, discover
 
+pytestmark = pytest.mark.processes
+
 STATIC = '[[static]]\ntarget = "lower"\nsource = "flange"\nxyz = [0, 0, 1]\nrpy_deg = [0, 0, 0]\n'
 
 
@@ -69,9 +71,11 @@ def test_a_part_that_dies_ends_all_with_its_last_error(up):
 
 
 def test_the_last_error_of_a_part_is_the_cause_that_is_told(up, free_port: int):
-    child = up(f'[network]\nmode = "client"\nconnect = ["tcp/127.0.0.1:{free_port}"]\n' + robot(model=RRBOT))
-    assert child.wait() == 1
-    assert "'rrbot' ended with exit code 1: zstate: nothing answers at" in child.stderr
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    with connect(listen=endpoint):
+        child = up(f"[network]\nlisten = ['{endpoint}']\n" + robot(model=RRBOT))
+        assert child.wait() == 1
+    assert f"'rrbot' ended with exit code 1: zstate: somebody listens at {endpoint!r}" in child.stderr
 
 
 def test_models_are_found_beside_the_file(tmp_path: Path, up):
@@ -96,6 +100,7 @@ def test_models_are_found_beside_the_file(tmp_path: Path, up):
         (robot(model=RRBOT) + STATIC.replace("rpy_deg", "rpy_rad"), "unknown field `rpy_rad`"),
         (robot(model=RRBOT) + STATIC.replace("[0, 0, 1]", "[0, 0]"), "static[0].xyz"),
         (robot(model=RRBOT) + STATIC.replace("flange", "lower"), "itself"),
+        (robot(model=RRBOT) + STATIC.partition("xyz")[0], "'flange' in 'lower' has 0 rotations and no xyz"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_told_with_the_place_in_it(tmp_path: Path, text: str, told: str):

@@ -62,11 +62,11 @@ class RobotSection(_Section, frozen=True):
 
 
 class StaticSection(_Section, frozen=True):
-    """``[[static]]``: as the arguments of `zstate static`; exactly one of the three rotations."""
+    """``[[static]]``: as the arguments of `zstate static`; ``xyz``, one of the three rotations, or both."""
 
     target: str
     source: str
-    xyz: Vector3
+    xyz: Vector3 | None = None
     rpy_deg: Vector3 | None = None
     rpy: Vector3 | None = None
     quat_xyzw: Quaternion | None = None
@@ -76,16 +76,17 @@ class StaticSection(_Section, frozen=True):
         self.transform()
 
     def transform(self) -> Transform:
-        """The edge. Raises InvalidInput unless there is one rotation, and for what is no pose."""
-        given = [value for value in (self.rpy_deg, self.rpy, self.quat_xyzw) if value is not None]
-        if len(given) != 1:
+        """The edge. Raises InvalidInput for several rotations, for neither one nor xyz, and for no pose."""
+        rotations = 3 - (self.rpy_deg, self.rpy, self.quat_xyzw).count(None)
+        if rotations > 1 or (rotations == 0 and self.xyz is None):
             raise InvalidInput(
-                f"the pose of {self.source!r} in {self.target!r} has {len(given)} rotations; give one of "
-                "rpy_deg (0 0 0 for none), rpy, quat_xyzw"
+                f"the pose of {self.source!r} in {self.target!r} has {rotations} rotations"
+                f"{'' if rotations else ' and no xyz'}; give xyz, one of rpy_deg, rpy and quat_xyzw, or both"
             )
+        xyz = self.xyz or (0.0, 0.0, 0.0)
         if self.quat_xyzw is not None:
-            return Transform(self.target, self.source, self.xyz, self.quat_xyzw)
-        return Transform.from_rpy(self.target, self.source, self.xyz, self._angles())
+            return Transform(self.target, self.source, xyz, self.quat_xyzw)
+        return Transform.from_rpy(self.target, self.source, xyz, self._angles())
 
     @property
     def owner(self) -> str | None:
@@ -94,10 +95,9 @@ class StaticSection(_Section, frozen=True):
         return self.robot or next(named, None)
 
     def _angles(self) -> Vector3:
-        if self.rpy_deg is None:
-            assert self.rpy is not None
+        if self.rpy is not None:
             return self.rpy
-        roll, pitch, yaw = self.rpy_deg
+        roll, pitch, yaw = self.rpy_deg or (0.0, 0.0, 0.0)
         return radians(roll), radians(pitch), radians(yaw)
 
 

@@ -53,7 +53,8 @@ def static_command(
 ) -> None:
     """Publish the pose of SOURCE in TARGET until Ctrl-C; then it is withdrawn.
 
-    SOURCE becomes a child of TARGET. Late joiners have it at once. Bare frame names are the robot's own;
+    SOURCE becomes a child of TARGET. Late joiners have it at once. Without --xyz it is at the origin of
+    TARGET, without a rotation it is not turned; say at least one. Bare frame names are the robot's own;
     `robot/frame` names a frame in full.
 
     \b
@@ -71,8 +72,8 @@ def static_command(
         if target is not None:
             raise click.UsageError("give TARGET and SOURCE, or --file, not both")
         statics = read_config(file).static
-    elif target is None or source is None or xyz is None:
-        raise click.UsageError("give TARGET, SOURCE, --xyz and a rotation; or --file")
+    elif target is None or source is None or (xyz, rpy_deg, rpy, quat_xyzw) == (None,) * 4:
+        raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
         statics = (StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw, robot),)
     if not statics:

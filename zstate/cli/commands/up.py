@@ -43,7 +43,7 @@ def up_command(file: str) -> None:
     target = "panda_hand"
     source = "camera"
     xyz = [0.05, 0.0, 0.04]
-    rpy_deg = [0.0, -90.0, 0.0]        # or rpy, or quat_xyzw
+    rpy_deg = [0.0, -90.0, 0.0]        # or rpy, or quat_xyzw; left out: not turned
     """
     from zstate.cli.config_file import read_config
     from zstate.cli.starts import planned
