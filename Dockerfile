@@ -8,8 +8,10 @@ FROM python:3.12-slim AS base
 RUN apt-get update && apt-get install -y --no-install-recommends libgomp1 && rm -rf /var/lib/apt/lists/*
 
 FROM python:3.12-slim AS build
+# With a compiler the buffer's C extension is built.
+RUN apt-get update && apt-get install -y --no-install-recommends gcc libc6-dev && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml setup.py README.md LICENSE ./
 COPY zstate zstate
 COPY models models
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .

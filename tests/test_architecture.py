@@ -16,9 +16,9 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
-    {"closing", "errors"},
-    {"clock"},
-    {"se3", "rate"},
+    {"closing", "errors", "_kernel"},
+    {"clock", "extension"},
+    {"se3", "rate", "facts"},
     {"transform", "twist"},
     {"model", "buffer", "wire"},
     {"net", "record"},

@@ -15,11 +15,18 @@ ROOT = Path(__file__).parent.parent
 
 def build(kind: str, source: Path, folder: Path) -> Path:
     """The wheel or sdist made of ``source``."""
-    command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", str(folder)]
-    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    code = f"from setuptools import build_meta; build_meta.build_{kind}({str(folder)!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     (made,) = folder.iterdir()
     return made
+
+
+def extension(wheel: Path) -> set[str]:
+    """The C extension, where there was a compiler."""
+    return {name for name in names_in(wheel) if Path(name).suffix in (".so", ".pyd")}
 
 
 def names_in(wheel: Path) -> set[str]:
@@ -27,20 +34,27 @@ def names_in(wheel: Path) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy to build in, for building leaves its traces."""
+    ignored = shutil.ignore_patterns(".*", "__pycache__", "build", "*.egg-info", "*.so")
+    return shutil.copytree(ROOT, tmp_path_factory.mktemp("source") / "zstate", ignore=ignored)
 
 
 @pytest.fixture(scope="module")
-def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+def sdist(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("sdist", source, tmp_path_factory.mktemp("sdist"))
+
+
+@pytest.fixture(scope="module")
+def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build("wheel", source, tmp_path_factory.mktemp("wheel"))
 
 
 def test_the_wheel_holds_the_code_the_robots_and_nothing_else(wheel: Path):
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "zstate").rglob("*.py")}
     robots = {f"zstate/models/{path.name}" for path in (ROOT / "models").iterdir()}
-    shipped = {name for name in names_in(wheel) if ".dist-info/" not in name}
-    assert shipped == code | robots | {"zstate/py.typed"}
+    shipped = {name for name in names_in(wheel) if ".dist-info/" not in name and name not in extension(wheel)}
+    assert shipped == code | robots | {"zstate/py.typed", "zstate/_kernel.pyi"}
 
 
 def test_the_wheel_says_its_licence_and_its_command(wheel: Path):
@@ -59,10 +73,28 @@ def test_a_wheel_made_from_the_sdist_is_the_same(wheel: Path, sdist: Path, tmp_p
     assert names_in(build("wheel", source, tmp_path / "wheel")) == names_in(wheel)
 
 
+def test_without_a_compiler_everything_but_the_extension_is_built(
+    source: Path, wheel: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    copy = shutil.copytree(source, tmp_path / "source", ignore=shutil.ignore_patterns("build"))
+    made = build("wheel", copy, tmp_path / "wheel")
+    assert extension(made) == set()
+    assert names_in(made) == names_in(wheel) - extension(wheel)
+
+
 def test_the_sdist_holds_what_the_tests_need(sdist: Path):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"tests/conftest.py", "README.md", "CHANGELOG.md", "Dockerfile", "models/rrbot.urdf"} <= names
+    assert {
+        "tests/conftest.py",
+        "README.md",
+        "CHANGELOG.md",
+        "Dockerfile",
+        "models/rrbot.urdf",
+        "setup.py",
+        "zstate/buffer/_kernel.c",
+    } <= names
 
 
 def test_the_changelog_begins_with_this_version():

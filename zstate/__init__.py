@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         UnknownFrame,
         ZStateError,
     )
+    from zstate.extension import kernel
     from zstate.listener import TransformListener
     from zstate.model.catalog import load_model
     from zstate.model.kinematics import Kinematics
@@ -61,6 +62,7 @@ __all__ = [
     "ZStateError",
     "connect",
     "discover",
+    "kernel",
     "load_model",
 ]
 
@@ -76,6 +78,7 @@ _HOMES = {
     "Twist": "twist",
     "connect": "net.session",
     "discover": "net.presence",
+    "kernel": "extension",
     "load_model": "model.catalog",
 }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from zstate import se3
 from zstate.clock import Clock, check_stamp, stamp_text
 from zstate.errors import FrameMismatch, InvalidInput, duration_text
+from zstate.facts import Facts, Kind
 
-Kind: TypeAlias = Literal["static", "exact", "interpolated", "predicted"]
 Array: TypeAlias = NDArray[np.float64]
 
 # A path is as good as its least certain part: the later kind wins.
@@ -55,7 +55,7 @@ def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
     return (*values[:3], *(value / norm for value in values[3:]))
 
 
-class Transform:
+class Transform(Facts):
     """The pose of frame ``source`` in frame ``target``, at one instant or for ever.
 
     ``translation`` is x y z [m] in target axes, ``rotation`` the unit quaternion x y z w, ``stamp``
@@ -64,16 +64,9 @@ class Transform:
     the newest sample. Immutable. Raises InvalidInput for numbers that are no pose.
     """
 
-    __slots__ = ("_pose", "kind", "predicted_s", "source", "stamp", "target")
+    __slots__ = ()
     # numpy must not take ``transform @ array`` for a product of matrices.
     __array_ufunc__ = None
-
-    _pose: tuple[float, ...]
-    target: str
-    source: str
-    stamp: int | None
-    kind: Kind
-    predicted_s: float
 
     def __init__(
         self,
@@ -96,34 +89,6 @@ class Transform:
         if kind is not None and kind not in KINDS:
             raise InvalidInput(f"a transform's kind is one of {', '.join(KINDS)}; got {kind!r}")
         self._fill(target, source, pose, stamp, kind or ("static" if stamp is None else "exact"))
-
-    def _fill(  # noqa: PLR0917 - one call for each fact, on the hot path
-        self,
-        target: str,
-        source: str,
-        pose: tuple[float, ...],
-        stamp: int | None,
-        kind: Kind,
-        predicted_s: float = 0.0,
-    ) -> None:
-        values = zip(self.__slots__, (pose, kind, predicted_s, source, stamp, target), strict=True)
-        for name, value in values:
-            object.__setattr__(self, name, value)
-
-    @classmethod
-    def trusted(  # noqa: PLR0917 - the buffer's hot path
-        cls,
-        target: str,
-        source: str,
-        pose: tuple[float, ...],
-        stamp: int | None,
-        kind: Kind,
-        predicted_s: float = 0.0,
-    ) -> Transform:
-        """From seven floats that are known to be a pose: for the buffer, which checked at insert."""
-        transform = cls.__new__(cls)
-        transform._fill(target, source, pose, stamp, kind, predicted_s)
-        return transform
 
     @classmethod
     def from_pose7(cls, target: str, source: str, pose7: ArrayLike, stamp: int | None = None) -> Transform:

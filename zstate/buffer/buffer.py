@@ -55,6 +55,13 @@ class TransformBuffer(Questions):
         Raises UnknownFrame, AmbiguousFrame, Disconnected, NoData, InPast, InFuture or Stale, all of
         them LookupFailed; after a wait also a TimeoutError.
         """
+        if max_age_s is None and timeout_s == 0.0 and predict_s == 0.0:
+            known = self._paths.get((target, source))
+            if known is not None and known[0] == self._tree.version:
+                transform = known[1].at(at)
+                if transform is not None:
+                    return transform
+                known[1].refuse(at)
         question = self._question(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
         if seconds("timeout_s", timeout_s) > 0.0:
             return self._wait(question, timeout_s)
@@ -86,8 +93,7 @@ class TransformBuffer(Questions):
 
     def plan(self, target: str, source: str) -> Plan:
         """The same question for many instants, compiled. Raises as ``lookup`` for unknown frames."""
-        self._path(target, source)
-        return Plan(target, source, lambda: self._path(target, source))
+        return Plan(target, source, self._tree, lambda: self._path(target, source))
 
     def twist(self, frame: str, reference: str, at: int | None = None) -> Twist:
         """How fast ``frame`` moves in ``reference``: d/dt of ``reference_from_frame``.

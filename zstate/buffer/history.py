@@ -7,6 +7,7 @@ one stamp, room running out) writes a new copy. Then the new view is published b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +78,9 @@ class History:
         """Whether a sample of that stamp would be kept: at most ``span_ns`` older than the newest."""
         return not self.view.size or stamp >= self.view.newest - self.span_ns
 
+    def take(self, stamp: object, positions: object, velocities: object, position_count: int) -> bool | None:
+        """Insert unchecked input, where that can be done and checked in one go. None: it cannot, ever."""
+
     def insert(self, stamp: int, row: NDArray[np.float64]) -> bool:
         """Take a sample; False when it is older than the history reaches."""
         view = self.view
@@ -119,3 +123,9 @@ class History:
         fresh.stamps[:at], fresh.stamps[at], fresh.stamps[at + 1 : end] = stamps[:at], stamp, stamps[after:]
         fresh.rows[:at], fresh.rows[at], fresh.rows[at + 1 : end] = rows[:at], row, rows[after:]
         self.view = fresh._replace(end=end)
+
+
+def insert_together(histories: Sequence[History], stamp: int, rows: Sequence[NDArray[np.float64]]) -> None:
+    """One instant of several histories, none of which it is too old for."""
+    for history, row in zip(histories, rows, strict=True):
+        history.insert(stamp, row)

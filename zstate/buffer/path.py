@@ -17,7 +17,7 @@ from zstate.buffer.history import View
 from zstate.buffer.steps import Motion, Step, Values, chain_motion, chain_pose
 from zstate.buffer.tracks import JointTrack, Track, coverage
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, Stale
-from zstate.transform import Kind
+from zstate.transform import Kind, Transform
 
 Stamps: TypeAlias = NDArray[np.int64]
 ViewTaker: TypeAlias = Callable[[Sequence["TrackUse"]], list[View]]
@@ -65,6 +65,12 @@ class Path:
         self.steps_to_source = steps_to_source
         self.uses = tuple(uses)
         self._take_views = take_views
+
+    def at(self, stamp: object = None, /) -> Transform | None:
+        """The answer where that is found at once; None where ``answer`` has to be asked."""
+
+    def refuse(self, stamp: object, /) -> None:
+        """Raise the reason where it is known at once that there is no answer at this moment."""
 
     def latest(self) -> int:
         """The newest instant that every moving edge knows [ns]. Raises NoData."""

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate import se3
 from zstate.buffer.cells import Cell, Line, Pose7, Turn
+from zstate.buffer.compiled import make_path
 from zstate.buffer.path import Path, Stamps, TrackUse, ViewTaker
 from zstate.buffer.steps import Fixed, Given, Hinge, Planar, Slide, Step
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
@@ -24,10 +25,12 @@ class Plan:
     Made by ``TransformBuffer.plan``; follows the buffer when frames are added or withdrawn.
     """
 
-    def __init__(self, target: str, source: str, current_path: Callable[[], Path]) -> None:
+    def __init__(self, target: str, source: str, tree: Tree, current_path: Callable[[], Path]) -> None:
         self.target = target
         self.source = source
+        self._tree = tree
         self._current_path = current_path
+        self._known = tree.version, current_path()
 
     def __repr__(self) -> str:
         return f"<plan of {self.source!r} in {self.target!r}>"
@@ -37,8 +40,15 @@ class Plan:
 
         Raises LookupFailed as ``TransformBuffer.lookup`` does.
         """
-        at = None if stamp is None else check_stamp(stamp)
-        return transform_of(self._current_path(), at)
+        version, path = self._known
+        if version != self._tree.version:
+            # The version is asked first: a path that is newer than it says is made again, never kept.
+            self._known = self._tree.version, self._current_path()
+            path = self._known[1]
+        transform = path.at(stamp)
+        if transform is not None:
+            return transform
+        return transform_of(path, None if stamp is None else check_stamp(stamp))
 
     def poses(self, stamps: ArrayLike, out: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """pose7 at each of ``stamps``: (T, 7), written into ``out`` when given.
@@ -75,6 +85,9 @@ def check_stamps(stamps: ArrayLike) -> Stamps:
 
 def transform_of(path: Path, at: int | None, predict_ns: int = 0) -> Transform:
     """A path's answer, with the names it was asked by."""
+    transform = path.at(at)
+    if transform is not None:
+        return transform
     answer = path.answer(at, predict_ns)
     return Transform.trusted(path.target, path.source, *answer)
 
@@ -85,7 +98,7 @@ def compile_path(tree: Tree, target: str, source: str, take_views: ViewTaker) ->
     uses = _Uses()
     steps_to_target = _steps(to_target, uses)
     steps_to_source = _steps(to_source, uses)
-    return Path((target, source), steps_to_target, steps_to_source, uses.done(), take_views)
+    return make_path((target, source), steps_to_target, steps_to_source, uses.done(), take_views)
 
 
 def joints_path(track: JointTrack, take_views: ViewTaker) -> Path:

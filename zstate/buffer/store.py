@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.buffer.feeds import EdgeNames, Feed, Feeds, TooOld, second_writer
 from zstate.buffer.frames import FrameInfo, frame_info
 from zstate.buffer.history import View
+from zstate.buffer.kernel import insert_together
 from zstate.buffer.path import TrackUse
 from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack
 from zstate.buffer.tree import Edge, Tree
@@ -105,6 +106,10 @@ class Store:
         sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity,
         and for a floating joint's quaternion that is not of length one.
         """
+        with self._lock:
+            taken = track.take(stamp, positions, velocities)
+        if taken is not None:
+            return self._count(taken=taken)
         stamp = check_stamp(stamp)
         numbers = track.check_positions(positions)
         rates = None if velocities is None else track.model.check_velocities(velocities)
@@ -163,8 +168,8 @@ class Store:
     def _write_together(self, feed: Feed, stamp: int, poses: Poses) -> None:
         # Odd while tracks disagree: a reader that sees it asks again under the lock.
         self._writes += 1
-        for track, rows in feed:
-            track.history.insert(stamp, poses[rows].ravel())
+        histories = tuple(track.history for track, _ in feed)
+        insert_together(histories, stamp, tuple(poses[rows].ravel() for _, rows in feed))
         self._writes += 1
 
     def _count(self, *, taken: bool) -> bool:

@@ -9,7 +9,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.history import History, View
+from zstate.buffer.history import View
+from zstate.buffer.kernel import History
 from zstate.model.edges import EdgeForm, EdgeTable
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -34,6 +35,9 @@ class JointTrack:
         self.interpolation = interpolation
         self.writer: str | None = None
         self.history = History(model.position_count, span_ns)
+        # Quaternions of floating joints have to be looked at and normalised.
+        self._plain = all(form.kind != "floating" for form in self.forms)
+        self._position_count = model.position_count
 
     def __repr__(self) -> str:
         return f"<track of {self.name!r}, {self.history.view.size} samples>"
@@ -69,6 +73,12 @@ class JointTrack:
     def check_positions(self, positions: ArrayLike) -> NDArray[np.float64]:
         """As ``RobotModel.check_positions``, and quaternions of floating joints at length one."""
         return self._table.normalised(self.model.check_positions(positions))
+
+    def take(self, stamp: object, positions: object, velocities: object) -> bool | None:
+        """``insert`` of what may be anything; None where it has to be looked at more closely first."""
+        if not self._plain:
+            return None
+        return self.history.take(stamp, positions, velocities, self._position_count)
 
     def insert(
         self, stamp: int, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None

@@ -1,0 +1,49 @@
+"""The C extension, made of buffer/_kernel.c. ``zstate.extension`` says whether it is there."""
+
+from typing import Any, TypeAlias
+
+from numpy.typing import NDArray
+from typing_extensions import Buffer
+
+from zstate.buffer.compiled import Description
+from zstate.transform import Transform
+
+REVISION: int
+
+Blame: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
+
+class Block(Buffer):
+    @property
+    def capacity(self) -> int: ...
+    @property
+    def width(self) -> int: ...
+
+class History:
+    def __init__(self, width: int, span_ns: int) -> None: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def span_ns(self) -> int: ...
+    @property
+    def window(self) -> tuple[Block, int, int]: ...
+    def insert(self, stamp: int, row: NDArray[Any], /) -> bool: ...
+    def take(
+        self, stamp: object, positions: object, velocities: object, position_count: int, /
+    ) -> bool | None: ...
+    def replace(self, stamps: NDArray[Any], rows: NDArray[Any], /) -> None: ...
+    def reaches(self, stamp: int, /) -> bool: ...
+    def clear(self) -> None: ...
+
+class Path:
+    def __init__(
+        self,
+        type: type[Transform],
+        target: str,
+        source: str,
+        to_target: tuple[Description, ...],
+        to_source: tuple[Description, ...],
+        histories: tuple[object, ...],
+    ) -> None: ...
+    def at(self, stamp: object = None, /) -> Transform | None: ...
+    def blame(self, stamp: object, /) -> Blame | None: ...
+    def poses(self, stamps: NDArray[Any], out: NDArray[Any], valid: NDArray[Any], /) -> None: ...
