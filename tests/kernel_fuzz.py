@@ -1,0 +1,289 @@
+"""Hostile arguments for the C extension, under AddressSanitizer and UndefinedBehaviorSanitizer.
+
+    python tests/kernel_fuzz.py [SECONDS]
+
+Builds the extension with gcc's sanitizers, calls everything it offers with whatever comes to mind, and
+ends with a non-zero exit at the first crash, bad access, undefined operation or SystemError.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import random
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from importlib.machinery import ExtensionFileLoader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SOURCE = Path(__file__).parent.parent / "zstate" / "buffer" / "_kernel.c"
+SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
+LIBRARY = "KERNEL_FUZZ_LIBRARY"
+
+STAMPS = (0, 1, -1, 7, 10**18, 2**63 - 1, -(2**63), 2**63, -(2**63) - 1, 2**200)
+ODD = (None, 1.5, math.nan, "abc", b"\0" * 16, [1.0, 2.0], (), {}, True, object(), np.int64(4), type, float)
+FLOATS = (0.0, -0.0, 1.0, math.nan, math.inf, -math.inf, 1e308, 5e-324, 3.0)
+STEP_NUMBERS = (7, 13, 12, 7, 7)
+
+
+def build(folder: str) -> Path:
+    """The extension with sanitizers."""
+    library = Path(folder, f"_kernel{sysconfig.get_config_var('EXT_SUFFIX')}")
+    include = sysconfig.get_path("include")
+    warnings = ["-Wall", "-Wextra", "-Wshadow", "-Wno-missing-field-initializers", "-Werror"]
+    command = ["gcc", "-std=c11", "-g", "-O1", *warnings, *SANITIZERS, "-fPIC", "-shared", f"-I{include}"]
+    subprocess.run([*command, str(SOURCE), "-o", str(library)], check=True)
+    return library
+
+
+def run_under_sanitizers(seconds: float) -> int:
+    """This script again, with the sanitizers' runtime loaded before Python's own memory is."""
+    found = subprocess.run(["gcc", "-print-file-name=libasan.so"], check=True, capture_output=True, text=True)
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {
+            LIBRARY: str(build(folder)),
+            "LD_PRELOAD": found.stdout.strip(),
+            "ASAN_OPTIONS": "detect_leaks=0,allocator_may_return_null=1",  # the interpreter itself leaks
+            "PYTHONMALLOC": "malloc",  # so that each object is a piece of memory of its own
+        }
+        command = [sys.executable, __file__, str(seconds)]
+        return subprocess.run(command, env=environment, check=False).returncode
+
+
+class Fuzz:
+    """One seed's worth of calls; histories and paths made on the way are used again."""
+
+    def __init__(self, kernel: Any, seed: int) -> None:
+        self.kernel = kernel
+        self.random = random.Random(seed)
+        self.numbers = np.random.default_rng(seed)
+        self.histories: list[Any] = [kernel.History(width, 10**9) for width in (0, 1, 7, 14, 40)]
+        self.paths: list[Any] = []
+        self.kept: list[Any] = []
+        self.transform = type("Transform", (kernel.Facts,), {"__slots__": ()})
+        self.calls: tuple[Callable[[], object], ...] = (
+            self.make_history,
+            *(self.write,) * 8,
+            self.replace,
+            self.forget,
+            self.write_together,
+            self.make_path,
+            self.make_good_path,
+            *(self.ask,) * 6,
+            *(self.ask_many,) * 2,
+            self.make_facts,
+            self.keep_memory,
+        )
+
+    def pick(self, *choices: Any) -> Any:
+        return self.random.choice(choices)
+
+    def stamp(self) -> Any:
+        near = self.random.randrange(-50, 1000)
+        return self.pick(near, near, near, near * 10**7, self.pick(*STAMPS), self.pick(*ODD))
+
+    def array(self, size: int, good: float = 0.8) -> Any:
+        """Mostly ``size`` doubles; at times something else."""
+        row = self.numbers.normal(size=max(size, 0))
+        if self.random.random() < good:
+            return row
+        wide = np.zeros((max(size, 1), 2))
+        frozen = row.copy()
+        frozen.flags.writeable = False
+        odd = [row[::-1], wide[:, 0], frozen, row.astype("f4"), row.astype("i8"), row.astype(">f8")]
+        odd += [
+            np.zeros(size + 1),
+            np.zeros((size, 1)),
+            np.full(size, math.nan),
+            memoryview(row),
+            np.zeros(()),
+        ]
+        odd += [row.view("u1"), np.zeros((3, 0)), np.empty(2, object), bytearray(8 * size), self.pick(*ODD)]
+        return self.pick(*odd, *self.kept)
+
+    def history(self) -> Any:
+        return self.random.choice(self.histories)
+
+    def make_history(self) -> None:
+        width = self.pick(0, 1, 3, 7, -1, 2**20 + 1, 2**62, 2**70, *ODD)
+        self.histories.append(self.kernel.History(width, self.pick(0, 1, 5, 10**9, 2**63 - 1, -1, *ODD)))
+        del self.histories[: max(0, len(self.histories) - 12)]
+
+    def write(self) -> None:
+        history = self.history()
+        if self.random.random() < 0.5:
+            history.insert(self.stamp(), self.array(history.width))
+        else:
+            count = self.pick(history.width, history.width // 2, -1, 2**62, *ODD)
+            size = count if isinstance(count, int) and 0 <= count < 100 else 3
+            rates = self.pick(None, self.array(history.width - size))
+            history.take(self.stamp(), self.array(size), rates, count)
+        history.reaches(self.stamp())
+
+    def replace(self) -> None:
+        history = self.history()
+        size = self.random.randrange(30)
+        stamps = np.cumsum(self.numbers.integers(0 if self.random.random() < 0.1 else 1, 9, size))
+        rows = self.array(size * history.width)
+        history.replace(self.pick(stamps, stamps[::-1], stamps.astype("i4"), self.array(3)), rows)
+
+    def forget(self) -> None:
+        self.history().clear()
+
+    def write_together(self) -> None:
+        some = tuple(self.random.choices(self.histories, k=self.random.randrange(4)))
+        rows = tuple(self.array(history.width, 0.95) for history in some)
+        self.kernel.insert_together(
+            self.pick(some, list(some), (1,)), self.stamp(), self.pick(rows, rows[:1])
+        )
+
+    def step(self, tracks: int) -> tuple[Any, ...]:
+        kind = self.random.randrange(5)
+        numbers: list[Any] = list(self.numbers.normal(size=STEP_NUMBERS[kind]))
+        if self.random.random() < 0.1:
+            numbers[0] = self.pick(*FLOATS, *ODD)
+        use = self.random.randrange(max(tracks, 1))
+        return (kind, use, self.random.randrange(8), self.random.random() < 0.5, tuple(numbers))
+
+    def make_path(self) -> None:
+        some = tuple(self.random.choices(self.histories, k=self.random.randrange(4)))
+        steps = [self.step(len(some)) for _ in range(self.random.randrange(5))]
+        if self.random.random() < 0.5 and steps:
+            bad = list(steps[-1])
+            bad[self.random.randrange(5)] = self.pick(-1, 5, 2**31, 2**62, 2**70, (1.0,) * 7, *ODD)
+            steps[-1] = tuple(bad)
+        chains = tuple(steps[:2]), tuple(steps[2:])
+        of = self.pick(self.transform, self.transform, self.transform, self.kernel.Facts, int, *ODD)
+        self.paths.append(self.kernel.Path(of, *self.pick(("a", "b"), ODD[:2]), *chains, some))
+
+    def make_good_path(self) -> None:
+        history = self.kernel.History(7, 2**62)
+        first = self.pick(0, -(2**63), 2**63 - 2000)
+        for number in range(self.random.randrange(40)):
+            history.insert(first + number * self.pick(1, 2, 30), self.numbers.normal(size=7))
+        self.histories.append(history)
+        uses = range(self.pick(1, 2, 20))
+        steps = tuple((4, use, 0, False, (0.0,) * 6 + (1.0,)) for use in uses)
+        self.paths.append(
+            self.kernel.Path(self.transform, "a", "b", steps, steps[:1], (history,) * len(uses))
+        )
+        del self.paths[: max(0, len(self.paths) - 8)]
+
+    def ask(self) -> None:
+        for path in self.paths[-3:]:
+            answer = path.at(*self.pick((), (self.stamp(),), (1, 2)))
+            if answer is not None:
+                repr((answer._pose, answer.stamp, answer.kind, answer.target, answer.predicted_s))
+            path.blame(self.stamp())
+
+    def ask_many(self) -> None:
+        for path in self.paths[-3:]:
+            count = self.random.randrange(40)
+            stamps = self.numbers.integers(-50, 1000, count)
+            stamps[: count // 3] = self.numbers.integers(-(2**63), 2**63 - 1, count // 3)
+            valid = self.pick(
+                np.empty(count, bool), np.empty(count, bool), bytearray(count + 1), b"x" * count
+            )
+            path.poses(
+                self.pick(stamps, stamps, stamps[::2], self.array(count)), self.array(7 * count), valid
+            )
+
+    def make_facts(self) -> None:
+        pose = tuple(self.numbers.normal(size=self.pick(7, 7, 6)))
+        facts = self.transform.trusted(*self.pick(("a", "b", pose, 1, "exact"), ODD[:5], (), (1,) * 9))
+        empty = self.transform()
+        for name in ("_pose", "target", "source", "stamp", "kind", "predicted_s"):
+            getattr(facts, name)
+            getattr(empty, name, None)
+        empty._fill(*self.pick(("a", "b", pose, 1, "exact", 0.5), ODD[:5], ()))
+        empty._fill("a", "b", pose, 1, "exact")
+
+    def keep_memory(self) -> None:
+        """Memory of a history as an argument of calls to come, at times after its history is gone."""
+        block, first, end = self.history().window
+        rows = np.frombuffer(block, np.float64, offset=8 * block.capacity)
+        float(np.nansum(rows[first * block.width : end * block.width]))
+        self.kept = [*self.kept[-2:], rows[: block.width], self.pick(rows, memoryview(block))]
+
+    def run(self, calls: int) -> Counter[str]:
+        outcomes: Counter[str] = Counter()
+        for _ in range(calls):
+            outcomes[self.outcome()] += 1
+        return outcomes
+
+    def outcome(self) -> str:
+        try:
+            self.random.choice(self.calls)()
+        except Exception as error:
+            if isinstance(error, SystemError):  # the extension broke a rule of CPython
+                raise
+            return type(error).__name__
+        return "fine"
+
+
+def beside_each_other(kernel: Any, seconds: float) -> None:
+    """Batches without the GIL while another thread writes, late samples and clears included."""
+    history = kernel.History(7, 5000)
+    transform = type("Transform", (kernel.Facts,), {"__slots__": ()})
+    step = (4, 0, 0, False, (0.0,) * 6 + (1.0,))
+    path = kernel.Path(transform, "a", "b", (), (step,), (history,))
+    stop = threading.Event()
+
+    def write() -> None:
+        row = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
+        stamp = 0
+        while not stop.is_set():
+            stamp += 10
+            history.insert(stamp, row)
+            if stamp % 70 == 0:
+                history.insert(stamp - 35, row)
+            if stamp % 100_000 == 0:
+                history.clear()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    deadline = time.monotonic() + seconds
+    poses, valid = np.empty((5000, 7)), np.empty(5000, bool)
+    while time.monotonic() < deadline:
+        block, _, end = history.window
+        newest = int(np.frombuffer(block, np.int64, block.capacity)[end - 1]) if end else 0
+        path.poses(newest - np.arange(5000), poses, valid)
+        assert (poses[valid, :3] == (1.0, 2.0, 3.0)).all()
+    stop.set()
+    writer.join()
+
+
+def main() -> int:
+    """Fuzz for so many seconds; the exit code says whether all went well."""
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
+    library = os.environ.get(LIBRARY)
+    if library is None:
+        return run_under_sanitizers(seconds)
+    loader = ExtensionFileLoader("zstate._kernel", library)
+    spec = importlib.util.spec_from_loader("zstate._kernel", loader)
+    assert spec is not None
+    kernel = importlib.util.module_from_spec(spec)
+    loader.exec_module(kernel)
+    outcomes: Counter[str] = Counter()
+    deadline = time.monotonic() + 0.8 * seconds
+    seed = 0
+    while time.monotonic() < deadline:
+        outcomes += Fuzz(kernel, seed).run(2000)
+        seed += 1
+    beside_each_other(kernel, 0.2 * seconds)
+    print(f"{outcomes.total()} calls from {seed} seeds, no crash: {dict(outcomes.most_common())}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
