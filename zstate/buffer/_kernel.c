@@ -212,13 +212,29 @@ limit_of(const History *self, int64_t newest)
     return newest < INT64_MIN + self->span_ns ? INT64_MIN : newest - self->span_ns;
 }
 
+/* The rows around a guess: in a history larger than the caches they are on their way while the stamps
+ * are still being looked at. Columns of a wide row beyond these lines are waited for. */
+static inline void
+prefetch_rows(const Block *block, Py_ssize_t guess)
+{
+#if defined(__GNUC__)
+    Py_ssize_t end = block->capacity * block->width, i = guess * block->width;
+    Py_ssize_t stop = i + 2 * block->width < end ? i + 2 * block->width : end;
+    for (stop = stop < i + 32 ? stop : i + 32; i < stop; i += 8)
+        __builtin_prefetch(block->rows + i);
+#else
+    (void)block, (void)guess;
+#endif
+}
+
 /* The first index whose stamp is not before `at`; `end` when there is none.
  *
  * Stamps of a track come at a nearly constant rate: where the mean period says, or near by, is a
  * better first guess than the middle. From there steps of doubled length find a stretch to bisect. */
 static Py_ssize_t
-index_not_before(const int64_t *stamps, Py_ssize_t first, Py_ssize_t end, int64_t at)
+index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t at)
 {
+    const int64_t *stamps = block->stamps;
     if (first == end || at > stamps[end - 1])
         return end;
     Py_ssize_t low = first, high = end - 1;
@@ -229,6 +245,7 @@ index_not_before(const int64_t *stamps, Py_ssize_t first, Py_ssize_t end, int64_
     double whole = (double)((uint64_t)stamps[high] - (uint64_t)stamps[low]);
     Py_ssize_t guess = low + (Py_ssize_t)(way / whole * (double)(high - low));
     guess = guess > high ? high : guess;
+    prefetch_rows(block, guess);
     Py_ssize_t step = 1;
     if (stamps[guess] >= at) {
         for (high = guess; high - low > step; step *= 2) {
@@ -272,12 +289,28 @@ history_reaches(const History *self, int64_t stamp)
     return is_empty(self) || stamp >= limit_of(self, newest_of(self));
 }
 
+/* Moves the samples to the front of their block, where nobody else can see it: an array made of it, or
+ * a batch that reads it, would hold a reference. False when it is seen, or little room would be won. */
+static bool
+moved_to_front(History *self)
+{
+    Block *block = self->block;
+    size_t size = (size_t)(self->end - self->first), width = (size_t)self->width;
+    if (Py_REFCNT(block) != 1 || self->first == 0 || (size_t)self->first < size / 8)
+        return false;
+    memmove(block->stamps, block->stamps + self->first, size * 8);
+    memmove(block->rows, block->rows + (size_t)self->first * width, size * width * 8);
+    self->first = 0;
+    self->end = (Py_ssize_t)size;
+    return true;
+}
+
 static int
-slot_behind(const History *self, Slot *slot)
+slot_behind(History *self, Slot *slot)
 {
     Block *block = self->block;
     Py_ssize_t size = self->end - self->first;
-    if (self->end < block->capacity) {
+    if (self->end < block->capacity || moved_to_front(self)) {
         Py_INCREF(block);
         *slot = (Slot){block, self->end, self->first, self->end + 1};
         return 0;
@@ -297,7 +330,7 @@ slot_among(const History *self, int64_t stamp, Slot *slot)
 {
     const Block *block = self->block;
     Py_ssize_t size = self->end - self->first;
-    Py_ssize_t place = index_not_before(block->stamps, self->first, self->end, stamp);
+    Py_ssize_t place = index_not_before(block, self->first, self->end, stamp);
     Py_ssize_t after = block->stamps[place] == stamp ? place + 1 : place;
     Py_ssize_t at = place - self->first;
     Block *fresh = block_new(SMALLEST_CAPACITY + size + size / 8, self->width);
@@ -309,9 +342,9 @@ slot_among(const History *self, int64_t stamp, Slot *slot)
     return 0;
 }
 
-/* Finds room without changing anything. -1 and MemoryError when there is none. */
+/* Finds room; the samples stay what they are. -1 and MemoryError when there is none. */
 static int
-slot_for(const History *self, int64_t stamp, Slot *slot)
+slot_for(History *self, int64_t stamp, Slot *slot)
 {
     if (is_empty(self) || stamp > newest_of(self))
         return slot_behind(self, slot);
@@ -1133,7 +1166,7 @@ static inline bool
 rows_around(const Window *window, int64_t at, Between *now)
 {
     const Block *block = window->block;
-    Py_ssize_t after = index_not_before(block->stamps, window->first, window->end, at);
+    Py_ssize_t after = index_not_before(block, window->first, window->end, at);
     if (after == window->end)
         return false;
     now->b = block->rows + (size_t)after * (size_t)block->width;

@@ -1,0 +1,1 @@
+"""Lookups, side by side with other transform buffers: ``python -m bench.micro.lookup``."""
