@@ -74,18 +74,7 @@ class CompiledPath(Path):
     def refuse(self, stamp: object, /) -> None:
         blamed = self._compiled.blame(stamp)
         if blamed is not None:
-            failure, number, requested, oldest, newest, rate_hz = blamed
-            use = self.uses[number]
-            raise _FAILURES[failure](
-                self.target,
-                self.source,
-                edge=use.edge,
-                requested=requested,
-                oldest=oldest,
-                newest=newest,
-                rate_hz=rate_hz,
-                writer=use.track.writer,
-            )
+            raise self._error(_FAILURES[blamed[0]], *blamed[1:])
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         poses, valid = np.empty((len(stamps), 7)), np.empty(len(stamps), np.bool_)

@@ -182,15 +182,27 @@ class Path:
     def _failure(
         self, error: type[LookupFailed], number: int, views: Sequence[View], at: int | None
     ) -> LookupFailed:
-        use, facts = self.uses[number], coverage(views[number])
+        facts = coverage(views[number])
+        return self._error(error, number, at, facts.oldest, facts.newest, facts.rate_hz)
+
+    def _error(  # noqa: PLR0917 - what a failed lookup in a control loop costs
+        self,
+        error: type[LookupFailed],
+        number: int,
+        requested: int | None,
+        oldest: int | None,
+        newest: int | None,
+        rate_hz: float | None,
+    ) -> LookupFailed:
+        use = self.uses[number]
         failure = error(
             self.target,
             self.source,
             edge=use.edge,
-            requested=at,
-            oldest=facts.oldest,
-            newest=facts.newest,
-            rate_hz=facts.rate_hz,
+            requested=requested,
+            oldest=oldest,
+            newest=newest,
+            rate_hz=rate_hz,
             writer=use.track.writer,
         )
         failure.track = use.track.name
