@@ -23,6 +23,12 @@ setup(
     cmdclass={"build_py": BuildWithModels},
     ext_modules=[
         # Where there is no C compiler it is left out, and the reference does its work.
-        Extension("zstate._kernel", ["zstate/buffer/_kernel.c"], extra_compile_args=OPTIONS, optional=True)
+        Extension(
+            "zstate._kernel",
+            ["zstate/buffer/_kernel.c"],
+            depends=sorted(str(path) for path in Path("zstate/buffer/_kernel").glob("*.h")),
+            extra_compile_args=OPTIONS,
+            optional=True,
+        )
     ],
 )

@@ -94,6 +94,7 @@ def test_the_sdist_holds_what_the_tests_need(sdist: Path):
         "models/rrbot.urdf",
         "setup.py",
         "zstate/buffer/_kernel.c",
+        "zstate/buffer/_kernel/path.h",
     } <= names
 
 

@@ -1,0 +1,65 @@
+/* Numbers and buffers that come from Python, checked where they come in. */
+
+/* The stamp in an exact int of 64 bits. False, without an error, for anything else: the caller then
+ * leaves the question to the reference, which accepts it or says what is wrong. */
+static bool
+plain_stamp(PyObject *number, int64_t *stamp)
+{
+    int overflow = 0;
+    if (!PyLong_CheckExact(number))
+        return false;
+    *stamp = PyLong_AsLongLongAndOverflow(number, &overflow);
+    return overflow == 0;
+}
+
+/* A stamp, or TypeError or OverflowError. */
+static bool
+checked_stamp(PyObject *number, int64_t *stamp)
+{
+    *stamp = PyLong_AsLongLong(number);
+    return *stamp != -1 || !PyErr_Occurred();
+}
+
+/* A C-contiguous buffer of 8-byte items of one of these formats. -1 and BufferError, TypeError or
+ * ValueError when it is none. */
+static int
+get_items(PyObject *object, Py_buffer *view, const char *formats, int flags)
+{
+    if (PyObject_GetBuffer(object, view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | flags) < 0)
+        return -1;
+    const char *format = view->format != NULL ? view->format : "B";
+    if (view->itemsize == 8 && strlen(format) == 1 && strchr(formats, format[0]) != NULL)
+        return 0;
+    PyErr_Format(PyExc_ValueError, "a buffer of format %s is wanted, not '%s'", formats, format);
+    PyBuffer_Release(view);
+    return -1;
+}
+
+static int
+get_doubles(PyObject *object, Py_buffer *view, int flags)
+{
+    return get_items(object, view, "d", flags);
+}
+
+/* int64 is "l" where a C long has 64 bits and "q" elsewhere. */
+static int
+get_stamps(PyObject *object, Py_buffer *view)
+{
+    return get_items(object, view, sizeof(long) == 8 ? "lq" : "q", 0);
+}
+
+static Py_ssize_t
+count_of(const Py_buffer *view)
+{
+    return view->len / 8;
+}
+
+static bool
+all_finite(const double *numbers, Py_ssize_t count)
+{
+    /* x * 0 is 0 for finite x and NaN otherwise: no branch in the loop. */
+    double sum = 0.0;
+    for (Py_ssize_t i = 0; i < count; i++)
+        sum += numbers[i] * 0.0;
+    return sum == 0.0;
+}

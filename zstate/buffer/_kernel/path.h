@@ -1,0 +1,423 @@
+/* Path: the way between two frames, compiled, for zstate/buffer/path.py. */
+
+typedef struct {
+    PyObject_HEAD
+    PyTypeObject *type; /* of the answers: Transform, which derives from Facts */
+    PyObject *target;
+    PyObject *source;
+    PyObject *histories; /* a tuple: the tracks that the path passes */
+    Step *steps;         /* those to the target, then those to the source */
+    Py_ssize_t to_target;
+    Py_ssize_t to_source;
+} Path;
+
+static PyTypeObject Path_type;
+
+/* One track as a path sees it during one call. */
+typedef struct {
+    const Block *block;
+    Py_ssize_t first;
+    Py_ssize_t end;
+} Window;
+
+/* So many tracks a path may pass before its calls need memory from the heap. */
+#define FEW_TRACKS 16
+
+static Py_ssize_t
+track_count(const Path *self)
+{
+    return PyTuple_GET_SIZE(self->histories);
+}
+
+static inline Window
+window_of(const Path *self, Py_ssize_t index)
+{
+    const History *history = (History *)PyTuple_GET_ITEM(self->histories, index);
+    return (Window){history->block, history->first, history->end};
+}
+
+/* False where the track does not reach. */
+static inline bool
+rows_around(const Window *window, int64_t at, Between *now)
+{
+    const Block *block = window->block;
+    Py_ssize_t after = index_not_before(block, window->first, window->end, at);
+    if (after == window->end)
+        return false;
+    now->b = block->rows + (size_t)after * (size_t)block->width;
+    now->a = now->b;
+    now->ratio = 0.0;
+    int64_t later = block->stamps[after];
+    if (later == at)
+        return true;
+    if (after == window->first)
+        return false;
+    int64_t earlier = block->stamps[after - 1];
+    now->a -= block->width;
+    now->ratio =
+        (double)((uint64_t)at - (uint64_t)earlier) / (double)((uint64_t)later - (uint64_t)earlier);
+    return true;
+}
+
+static Pose
+pose_at(const Path *self, const Between *nows)
+{
+    Pose source_from_top = chain_pose(self->steps + self->to_target, self->to_source, nows);
+    if (self->to_target == 0)
+        return source_from_top;
+    Pose target_from_top = invert(chain_pose(self->steps, self->to_target, nows));
+    return self->to_source == 0 ? target_from_top : compose(target_from_top, source_from_top);
+}
+
+/* The newest instant that all tracks know. False when one is empty. */
+static bool
+newest_common(const Path *self, int64_t *at)
+{
+    *at = INT64_MAX;
+    for (Py_ssize_t i = 0; i < track_count(self); i++) {
+        const History *history = (History *)PyTuple_GET_ITEM(self->histories, i);
+        if (is_empty(history))
+            return false;
+        int64_t newest = newest_of(history);
+        *at = newest < *at ? newest : *at;
+    }
+    return true;
+}
+
+static PyObject *
+answer_static(const Path *self, PyObject *stamp)
+{
+    return facts_new(self->type, self->target, self->source, pose_at(self, NULL), stamp,
+                     kind_static);
+}
+
+/* The answer at an instant, or None; `stamp` is NULL or the very object it was asked with. */
+static PyObject *
+answer_at(const Path *self, int64_t at, PyObject *stamp, Between *nows)
+{
+    PyObject *kind = kind_exact;
+    for (Py_ssize_t i = 0; i < track_count(self); i++) {
+        Window window = window_of(self, i);
+        if (!rows_around(&window, at, &nows[i]))
+            Py_RETURN_NONE;
+        if (nows[i].a != nows[i].b)
+            kind = kind_interpolated;
+    }
+    Pose pose = normalized(pose_at(self, nows));
+    if (stamp != NULL)
+        return facts_new(self->type, self->target, self->source, pose, stamp, kind);
+    stamp = PyLong_FromLongLong(at);
+    if (stamp == NULL)
+        return NULL;
+    PyObject *answer = facts_new(self->type, self->target, self->source, pose, stamp, kind);
+    Py_DECREF(stamp);
+    return answer;
+}
+
+static PyObject *
+path_at(Path *self, PyObject *const *args, Py_ssize_t count)
+{
+    PyObject *stamp = count == 1 ? args[0] : Py_None;
+    int64_t at = 0;
+    if (count > 1) {
+        PyErr_SetString(PyExc_TypeError, "at(stamp=None)");
+        return NULL;
+    }
+    if (stamp != Py_None && !plain_stamp(stamp, &at))
+        Py_RETURN_NONE;
+    Py_ssize_t tracks = track_count(self);
+    if (tracks == 0)
+        return answer_static(self, stamp);
+    if (stamp == Py_None) {
+        stamp = NULL;
+        if (!newest_common(self, &at))
+            Py_RETURN_NONE;
+    }
+    Between few[FEW_TRACKS];
+    if (tracks <= FEW_TRACKS)
+        return answer_at(self, at, stamp, few);
+    Between *nows = PyMem_New(Between, (size_t)tracks);
+    if (nows == NULL)
+        return PyErr_NoMemory();
+    PyObject *answer = answer_at(self, at, stamp, nows);
+    PyMem_Free(nows);
+    return answer;
+}
+
+/* blame(stamp): which track cannot answer, in the order of zstate/buffer/path.py. */
+
+typedef enum { IN_PAST, NO_DATA, IN_FUTURE } Failure;
+
+static PyObject *
+failure_of(const Path *self, Failure failure, Py_ssize_t index, PyObject *stamp)
+{
+    const History *history = (History *)PyTuple_GET_ITEM(self->histories, index);
+    if (is_empty(history))
+        return Py_BuildValue("(inOOOO)", (int)failure, index, stamp, Py_None, Py_None, Py_None);
+    long long oldest = history->block->stamps[history->first], newest = newest_of(history);
+    if (oldest == newest)
+        return Py_BuildValue("(inOLLO)", (int)failure, index, stamp, oldest, newest, Py_None);
+    double periods = (double)(history->end - history->first - 1);
+    double rate_hz = periods * 1e9 / (double)((uint64_t)newest - (uint64_t)oldest);
+    return Py_BuildValue("(inOLLd)", (int)failure, index, stamp, oldest, newest, rate_hz);
+}
+
+static PyObject *
+path_blame(Path *self, PyObject *stamp)
+{
+    int64_t at = 0, worst_oldest = 0, worst_newest = 0;
+    Py_ssize_t young = -1, empty = -1, behind = -1;
+    bool latest = stamp == Py_None;
+    if (!latest && !plain_stamp(stamp, &at))
+        Py_RETURN_NONE;
+    for (Py_ssize_t i = 0; i < track_count(self); i++) {
+        const History *history = (History *)PyTuple_GET_ITEM(self->histories, i);
+        if (is_empty(history)) {
+            empty = empty < 0 ? i : empty;
+            continue;
+        }
+        int64_t oldest = history->block->stamps[history->first], newest = newest_of(history);
+        if (at < oldest && (young < 0 || oldest >= worst_oldest)) {
+            young = i;
+            worst_oldest = oldest;
+        }
+        if (at > newest && (behind < 0 || newest < worst_newest)) {
+            behind = i;
+            worst_newest = newest;
+        }
+    }
+    if (young >= 0 && !latest)
+        return failure_of(self, IN_PAST, young, stamp);
+    if (empty >= 0)
+        return failure_of(self, NO_DATA, empty, stamp);
+    if (behind >= 0 && !latest)
+        return failure_of(self, IN_FUTURE, behind, stamp);
+    Py_RETURN_NONE;
+}
+
+/* poses(stamps, out, valid): a batch, without the GIL. */
+
+typedef struct {
+    Window *windows;
+    Between *nows;
+    Py_ssize_t tracks;
+    int64_t oldest; /* the instants between these two can be answered */
+    int64_t newest;
+} Batch;
+
+static void
+batch_release(Batch *batch)
+{
+    for (Py_ssize_t i = 0; batch->windows != NULL && i < batch->tracks; i++)
+        Py_DECREF((PyObject *)batch->windows[i].block);
+    PyMem_Free(batch->windows);
+    PyMem_Free(batch->nows);
+}
+
+/* Takes the windows of all tracks at one moment, with references to their blocks. */
+static int
+batch_begin(const Path *self, Batch *batch)
+{
+    Py_ssize_t tracks = track_count(self);
+    batch->tracks = tracks;
+    batch->oldest = INT64_MIN;
+    batch->newest = INT64_MAX;
+    batch->windows = PyMem_New(Window, (size_t)tracks + 1);
+    batch->nows = PyMem_New(Between, (size_t)tracks + 1);
+    if (batch->windows == NULL || batch->nows == NULL) {
+        PyMem_Free(batch->windows);
+        PyMem_Free(batch->nows);
+        PyErr_NoMemory();
+        return -1;
+    }
+    for (Py_ssize_t i = 0; i < tracks; i++) {
+        Window window = window_of(self, i);
+        batch->windows[i] = window;
+        Py_INCREF((PyObject *)window.block);
+        if (window.first == window.end) {
+            batch->newest = INT64_MIN;
+            batch->oldest = INT64_MAX;
+            continue;
+        }
+        int64_t oldest = window.block->stamps[window.first],
+                newest = window.block->stamps[window.end - 1];
+        batch->oldest = oldest > batch->oldest ? oldest : batch->oldest;
+        batch->newest = newest < batch->newest ? newest : batch->newest;
+    }
+    return 0;
+}
+
+static bool
+batch_pose(const Path *self, const Batch *batch, int64_t at, Pose *pose)
+{
+    if (at < batch->oldest || at > batch->newest)
+        return false;
+    for (Py_ssize_t i = 0; i < batch->tracks; i++)
+        if (!rows_around(&batch->windows[i], at, &batch->nows[i]))
+            return false;
+    *pose = pose_at(self, batch->nows);
+    if (batch->tracks != 0)
+        *pose = normalized(*pose);
+    return true;
+}
+
+static void
+batch_run(const Path *self, const Batch *batch, const int64_t *stamps, Py_ssize_t count,
+          double *out, char *valid)
+{
+    const Pose unknown = {Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN, Py_NAN};
+    for (Py_ssize_t i = 0; i < count; i++) {
+        Pose pose = unknown;
+        valid[i] = batch_pose(self, batch, stamps[i], &pose);
+        memcpy(out + 7 * i, &pose, sizeof(pose));
+    }
+}
+
+static PyObject *
+poses_into(const Path *self, const Py_buffer *stamps, const Py_buffer *out, const Py_buffer *valid)
+{
+    Py_ssize_t count = count_of(stamps);
+    Batch batch;
+    if (count_of(out) % 7 != 0 || count_of(out) / 7 != count || valid->len != count) {
+        PyErr_SetString(PyExc_ValueError,
+                        "each stamp has seven numbers in out and a byte in valid");
+        return NULL;
+    }
+    if (batch_begin(self, &batch) < 0)
+        return NULL;
+    Py_BEGIN_ALLOW_THREADS batch_run(self, &batch, stamps->buf, count, out->buf, valid->buf);
+    Py_END_ALLOW_THREADS batch_release(&batch);
+    Py_RETURN_NONE;
+}
+
+static PyObject *
+path_poses(Path *self, PyObject *const *args, Py_ssize_t count)
+{
+    Py_buffer stamps, out, valid;
+    PyObject *done = NULL;
+    if (count != 3) {
+        PyErr_SetString(PyExc_TypeError, "poses(stamps, out, valid)");
+        return NULL;
+    }
+    if (get_stamps(args[0], &stamps) < 0)
+        return NULL;
+    if (get_doubles(args[1], &out, PyBUF_WRITABLE) == 0) {
+        if (PyObject_GetBuffer(args[2], &valid, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) == 0) {
+            done = poses_into(self, &stamps, &out, &valid);
+            PyBuffer_Release(&valid);
+        }
+        PyBuffer_Release(&out);
+    }
+    PyBuffer_Release(&stamps);
+    return done;
+}
+
+static int
+path_read_steps(Path *self, PyObject *to_target, PyObject *to_source, const Py_ssize_t *widths)
+{
+    self->to_target = PyTuple_GET_SIZE(to_target);
+    self->to_source = PyTuple_GET_SIZE(to_source);
+    Py_ssize_t count = self->to_target + self->to_source;
+    self->steps = PyMem_New(Step, (size_t)count + 1);
+    if (self->steps == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        PyObject *description = i < self->to_target
+                                    ? PyTuple_GET_ITEM(to_target, i)
+                                    : PyTuple_GET_ITEM(to_source, i - self->to_target);
+        if (read_step(description, &self->steps[i]) < 0 ||
+            check_step(&self->steps[i], track_count(self), widths) < 0)
+            return -1;
+    }
+    return 0;
+}
+
+static int
+path_fill(Path *self, PyObject *to_target, PyObject *to_source)
+{
+    Py_ssize_t tracks = track_count(self);
+    Py_ssize_t *widths = PyMem_New(Py_ssize_t, (size_t)tracks + 1);
+    if (widths == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    for (Py_ssize_t i = 0; i < tracks; i++) {
+        PyObject *history = PyTuple_GET_ITEM(self->histories, i);
+        if (!PyObject_TypeCheck(history, &History_type)) {
+            PyErr_SetString(PyExc_TypeError, "a path passes histories");
+            PyMem_Free(widths);
+            return -1;
+        }
+        widths[i] = ((History *)history)->width;
+    }
+    int done = path_read_steps(self, to_target, to_source, widths);
+    PyMem_Free(widths);
+    return done;
+}
+
+static PyObject *
+path_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
+{
+    static char *names[] = {"type",      "target",    "source", "to_target",
+                            "to_source", "histories", NULL};
+    PyTypeObject *answers;
+    PyObject *target, *source, *to_target, *to_source, *histories;
+    if (!PyArg_ParseTupleAndKeywords(args, keywords, "O!OOO!O!O!:Path", names, &PyType_Type,
+                                     &answers, &target, &source, &PyTuple_Type, &to_target,
+                                     &PyTuple_Type, &to_source, &PyTuple_Type, &histories))
+        return NULL;
+    if (!PyType_IsSubtype(answers, &Facts_type)) {
+        PyErr_SetString(PyExc_TypeError, "answers are of a type that derives from Facts");
+        return NULL;
+    }
+    Path *self = (Path *)type->tp_alloc(type, 0);
+    if (self == NULL)
+        return NULL;
+    Py_INCREF(answers);
+    Py_INCREF(target);
+    Py_INCREF(source);
+    Py_INCREF(histories);
+    self->type = answers;
+    self->target = target;
+    self->source = source;
+    self->histories = histories;
+    if (path_fill(self, to_target, to_source) < 0) {
+        Py_DECREF(self);
+        return NULL;
+    }
+    return (PyObject *)self;
+}
+
+static void
+path_dealloc(Path *self)
+{
+    Py_XDECREF((PyObject *)self->type);
+    Py_XDECREF(self->target);
+    Py_XDECREF(self->source);
+    Py_XDECREF(self->histories);
+    PyMem_Free(self->steps);
+    Py_TYPE(self)->tp_free(self);
+}
+
+static PyMethodDef path_methods[] = {
+    {"at", (PyCFunction)(void (*)(void))path_at, METH_FASTCALL,
+     "at(stamp=None): the Transform, or None where the reference has to be asked."},
+    {"blame", (PyCFunction)path_blame, METH_O,
+     "blame(stamp): (failure, track, stamp, oldest, newest, rate_hz), or None when there is none."},
+    {"poses", (PyCFunction)(void (*)(void))path_poses, METH_FASTCALL,
+     "poses(stamps, out, valid): many at once; NaN and False where there is no answer."},
+    {NULL},
+};
+
+static PyTypeObject Path_type = {
+    PyVarObject_HEAD_INIT(NULL, 0)
+    .tp_name = "zstate._kernel.Path",
+    .tp_doc = "The way between two frames, compiled.",
+    .tp_basicsize = sizeof(Path),
+    .tp_new = path_new,
+    .tp_dealloc = (destructor)path_dealloc,
+    .tp_flags = Py_TPFLAGS_DEFAULT,
+    .tp_methods = path_methods,
+};
