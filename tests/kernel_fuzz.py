@@ -82,6 +82,7 @@ class Fuzz:
             *(self.ask,) * 6,
             *(self.ask_many,) * 2,
             self.make_facts,
+            self.edges,
             self.keep_memory,
         )
 
@@ -197,6 +198,13 @@ class Fuzz:
             path.poses(
                 self.pick(stamps, stamps, stamps[::2], self.array(count)), self.array(7 * count), valid
             )
+
+    def edges(self) -> None:
+        width = self.pick(8, 14, 0, -1, *ODD)
+        steps = tuple(self.step(1) for _ in range(self.random.randrange(6)))
+        edges = self.kernel.Edges(width, steps)
+        rows = self.random.randrange(4)
+        edges.poses(self.array(rows * width), self.array(rows * 7 * len(steps)))
 
     def make_facts(self) -> None:
         pose = tuple(self.numbers.normal(size=self.pick(7, 7, 6)))

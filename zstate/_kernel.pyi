@@ -5,11 +5,11 @@ from typing import Any, TypeAlias
 from numpy.typing import NDArray
 from typing_extensions import Buffer
 
-from zstate.buffer.compiled import Description
 from zstate.transform import Transform
 
 REVISION: int
 
+Description: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 Blame: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
 
 class Block(Buffer):
@@ -33,6 +33,10 @@ class History:
     def replace(self, stamps: NDArray[Any], rows: NDArray[Any], /) -> None: ...
     def reaches(self, stamp: int, /) -> bool: ...
     def clear(self) -> None: ...
+
+class Edges:
+    def __init__(self, width: int, steps: tuple[Description, ...]) -> None: ...
+    def poses(self, positions: NDArray[Any], out: NDArray[Any], /) -> None: ...
 
 class Path:
     def __init__(

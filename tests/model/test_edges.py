@@ -190,3 +190,15 @@ def test_a_robot_that_cannot_move_has_its_fixed_edges_and_takes_no_numbers() -> 
     pose = only_pose(robot(joint("bolt", "fixed", "root")))
     assert np.allclose(pose, TURNED_ABOUT_Z, rtol=0.0, atol=1e-15)
     assert EdgeTable(robot()).poses(np.empty(0)).shape == (0, 7)
+
+
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_the_extension_and_numpy_agree(count: int) -> None:
+    model = everything()
+    compiled, in_numpy = EdgeTable(model), EdgeTable(model)
+    in_numpy._compiled = None
+    positions = random_positions(model, count, 20.0)
+    np.testing.assert_allclose(compiled.poses(positions), in_numpy.poses(positions), rtol=0.0, atol=3e-14)
+    out = np.empty((len(model.joints), 14))[:, ::2]
+    one = random_positions(model, 1, 3.0)[0]
+    np.testing.assert_allclose(compiled.poses(one, out), in_numpy.poses(one), rtol=0.0, atol=3e-14)

@@ -28,7 +28,7 @@ _FAILURES: tuple[type[LookupFailed], ...] = (InPast, NoData, InFuture)
 
 Numbers: TypeAlias = tuple[float, ...]
 Description: TypeAlias = tuple[int, int, int, bool, Numbers]
-"""A step as the extension wants it: kind, use, column, whether a continuous joint turns, numbers."""
+"""A step as the extension wants it: kind, track, column, whether a continuous joint turns, numbers."""
 
 
 def make_path(

@@ -12,14 +12,18 @@ The pose of a link in its parent needs no tree and no solver: with ``x = scale *
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput
+from zstate.extension import kernel
 from zstate.model.robot import Joint, JointType, RobotModel
 from zstate.se3 import multiply, rotate, to_matrix
+
+if TYPE_CHECKING or kernel == "c":
+    from zstate import _kernel
 
 EdgeKind = Literal["fixed", "hinge", "slide", "planar", "floating"]
 Vector = tuple[float, float, float]
@@ -84,6 +88,7 @@ class EdgeTable:
         self._turns = _Turns.of(self.forms)
         self._slides = _Slides.of(self.forms)
         self._floats = _Floats.of(self.forms)
+        self._compiled = _compiled(model.position_count, self.forms) if kernel == "c" else None
 
     def poses(self, positions: Floats, out: Floats | None = None) -> Floats:
         """``parent_from_child`` of every edge, rows as ``forms``: x y z [m], qx qy qz qw.
@@ -94,6 +99,9 @@ class EdgeTable:
         if out is None:
             out = np.empty((*positions.shape[:-1], *self._rest.shape))
         positions = self.normalised(positions)
+        if self._compiled is not None and _plain(positions) and _plain(out):
+            self._compiled.poses(positions, out)
+            return out
         out[...] = self._rest
         if self._turns is not None:
             self._turns.write(positions, out)
@@ -240,6 +248,25 @@ def _form(model: RobotModel, joint: Joint) -> EdgeForm:
         origin=(*joint.origin[:3], *rotation),
         axis=axis,
     )
+
+
+def _plain(array: Floats) -> bool:
+    return array.flags.c_contiguous and array.dtype == np.float64
+
+
+def _compiled(width: int, forms: tuple[EdgeForm, ...]) -> _kernel.Edges:
+    """The same formulas in the C extension, which takes the kinds in the order of ``EdgeKind``."""
+    kinds = get_args(EdgeKind)
+    return _kernel.Edges(
+        width, tuple((kinds.index(form.kind), 0, form.column, False, _numbers(form)) for form in forms)
+    )
+
+
+def _numbers(form: EdgeForm) -> tuple[float, ...]:
+    if form.kind in ("hinge", "slide"):
+        along = form.q_sin if form.kind == "hinge" else form.t1
+        return (form.scale, form.shift, *form.q_cos, *form.t0, *along)
+    return form.origin
 
 
 def _rest_poses(forms: tuple[EdgeForm, ...]) -> Floats:
