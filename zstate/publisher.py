@@ -115,10 +115,10 @@ class StatePublisher(Closing):
                 raise Closed(f"the publisher of {self.robot!r} is closed")
             seq, self._seq = self._seq, self._seq + 1
             head = (stamp, seq, self._session_id)
+            state = JointState(*head, self._joint_order, to_block(numbers), rates, forces)
             for output in self._outputs:
-                if output.joints is not None:
-                    output.put_joints(JointState(*head, self._joint_order, to_block(numbers), rates, forces))
-                if output.transforms is not None and output.transforms.has_readers:
+                output.put_joints(state)
+                if output.wants_transforms:
                     poses = to_block(self._edges.poses(numbers))
                     output.put_transforms(TransformSample(*head, self._edges.order, poses))
 
@@ -153,11 +153,11 @@ class _Output:
         self,
         session: Session,
         publisher: StatePublisher,
-        wire_name: str,
+        wire: str,
         streams: Sequence[Stream],
         opening: ExitStack,
     ) -> None:
-        self._wire = wire_named(wire_name)
+        self._wire = wire_named(wire)
         self._robot = publisher.robot
         self._session = session
         self._opening = opening
@@ -165,8 +165,13 @@ class _Output:
             self._latch("robot_description", publisher.description())
         if "tf_static" in streams:
             self._latch("tf_static", publisher.statics())
-        self.joints = self._stream("joint_states") if "joint_states" in streams else None
-        self.transforms = self._stream("tf") if "tf" in streams else None
+        self._joints = self._stream("joint_states") if "joint_states" in streams else None
+        self._transforms = self._stream("tf") if "tf" in streams else None
+
+    @property
+    def wants_transforms(self) -> bool:
+        """Whether somebody reads the transforms, so that computing them is worth it."""
+        return self._transforms is not None and self._transforms.has_readers
 
     def _stream(self, stream: Stream) -> StreamPublisher:
         key, encoding = self._wire.key(self._robot, stream), self._wire.encoding(stream)
@@ -178,12 +183,12 @@ class _Output:
         self._opening.enter_context(latched).set(self._wire.encode(message))
 
     def put_joints(self, state: JointState) -> None:
-        if self.joints is not None:
-            self.joints.put(self._wire.encode(state))
+        if self._joints is not None:
+            self._joints.put(self._wire.encode(state))
 
     def put_transforms(self, sample: TransformSample) -> None:
-        if self.transforms is not None:
-            self.transforms.put(self._wire.encode(sample))
+        if self._transforms is not None:
+            self._transforms.put(self._wire.encode(sample))
 
 
 def _check_streams(streams: Sequence[Stream]) -> None:
