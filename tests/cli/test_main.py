@@ -105,10 +105,10 @@ def test_a_reader_that_goes_away_ends_a_command_quietly():
     assert ended.stderr == ""
 
 
-def test_the_version_is_the_packages():
-    from zstate import __version__
+def test_the_version_is_the_packages_and_says_which_kernel_is_used():
+    from zstate import __version__, kernel
 
-    assert zstate("--version").stdout.decode() == f"zstate {__version__}\n"
+    assert zstate("--version").stdout.decode() == f"zstate {__version__} (kernel: {kernel})\n"
 
 
 def test_ctrl_c_while_joints_are_published_tells_what_was_achieved(spawn: Spawn):

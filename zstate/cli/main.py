@@ -66,9 +66,9 @@ class Commands(click.Group):
 
 def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if wanted:
-        from zstate import __version__
+        from zstate import __version__, kernel
 
-        click.echo(f"zstate {__version__}")
+        click.echo(f"zstate {__version__} (kernel: {kernel})")
         ctx.exit()
 
 
