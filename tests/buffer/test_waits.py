@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 from collections.abc import Callable
 
 import pytest
+from support import until
 from worlds import MS, S, every_joint, filled, moving, pose_of_every, static, x_of
 
 from zstate.buffer.buffer import TransformBuffer
@@ -37,10 +37,7 @@ class Waiting:
         seats = len(buffer._room._waiters)
         self._thread = threading.Thread(target=self._run, args=(call,), daemon=True)
         self._thread.start()
-        deadline = time.monotonic() + LONG_S
-        while len(buffer._room._waiters) == seats and self._thread.is_alive():
-            assert time.monotonic() < deadline
-            time.sleep(0.0005)
+        until(lambda: len(buffer._room._waiters) != seats or not self._thread.is_alive(), LONG_S)
 
     def _run(self, call: Callable[[], Transform]) -> None:
         try:
