@@ -1,0 +1,154 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from xxhash import xxh3_128_intdigest
+
+from zstate.wire.ros2.graph import (
+    DDS_GRAPH_EXPRESSION,
+    DdsToken,
+    EndpointToken,
+    NodeToken,
+    gid,
+    graph_expression,
+    parse_dds_token,
+    parse_token,
+)
+from zstate.wire.ros2.qos import STREAM_QOS, Qos
+
+ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
+JOINT_STATE_HASH = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+NODE = NodeToken(0, ZID, 0, "/", "/", "zstate")
+PUBLISHER = EndpointToken(
+    domain=5,
+    zid=ZID,
+    nid=0,
+    eid=10,
+    kind="MP",
+    enclave="/",
+    namespace="/fleet/r1",
+    node="zstate",
+    topic="/fleet/r1/joint_states",
+    dds_type="sensor_msgs::msg::dds_::JointState_",
+    hash=JOINT_STATE_HASH,
+    qos=STREAM_QOS["joint_states"],
+)
+PUBLISHER_KEY = (
+    f"@ros2_lv/5/{ZID}/0/10/MP/%/%fleet%r1/zstate/%fleet%r1%joint_states/"
+    f"sensor_msgs::msg::dds_::JointState_/{JOINT_STATE_HASH}/::,10:,:,:,,"
+)
+
+WORDS = st.text("abcXYZ_019", min_size=1, max_size=10)
+PATHS = st.lists(WORDS, max_size=3).map(lambda tokens: "/" + "/".join(tokens))
+NUMBERS = st.integers(0, 10**9)
+QOS = st.sampled_from([*STREAM_QOS.values(), Qos("best_effort", depth=5), Qos(history="keep_all", depth=0)])
+NODES = st.builds(NodeToken, NUMBERS, WORDS, NUMBERS, PATHS, PATHS, WORDS)
+ENDPOINTS = st.builds(
+    EndpointToken,
+    NUMBERS,
+    WORDS,
+    NUMBERS,
+    NUMBERS,
+    st.sampled_from(["MP", "MS", "SS", "SC"]),
+    PATHS,
+    PATHS,
+    WORDS,
+    PATHS,
+    WORDS,
+    WORDS,
+    QOS,
+)
+
+
+def test_a_node_in_the_root_is_told_with_percent_signs_for_slashes():
+    assert NODE.key == f"@ros2_lv/0/{ZID}/0/0/NN/%/%/zstate"
+
+
+def test_an_endpoint_is_told_in_thirteen_chunks():
+    assert PUBLISHER.key == PUBLISHER_KEY
+    assert PUBLISHER.key.count("/") == 12
+
+
+@given(token=NODES | ENDPOINTS)
+def test_what_is_told_is_understood(token: NodeToken | EndpointToken):
+    assert parse_token(token.key) == token
+
+
+def test_what_a_later_version_appends_is_passed_over():
+    assert parse_token(f"{PUBLISHER_KEY}/backends:cpu") == PUBLISHER
+
+
+@pytest.mark.parametrize(
+    "stranger",
+    [
+        "",
+        "0/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_00",
+        NODE.key.replace("@ros2_lv", "@other"),
+        NODE.key.replace("/NN/", "/XX/"),
+        NODE.key.removesuffix("/zstate"),
+        NODE.key.replace("/0/0/", "/0/x/"),
+        NODE.key.replace("/0/0/", "//0/"),
+        NODE.key.replace("/0/0/", "/0/²/"),
+        PUBLISHER_KEY.replace("/MP/", "/AS/"),
+        PUBLISHER_KEY.removesuffix("/::,10:,:,:,,"),
+        PUBLISHER_KEY.replace("::,10:,:,:,,", "7::,10:,:,:,,"),
+        f"@/{ZID}/@ros2_lv/MP/joint_states/sensor_msgs§msg§JointState/:1:0:0,10",
+    ],
+)
+def test_strangers_tell_nothing(stranger: str):
+    assert parse_token(stranger) is None
+
+
+@given(
+    chunks=st.lists(st.sampled_from(["@ros2_lv", "0", "12", "MP", "NN", "%", "::,1:", "@", ""]) | st.text())
+)
+def test_no_key_raises(chunks: list[str]):
+    for key in ("/".join(chunks), "@ros2_lv/0/a/1/2/" + "/".join(chunks)):
+        parse_token(key)
+        parse_dds_token(key)
+
+
+def test_a_gid_is_the_hash_of_the_token_low_half_first():
+    number = xxh3_128_intdigest(PUBLISHER_KEY.encode())
+    low, high = number % 2**64, number // 2**64
+    assert gid(PUBLISHER_KEY) == low.to_bytes(8, "little") + high.to_bytes(8, "little")
+    assert gid(PUBLISHER_KEY) != gid(NODE.key)
+
+
+def test_one_expression_hears_the_graph_of_a_domain():
+    assert graph_expression(5) == "@ros2_lv/5/**"
+    assert DDS_GRAPH_EXPRESSION == "@/*/@ros2_lv/**"
+
+
+def test_a_bridge_tells_a_topic_with_its_type_and_qos():
+    token = DdsToken(
+        ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", STREAM_QOS["tf_static"], "RIHS01_e3"
+    )
+    start = f"@/{ZID}/@ros2_lv/MP/r1§tf_static/tf2_msgs§msg§TFMessage/:1:1:0,1"
+    assert token.key == f"{start}:typehash=RIHS01_e3;"
+    assert parse_dds_token(token.key) == token
+    assert parse_dds_token(start) == DdsToken(
+        ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", STREAM_QOS["tf_static"]
+    )
+
+
+@given(
+    token=st.builds(
+        DdsToken, WORDS, st.sampled_from(["MP", "MS"]), WORDS, WORDS, QOS, st.sampled_from(["", "RIHS01_00"])
+    )
+)
+def test_what_a_bridge_tells_is_understood(token: DdsToken):
+    assert parse_dds_token(token.key) == token
+
+
+@pytest.mark.parametrize(
+    "stranger",
+    [
+        "",
+        PUBLISHER_KEY,
+        f"@/{ZID}/@ros2_lv",
+        f"@/{ZID}/@ros2_lv/SS/add/example§srv§Add",
+        f"@/{ZID}/@ros2_lv/MP/tf/tf2_msgs§msg§TFMessage/x",
+    ],
+)
+def test_strangers_are_no_tokens_of_a_bridge(stranger: str):
+    assert parse_dds_token(stranger) is None

@@ -1,0 +1,104 @@
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.interfaces import Qos as RosbagQos
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2.metadata import dump_qos_v8, parse_qos
+
+from zstate.errors import InvalidInput, MessageError
+from zstate.wire.ros2.qos import STREAM_QOS, Qos
+
+DEPTHS = st.integers(1, 2**31 - 1)
+KEPT = st.one_of(
+    st.tuples(st.just("keep_last"), DEPTHS),
+    st.just(("keep_all", 0)),
+)
+QOS = st.builds(
+    lambda reliability, durability, kept: Qos(reliability, durability, *kept),
+    st.sampled_from(["reliable", "best_effort"]),
+    st.sampled_from(["volatile", "transient_local"]),
+    KEPT,
+)
+
+
+@pytest.mark.parametrize(
+    ("qos", "rmw", "dds"),
+    [
+        (Qos(depth=10), "::,10:,:,:,,", ":1:0:0,10"),
+        (Qos(depth=42), "::,:,:,:,,", ":1:0:0,42"),
+        (Qos(depth=100), "::,100:,:,:,,", ":1:0:0,100"),
+        (Qos(durability="transient_local", depth=1), ":1:,1:,:,:,,", ":1:1:0,1"),
+        (Qos("best_effort", depth=5), "2::,5:,:,:,,", ":0:0:0,5"),
+        (Qos(history="keep_all", depth=0), "::2,:,:,:,,", ":1:0:1,-1"),
+    ],
+)
+def test_a_qos_is_written_as_each_side_writes_it(qos: Qos, rmw: str, dds: str):
+    assert qos.encode_rmw() == rmw
+    assert Qos.parse_rmw(rmw) == qos
+    assert qos.encode_dds() == dds
+    assert Qos.parse_dds(dds) == qos
+
+
+@given(qos=QOS)
+def test_what_is_written_is_read(qos: Qos):
+    assert Qos.parse_rmw(qos.encode_rmw()) == qos
+    assert Qos.parse_dds(qos.encode_dds()) == qos
+
+
+def test_a_deadline_a_lifespan_and_a_lease_are_passed_over():
+    assert Qos.parse_rmw("2:1:,7:1,0:2,500:3,4,5") == Qos("best_effort", "transient_local", depth=7)
+
+
+def test_a_type_hash_behind_a_bridges_qos_is_passed_over():
+    assert Qos.parse_dds(":1:0:0,10:typehash=RIHS01_00;") == Qos(depth=10)
+    assert Qos.parse_dds("K:::") == Qos(depth=1)  # what DDS has where nothing is told
+
+
+@pytest.mark.parametrize(
+    "text", ["", ":", "::", "::10:,:,:,,", "::,x:,:,:,,", "3::,1:", ":0:,1", "::,-1", "::,0", "::1,2,3"]
+)
+def test_what_is_no_qos_is_refused(text: str):
+    with pytest.raises(MessageError, match="'::,10:,:,:,,'") as caught:
+        Qos.parse_rmw(text)
+    assert caught.value.reason == "malformed"
+
+
+@pytest.mark.parametrize("parse", [Qos.parse_rmw, Qos.parse_dds])
+@given(text=st.text("0123,:-x", max_size=20) | st.text())
+def test_no_text_raises_anything_else(parse: Callable[[str], Qos], text: str):
+    try:
+        assert isinstance(parse(text), Qos)
+    except MessageError as error:
+        assert error.reason == "malformed"
+
+
+@pytest.mark.parametrize(("history", "depth"), [("keep_last", 0), ("keep_last", -1), ("keep_all", 1)])
+def test_a_depth_that_contradicts_the_history_is_refused(history: str, depth: int):
+    with pytest.raises(InvalidInput, match="'keep_last' has a depth from 1 on"):
+        Qos(history=history, depth=depth)
+
+
+@given(qos=QOS)
+def test_a_recording_names_the_same_qos_to_rosbags(qos: Qos):
+    forever = QosTime(9223372036, 854775807)
+    theirs = RosbagQos(
+        history=QosHistory[qos.history.upper()],
+        depth=qos.depth,
+        reliability=QosReliability[qos.reliability.upper()],
+        durability=QosDurability[qos.durability.upper()],
+        deadline=forever,
+        lifespan=forever,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=forever,
+        avoid_ros_namespace_conventions=False,
+    )
+    assert parse_qos(qos.to_rosbag_yaml()) == [theirs]
+    assert parse_qos(dump_qos_v8([theirs])) == [theirs]
+
+
+def test_what_late_joiners_must_have_is_transient_local_and_the_rest_is_not():
+    latched = {stream for stream, qos in STREAM_QOS.items() if qos.durability == "transient_local"}
+    assert latched == {"tf_static", "robot_description"}
+    assert {qos.reliability for qos in STREAM_QOS.values()} == {"reliable"}

@@ -1,0 +1,103 @@
+import pytest
+
+from zstate.errors import InvalidInput
+from zstate.wire.ros2.options import Ros2Options
+
+
+def test_an_empty_text_gives_the_defaults_of_ros():
+    for text in ("", "  "):
+        assert Ros2Options.parse(text) == Ros2Options()
+    defaults = Ros2Options()
+    assert (defaults.domain, defaults.namespace, defaults.frame_prefix) == (0, "", "")
+    assert (defaults.tf, defaults.hash, defaults.node) == ("global", "iron", "zstate")
+
+
+def test_every_option_can_be_written():
+    text = "domain=5, namespace=/fleet/r1,frame_prefix=r1/,tf=namespace,hash=humble,node=arm_state"
+    assert Ros2Options.parse(text) == Ros2Options(
+        domain=5,
+        namespace="fleet/r1",
+        frame_prefix="r1/",
+        tf="namespace",
+        hash="humble",
+        node="arm_state",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("namepsace=r1", "has no option 'namepsace', did you mean 'namespace'? known: domain, namespace,"),
+        ("colour=red", "has no option 'colour'; known: domain, namespace, frame_prefix, tf, hash, node"),
+        ("domain", "'domain' is not written as key=value"),
+        ("tf=global,tf=global", "'tf' is given twice"),
+        ("domain=233", "domain is 233; allowed are whole numbers from 0 to 232"),
+        ("domain=-1", "domain is '-1'; allowed are whole numbers from 0 to 232"),
+        ("domain=", "domain is ''; allowed are whole numbers from 0 to 232"),
+        ("domain=1.5", "domain is '1.5'"),
+        ("tf=local", "tf is 'local'; allowed are 'global' and 'namespace'"),
+        ("hash=jazzy", "hash is 'jazzy'; allowed are 'iron' and 'humble'"),
+        ("node=my-node", "the node 'my-node' contains '-'"),
+        ("node=", "the node '' is empty"),
+        ("frame_prefix=/r1/", "the frame_prefix '/r1/' begins with a slash"),
+        ("frame_prefix=r 1/", "contains ' '"),
+        ("frame_prefix=r1//", "contains '//'"),
+    ],
+)
+def test_what_cannot_be_used_is_named_with_what_can(text: str, says: str):
+    with pytest.raises(InvalidInput) as caught:
+        Ros2Options.parse(text)
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("namespace", "says", "instead"),
+    [
+        ("arm-2.left", "'arm-2.left' contains '-' and '.'", "'arm_2_left'"),
+        ("fleet/2nd", "'2nd' in 'fleet/2nd' begins with a digit", "'_2nd'"),
+        ("fleet//r1", "'' in 'fleet//r1' is empty", "'r1'"),
+        ("über", "'über' contains 'ü'", "'_ber'"),
+        ("fleet/*", "'fleet/*' has a '*' within", "'*' alone"),
+    ],
+)
+def test_a_namespace_that_ros_would_refuse_is_refused_with_one_that_it_takes(
+    namespace: str, says: str, instead: str
+):
+    with pytest.raises(InvalidInput) as caught:
+        Ros2Options(namespace=namespace)
+    assert says in str(caught.value)
+    assert instead in str(caught.value)
+
+
+@pytest.mark.parametrize("written", ["fleet/r1", "/fleet/r1", "/fleet/r1/"])
+def test_a_namespace_is_one_with_and_without_outer_slashes(written: str):
+    assert Ros2Options(namespace=written).namespace_of("panda") == "fleet/r1"
+
+
+def test_the_root_namespace_can_be_written_as_ros_does():
+    assert Ros2Options(namespace="/") == Ros2Options()
+
+
+def test_a_star_is_a_namespace_of_the_robots_own_name():
+    options = Ros2Options(namespace="*")
+    assert options.namespace_of("panda") == "panda"
+    with pytest.raises(InvalidInput) as caught:
+        options.namespace_of("arm-2")
+    assert "the robot 'arm-2'" in str(caught.value)
+    assert "contains '-'" in str(caught.value)
+    assert "'arm_2'" in str(caught.value)
+
+
+def test_a_star_in_the_frame_prefix_is_the_robots_name():
+    assert Ros2Options(frame_prefix="*/").prefix_of("arm-2") == "arm-2/"
+    assert Ros2Options(frame_prefix="left_").prefix_of("arm-2") == "left_"
+    assert Ros2Options().prefix_of("arm-2") == ""
+
+
+def test_a_name_that_no_robot_can_have_has_no_namespace_and_no_prefix():
+    for options in (Ros2Options(), Ros2Options(namespace="*", frame_prefix="*/")):
+        for name in ("*", "a/b", ""):
+            with pytest.raises(InvalidInput, match="robot name"):
+                options.namespace_of(name)
+            with pytest.raises(InvalidInput, match="robot name"):
+                options.prefix_of(name)

@@ -1,0 +1,111 @@
+import pytest
+
+from zstate.errors import InvalidInput
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, type_of
+
+STREAMS = ("joint_states", "robot_description", "tf", "tf_static", "clock")
+# `ros2 topic info -v` of a genuine ROS 2 names these hashes.
+JOINT_STATE = (
+    "sensor_msgs::msg::dds_::JointState_/"
+    "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+)
+TF = "tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+STRING = (
+    "std_msgs::msg::dds_::String_/RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+)
+CLOCK = (
+    "rosgraph_msgs::msg::dds_::Clock_/RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"
+)
+
+
+def test_in_the_root_namespace_the_topics_are_those_of_a_robot_state_publisher():
+    keys = RmwKeys(Ros2Options())
+    assert {stream: keys.key("panda", stream) for stream in STREAMS} == {
+        "joint_states": f"0/joint_states/{JOINT_STATE}",
+        "robot_description": f"0/robot_description/{STRING}",
+        "tf": f"0/tf/{TF}",
+        "tf_static": f"0/tf_static/{TF}",
+        "clock": f"0/clock/{CLOCK}",
+    }
+
+
+def test_a_namespace_stands_before_what_is_the_robots_and_not_before_tf_and_clock():
+    keys = RmwKeys(Ros2Options(domain=5, namespace="/fleet/r1"))
+    assert keys.key("panda", "joint_states") == f"5/fleet/r1/joint_states/{JOINT_STATE}"
+    assert keys.key("panda", "robot_description") == f"5/fleet/r1/robot_description/{STRING}"
+    assert keys.key("panda", "tf_static") == f"5/tf_static/{TF}"
+    assert keys.key("panda", "clock") == f"5/clock/{CLOCK}"
+
+
+def test_tf_can_be_put_into_the_namespace_but_the_clock_stays_everybodys():
+    keys = RmwKeys(Ros2Options(namespace="*", tf="namespace"))
+    assert keys.topic("r1", "tf") == "/r1/tf"
+    assert keys.topic("r1", "tf_static") == "/r1/tf_static"
+    assert keys.topic("r1", "clock") == "/clock"
+
+
+def test_humble_writes_that_it_has_no_hashes_and_readers_hear_either():
+    iron, humble = (RmwKeys(Ros2Options(hash=style)) for style in ("iron", "humble"))
+    assert humble.key("r1", "tf") == "0/tf/tf2_msgs::msg::dds_::TFMessage_/TypeHashNotSupported"
+    assert iron.expression("r1", "tf") == humble.expression("r1", "tf")
+    assert humble.expression("r1", "tf") == "0/tf/tf2_msgs::msg::dds_::TFMessage_/*"
+
+
+def test_listening_to_all_robots_means_whoever_is_in_the_namespace():
+    end = "joint_states/sensor_msgs::msg::dds_::JointState_/*"
+    assert RmwKeys(Ros2Options(namespace="*")).expression("*", "joint_states") == f"0/*/{end}"
+    assert RmwKeys(Ros2Options(namespace="*")).expression("r1", "joint_states") == f"0/r1/{end}"
+    assert RmwKeys(Ros2Options(namespace="fleet/r1")).expression("*", "joint_states") == f"0/fleet/r1/{end}"
+    assert RmwKeys(Ros2Options()).expression("*", "joint_states") == f"0/{end}"
+
+
+def test_a_bridge_puts_its_namespace_before_everything_and_nothing_else():
+    keys = DdsKeys(Ros2Options(domain=5, namespace="fleet/r1", hash="humble"))
+    for stream in STREAMS:
+        assert keys.key("panda", stream) == f"fleet/r1/{stream}"
+        assert keys.topic("panda", stream) == f"/fleet/r1/{stream}"
+        assert DdsKeys(Ros2Options()).key("panda", stream) == stream
+    assert DdsKeys(Ros2Options(namespace="*")).expression("*", "tf") == "*/tf"
+    assert DdsKeys(Ros2Options(namespace="*")).expression("r1", "tf") == "r1/tf"
+
+
+@pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])
+@pytest.mark.parametrize(
+    ("namespace", "robot"), [("", SHARED), ("*", "panda"), ("r1", "r1"), ("fleet/r1", "r1")]
+)
+def test_the_robot_of_a_key_is_the_end_of_its_namespace(layout, namespace: str, robot: str):
+    keys = layout(Ros2Options(namespace=namespace, tf="namespace"))
+    for stream in STREAMS[:-1]:
+        assert keys.robot_of(keys.key("panda", stream)) == robot
+
+
+def test_what_is_everybodys_is_the_shared_robots():
+    keys = RmwKeys(Ros2Options(namespace="*"))
+    for stream in ("tf", "tf_static", "clock"):
+        assert keys.robot_of(keys.key("panda", stream)) == SHARED
+
+
+@pytest.mark.parametrize("stranger", ["", "0", "0/tf", "0/tf/tf2_msgs::msg::dds_::TFMessage_"])
+def test_a_key_of_another_layout_has_no_robot(stranger: str):
+    with pytest.raises(InvalidInput, match="'<domain>/<topic>/<type>/<hash>'"):
+        RmwKeys(Ros2Options()).robot_of(stranger)
+
+
+@pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])
+def test_ros_has_no_topic_for_joint_commands(layout):
+    keys = layout(Ros2Options())
+    for use in (keys.key, keys.topic, keys.expression):
+        with pytest.raises(
+            InvalidInput, match="'joint_commands' is not carried by ROS 2; carried are 'joint"
+        ):
+            use("panda", "joint_commands")
+    with pytest.raises(InvalidInput):
+        type_of("joint_commands")
+
+
+@pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])
+def test_a_robot_whose_name_is_no_ros_name_is_refused_only_where_it_would_be_one(layout):
+    assert layout(Ros2Options(namespace="r1")).topic("arm-2", "joint_states") == "/r1/joint_states"
+    with pytest.raises(InvalidInput, match="'arm_2'"):
+        layout(Ros2Options(namespace="*")).key("arm-2", "joint_states")

@@ -1,0 +1,178 @@
+"""The ROS graph: liveliness tokens that tell who publishes and subscribes what, and with which QoS.
+
+A token is a key; its being alive is the statement. A token that was heard is known by its own key:
+``parse_token(key).key`` can differ where the other side wrote more than is kept here.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal, cast
+
+from xxhash import xxh3_128_digest
+
+from zstate.errors import MessageError
+from zstate.wire.ros2.qos import Qos
+
+Kind = Literal["MP", "MS", "SS", "SC"]
+"""Message publisher, message subscription, service server, service client."""
+
+DDS_GRAPH_EXPRESSION = "@/*/@ros2_lv/**"
+"""Hears every token of the bridges of zenoh-plugin-ros2dds."""
+
+_ADMIN = "@ros2_lv"
+_NODE = "NN"
+_KINDS = ("MP", "MS", "SS", "SC")
+_NUMBER = re.compile(r"\d{1,18}", re.ASCII)
+_DDS_SLASH = "§"
+_TYPE_HASH = re.compile(r"typehash=([^;]+);")
+
+
+@dataclass(frozen=True)
+class NodeToken:
+    """A node. ``zid`` is the id of its Zenoh session, ``nid`` its number there, from 0 on.
+
+    ``enclave`` and ``namespace`` begin with a slash; "/" is the root.
+    """
+
+    domain: int
+    zid: str
+    nid: int
+    enclave: str
+    namespace: str
+    name: str
+
+    @property
+    def key(self) -> str:
+        """The liveliness key."""
+        names = (_mangled(part) for part in (self.enclave, self.namespace, self.name))
+        return "/".join([_ADMIN, str(self.domain), self.zid, *[str(self.nid)] * 2, _NODE, *names])
+
+
+@dataclass(frozen=True)
+class EndpointToken:
+    """A publisher, subscription, service or client of a node, numbered ``eid`` in its session.
+
+    ``topic`` is the full name with its leading slash; ``dds_type`` as in keys, for instance
+    "std_msgs::msg::dds_::String_". One counter gives out ``nid`` and ``eid``.
+    """
+
+    domain: int
+    zid: str
+    nid: int
+    eid: int
+    kind: Kind
+    enclave: str
+    namespace: str
+    node: str
+    topic: str
+    dds_type: str
+    hash: str
+    qos: Qos
+
+    @property
+    def key(self) -> str:
+        """The liveliness key, of which ``gid`` is made."""
+        names = (_mangled(part) for part in (self.enclave, self.namespace, self.node, self.topic))
+        numbers = (str(self.nid), str(self.eid))
+        what = (self.dds_type, self.hash, self.qos.encode_rmw())
+        return "/".join([_ADMIN, str(self.domain), self.zid, *numbers, self.kind, *names, *what])
+
+
+@dataclass(frozen=True)
+class DdsToken:
+    """A topic routed by a bridge of zenoh-plugin-ros2dds, which tells no nodes.
+
+    ``topic`` is the Zenoh key of its messages, ``type_name`` for instance "std_msgs/msg/String";
+    ``hash`` is empty where the bridge tells none.
+    """
+
+    zid: str
+    kind: Literal["MP", "MS"]
+    topic: str
+    type_name: str
+    qos: Qos
+    hash: str = ""
+
+    @property
+    def key(self) -> str:
+        """The liveliness key."""
+        names = (part.replace("/", _DDS_SLASH) for part in (self.topic, self.type_name))
+        user_data = f":typehash={self.hash};" if self.hash else ""
+        return "/".join(["@", self.zid, _ADMIN, self.kind, *names, self.qos.encode_dds() + user_data])
+
+
+def graph_expression(domain: int) -> str:
+    """The key expression that hears every token of rmw_zenoh_cpp in ``domain``."""
+    return f"{_ADMIN}/{domain}/**"
+
+
+def gid(token_key: str) -> bytes:
+    """The 16 bytes that ROS knows an endpoint by: a hash of its token's key, exactly as declared."""
+    digest = xxh3_128_digest(token_key.encode())  # big-endian: high half, low half
+    return digest[:7:-1] + digest[7::-1]  # rmw_zenoh_cpp: low, high, as a little-endian memory has them
+
+
+def parse_token(key: str) -> NodeToken | EndpointToken | None:
+    """The node or endpoint that the token ``key`` of rmw_zenoh_cpp tells; None if it is no such key.
+
+    What a later version appends to an endpoint is passed over.
+    """
+    chunks = key.split("/")
+    if len(chunks) < 9 or not all(chunks) or chunks[0] != _ADMIN:
+        return None
+    if not all(_NUMBER.fullmatch(chunks[place]) for place in (1, 3, 4)):
+        return None
+    if chunks[5] == _NODE:
+        return _node(chunks)
+    return _endpoint(chunks) if chunks[5] in _KINDS and len(chunks) >= 13 else None
+
+
+def parse_dds_token(key: str) -> DdsToken | None:
+    """The publisher or subscription that the token ``key`` of a bridge tells; None for other keys."""
+    chunks = key.split("/")
+    if len(chunks) != 7 or chunks[0] != "@" or chunks[2] != _ADMIN or chunks[3] not in ("MP", "MS"):
+        return None
+    topic, type_name = (chunk.replace(_DDS_SLASH, "/") for chunk in chunks[4:6])
+    user_data = _TYPE_HASH.search(chunks[6])
+    try:
+        qos = Qos.parse_dds(chunks[6])
+    except MessageError:
+        return None
+    return DdsToken(chunks[1], chunks[3], topic, type_name, qos, user_data[1] if user_data else "")
+
+
+def _node(chunks: list[str]) -> NodeToken:
+    enclave, namespace, name = map(_plain, chunks[6:9])
+    return NodeToken(int(chunks[1]), chunks[2], int(chunks[3]), enclave, namespace, name)
+
+
+def _endpoint(chunks: list[str]) -> EndpointToken | None:
+    enclave, namespace, node, topic = map(_plain, chunks[6:10])
+    try:
+        qos = Qos.parse_rmw(chunks[12])
+    except MessageError:
+        return None
+    return EndpointToken(
+        domain=int(chunks[1]),
+        zid=chunks[2],
+        nid=int(chunks[3]),
+        eid=int(chunks[4]),
+        kind=cast(Kind, chunks[5]),
+        enclave=enclave,
+        namespace=namespace,
+        node=node,
+        topic=topic,
+        dds_type=chunks[10],
+        hash=chunks[11],
+        qos=qos,
+    )
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def _plain(chunk: str) -> str:
+    return chunk.replace("%", "/")
