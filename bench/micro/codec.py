@@ -1,0 +1,141 @@
+"""What it costs to write and to read ROS 2's messages, beside rosbags.
+
+    pip install rosbags
+    python -m bench.micro.codec
+
+A JointState of 30 joints, positions only and with velocities and efforts, and a TFMessage of 40 edges.
+Each side starts from what it keeps its numbers in and ends there: zstate in blocks of float64, rosbags in
+message objects, made once and not counted. Thread CPU time [us] per call in rounds that take turns; both
+sides' bytes are compared first. "first" is zstate reading a message unlike any before it, value by value.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_typestore
+
+from zstate.wire.messages import to_block
+from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
+from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
+from zstate.wire.ros2.times import to_time
+from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
+
+STAMP = 1_700_000_000_123_456_789
+ROUNDS = 41
+CALLS = 100
+STORE = get_typestore(Stores.ROS2_KILTED)
+
+Call = Callable[[], object]
+
+
+def header(frame_id: str) -> Any:
+    """A header of rosbags at the stamp."""
+    stamp = STORE.types["builtin_interfaces/msg/Time"](*to_time(STAMP))
+    return STORE.types["std_msgs/msg/Header"](stamp, frame_id)
+
+
+def rosbags_calls(name: str, message: Any, payload: bytes) -> dict[str, Call]:
+    """The calls of rosbags for a message whose bytes are ``payload``."""
+    assert bytes(STORE.serialize_cdr(message, name)) == payload
+    return {
+        "rosbags encode": lambda: STORE.serialize_cdr(message, name),
+        "rosbags decode": lambda: STORE.deserialize_cdr(payload, name),
+    }
+
+
+def of_joints(count: int, rows: int) -> dict[str, Call]:
+    """What is compared, for positions and ``rows - 1`` more numbers for each joint."""
+    names = [f"left_arm_joint_{number}" for number in range(count)]
+    arrays = np.random.default_rng(1).normal(size=(rows, count))
+    blocks = [to_block(array) for array in arrays]
+    encoder, decoder = JointStateEncoder(names, "base_link"), JointStateDecoder()
+    payload = encoder.encode(STAMP, *blocks)
+    assert decoder.decode(payload)[3 : 3 + rows] == tuple(blocks)
+    filled = [*arrays, *[np.empty(0)] * (3 - rows)]
+    message = STORE.types[JOINT_STATE.name](header("base_link"), names, *filled)
+    return {
+        "encode": lambda: encoder.encode(STAMP, *blocks),
+        "decode": lambda: decoder.decode(payload),
+        "first": lambda: JointStateDecoder().decode(payload),
+    } | rosbags_calls(JOINT_STATE.name, message, payload)
+
+
+def of_edges(count: int) -> dict[str, Call]:
+    """What is compared, for transforms of one instant."""
+    edges = tuple(pairwise(f"link_number_{number}" for number in range(count + 1)))
+    poses = np.random.default_rng(1).normal(size=(count, 7))
+    block = to_block(poses)
+    encoder, decoder = TfMessageEncoder(edges), TfMessageDecoder()
+    payload = encoder.encode(STAMP, block)
+    assert decoder.decode(payload).poses == block
+    message = STORE.types[TF_MESSAGE.name](
+        [stamped(*edge, pose) for edge, pose in zip(edges, poses, strict=True)]
+    )
+    return {
+        "encode": lambda: encoder.encode(STAMP, block),
+        "decode": lambda: decoder.decode(payload),
+        "first": lambda: TfMessageDecoder().decode(payload),
+    } | rosbags_calls(TF_MESSAGE.name, message, payload)
+
+
+def stamped(parent: str, child: str, pose: np.ndarray) -> Any:
+    """A transform of rosbags."""
+    x, y, z, *rotation = pose.tolist()
+    transform = STORE.types["geometry_msgs/msg/Transform"](
+        STORE.types["geometry_msgs/msg/Vector3"](x, y, z),
+        STORE.types["geometry_msgs/msg/Quaternion"](*rotation),
+    )
+    return STORE.types["geometry_msgs/msg/TransformStamped"](header(parent), child, transform)
+
+
+def measure(calls: dict[str, Call]) -> dict[str, np.ndarray]:
+    """Thread CPU time per call [us] of each round; the first round is not counted."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(ROUNDS + 1):
+        for name, call in calls.items():
+            before = time.thread_time_ns()
+            for _ in range(CALLS):
+                call()
+            times[name].append((time.thread_time_ns() - before) / CALLS / 1e3)
+    return {name: np.array(values[1:]) for name, values in times.items()}
+
+
+def main() -> None:
+    """Print the table."""
+    print(
+        f"Python {platform.python_version()}, numpy {np.__version__}, rosbags {version('rosbags')}, ", end=""
+    )
+    print(f"{platform.machine()}; {ROUNDS} rounds of {CALLS} calls, us of thread CPU time, median (minimum)")
+    print(f"{'message':<26}{'does':<8}{'zstate':>16}{'rosbags':>18}{'ratio':>7}{'first':>18}")
+    cases = {
+        "30 joints, positions": of_joints(30, 1),
+        "30 joints, all three": of_joints(30, 3),
+        "40 edges": of_edges(40),
+        "1 edge": of_edges(1),
+    }
+    for what, calls in cases.items():
+        times = measure(calls)
+        for does in ("encode", "decode"):
+            ours, theirs = times[does], times[f"rosbags {does}"]
+            ratio = float(np.median(theirs) / np.median(ours))
+            first = spread(times["first"]) if does == "decode" else ""
+            print(
+                f"{what:<26}{does:<8}{spread(ours):>16}{spread(theirs):>18}{ratio:>7.1f}{first:>18}",
+                flush=True,
+            )
+
+
+def spread(times: np.ndarray) -> str:
+    """The median, and the minimum behind it."""
+    return f"{np.median(times):.2f} ({times.min():.2f})"
+
+
+if __name__ == "__main__":
+    main()
