@@ -134,6 +134,7 @@ def one_of_each() -> list[errors.ZStateError]:
         errors.MessageError("text", reason="foreign"),
         errors.Unreachable("text", endpoints=("tcp/127.0.0.1:1",)),
         errors.PortBusy("text", endpoint="tcp/127.0.0.1:1"),
+        errors.RecordingError("text", path="run.mcap"),
         errors.UnknownFrame("a", "b", name="b", near_misses=("bb",)),
         errors.Stale("a", "b", age_s=2.0, max_age_s=1.0, edge=("a", "b")),
         late,

@@ -9,6 +9,7 @@ ZStateError
 │   └── UnknownModel                   no model of that name                      .name .near_misses
 ├── LibraryMissing (ImportError)       something to install first
 ├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
+├── RecordingError                     a file that cannot be read or written      .path
 ├── NetworkError                       Zenoh said no
 │   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
 │   ├── PortBusy                       somebody listens there already             .endpoint
@@ -38,6 +39,7 @@ from zstate.errors.base import (
     ModelError,
     NetworkError,
     PortBusy,
+    RecordingError,
     UnknownModel,
     Unreachable,
     ZStateError,
@@ -74,6 +76,7 @@ __all__ = [
     "NetworkError",
     "NoData",
     "PortBusy",
+    "RecordingError",
     "Stale",
     "UnknownFrame",
     "UnknownModel",

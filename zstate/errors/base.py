@@ -129,3 +129,11 @@ class PortBusy(NetworkError):
 
 class Closed(NetworkError):
     """Used after ``close()``, or in a process forked from the one that opened it."""
+
+
+class RecordingError(ZStateError):
+    """A recording that cannot be read or written; ``path`` is the file or folder at fault."""
+
+    def __init__(self, message: str, *, path: str) -> None:
+        super().__init__(message)
+        self.path = path

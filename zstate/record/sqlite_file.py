@@ -1,0 +1,111 @@
+"""One SQLite file of a rosbag2 recording."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+from zstate.errors import RecordingError
+from zstate.record.channel import CDR, Channel, Record
+from zstate.record.storage import Choice
+from zstate.record.time_order import Part
+
+_OPTIONAL = {"offered_qos_profiles": "offered_qos_profiles", "type_description_hash": "topic_type_hash"}
+_STAMPS = (-(1 << 63), (1 << 63) - 1)
+
+
+class SqliteFile:
+    """The storage "sqlite3". The file is never written to; log and publish times are the same."""
+
+    format: Literal["mcap", "sqlite3"] = "sqlite3"
+    profile = "ros2"
+    library = ""
+    complete = True
+    compressions: tuple[str, ...] = ()
+    losses: tuple[str, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self._reading():
+            self.size = path.stat().st_size
+            self._database = sqlite3.connect(_location(path), uri=True, check_same_thread=False)
+        try:
+            with self._reading():
+                self._channels = dict(self._read_channels())
+                self.span = self._read_span()
+        except RecordingError:
+            self.close()
+            raise
+        self.channels = tuple(self._channels.values())
+
+    @contextmanager
+    def _reading(self) -> Generator[None, None, None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError) as error:
+            text = (
+                f"{str(self.path)!r} cannot be read as a rosbag2 database: {error}; if it is damaged, "
+                "`sqlite3 FILE .recover` may save a part of it"
+            )
+            raise RecordingError(text, path=str(self.path)) from error
+
+    def _read_channels(self) -> Iterator[tuple[int, Channel]]:
+        counts = dict(self._rows("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+        known = {str(name) for _, name, *_ in self._rows("PRAGMA table_info(topics)")}
+        extra = [column for column in _OPTIONAL if column in known]
+        columns = ", ".join(["id", "name", "type", "serialization_format", *extra])
+        for number, *texts in self._rows(f"SELECT {columns} FROM topics ORDER BY id"):
+            if not isinstance(number, int) or not all(isinstance(text, str) for text in texts):
+                raise TypeError(f"the topic {number!r} is described by {texts!r}")
+            topic, type_name, encoding, *rest = texts
+            metadata = {_OPTIONAL[key]: text for key, text in zip(extra, rest, strict=True) if text}
+            yield number, Channel(topic, type_name, encoding, metadata, int(counts.get(number, 0)))
+
+    def _read_span(self) -> tuple[int, int] | None:
+        ((first, last),) = self._rows("SELECT min(timestamp), max(timestamp) FROM messages")
+        return None if first is None else (int(first), int(last))
+
+    def _rows(self, question: str, values: tuple[Any, ...] = ()) -> Iterator[Any]:
+        return self._database.execute(question, values)
+
+    def parts(self, choice: Choice) -> list[Part]:
+        if self.span is None:
+            return []
+        return [Part(self.span[0], partial(self._records, choice))]
+
+    def _records(self, choice: Choice) -> Iterator[Record]:
+        wanted = {
+            number: channel
+            for number, channel in self._channels.items()
+            if channel.encoding == CDR and (choice.topics is None or channel.topic in choice.topics)
+        }
+        question = (
+            "SELECT topic_id, timestamp, data FROM messages WHERE timestamp BETWEEN ? AND ? "
+            f"AND topic_id IN ({', '.join(map(str, wanted))}) ORDER BY timestamp, id"
+        )
+        with self._reading():
+            for number, stamp, data in self._rows(question, _within(choice)):
+                if not isinstance(stamp, int) or not isinstance(data, bytes):
+                    raise TypeError(f"a message at {stamp!r} is {type(data).__name__}")
+                yield Record(wanted[number], data, stamp, stamp, 0)
+
+    def close(self) -> None:
+        self._database.close()
+
+
+def _location(path: Path) -> str:
+    location = f"file:{quote(str(path.resolve()))}?mode=ro"
+    # Immutable: SQLite makes no files of its own beside it, for which the folder would have to be
+    # writable. It would also look past the journal in which a killed recorder left the newest messages.
+    journals = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
+    return location if any(journal.exists() for journal in journals) else f"{location}&immutable=1"
+
+
+def _within(choice: Choice) -> tuple[int, int]:
+    first, last = _STAMPS
+    return max(choice.begin, first), min(choice.end - 1, last)
