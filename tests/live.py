@@ -10,11 +10,12 @@ from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.net.streams import Arrival, StreamPublisher, StreamSubscriber
+from zstate.net.streams import StreamPublisher, StreamSubscriber
 from zstate.se3 import to_matrix
 from zstate.transform import Transform
 from zstate.wire.messages import JointState
 from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.wire import Arrival
 
 RRBOT = load_model("rrbot")
 """World, base, two links on continuous joints (shoulder, elbow), and a tool."""
@@ -46,7 +47,7 @@ class Tap:
     def payloads(self, count: int) -> list[bytes]:
         """The first ``count`` payloads, once they are there."""
         until(lambda: len(self.arrivals) >= count)
-        return [payload for _, payload, _ in self.arrivals]
+        return [arrival.payload for arrival in self.arrivals]
 
     def joint_states(self, count: int) -> list[JointState]:
         """The first ``count`` payloads, as joint states."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Literal
 
@@ -15,14 +17,19 @@ from zstate.following.joints import JointFollower
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import Writer, watch
+from zstate.net.presence import watch
 from zstate.net.session import Session
-from zstate.net.streams import CAPACITY, Arrival, StreamSubscriber
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, robot_of
+from zstate.net.streams import CAPACITY, StreamSubscriber
+from zstate.net.wires import wire_named
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
-from zstate.wire.wires import wire_named
+from zstate.wire.wire import Arrival
+from zstate.wire.writer import Announced
 
 Follow = Literal["joint_states", "tf"]
+
+# What the static edges of a ROS node are called that has not announced itself (yet).
+_UNNAMED = "a ROS node"
 
 
 class TransformListener(Closing):
@@ -54,19 +61,22 @@ class TransformListener(Closing):
         self._wire = wire_named(wire)
         self._follow: Follow = follow
         self._tally = Tally()
-        self._robots: dict[str, Follower] = {}
-        self._statics: dict[str, StaticFollower] = {}
+        self._names: dict[int, str] = {}
+        self._followers: dict[tuple[str, int], Follower] = {}
+        self._statics: dict[tuple[str, int], StaticFollower] = {}
+        # A model makes room for its links before it is added: no static edge may come between.
+        self._rebuilding = threading.Lock()
         with ExitStack() as opening:
-            self._open(session, robot, opening)
+            self._open(session, wire, opening)
             self._opened = opening.pop_all()
 
-    def _open(self, session: Session, robot: str, opening: ExitStack) -> None:
-        expression = self._wire.expression
+    def _open(self, session: Session, wire: str, opening: ExitStack) -> None:
+        expression, robot = self._wire.expression, self.robot
         key = expression(robot, "robot_description")
         opening.enter_context(LatchedSubscriber(session, key, self._on_description))
         key = expression(robot, "tf_static")
         opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
-        opening.enter_context(watch(session, robot, self._on_writer))
+        opening.enter_context(watch(session, robot, self._on_writer, wire))
         key = expression(robot, self._follow)
         opening.enter_context(StreamSubscriber(session, key, self._on_samples))
 
@@ -77,57 +87,103 @@ class TransformListener(Closing):
 
     def robots(self) -> tuple[str, ...]:
         """The robots that were heard so far, sorted by name."""
-        return tuple(sorted(name for name, robot in list(self._robots.items()) if robot.heard))
+        return tuple(sorted({robot.robot for robot in list(self._followers.values()) if robot.heard}))
 
     def close(self) -> None:
         """Stop listening; the buffer keeps what it has. A second call does nothing."""
         self._opened.close()
 
-    def _follower(self, robot: str) -> Follower:
-        follower = self._robots.get(robot)
+    def _robot_of(self, key: str) -> str:
+        return self._wire.robot_of(key) if self.robot == ANY else self.robot
+
+    def _follower(self, robot: str, session: int) -> Follower:
+        shared = self._follow in self._wire.shared
+        key = (robot, session if shared else 0)
+        follower = self._followers.get(key)
         if follower is None:
-            make = JointFollower if self._follow == "joint_states" else EdgeFollower
-            follower = self._robots.setdefault(robot, make(robot, self.buffer, self._tally))
+            if self._follow == "joint_states":
+                follower = JointFollower(robot, self.buffer, self._tally)
+            else:
+                follower = EdgeFollower(robot, self.buffer, self._tally, self._names)
+            follower = self._followers.setdefault(key, follower)
+            if shared and session in self._names:
+                follower.name_writer(session, self._names[session])
         return follower
 
     def _on_samples(self, arrivals: list[Arrival]) -> None:
         overflowed = len(arrivals) >= CAPACITY
-        for key, payload, encoding in arrivals:
-            sample = self._decode(key, self._follow, payload, encoding)
-            if isinstance(sample, Sample):
-                self._follower(robot_of(key)).take(sample, overflowed=overflowed)
-                overflowed = False
+        for arrival in arrivals:
+            robot = self._robot_of(arrival.key)
+            for sample in self._decode(self._follow, arrival, robot):
+                if isinstance(sample, Sample):
+                    self._follower(robot, sample.session).take(sample, overflowed=overflowed)
+                    overflowed = False
 
-    def _on_description(self, key: str, payload: bytes | None, encoding: str) -> None:
-        if payload is None:
+    def _on_description(self, arrival: Arrival) -> None:
+        if not arrival.payload:
             return
-        description = self._decode(key, "robot_description", payload, encoding)
-        if isinstance(description, RobotDescription):
-            self._follower(robot_of(key)).describe(description)
+        robot = self._robot_of(arrival.key)
+        for description in self._decode("robot_description", arrival, robot):
+            if isinstance(description, RobotDescription):
+                with self._rebuilding:
+                    self._follower(robot, description.session).describe(description)
 
-    def _on_statics(self, key: str, payload: bytes | None, encoding: str) -> None:
-        robot, writer = robot_of(key), key.rpartition("/")[2]
+    def _on_statics(self, arrival: Arrival) -> None:
+        robot, writer = self._robot_of(arrival.key), self._wire.statics_writer(arrival.key)
         if writer == MODEL_WRITER and self._follow == "joint_states":
             return  # the model itself says the same
-        statics = self._statics.setdefault(key, StaticFollower(robot, writer, self.buffer, self._tally))
-        message = None if payload is None else self._decode(key, "tf_static", payload, encoding)
-        if payload is None:
-            statics.withdraw()
-        elif isinstance(message, StaticTransforms):
-            self._follower(robot).note_heard()
-            statics.replace(message)
+        if arrival.payload:
+            for message in self._decode("tf_static", arrival, robot):
+                if isinstance(message, StaticTransforms):
+                    self._take_statics(arrival.key, robot, writer, message)
+        elif writer is not None:
+            self._static_follower(arrival.key, robot, writer).withdraw()
 
-    def _decode(self, key: str, stream: Stream, payload: bytes, encoding: str) -> Message | None:
+    def _take_statics(self, key: str, robot: str, writer: str | None, message: StaticTransforms) -> None:
+        self._follower(robot, message.session).note_heard()
+        with self._rebuilding:
+            if writer is not None:
+                self._static_follower(key, robot, writer).replace(message)
+            else:
+                name = self._names.get(message.session, _UNNAMED)
+                self._static_follower(key, robot, name, message.session).add(message)
+
+    def _static_follower(self, key: str, robot: str, writer: str, session: int = 0) -> StaticFollower:
+        make = StaticFollower(robot, writer, self.buffer, self._tally)
+        return self._statics.setdefault((key, session), make)
+
+    def _decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
         try:
-            return self._wire.decode(stream, payload, encoding)
+            return self._wire.decode(stream, arrival, robot)
         except MessageError as error:
-            self._tally.refuse(error.reason, f"{key}: {error}")
-            return None
+            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
+            return ()
 
-    def _on_writer(self, robot: str, stream: Stream, writer: Writer, alive: bool) -> None:
-        if stream != self._follow:
-            return
+    def _on_writer(self, announced: Announced, alive: bool) -> None:
+        session = announced.writer.session
         if alive:
-            self._follower(robot).name_writer(writer.session, str(writer))
+            self._names[session] = str(announced.writer)
         else:
-            self._follower(robot).writer_left(writer.session)
+            self._names.pop(session, None)
+        if alive and announced.stream == "tf_static" and announced.stream in self._wire.shared:
+            self._name_statics(session)
+        if announced.stream != self._follow:
+            return
+        if self._follow not in self._wire.shared:
+            self._note_writer(self._follower(announced.robot, session), session, alive=alive)
+        elif (announced.robot, session) in self._followers:
+            self._note_writer(self._followers[announced.robot, session], session, alive=alive)
+            if not alive:
+                del self._followers[announced.robot, session]
+
+    def _name_statics(self, session: int) -> None:
+        with self._rebuilding:
+            for (_, writing), follower in self._statics.items():
+                if writing == session:
+                    follower.name_writer(self._names[session])
+
+    def _note_writer(self, follower: Follower, session: int, *, alive: bool) -> None:
+        if alive:
+            follower.name_writer(session, self._names[session])
+        else:
+            follower.writer_left(session)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 
 import numpy as np
@@ -13,25 +13,25 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
+from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
-from zstate.net.latched import LatchedPublisher
-from zstate.net.presence import Writer, announce
+from zstate.net.outlets import Outlets, StreamOutlet
+from zstate.net.presence import writer_here
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher
+from zstate.net.wires import wire_named
 from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
 from zstate.wire.keys import MODEL_WRITER, Stream, check_robot, wire_name
+from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     JointState,
-    Message,
     RobotDescription,
     StaticTransforms,
     TransformSample,
     order_digest,
     to_block,
 )
-from zstate.wire.wires import wire_named
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """What a robot's state consists of on the network."""
@@ -70,12 +70,19 @@ class StatePublisher(Closing):
         self._seq = 0
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
+        layout = Layout(coordinate_names(model), velocity_slots(model), self._edges.names)
+        writer = writer_here(self._session_id)
         with ExitStack() as opening:
-            self._outputs = [_Output(session, self, name, streams, opening) for name in wires]
-            writer = Writer.here(self._session_id)
-            for stream in streams:
-                opening.enter_context(announce(session, self.robot, stream, writer))
+            outlets = [Outlets(session, wire_named(wire), self.robot, writer, layout) for wire in wires]
+            self._outputs = [self._output(opening.enter_context(out), streams) for out in outlets]
             self._opened = opening.pop_all()
+
+    def _output(self, outlets: Outlets, streams: Sequence[Stream]) -> _Output:
+        if "robot_description" in streams:
+            outlets.latched("robot_description", MODEL_WRITER).set(self.description())
+        if "tf_static" in streams:
+            outlets.latched("tf_static", MODEL_WRITER).set(self.statics())
+        return _Output(outlets, streams, self._edges)
 
     def description(self) -> RobotDescription:
         """What late joiners are told of the robot."""
@@ -100,7 +107,8 @@ class StatePublisher(Closing):
         ``positions`` [rad] or [m] are in the order of ``model.joint_names``, or a mapping of joint names
         that has all of them; ``velocities`` per second and ``efforts`` [Nm] or [N] likewise in that order
         where they are known. Raises InvalidInput for wrong counts, unknown or missing names, NaN and
-        infinity, a floating joint without a unit quaternion, and Closed; then nothing was sent.
+        infinity, a floating joint without a unit quaternion, a stamp that a wire cannot say, and Closed;
+        then nothing was sent.
         """
         model = self.model
         numbers = (
@@ -113,14 +121,12 @@ class StatePublisher(Closing):
         with self._lock:
             if self._stop.is_set():
                 raise Closed(f"the publisher of {self.robot!r} is closed")
-            seq, self._seq = self._seq, self._seq + 1
-            head = (stamp, seq, self._session_id)
+            head = (stamp, self._seq, self._session_id)
             state = JointState(*head, self._joint_order, to_block(numbers), rates, forces)
-            for output in self._outputs:
-                output.put_joints(state)
-                if output.wants_transforms:
-                    poses = to_block(self._edges.poses(numbers))
-                    output.put_transforms(TransformSample(*head, self._edges.order, poses))
+            said = [one for output in self._outputs for one in output.said(state, numbers)]
+            self._seq += 1
+            for outlet, payload in said:
+                outlet.put(payload)
 
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish what ``source`` reads, at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
@@ -149,46 +155,19 @@ class StatePublisher(Closing):
 class _Output:
     """The streams of one wire."""
 
-    def __init__(
-        self,
-        session: Session,
-        publisher: StatePublisher,
-        wire: str,
-        streams: Sequence[Stream],
-        opening: ExitStack,
-    ) -> None:
-        self._wire = wire_named(wire)
-        self._robot = publisher.robot
-        self._session = session
-        self._opening = opening
-        if "robot_description" in streams:
-            self._latch("robot_description", publisher.description())
-        if "tf_static" in streams:
-            self._latch("tf_static", publisher.statics())
-        self._joints = self._stream("joint_states") if "joint_states" in streams else None
-        self._transforms = self._stream("tf") if "tf" in streams else None
+    def __init__(self, outlets: Outlets, streams: Sequence[Stream], edges: _MovingEdges) -> None:
+        self._edges = edges
+        self._joints = outlets.stream("joint_states") if "joint_states" in streams else None
+        self._transforms = outlets.stream("tf") if "tf" in streams else None
 
-    @property
-    def wants_transforms(self) -> bool:
-        """Whether somebody reads the transforms, so that computing them is worth it."""
-        return self._transforms is not None and self._transforms.has_readers
-
-    def _stream(self, stream: Stream) -> StreamPublisher:
-        key, encoding = self._wire.key(self._robot, stream), self._wire.encoding(stream)
-        return self._opening.enter_context(StreamPublisher(self._session, key, encoding))
-
-    def _latch(self, stream: Stream, message: Message) -> None:
-        key = self._wire.key(self._robot, stream, MODEL_WRITER)
-        latched = LatchedPublisher(self._session, key, self._wire.encoding(stream))
-        self._opening.enter_context(latched).set(self._wire.encode(message))
-
-    def put_joints(self, state: JointState) -> None:
+    def said(self, state: JointState, positions: NDArray[np.float64]) -> Iterator[tuple[StreamOutlet, bytes]]:
+        """What this wire says of ``state``: the transforms only while somebody reads them."""
         if self._joints is not None:
-            self._joints.put(self._wire.encode(state))
-
-    def put_transforms(self, sample: TransformSample) -> None:
-        if self._transforms is not None:
-            self._transforms.put(self._wire.encode(sample))
+            yield self._joints, self._joints.encode(state)
+        if self._transforms is not None and self._transforms.has_readers:
+            poses = to_block(self._edges.poses(positions))
+            sample = TransformSample(state.stamp, state.seq, state.session, self._edges.order, poses)
+            yield self._transforms, self._transforms.encode(sample)
 
 
 def _check_streams(streams: Sequence[Stream]) -> None:

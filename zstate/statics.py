@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import secrets
 import threading
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from urllib.parse import quote
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
-from zstate.net.latched import LatchedPublisher
-from zstate.net.presence import Writer, announce
+from zstate.net.outlets import Outlets
+from zstate.net.presence import writer_here
 from zstate.net.session import Session
+from zstate.net.wires import wire_named
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
-from zstate.wire.wires import wire_named
+from zstate.wire.writer import Writer
 
 
 class StaticPublisher(Closing):
@@ -24,17 +25,17 @@ class StaticPublisher(Closing):
 
     Bare frame names are the robot's own; other frames are named in full, ``robot/frame``. All edges
     of a writer travel together, and a new value replaces the old one everywhere. ``close()`` withdraws
-    them. ``writer`` tells this publisher from others: unless given, the program, its process id and a
-    random number.
+    them; the ROS wires cannot say that, so that there only late joiners do not get them any more.
+    ``writer`` tells this publisher from others: unless given, the program, its process id and a random
+    number.
     """
 
     def __init__(self, session: Session, robot: str, writer: str | None = None, wire: str = "native") -> None:
-        identity = Writer.here(secrets.randbits(32))
+        identity = writer_here(secrets.randbits(32))
         self.robot = check_robot(robot)
         self.writer = check_writer(_default_writer(identity) if writer is None else writer)
         if self.writer == MODEL_WRITER:
             raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
-        self._wire = wire_named(wire)
         self._session_id = identity.session
         self._edges: dict[str, Transform] = {}
         # Refuses here, where the mistake is made, what every reader would refuse.
@@ -42,10 +43,9 @@ class StaticPublisher(Closing):
         self._lock = threading.Lock()
         self._closed = False
         with ExitStack() as opening:
-            key, encoding = self._wire.key(robot, "tf_static", self.writer), self._wire.encoding("tf_static")
-            self._latched = opening.enter_context(LatchedPublisher(session, key, encoding))
-            opening.enter_context(announce(session, robot, "tf_static", identity))
-            self._opened = opening.pop_all()
+            self._outlets = opening.enter_context(Outlets(session, wire_named(wire), robot, identity))
+            self._latched = self._outlets.latched("tf_static", self.writer)
+            opening.pop_all()
 
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
@@ -84,7 +84,7 @@ class StaticPublisher(Closing):
     def _send(self) -> None:
         edges = tuple((edge.target, edge.source) for edge in self._edges.values())
         poses = to_block([edge.pose7 for edge in self._edges.values()])
-        self._latched.set(self._wire.encode(StaticTransforms(self._session_id, edges, poses)))
+        self._latched.set(StaticTransforms(self._session_id, edges, poses))
 
     def close(self) -> None:
         """Withdraw the edges. A second call does nothing."""
@@ -92,10 +92,8 @@ class StaticPublisher(Closing):
             if self._closed:
                 return
             self._closed = True
-            # If the session went first, everything declared on it went with it.
-            with suppress(Closed):
-                self._latched.withdraw()
-            self._opened.close()
+            self._latched.withdraw()
+            self._outlets.close()
 
 
 def _default_writer(identity: Writer) -> str:

@@ -45,7 +45,9 @@ class Following:
     def __init__(self, make: type[Follower], buffer: TransformBuffer | None = None) -> None:
         self.buffer = buffer or TransformBuffer()
         self.tally = Tally()
-        self.follower = make("r1", self.buffer, self.tally)
+        self.live: dict[int, str] = {}
+        live = (self.live,) if make is EdgeFollower else ()
+        self.follower: Follower = make("r1", self.buffer, self.tally, *live)
 
     def take(self, *samples: Sample) -> None:
         for sample in samples:
@@ -104,6 +106,42 @@ def test_what_is_older_than_the_history_is_late(following: Following):
     following.take(following.sample(0, [0, 0], stamp=5000), following.sample(1, [0, 0], stamp=3999))
     stats = following.tally.stats()
     assert (stats.received, stats.late, stats.refused) == (1, 1, {})
+
+
+def test_a_clock_that_was_set_back_is_a_new_epoch_at_the_second_sample(following: Following):
+    following = Following(type(following.follower), TransformBuffer(history_s=1e-6))
+    following.follower.describe(description())
+    stamps = (5000, 1000, 1100, 1200)
+    following.take(*(following.sample(seq, [0, 0.1 * seq], stamp=at) for seq, at in enumerate(stamps)))
+    stats = following.tally.stats()
+    assert (stats.received, stats.late, stats.refused) == (3, 1, {})
+    assert following.buffer.latest("r1/upper", "r1/lower") == 1200
+    assert following.elbow_is([0, 0.2], 1100)
+
+
+def test_a_held_up_sample_does_not_end_the_epoch(following: Following):
+    following = Following(type(following.follower), TransformBuffer(history_s=1e-6))
+    following.follower.describe(description())
+    stamps = (5000, 1000, 6000, 1100, 7000)
+    following.take(*(following.sample(seq, [0, 0], stamp=at) for seq, at in enumerate(stamps)))
+    assert (following.tally.stats().received, following.tally.stats().late) == (3, 2)
+
+
+def test_a_writer_whose_clock_is_behind_does_not_take_the_edges_of_one_that_lives():
+    ahead = Following(EdgeFollower, TransformBuffer(history_s=1e-6))
+    behind = Following(EdgeFollower, ahead.buffer)
+    behind.live |= {7: "ahead", 8: "behind"}
+    for following, session in ((ahead, 7), (behind, 8)):
+        following.follower.describe(description())
+        following.follower.name_writer(session, behind.live[session])
+    ahead.take(ahead.sample(0, [0, 0.5], stamp=9000))
+    late = [behind.sample(seq, [0, 0], session=8, stamp=1000 + seq) for seq in range(3)]
+    behind.take(*late)
+    assert behind.tally.stats().late == 3
+    assert ahead.elbow_is([0, 0.5])
+    del behind.live[7]
+    behind.take(behind.sample(3, [0, 0], session=8, stamp=1003))
+    assert behind.elbow_is([0, 0], 1003)
 
 
 def test_a_new_session_is_a_new_epoch_even_when_its_clock_is_behind(following: Following):

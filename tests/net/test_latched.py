@@ -4,6 +4,7 @@ from support import Child, until
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.session import connect
+from zstate.wire.wire import Arrival
 
 ENCODING = "zstate/StaticTransforms;v=1"
 ALL = "zstate/*/tf_static/*"
@@ -30,15 +31,15 @@ class Inbox:
 
     def __init__(self, session) -> None:
         self.values: dict[str, bytes] = {}
-        self.heard: list[tuple[str, bytes | None, str]] = []
+        self.heard: list[tuple[str, bytes, str]] = []
         self.subscriber = LatchedSubscriber(session, ALL, self._hear)
 
-    def _hear(self, key: str, payload: bytes | None, encoding: str) -> None:
-        if payload is None:
-            self.values.pop(key, None)
+    def _hear(self, arrival: Arrival) -> None:
+        if arrival.payload:
+            self.values[arrival.key] = arrival.payload
         else:
-            self.values[key] = payload
-        self.heard.append((key, payload, encoding))
+            self.values.pop(arrival.key, None)
+        self.heard.append((arrival.key, arrival.payload, arrival.encoding))
 
 
 def test_who_joins_late_receives_the_present_value_once():

@@ -7,21 +7,28 @@ from hypothesis import strategies as st
 from support import Child, until
 
 from zstate.errors import InvalidInput
-from zstate.net.presence import RobotInfo, Writer, announce, discover, watch
-from zstate.net.session import connect
-from zstate.wire.keys import check_writer
+from zstate.net.presence import Announcement, RobotInfo, announce, discover, watch, writer_here
+from zstate.net.session import Session, connect
+from zstate.wire.keys import Stream, check_writer, writer_key
+from zstate.wire.writer import Announced, Writer
 
 DRIVER = Writer("arm driver", "jetson", 412, 5, 7)
 CAMERA = Writer("camera", "nuc", 9, 6, 8)
 
 WRITER = """
     import sys
-    from zstate.net.presence import Writer, announce
+    from zstate.net.presence import announce, writer_here
     from zstate.net.session import connect
-    with connect() as session, announce(session, sys.argv[1], "joint_states", Writer.here(3, "driver")):
+    from zstate.wire.keys import writer_key
+    token = writer_key(sys.argv[1], "joint_states", writer_here(3, "driver").identity)
+    with connect() as session, announce(session, token):
         print("announced")
         sys.stdin.readline()
 """
+
+
+def said(session: Session, robot: str, stream: Stream, writer: Writer) -> Announcement:
+    return announce(session, writer_key(robot, stream, writer.identity))
 
 
 def test_a_writer_is_said_as_program_host_and_pid():
@@ -44,20 +51,20 @@ def test_an_identity_that_is_not_ours_is_refused(identity: str):
 
 def test_a_writer_here_tells_this_process():
     before = time.time_ns()
-    writer = Writer.here(7)
+    writer = writer_here(7)
     assert (writer.pid, writer.session) == (os.getpid(), 7)
     assert before <= writer.since <= time.time_ns()
     assert writer.program
-    assert Writer.here(7, "driver").program == "driver"
+    assert writer_here(7, "driver").program == "driver"
 
 
 def test_discover_names_every_robot_with_its_writers_sorted():
     with (
         connect() as one,
         connect() as two,
-        announce(one, "r2", "tf_static", CAMERA),
-        announce(one, "r1", "tf_static", CAMERA),
-        announce(two, "r1", "joint_states", DRIVER),
+        said(one, "r2", "tf_static", CAMERA),
+        said(one, "r1", "tf_static", CAMERA),
+        said(two, "r1", "joint_states", DRIVER),
         connect() as asker,
     ):
         assert discover(asker) == (
@@ -89,39 +96,41 @@ def test_tokens_that_are_not_ours_are_passed_over_and_counted():
             stranger.zenoh.liveliness().declare_token(f"zstate/r1/@writer/{rest}")
             for rest in ("joint_states/nonsense", "unknown_stream/a,b,1,2,3", "tf/a,b,1,2,x")
         ]
-        with announce(stranger, "r1", "tf", DRIVER), watch(session, "*", lambda *event: None) as follower:
-            until(lambda: follower.malformed == 3)
+        with said(stranger, "r1", "tf", DRIVER), watch(session, "*", lambda *event: None) as follower:
+            until(lambda: follower.foreign == 3)
             assert discover(session) == (RobotInfo("r1", (("tf", DRIVER),)),)
         for token in tokens:
             token.undeclare()
 
 
 def test_a_watch_hears_who_is_there_who_comes_and_who_goes():
-    events: list[tuple[str, str, Writer, bool]] = []
+    events: list[tuple[Announced, bool]] = []
+    camera, driver = Announced("r1", "tf", CAMERA), Announced("r1", "joint_states", DRIVER)
     with (
         connect() as writer,
         connect() as reader,
-        announce(writer, "r1", "tf", CAMERA),
+        said(writer, "r1", "tf", CAMERA),
         watch(reader, "r1", lambda *event: events.append(event)),
     ):
-        until(lambda: ("r1", "tf", CAMERA, True) in events)
-        driver = announce(writer, "r1", "joint_states", DRIVER)
-        until(lambda: ("r1", "joint_states", DRIVER, True) in events)
-        with announce(writer, "r2", "tf", DRIVER):
-            driver.close()
-            driver.close()
-            until(lambda: ("r1", "joint_states", DRIVER, False) in events)
-    assert {robot for robot, *_ in events} == {"r1"}
+        until(lambda: (camera, True) in events)
+        token = said(writer, "r1", "joint_states", DRIVER)
+        until(lambda: (driver, True) in events)
+        with said(writer, "r2", "tf", DRIVER):
+            token.close()
+            token.close()
+            until(lambda: (driver, False) in events)
+    assert {announced.robot for announced, _ in events} == {"r1"}
 
 
 def test_a_killed_writer_is_heard_to_go(spawn):
-    events: list[tuple[str, str, Writer, bool]] = []
+    events: list[tuple[Announced, bool]] = []
     with connect() as reader, watch(reader, "*", lambda *event: events.append(event)):
         child: Child = spawn(WRITER, "r1")
         until(lambda: len(events) == 1)
         child.kill()
         until(lambda: len(events) == 2)
-    came, went = events
-    assert came[:3] == went[:3] == ("r1", "joint_states", came[2])
-    assert (came[3], went[3]) == (True, False)
-    assert (came[2].program, came[2].pid) == ("driver", child.process.pid)
+    (came, was_alive), (went, is_alive) = events
+    assert came == went
+    assert (was_alive, is_alive) == (True, False)
+    assert (came.robot, came.stream) == ("r1", "joint_states")
+    assert (came.writer.program, came.writer.pid) == ("driver", child.process.pid)

@@ -16,7 +16,7 @@ NODE = """
     heard = set()
 
     def hear(samples):
-        for _, payload, _ in samples:
+        for _, payload, *_ in samples:
             if payload.decode() not in heard:
                 heard.add(payload.decode())
                 print(payload.decode())

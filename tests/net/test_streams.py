@@ -6,7 +6,8 @@ from support import until
 
 from zstate.errors import Closed
 from zstate.net.session import connect
-from zstate.net.streams import Arrival, StreamPublisher, StreamSubscriber
+from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.wire.wire import Arrival
 
 KEY = "zstate/r/joint_states"
 ENCODING = "zstate/JointState;v=1"
@@ -22,8 +23,20 @@ def test_samples_arrive_in_order_with_key_and_encoding(sessions):
         for number in range(100):
             publisher.put(bytes([number]))
         until(lambda: len(got) == 100)
-    assert got == [(KEY, bytes([number]), ENCODING) for number in range(100)]
+    assert got == [Arrival(KEY, bytes([number]), ENCODING) for number in range(100)]
     assert (subscriber.full_batches, subscriber.failures) == (0, 0)
+
+
+def test_what_goes_beside_a_sample_arrives_with_it(sessions):
+    got: list[Arrival] = []
+    with (
+        StreamPublisher(sessions[0], KEY, "") as publisher,
+        StreamSubscriber(sessions[1], KEY, got.extend),
+    ):
+        until(lambda: publisher.has_readers)
+        publisher.put(b"payload", b"beside")
+        until(lambda: got)
+    assert (got[0].payload, got[0].attachment) == (b"payload", b"beside")
 
 
 def test_a_writer_knows_whether_anybody_reads(sessions):
@@ -40,7 +53,7 @@ def test_a_slow_reader_gets_the_newest_samples_and_is_told_that_its_ring_was_ful
     busy, go_on = threading.Event(), threading.Event()
 
     def slow(samples: list[Arrival]) -> None:
-        batches.append([int(payload) for _, payload, _ in samples])
+        batches.append([int(sample.payload) for sample in samples])
         busy.set()
         assert go_on.wait(10)
 

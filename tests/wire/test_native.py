@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
+from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     Clock,
     JointCommand,
@@ -19,7 +20,8 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
-from zstate.wire.wire import Wire
+from zstate.wire.wire import Arrival, Place, Wire
+from zstate.wire.writer import Announced, Writer
 
 NAMES = ("j1", "j2")
 ORDER = order_digest(NAMES)
@@ -218,9 +220,19 @@ def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, a
 
 def test_the_native_wire_says_every_stream_through_the_seam():
     wire: Wire = NativeWire()
+    voice = wire.voice("r1", Writer("arm", "jetson", 412, 5, 7), Place("z1", 0), Layout())
     by_type = {type(message): message for message in MESSAGES}
     for stream, kind in STREAM_TYPES.items():
-        message = by_type[kind]
-        assert wire.encoding(stream) == ENCODINGS[kind]
-        assert wire.decode(stream, wire.encode(message), wire.encoding(stream)) == message
-        assert wire.key("r1", stream, "w").startswith(wire.expression("r1", stream).rstrip("*"))
+        message, outlet = by_type[kind], voice.outlet(stream, 0, "w")
+        assert outlet.encoding == ENCODINGS[kind]
+        assert outlet.key.startswith(wire.expression("r1", stream).rstrip("*"))
+        arrival = Arrival(outlet.key, outlet.encode(message), outlet.encoding, outlet.attachment(0))
+        assert wire.decode(stream, arrival, "r1") == (message,)
+
+
+def test_a_token_of_the_native_wire_says_who_writes_what():
+    wire, writer = NativeWire(), Writer("arm", "jetson", 412, 5, 7)
+    outlet = wire.voice("r1", writer, Place("z1", 0), Layout()).outlet("tf", 0)
+    assert outlet.token is not None
+    assert wire.announced(outlet.token, "r1") == Announced("r1", "tf", writer)
+    assert wire.announced("zstate/r1/@writer/tf/nonsense", "r1") is None

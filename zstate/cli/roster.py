@@ -10,9 +10,10 @@ from zstate.cli.console import fail
 from zstate.closing import Closing
 
 if TYPE_CHECKING:
-    from zstate.net.presence import RobotInfo, Writer
+    from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.wire.keys import Stream
+    from zstate.wire.writer import Announced
 
 
 def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
@@ -46,33 +47,28 @@ def unknown_robot(robot: str, robots: Sequence[RobotInfo]) -> str:
 class Roster(Closing):
     """The robots that are announced now, kept up to date."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, robot: str = "*", wire: str = "native") -> None:
         from zstate.net.presence import watch
 
-        self._writers: set[tuple[str, Stream, Writer]] = set()
-        self._watch = watch(session, "*", self._note)
+        self._announced: set[Announced] = set()
+        self._watch = watch(session, robot if wire != "native" else "*", self._note, wire)
 
     def close(self) -> None:
         self._watch.close()
 
-    def _note(self, robot: str, stream: Stream, writer: Writer, alive: bool) -> None:
-        change = self._writers.add if alive else self._writers.discard
-        change((robot, stream, writer))
+    def _note(self, announced: Announced, alive: bool) -> None:
+        change = self._announced.add if alive else self._announced.discard
+        change(announced)
 
     def robots(self) -> tuple[RobotInfo, ...]:
         """The robots that somebody writes for, as ``discover`` gives them."""
-        from zstate.net.presence import RobotInfo
+        from zstate.net.presence import by_robot
 
-        writers = sorted(self._writers.copy())
-        names = sorted({robot for robot, _, _ in writers})
-        return tuple(
-            RobotInfo(name, tuple((stream, writer) for robot, stream, writer in writers if robot == name))
-            for name in names
-        )
+        return by_robot(self._announced.copy())
 
     def streams(self, robot: str) -> frozenset[Stream]:
         """What somebody writes for ``robot``."""
-        return frozenset(stream for name, stream, _ in self._writers.copy() if name == robot)
+        return frozenset(said.stream for said in self._announced.copy() if said.robot == robot)
 
     def silence(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` comes (any more, if ``ended``), as far as one can tell from here."""

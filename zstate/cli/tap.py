@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.cli.console import fail, note
@@ -11,10 +12,11 @@ from zstate.cli.roster import Roster
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import MessageError
-from zstate.net.streams import Arrival, StreamSubscriber
+from zstate.net.streams import StreamSubscriber
+from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, check_robot
-from zstate.wire.messages import Sample
-from zstate.wire.native import NativeWire
+from zstate.wire.messages import Message, Sample
+from zstate.wire.wire import Arrival
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -33,13 +35,13 @@ class Tapped(NamedTuple):
 class Tap(Closing):
     """Hears ``stream`` of ``robot``. Messages that are not ours are noted, the first of each kind."""
 
-    def __init__(self, session: Session, robot: str, stream: Stream) -> None:
+    def __init__(self, session: Session, robot: str, stream: Stream, wire: str = "native") -> None:
         self.robot = check_robot(robot)
         self._stream: Stream = stream
-        self._wire = NativeWire()
+        self._wire = wire_named(wire)
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[Tapped] = queue.SimpleQueue()
-        self._roster = Roster(session)
+        self._roster = Roster(session, robot, wire)
         key = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, key, self._take)
 
@@ -50,18 +52,16 @@ class Tap(Closing):
     def _take(self, arrivals: list[Arrival]) -> None:
         came = time.monotonic_ns()
         for arrival in arrivals:
-            sample = self._decode(*arrival)
-            if sample is not None:
+            for sample in self._decode(arrival):
+                assert isinstance(sample, Sample)
                 self._samples.put(Tapped(came, sample))
 
-    def _decode(self, key: str, payload: bytes, encoding: str) -> Sample | None:
+    def _decode(self, arrival: Arrival) -> Sequence[Message]:
         try:
-            sample = self._wire.decode(self._stream, payload, encoding)
+            return self._wire.decode(self._stream, arrival, self.robot)
         except MessageError as error:
-            self._refuse(key, error)
-            return None
-        assert isinstance(sample, Sample)
-        return sample
+            self._refuse(arrival.key, error)
+            return ()
 
     def _refuse(self, key: str, error: MessageError) -> None:
         if error.reason not in self._refused:

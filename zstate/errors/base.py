@@ -99,7 +99,8 @@ class LibraryMissing(ZStateError, ImportError):
 class MessageError(ZStateError, ValueError):
     """Bytes that are not a message we can read.
 
-    ``reason`` is a counter's name: "foreign", "newer version", "truncated" or "malformed".
+    ``reason`` is a counter's name: "foreign", "newer version", "truncated", "malformed", and what a
+    message lacks: "no attachment", "no stamp", "no positions", "missing joints".
     """
 
     def __init__(self, message: str, *, reason: str) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.frames import FrameInfo
 from zstate.errors import InvalidInput
 from zstate.following.follower import Follower
 from zstate.following.tally import Tally
@@ -18,10 +21,11 @@ from zstate.wire.messages import (
 
 
 class EdgeFollower(Follower):
-    """Follows ready transforms, without a model."""
+    """Follows ready transforms, without a model. ``live`` names the writers there are, by session."""
 
-    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally) -> None:
+    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally, live: Mapping[int, str]) -> None:
         super().__init__(robot, buffer, tally)
+        self._live = live
         self._edges: Edges = ()
         self._order = b""
         self._undescribed: set[str] = set()
@@ -60,12 +64,18 @@ class EdgeFollower(Follower):
         return sample.edges is not None or sample.order == self._order
 
     def _restart(self) -> None:
-        children = {child for _, child in self._edges} | self._undescribed
+        for frame in self._placed():
+            self._buffer.withdraw(frame.name)
         self._undescribed = set()
-        for frame in self._buffer.frames():
-            # What a model or a static writer places by now is theirs.
-            if frame.kind == "pose" and frame.name in children:
-                self._buffer.withdraw(frame.name)
+
+    def _may_begin_again(self) -> bool:
+        others = set(self._live.values()) - {self.writer}
+        return all(frame.writer not in others for frame in self._placed())
+
+    def _placed(self) -> list[FrameInfo]:
+        """Our edges, without those that a model or a static writer places by now."""
+        children = {child for _, child in self._edges} | self._undescribed
+        return [frame for frame in self._buffer.frames() if frame.kind == "pose" and frame.name in children]
 
     def _writer_changed(self) -> None:
         pass  # each sample is inserted under its writer's name

@@ -27,6 +27,7 @@ class Follower(ABC):
         self._session: int | None = None
         self._ended_sessions: set[int] = set()
         self._next_seq: int | None = None
+        self._last_late: Sample | None = None
         self._early: deque[Sample] = deque(maxlen=_EARLY)
         self._lock = threading.RLock()
         buffer.name_robot(robot)
@@ -86,12 +87,29 @@ class Follower(ABC):
 
     def _insert_counted(self, sample: Sample) -> None:
         try:
-            taken = self._insert(sample)
+            taken = self._insert(sample) or self._begin_again(sample)
         except (InvalidInput, MessageError) as error:
             reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
             self._tally.refuse(reason, f"{self.robot!r}: {error}")
         else:
             self._tally.count("received" if taken else "late")
+
+    def _begin_again(self, sample: Sample) -> bool:
+        """A new epoch with this sample, if it shows that the writer's clock was set back.
+
+        One sample that is older than the history may have been held up; two that follow each other were not.
+        """
+        before, self._last_late = self._last_late, sample
+        if before is None or sample.seq != before.seq + 1 or not before.stamp < sample.stamp:
+            return False
+        if not self._may_begin_again():
+            return False
+        self._last_late = None
+        self._restart()
+        self._tally.note(
+            f"{self.robot} back", f"the clock of {self.robot!r} went back: its history begins anew"
+        )
+        return self._insert(sample)
 
     def _follow_session(self, session: int) -> bool:
         """Whether samples of this session count: those of the newest writer to appear."""
@@ -104,6 +122,7 @@ class Follower(ABC):
                 self._restart()
             self._session = session
             self._next_seq = None
+            self._last_late = None
             self._writer_changed()
         return True
 
@@ -126,6 +145,10 @@ class Follower(ABC):
     @abstractmethod
     def _restart(self) -> None:
         """A new writer: what the old one said is another epoch."""
+
+    @abstractmethod
+    def _may_begin_again(self) -> bool:
+        """Whether nobody else writes what this follower would forget."""
 
     @abstractmethod
     def _writer_changed(self) -> None:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.frames import FrameInfo
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
 from zstate.following.follower import Follower
 from zstate.following.tally import Tally
-from zstate.model.robot import RobotModel
+from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.model.robot import Joint, RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.transform import Transform
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
+
+# A static edge that is this near to the model's [m, or the sine of a turn] was computed from the same URDF.
+_SAME = 1e-6
 
 
 class JointFollower(Follower):
@@ -41,19 +49,29 @@ class JointFollower(Follower):
         if self._track is not None:
             self._buffer.remove_robot(self._track)
             self._track = None
-        self._order = JointOrder(model.joint_names)
+        self._order = JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
         self._make_room(model)
         self._track = self._buffer.add_robot(model, self.robot)
 
     def _make_room(self, model: RobotModel) -> None:
         # The robot's own model knows best: whoever else placed one of its links gives way.
-        links = {f"{self.robot}/{joint.child}" for joint in model.joints}
+        joints = {f"{self.robot}/{joint.child}": joint for joint in model.joints}
         for frame in self._buffer.frames():
-            if frame.name in links and frame.parent is not None:
-                self._tally.refuse(
-                    "second writer", f"{frame.writer!r} placed {frame.name!r}, a link of the model"
-                )
+            if frame.name in joints and frame.parent is not None:
+                if not self._says_the_same(frame, joints[frame.name]):
+                    self._tally.refuse(
+                        "second writer", f"{frame.writer!r} placed {frame.name!r}, a link of the model"
+                    )
                 self._buffer.withdraw(frame.name)
+
+    def _says_the_same(self, frame: FrameInfo, joint: Joint) -> bool:
+        """In ROS the fixed edges of a model are among the static ones of its state publisher."""
+        parent = f"{self.robot}/{joint.parent}"
+        if frame.kind != "static" or joint.type != "fixed" or frame.parent != parent:
+            return False
+        said = self._buffer.lookup(parent, frame.name)
+        known = Transform.from_pose7(parent, frame.name, joint.origin)
+        return bool(np.allclose(said.matrix, known.matrix, rtol=0.0, atol=_SAME))
 
     def _can_read(self, sample: Sample) -> bool:
         return self._track is not None
@@ -63,6 +81,9 @@ class JointFollower(Follower):
         assert self._track is not None
         numbers = self._order.read(sample)
         return self._buffer.insert_joints(self._track, sample.stamp, numbers.positions, numbers.velocities)
+
+    def _may_begin_again(self) -> bool:
+        return True  # a robot has one writer of joint states at a time
 
     def _restart(self) -> None:
         if self._track is not None:

@@ -20,20 +20,38 @@ class StaticFollower:
         self._writer = writer
         self._buffer = buffer
         self._tally = tally
-        self._parents: dict[str, str] = {}
+        self._edges: dict[str, Transform] = {}
+
+    def name_writer(self, writer: str) -> None:
+        """Who the writer is, if that is learned later than what it says."""
+        ours = self._still_ours()
+        self._writer = writer
+        for child in ours & self._edges.keys():
+            self._buffer.insert_static(self._edges[child], writer=writer)
 
     def replace(self, statics: StaticTransforms) -> None:
         """Take these edges; withdraw those that are named no more, or on another parent."""
         named = [self._named(*edge) for edge in statics.edges]
         wanted = {edge[1]: edge[0] for edge in named if edge is not None}
-        self._withdraw([child for child, parent in self._parents.items() if wanted.get(child) != parent])
+        self._withdraw([child for child, edge in self._edges.items() if wanted.get(child) != edge.target])
         for edge, pose in zip(named, poses_from_block(statics.poses), strict=True):
             if edge is not None:
                 self._insert(*edge, pose)
 
+    def add(self, statics: StaticTransforms) -> None:
+        """Take these edges besides those that were named before, as ROS does: nothing is withdrawn there."""
+        for names, pose in zip(statics.edges, poses_from_block(statics.poses), strict=True):
+            edge = self._named(*names)
+            if edge is not None:
+                known = self._edges.get(edge[1])
+                if known is not None and known.target != edge[0]:
+                    self._withdraw([edge[1]])
+                # There the model's own fixed edges are among those that its state publisher calls static.
+                self._insert(*edge, pose, beside_model=True)
+
     def withdraw(self) -> None:
         """Take all of this writer's edges away."""
-        self._withdraw(list(self._parents))
+        self._withdraw(list(self._edges))
 
     def _named(self, parent: str, child: str) -> tuple[str, str] | None:
         try:
@@ -42,22 +60,25 @@ class StaticFollower:
             self._refuse("frame name", error)
             return None
 
-    def _insert(self, parent: str, child: str, pose: ArrayLike) -> None:
+    def _insert(self, parent: str, child: str, pose: ArrayLike, *, beside_model: bool = False) -> None:
         try:
             transform = Transform.from_pose7(parent, child, pose)
             self._buffer.insert_static(transform, writer=self._writer)
-            self._parents[child] = parent
+            self._edges[child] = transform
         except InvalidInput as error:
-            self._refuse(error.reason if isinstance(error, InsertRefused) else "bad numbers", error)
+            reason = error.reason if isinstance(error, InsertRefused) else "bad numbers"
+            if not (beside_model and reason == "second writer"):
+                self._refuse(reason, error)
 
     def _withdraw(self, children: list[str]) -> None:
         for child in children:
-            del self._parents[child]
+            del self._edges[child]
+        for child in self._still_ours().intersection(children):
+            self._buffer.withdraw(child)
+
+    def _still_ours(self) -> set[str]:
         # A model or another writer may have taken an edge over meanwhile: then it is theirs.
-        ours = {frame.name for frame in self._buffer.frames() if frame.writer == self._writer}
-        for child in children:
-            if child in ours:
-                self._buffer.withdraw(child)
+        return {frame.name for frame in self._buffer.frames() if frame.writer == self._writer}
 
     def _refuse(self, reason: str, error: InvalidInput) -> None:
         self._tally.refuse(reason, f"static edge of {self._writer!r}: {error}")

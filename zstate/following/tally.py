@@ -32,6 +32,7 @@ class Tally:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
+        self._noted: set[str] = set()
 
     def count(self, what: str, number: int = 1) -> None:
         """Add to one of received, dropped, missed, late."""
@@ -45,6 +46,14 @@ class Tally:
             first = self._refused[reason] == 1
         if first:
             _LOG.warning("refused (%s): %s; further ones are only counted", reason, text)
+
+    def note(self, event: str, text: str) -> None:
+        """Log the first event of its kind."""
+        with self._lock:
+            first = event not in self._noted
+            self._noted.add(event)
+        if first:
+            _LOG.warning("%s; further such events are not logged", text)
 
     def stats(self) -> Stats:
         """All counts now."""

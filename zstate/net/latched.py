@@ -13,6 +13,8 @@ from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
+from zstate.net.streams import arrival_of
+from zstate.wire.wire import Arrival
 
 CAPACITY = 4096
 HEARTBEAT_S = 0.5
@@ -31,7 +33,7 @@ class LatchedPublisher(Closing):
         self._publisher = zenoh.ext.declare_advanced_publisher(
             session.zenoh,
             key,
-            encoding=encoding,
+            encoding=encoding or None,
             congestion_control=zenoh.CongestionControl.BLOCK,
             cache=zenoh.ext.CacheConfig(1),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(
@@ -40,13 +42,13 @@ class LatchedPublisher(Closing):
             publisher_detection=True,
         )
 
-    def set(self, payload: bytes) -> None:
+    def set(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Replace the value, for everybody. An empty one is InvalidInput. Raises Closed."""
         if not payload:
             raise InvalidInput(f"the value of {self._key!r} is empty; withdraw() takes a value back")
         self._session.check()
         try:
-            self._publisher.put(payload)
+            self._publisher.put(payload, attachment=attachment)
         except zenoh.ZError:
             raise Closed(f"the publisher of {self._key!r} is closed") from None
 
@@ -66,17 +68,15 @@ class LatchedPublisher(Closing):
 class LatchedSubscriber(Closing):
     """Hears the present value of every matching key, then each change.
 
-    ``on_value(key, payload, encoding)`` is called from one thread of this subscriber; the payload is
-    None when the value was withdrawn. See ``Receiver`` for what happens when it raises.
+    ``on_value(arrival)`` is called from one thread of this subscriber; the payload is empty when the
+    value was withdrawn. See ``Receiver`` for what happens when it raises.
     """
 
-    def __init__(
-        self, session: Session, keyexpr: str, on_value: Callable[[str, bytes | None, str], None]
-    ) -> None:
+    def __init__(self, session: Session, keyexpr: str, on_value: Callable[[Arrival], None]) -> None:
         def hand_over(batch: list[zenoh.Sample]) -> None:
             for sample in batch:
-                # Zenoh's cache replays a delete to late joiners as an empty put
-                on_value(str(sample.key_expr), sample.payload.to_bytes() or None, str(sample.encoding))
+                # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
+                on_value(arrival_of(sample))
 
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         subscriber = zenoh.ext.declare_advanced_subscriber(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import re
@@ -146,6 +147,7 @@ class Session(Closing):
         self._pid = os.getpid()
         self._closed = False
         self._lock = threading.Lock()
+        self._numbers = itertools.count()
         self.zid = str(raw.zid())
 
     def __repr__(self) -> str:
@@ -156,6 +158,10 @@ class Session(Closing):
         """The Zenoh session itself, for what zstate does not do. Raises Closed."""
         self.check()
         return self._raw
+
+    def next_number(self) -> int:
+        """A number that nothing else of this session has: 0, 1, 2, ..."""
+        return next(self._numbers)
 
     def check(self) -> None:
         """Raise Closed if this session cannot be used any more, or not in this process."""

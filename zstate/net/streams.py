@@ -13,11 +13,20 @@ from zstate.closing import Closing
 from zstate.errors import Closed
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
+from zstate.wire.wire import Arrival
 
 CAPACITY = 1024
 
-Arrival = tuple[str, bytes, str]
-"""Key, payload and encoding of one sample."""
+
+def arrival_of(sample: zenoh.Sample) -> Arrival:
+    """What came, as the wires read it."""
+    beside = sample.attachment
+    return Arrival(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        str(sample.encoding),
+        None if beside is None else beside.to_bytes(),
+    )
 
 
 class StreamPublisher(Closing):
@@ -28,7 +37,7 @@ class StreamPublisher(Closing):
         self._key = key
         self._publisher = session.zenoh.declare_publisher(
             key,
-            encoding=encoding,
+            encoding=encoding or None,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=False,
@@ -40,11 +49,11 @@ class StreamPublisher(Closing):
         # the stub says bool, but it is an object and always true
         return bool(self._publisher.matching_status.matching)  # pyright: ignore
 
-    def put(self, payload: bytes) -> None:
-        """Hand one sample to the network. Raises Closed."""
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        """Hand one sample to the network, with what goes beside it. Raises Closed."""
         self._session.check()
         try:
-            self._publisher.put(payload)
+            self._publisher.put(payload, attachment=attachment)
         except zenoh.ZError:
             raise Closed(f"the publisher of {self._key!r} is closed") from None
 
@@ -68,13 +77,7 @@ class StreamSubscriber(Closing):
         capacity: int = CAPACITY,
     ) -> None:
         def hand_over(batch: list[zenoh.Sample]) -> None:
-            on_samples(
-                [
-                    (str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
-                    for sample in batch
-                    if sample.kind == zenoh.SampleKind.PUT
-                ]
-            )
+            on_samples([arrival_of(sample) for sample in batch if sample.kind == zenoh.SampleKind.PUT])
 
         ring: Ring = zenoh.handlers.RingChannel(capacity)
         self._receiver = Receiver(

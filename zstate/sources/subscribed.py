@@ -5,19 +5,21 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ZStateError
+from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.net.streams import Arrival, StreamSubscriber
+from zstate.net.streams import StreamSubscriber
+from zstate.net.wires import wire_named
 from zstate.sources.source import JointReading
 from zstate.wire.joint_order import JointNumbers, JointOrder
-from zstate.wire.messages import JointState
-from zstate.wire.native import NativeWire
+from zstate.wire.messages import JointState, Message
+from zstate.wire.wire import Arrival
 
 _LOG = logging.getLogger("zstate")
 
@@ -32,29 +34,38 @@ class SubscribedSource(Closing):
     cannot be used are counted in ``refused``, by reason; the first of each is also logged.
     """
 
-    def __init__(self, session: Session, model: RobotModel, robot: str | None = None) -> None:
+    def __init__(
+        self, session: Session, model: RobotModel, robot: str | None = None, *, wire: str = "native"
+    ) -> None:
         self.refused: dict[str, int] = {}
         self._model = model
         self._table = EdgeTable(model)
-        self._order = JointOrder(model.joint_names)
-        self._wire = NativeWire()
+        self._order = JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
+        self._robot = robot or model.name
+        self._wire = wire_named(wire)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
         self._changed = threading.Condition()
         self._closed = False
-        key = self._wire.expression(robot or model.name, "joint_states")
+        key = self._wire.expression(self._robot, "joint_states")
         self._subscriber = StreamSubscriber(session, key, self._take)
 
     def _take(self, arrivals: list[Arrival]) -> None:
-        readings = [reading for arrival in arrivals if (reading := self._read(arrival)) is not None]
+        states = [state for arrival in arrivals for state in self._decode(arrival)]
+        readings = [reading for state in states if (reading := self._read(state)) is not None]
         with self._changed:
             self._readings.extend(readings)
             self._changed.notify_all()
 
-    def _read(self, arrival: Arrival) -> JointReading | None:
-        _, payload, encoding = arrival
+    def _decode(self, arrival: Arrival) -> Sequence[Message]:
         try:
-            state = self._wire.decode("joint_states", payload, encoding)
-            assert isinstance(state, JointState)
+            return self._wire.decode("joint_states", arrival, self._robot)
+        except MessageError as error:
+            self._refuse(error.reason, error)
+            return ()
+
+    def _read(self, state: Message) -> JointReading | None:
+        assert isinstance(state, JointState)
+        try:
             numbers = self._order.read(state)
             self._check(numbers)
         except MessageError as error:

@@ -25,27 +25,33 @@ class JointNumbers(NamedTuple):
 class JointOrder:
     """The joints a reader expects, by name, and how to find them in what writers send.
 
-    A writer with the same order is read as it is. One that names its joints in full may have any
-    order and joints of its own besides (one number each); every joint of ours must be among them.
+    A writer with the same order of joint ``names`` is read as it is. One that names its numbers in full
+    may have any order and others besides; each of our ``coordinates`` must be among them, which are the
+    names unless given. ``velocity_slots`` says which coordinate each velocity stands under.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.names = tuple(names)
-        self.digest = order_digest(self.names)
-        self._picks: dict[tuple[str, ...], NDArray[np.intp]] = {}
+    def __init__(
+        self, names: Sequence[str], coordinates: Sequence[str] = (), velocity_slots: Sequence[int] = ()
+    ) -> None:
+        self.digest = order_digest(tuple(names))
+        self._coordinates = tuple(coordinates or names)
+        self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
+        self._picks: dict[tuple[str, ...], _Pick] = {}
 
     def read(self, state: JointState) -> JointNumbers:
         """The numbers of ``state`` in our order. Raises MessageError when they are not all there."""
-        blocks = (state.positions, state.velocities, state.efforts)
-        numbers = [None if block is None else from_block(block) for block in blocks]
-        if state.order != self.digest:
-            pick = self._pick(state.names)
-            numbers = [None if block is None else block[pick] for block in numbers]
-        positions, velocities, efforts = numbers
-        assert positions is not None
-        return JointNumbers(positions, velocities, efforts)
+        pick = None if state.order == self.digest else self._pick(state.names)
+        positions = from_block(state.positions)
+        velocities, efforts = _numbers(state.velocities), _numbers(state.efforts)
+        if pick is None:
+            return JointNumbers(positions, velocities, efforts)
+        return JointNumbers(
+            positions[pick.positions],
+            None if velocities is None else velocities[pick.velocities],
+            None if efforts is None else efforts[pick.velocities],
+        )
 
-    def _pick(self, names: tuple[str, ...] | None) -> NDArray[np.intp]:
+    def _pick(self, names: tuple[str, ...] | None) -> _Pick:
         if names is None:
             raise MessageError(
                 "a joint state in an order of another model; do both sides use the same URDF?",
@@ -53,12 +59,24 @@ class JointOrder:
             )
         pick = self._picks.get(names)
         if pick is None:
-            missing = [name for name in self.names if name not in names]
+            missing = [name for name in self._coordinates if name not in names]
             if missing:
                 raise MessageError(
                     f"a joint state without {', '.join(map(repr, missing))}", reason="missing joints"
                 )
             # One order per writer is usual; a writer that shuffles must not fill the memory.
-            pick = np.array([names.index(name) for name in self.names], dtype=np.intp)
+            positions = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
+            pick = _Pick(positions, positions[self._slots])
             self._picks = {names: pick}
         return pick
+
+
+class _Pick(NamedTuple):
+    """Where our numbers stand in what a writer sends."""
+
+    positions: NDArray[np.intp]
+    velocities: NDArray[np.intp]
+
+
+def _numbers(block: bytes | None) -> Floats | None:
+    return None if block is None else from_block(block)

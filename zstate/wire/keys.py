@@ -14,11 +14,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from zstate.errors import InvalidInput
 
-Stream = Literal["joint_states", "tf", "tf_static", "robot_description", "joint_commands"]
+Stream = Literal["joint_states", "tf", "tf_static", "robot_description", "joint_commands", "clock"]
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
@@ -61,13 +61,17 @@ def _chunk_problem(name: str) -> str:
 
 
 def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
-    """The key on which a writer puts ``stream``; ``tf_static`` has one per ``writer``."""
+    """The key on which a writer puts ``stream``; ``tf_static`` has one per ``writer``, ``clock`` only one."""
+    if stream == "clock":
+        return CLOCK_KEY
     key = f"zstate/{check_robot(robot)}/{stream}"
     return f"{key}/{check_writer(writer)}" if stream == "tf_static" else key
 
 
 def stream_expression(robot: str, stream: Stream) -> str:
     """The key expression that hears every writer of ``stream``; robot ``"*"`` means all robots."""
+    if stream == "clock":
+        return CLOCK_KEY
     key = f"zstate/{robot if robot == ANY else check_robot(robot)}/{stream}"
     return f"{key}/*" if stream == "tf_static" else key
 
@@ -85,6 +89,16 @@ def writer_key(robot: str, stream: Stream, identity: str) -> str:
 def writer_expression(robot: str) -> str:
     """The key expression of all tokens of ``robot``, or of every robot for ``"*"``."""
     return f"zstate/{robot if robot == ANY else check_robot(robot)}/@writer/*/*"
+
+
+def parse_writer_key(key: str) -> tuple[str, Stream, str]:
+    """Robot, stream and identity in a ``writer_key``. Raises InvalidInput for any other key."""
+    chunks = key.split("/")
+    if len(chunks) == 5 and chunks[0] == "zstate" and chunks[2] == "@writer":
+        for stream in get_args(Stream):
+            if chunks[3] == stream:
+                return chunks[1], stream, chunks[4]
+    raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@writer/<stream>/<identity>'")
 
 
 def robot_of(key: str) -> str:

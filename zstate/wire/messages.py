@@ -8,6 +8,7 @@ version may append some and today's readers pass over them; anything else needs 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from hashlib import blake2b
 from typing import Annotated
 
@@ -46,7 +47,13 @@ def order_digest(order: Sequence[str] | Sequence[tuple[str, str]]) -> bytes:
 
     BLAKE2b of the order as a MessagePack array.
     """
-    return blake2b(msgspec.msgpack.encode(tuple(order)), digest_size=8).digest()
+    return _order_digest(tuple(order))
+
+
+# A writer that names its numbers in full does so in each sample.
+@lru_cache(maxsize=256)
+def _order_digest(order: tuple[object, ...]) -> bytes:
+    return blake2b(msgspec.msgpack.encode(order), digest_size=8).digest()
 
 
 class Message(Struct, frozen=True, array_like=True, gc=False):

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import TypeVar
 
 import msgspec
 
-from zstate.errors import MessageError
-from zstate.wire.keys import Stream, stream_expression, stream_key
+from zstate.errors import InvalidInput, MessageError
+from zstate.wire.keys import (
+    Stream,
+    parse_writer_key,
+    robot_of,
+    stream_expression,
+    stream_key,
+    writer_expression,
+    writer_key,
+)
+from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     Clock,
     JointCommand,
@@ -18,6 +28,8 @@ from zstate.wire.messages import (
     StaticTransforms,
     TransformSample,
 )
+from zstate.wire.wire import Arrival, Place
+from zstate.wire.writer import Announced, Writer
 
 VERSION = 1
 
@@ -38,6 +50,7 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "tf_static": StaticTransforms,
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
+    "clock": Clock,
 }
 
 _ENCODER = msgspec.msgpack.Encoder()
@@ -64,25 +77,66 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
         raise _broken(payload, kind, error) from None
 
 
-class NativeWire:
-    """The native wire behind the seam of ``zstate.wire.wire.Wire``."""
+class NativeOutlet:
+    """How one writer says one stream on the native wire."""
 
-    name = "native"
+    can_withdraw = True
 
-    def key(self, robot: str, stream: Stream, writer: str = "") -> str:
-        return stream_key(robot, stream, writer)
-
-    def expression(self, robot: str, stream: Stream) -> str:
-        return stream_expression(robot, stream)
-
-    def encoding(self, stream: Stream) -> str:
-        return ENCODINGS[STREAM_TYPES[stream]]
+    def __init__(self, robot: str, stream: Stream, writer: Writer, name: str) -> None:
+        self.key = stream_key(robot, stream, name)
+        self.encoding = ENCODINGS[STREAM_TYPES[stream]]
+        self.token = None if stream == "clock" else writer_key(robot, stream, writer.identity)
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
 
-    def decode(self, stream: Stream, payload: bytes, encoding: str) -> Message:
-        return decode(payload, encoding, STREAM_TYPES[stream])
+    def attachment(self, now: int) -> None:
+        return None
+
+
+class NativeVoice:
+    """One writer of one robot on the native wire."""
+
+    token = None
+
+    def __init__(self, robot: str, writer: Writer) -> None:
+        self._robot = robot
+        self._writer = writer
+
+    def outlet(self, stream: Stream, number: int, name: str = "") -> NativeOutlet:
+        return NativeOutlet(self._robot, stream, self._writer, name)
+
+
+class NativeWire:
+    """The native wire behind the seam of ``zstate.wire.wire.Wire``."""
+
+    name = "native"
+    shared: frozenset[Stream] = frozenset()
+
+    def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> NativeVoice:
+        return NativeVoice(robot, writer)
+
+    def expression(self, robot: str, stream: Stream) -> str:
+        return stream_expression(robot, stream)
+
+    def robot_of(self, key: str) -> str:
+        return robot_of(key)
+
+    def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+        return (decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream]),)
+
+    def statics_writer(self, key: str) -> str:
+        return key.rpartition("/")[2]
+
+    def writers_expression(self, robot: str) -> str:
+        return writer_expression(robot)
+
+    def announced(self, token: str, robot: str) -> Announced | None:
+        try:
+            name, stream, identity = parse_writer_key(token)
+            return Announced(name, stream, Writer.parse(identity))
+        except InvalidInput:
+            return None
 
 
 def _stranger(encoding: str, kind: type[Message]) -> MessageError:

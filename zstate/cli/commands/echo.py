@@ -18,6 +18,7 @@ from zstate.errors import MessageError
 if TYPE_CHECKING:
     from zstate.cli.tap import Tapped
     from zstate.net.session import Session
+    from zstate.wire.wire import Arrival
 
 # A robot's description comes within milliseconds, if there is one.
 _NAMES_WITHIN_S = 1.0
@@ -63,13 +64,13 @@ def echo_command(
 class Named(Closing):
     """Names the joints in samples of ``robot``, once it has been described."""
 
-    def __init__(self, session: Session, robot: str) -> None:
+    def __init__(self, session: Session, robot: str, wire: str = "native") -> None:
         from zstate.cli.documents import DocumentWriter
         from zstate.net.latched import LatchedSubscriber
-        from zstate.wire.native import NativeWire
+        from zstate.net.wires import wire_named
 
         self._robot = robot
-        self._wire = NativeWire()
+        self._wire = wire_named(wire)
         self._writer = DocumentWriter()
         self._described = Event()
         self._warned = False
@@ -79,15 +80,15 @@ class Named(Closing):
     def close(self) -> None:
         self._subscriber.close()
 
-    def _describe(self, key: str, payload: bytes | None, encoding: str) -> None:
+    def _describe(self, arrival: Arrival) -> None:
         from zstate.wire.messages import RobotDescription
 
-        if payload is None:
+        if not arrival.payload:
             return
         try:
-            description = self._wire.decode("robot_description", payload, encoding)
+            (description,) = self._wire.decode("robot_description", arrival, self._robot)
         except MessageError as error:
-            note(f"{key}: {error}")
+            note(f"{arrival.key}: {error}")
             return
         assert isinstance(description, RobotDescription)
         self._writer.describe(description)

@@ -17,7 +17,8 @@ from zstate.cli.roster import announced_text
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
-    from zstate.net.presence import RobotInfo, Writer
+    from zstate.net.presence import RobotInfo
+    from zstate.wire.writer import Writer
 
 
 @click.command("ls")

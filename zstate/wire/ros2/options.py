@@ -27,7 +27,8 @@ class Ros2Options:
     own frames, as robot_state_publisher's parameter of that name; a "*" in it is the robot's name.
     ``tf`` says whether /tf and /tf_static are "global", as tf2 has them, or in the "namespace".
     ``hash`` is "iron" for ROS 2 from Iron on, or "humble", where types have none: it decides what is
-    written, readers hear both. ``node`` is the name under which zstate stands in the ROS graph.
+    written, readers hear both. ``node`` is the name under which a writer stands in the ROS graph; that of
+    its program unless given.
     """
 
     domain: int = 0
@@ -35,7 +36,7 @@ class Ros2Options:
     frame_prefix: str = ""
     tf: Literal["global", "namespace"] = "global"
     hash: Literal["iron", "humble"] = "iron"
-    node: str = "zstate"
+    node: str = ""
 
     def __post_init__(self) -> None:
         if self.domain not in range(LAST_DOMAIN + 1):
@@ -48,7 +49,8 @@ class Ros2Options:
             raise _not_allowed("tf", self.tf, "'global' and 'namespace'")
         if self.hash not in ("iron", "humble"):
             raise _not_allowed("hash", self.hash, "'iron' and 'humble'")
-        _check_token("node", self.node)
+        if self.node:
+            _check_token("node", self.node)
 
     @classmethod
     def parse(cls, text: str) -> Ros2Options:

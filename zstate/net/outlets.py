@@ -1,0 +1,92 @@
+"""Outlets: all that one writer puts on one wire, announced to everybody."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack, suppress
+
+from zstate.closing import Closing
+from zstate.errors import Closed
+from zstate.net.latched import LatchedPublisher
+from zstate.net.presence import announce
+from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher
+from zstate.wire.keys import Stream
+from zstate.wire.layout import Layout
+from zstate.wire.messages import Message
+from zstate.wire.wire import Outlet, Place, Wire
+from zstate.wire.writer import Writer
+
+
+class Outlets(Closing):
+    """One writer of ``robot`` on ``wire``: opens its streams and latched values, closes them together."""
+
+    def __init__(
+        self, session: Session, wire: Wire, robot: str, writer: Writer, layout: Layout | None = None
+    ) -> None:
+        self._session = session
+        place = Place(session.zid, session.next_number())
+        self._voice = wire.voice(robot, writer, place, layout or Layout())
+        self._opened = ExitStack()
+        if self._voice.token is not None:
+            self._opened.enter_context(announce(session, self._voice.token))
+
+    def stream(self, stream: Stream) -> StreamOutlet:
+        """Open ``stream`` for samples, and announce it."""
+        outlet = self._voice.outlet(stream, self._session.next_number())
+        publisher = StreamPublisher(self._session, outlet.key, outlet.encoding)
+        self._open(publisher, outlet)
+        return StreamOutlet(outlet, publisher)
+
+    def latched(self, stream: Stream, name: str = "") -> LatchedOutlet:
+        """Open ``stream`` for a value that late joiners receive too, and announce it."""
+        outlet = self._voice.outlet(stream, self._session.next_number(), name)
+        publisher = LatchedPublisher(self._session, outlet.key, outlet.encoding)
+        self._open(publisher, outlet)
+        return LatchedOutlet(outlet, publisher)
+
+    def _open(self, publisher: Closing, outlet: Outlet) -> None:
+        self._opened.enter_context(publisher)
+        if outlet.token is not None:
+            self._opened.enter_context(announce(self._session, outlet.token))
+
+    def close(self) -> None:
+        """Withdraw from all of it. A second call does nothing."""
+        self._opened.close()
+
+
+class StreamOutlet:
+    """One stream of one writer."""
+
+    def __init__(self, outlet: Outlet, publisher: StreamPublisher) -> None:
+        self._outlet = outlet
+        self._publisher = publisher
+        self.encode = outlet.encode
+
+    @property
+    def has_readers(self) -> bool:
+        """Whether anybody subscribes now."""
+        return self._publisher.has_readers
+
+    def put(self, payload: bytes) -> None:
+        """Send what ``encode`` made of a message. Raises Closed."""
+        self._publisher.put(payload, self._outlet.attachment(time.time_ns()))
+
+
+class LatchedOutlet:
+    """One latched value of one writer."""
+
+    def __init__(self, outlet: Outlet, publisher: LatchedPublisher) -> None:
+        self._outlet = outlet
+        self._publisher = publisher
+
+    def set(self, message: Message) -> None:
+        """Replace the value, for everybody. Raises Closed."""
+        self._publisher.set(self._outlet.encode(message), self._outlet.attachment(time.time_ns()))
+
+    def withdraw(self) -> None:
+        """Take the value back, from everybody, where the wire can say that."""
+        # If the session went first, everything declared on it went with it.
+        with suppress(Closed):
+            if self._outlet.can_withdraw:
+                self._publisher.withdraw()

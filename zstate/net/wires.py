@@ -1,0 +1,48 @@
+"""The wires there are, by name."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from zstate.errors import InvalidInput
+from zstate.wire.native import NativeWire
+from zstate.wire.wire import Wire
+
+if TYPE_CHECKING:
+    from zstate.wire.ros2.options import Ros2Options
+
+DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
+
+NAMES = ("native", "ros2", "ros2dds")
+
+
+def wire_named(name: str) -> Wire:
+    """The wire a user calls ``name``: "native", "ros2" or "ros2dds".
+
+    What follows a colon are options of a ROS wire, as ``Ros2Options.parse`` reads them: for instance
+    "ros2:domain=5,namespace=r1". The domain is ROS_DOMAIN_ID unless given. Raises InvalidInput.
+    """
+    kind, colon, options = name.partition(":")
+    if kind not in NAMES:
+        raise InvalidInput(f"there is no wire {name!r}; known: {', '.join(map(repr, NAMES))}")
+    if kind == "native":
+        if colon:
+            raise InvalidInput(f"the native wire has no options; {name!r} gives some")
+        return NativeWire()
+    # Loaded for those who speak to ROS, with its hash library.
+    from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire  # noqa: PLC0415
+
+    return Ros2Wire(_ros_options(options)) if kind == "ros2" else Ros2DdsWire(_ros_options(options))
+
+
+def _ros_options(text: str) -> Ros2Options:
+    from zstate.wire.ros2.options import Ros2Options  # noqa: PLC0415 - as above
+
+    domain = os.environ.get(DOMAIN_VARIABLE, "")
+    if not domain or "domain=" in text:
+        return Ros2Options.parse(text)
+    try:
+        return Ros2Options.parse(",".join(filter(None, (f"domain={domain}", text))))
+    except InvalidInput as error:
+        raise InvalidInput(f"{error} (the domain is that of {DOMAIN_VARIABLE})") from None

@@ -1,0 +1,110 @@
+"""RosOutlet: the messages of one writer of one topic, as CDR, each signed by the writer's gid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from zstate.errors import InvalidInput
+from zstate.wire.keys import Stream
+from zstate.wire.layout import Layout
+from zstate.wire.messages import (
+    Clock,
+    Edges,
+    JointState,
+    Message,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+    from_block,
+    to_block,
+)
+from zstate.wire.ros2.attachment import pack
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.joint_state import JointStateEncoder
+from zstate.wire.ros2.plain import encode_clock, encode_string
+from zstate.wire.ros2.tf_message import TfMessageEncoder
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where one topic is put, and the token that tells who puts it; ``gid`` is None where none is told."""
+
+    key: str
+    token: str
+    gid: bytes | None
+
+
+class RosOutlet:
+    """How one writer says one stream in ROS 2."""
+
+    encoding = ""
+    can_withdraw = False  # a ROS node takes a Zenoh delete for a broken message
+
+    def __init__(self, stream: Stream, address: Address, names: FrameNames, layout: Layout) -> None:
+        self.key = address.key
+        self.token = address.token
+        self._gid = address.gid
+        self._seq = 0
+        self._stream = stream
+        self._names = names
+        self._layout = layout
+        self._joints: tuple[tuple[str, ...], JointStateEncoder] | None = None
+        self._edges: tuple[Edges, TfMessageEncoder] | None = None
+
+    def attachment(self, now: int) -> bytes | None:
+        """Sequence number, time of writing ``now`` [ns] and writer, which every ROS node asks for."""
+        if self._gid is None:
+            return None
+        self._seq += 1
+        return pack(self._seq, now, self._gid)
+
+    def encode(self, message: Message) -> bytes:
+        """``message`` as CDR.
+
+        Raises InvalidInput for a stamp that ROS has no place for, and for numbers without names.
+        """
+        if isinstance(message, JointState):
+            return self._encode_joints(message)
+        if isinstance(message, TransformSample):
+            edges = self._layout.moving_edges if message.edges is None else message.edges
+            return self._encode_edges(edges, _dated(message.stamp), message.poses)
+        if isinstance(message, StaticTransforms):
+            return self._encode_edges(message.edges, 0, message.poses)
+        if isinstance(message, RobotDescription):
+            return encode_string(message.urdf)
+        if isinstance(message, Clock):
+            return encode_clock(message.stamp)
+        raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
+
+    def _encode_joints(self, state: JointState) -> bytes:
+        names = self._layout.coordinates if state.names is None else state.names
+        if self._joints is None or self._joints[0] is not names:
+            self._joints = names, JointStateEncoder(names)
+        rates, forces = state.velocities, state.efforts
+        if len(self._layout.velocity_slots) != len(names):
+            rates, forces = self._spread(rates, len(names)), self._spread(forces, len(names))
+        return self._joints[1].encode(_dated(state.stamp), state.positions, rates, forces)
+
+    def _spread(self, block: bytes | None, count: int) -> bytes | None:
+        """Each number in the place of its coordinate: ROS knows as many velocities as positions."""
+        slots = self._layout.velocity_slots
+        if block is None or len(block) != 8 * len(slots):
+            return block
+        numbers = np.full(count, np.nan)
+        numbers[list(slots)] = from_block(block)
+        return to_block(numbers)
+
+    def _encode_edges(self, edges: Edges, stamp: int, poses: bytes) -> bytes:
+        if self._edges is None or self._edges[0] is not edges:
+            self._edges = edges, TfMessageEncoder(self._names.edges_to_ros(edges))
+        return self._edges[1].encode(stamp, poses)
+
+
+def _dated(stamp: int) -> int:
+    if not stamp:
+        raise InvalidInput(
+            "the stamp is 0, by which ROS means that there is none; give the time of the sample"
+        )
+    return stamp

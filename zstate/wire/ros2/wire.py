@@ -1,0 +1,178 @@
+"""The ROS 2 wires: what ROS nodes say and hear over Zenoh, without ROS."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from functools import lru_cache, partial
+
+from zstate.wire.keys import ANY, Stream
+from zstate.wire.layout import Layout
+from zstate.wire.messages import Message
+from zstate.wire.ros2.attachment import session_of, unpack
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.graph import (
+    DDS_GRAPH_EXPRESSION,
+    DdsToken,
+    EndpointToken,
+    NodeToken,
+    gid,
+    graph_expression,
+    parse_dds_token,
+    parse_token,
+)
+from zstate.wire.ros2.hearing import RosHearing
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.outlet import Address, RosOutlet
+from zstate.wire.ros2.qos import STREAM_QOS
+from zstate.wire.ros2.topics import DdsKeys, RmwKeys, TopicKeys, robot_of_topic, type_of
+from zstate.wire.wire import Arrival, Place
+from zstate.wire.writer import Announced, Writer
+
+STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+
+
+class RosVoice:
+    """One ROS node: a writer of one robot."""
+
+    def __init__(self, wire: Ros2Wire, robot: str, writer: Writer, place: Place, layout: Layout) -> None:
+        self._wire = wire
+        self._robot = robot
+        self._layout = layout
+        self._names = FrameNames(wire.options, robot)
+        namespace = f"/{wire.options.namespace_of(robot)}"
+        name = wire.options.node or re.sub(r"\W|^(?=\d)", "_", writer.program, flags=re.ASCII)
+        self._node = NodeToken(wire.options.domain, place.zid, place.number, "/", namespace, name)
+        self.token = wire.node_token(self._node)
+
+    def outlet(self, stream: Stream, number: int, name: str = "") -> RosOutlet:
+        address = self._wire.address(self._node, self._robot, stream, number)
+        return RosOutlet(stream, address, self._names, self._layout)
+
+
+class Ros2Wire:
+    """As ROS 2 nodes on rmw_zenoh_cpp speak: CDR, with an attachment, announced in the ROS graph.
+
+    ROS has topics and no robots. A listener to one robot calls by its name whatever is said in the
+    namespace of ``options``; a listener to all calls by the namespace's name what stands in one.
+    """
+
+    name = "ros2"
+    shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
+
+    def __init__(self, options: Ros2Options | None = None) -> None:
+        self.options = options or Ros2Options()
+        self._keys = self._key_layout(self.options)
+        self._hearing = RosHearing()
+        self._frame_names = lru_cache(64)(partial(FrameNames, self.options))
+
+    def _key_layout(self, options: Ros2Options) -> TopicKeys:
+        return RmwKeys(options)
+
+    def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> RosVoice:
+        return RosVoice(self, robot, writer, place, layout)
+
+    def node_token(self, node: NodeToken) -> str | None:
+        """The token of a node of ours."""
+        return node.key
+
+    def address(self, node: NodeToken, robot: str, stream: Stream, number: int) -> Address:
+        """Where ``node`` puts ``stream`` of ``robot``, as its endpoint ``number``."""
+        key = self._keys.key(robot, stream)
+        written = key.rpartition("/")[2]
+        token = EndpointToken(
+            domain=node.domain,
+            zid=node.zid,
+            nid=node.nid,
+            eid=number,
+            kind="MP",
+            enclave=node.enclave,
+            namespace=node.namespace,
+            node=node.name,
+            topic=self._keys.topic(robot, stream),
+            dds_type=type_of(stream).dds,
+            hash=written,
+            qos=STREAM_QOS[stream],
+        ).key
+        return Address(key, token, gid(token))
+
+    def expression(self, robot: str, stream: Stream) -> str:
+        return self._keys.expression(robot, stream)
+
+    def robot_of(self, key: str) -> str:
+        return self._keys.robot_of(key)
+
+    def statics_writer(self, key: str) -> None:
+        """The key does not tell: all static edges of ROS share one topic."""
+
+    def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+        session, seq = self._origin(arrival)
+        return self._hearing.messages(stream, arrival.payload, session, seq, self._frame_names(robot))
+
+    def _origin(self, arrival: Arrival) -> tuple[int, int]:
+        """Which start of a writer, and which of its messages."""
+        attachment = unpack(arrival.attachment)
+        return session_of(attachment.gid), attachment.seq
+
+    def writers_expression(self, robot: str) -> str:
+        return graph_expression(self.options.domain)
+
+    def announced(self, token: str, robot: str) -> Announced | None:
+        parsed = parse_token(token)
+        if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
+            return None
+        node = f"{parsed.namespace.rstrip('/')}/{parsed.node}"
+        writer = Writer(node, host="", pid=0, since=0, session=session_of(gid(token)))
+        return self._announced(parsed.topic, parsed.dds_type, robot, writer)
+
+    def _announced(self, topic: str, dds_type: str, robot: str, writer: Writer) -> Announced | None:
+        for stream in STREAMS:
+            if dds_type == type_of(stream).dds and self._speaks_of(topic, robot, stream):
+                return Announced(robot_of_topic(topic) if robot == ANY else robot, stream, writer)
+        return None
+
+    def _speaks_of(self, topic: str, robot: str, stream: Stream) -> bool:
+        if robot != ANY or self.options.namespace != ANY:
+            return topic == self._keys.topic("any" if robot == ANY else robot, stream)
+        *namespace, name = topic.strip("/").split("/")
+        return name == stream and len(namespace) <= 1
+
+
+class Ros2DdsWire(Ros2Wire):
+    """As zenoh-plugin-ros2dds carries ROS 2 over Zenoh: CDR on plain keys, nothing beside it.
+
+    Who writes a message is not told, so that a restart is seen by its stamps only.
+    """
+
+    name = "ros2dds"
+
+    def __init__(self, options: Ros2Options | None = None) -> None:
+        super().__init__(options)
+        self._heard: Counter[str] = Counter()
+
+    def _key_layout(self, options: Ros2Options) -> TopicKeys:
+        return DdsKeys(options)
+
+    def node_token(self, node: NodeToken) -> None:
+        """The bridges tell no nodes."""
+
+    def address(self, node: NodeToken, robot: str, stream: Stream, number: int) -> Address:
+        key, kind = self._keys.key(robot, stream), type_of(stream)
+        token = DdsToken(node.zid, "MP", key, kind.name, STREAM_QOS[stream], kind.hash)
+        return Address(key, token.key, None)
+
+    def _origin(self, arrival: Arrival) -> tuple[int, int]:
+        self._heard[arrival.key] += 1
+        return 0, self._heard[arrival.key]
+
+    def writers_expression(self, robot: str) -> str:
+        return DDS_GRAPH_EXPRESSION
+
+    def announced(self, token: str, robot: str) -> Announced | None:
+        parsed = parse_dds_token(token)
+        if parsed is None or parsed.kind != "MP":
+            return None
+        package, _, name = parsed.type_name.split("/") if parsed.type_name.count("/") == 2 else ("", "", "")
+        writer = Writer(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
+        return self._announced(f"/{parsed.topic}", f"{package}::msg::dds_::{name}_", robot, writer)
