@@ -12,11 +12,10 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 from zstate.errors import RecordingError
+from zstate.record.storage import Format
 
-Format = Literal["mcap", "sqlite3"]
 FORMATS: dict[str, Format] = {".mcap": "mcap", ".db3": "sqlite3"}
 METADATA = "metadata.yaml"
 

@@ -6,7 +6,6 @@ from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from mcap.opcode import Opcode
 
@@ -16,7 +15,7 @@ from zstate.record.byte_file import ByteFile
 from zstate.record.channel import CDR, Channel, Record
 from zstate.record.index import Index, Piece
 from zstate.record.scan import Scan
-from zstate.record.storage import Choice
+from zstate.record.storage import Choice, Format
 from zstate.record.summary import Summary, header_of
 from zstate.record.time_order import Part
 
@@ -37,7 +36,7 @@ def reading(path: Path) -> Generator[ByteFile, None, None]:
 class McapFile:
     """The storage "mcap". The file is open only while it is read, as a recording may have thousands."""
 
-    format: Literal["mcap", "sqlite3"] = "mcap"
+    format: Format = "mcap"
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -10,7 +10,7 @@ from collections import Counter
 from contextlib import suppress
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema
 
 from zstate.record.blocks import (
     FIRST_PRIVATE_OPCODE,
@@ -96,6 +96,8 @@ class Scan:
         raise Damaged("the file is cut off there" if self._known is None else "a record's length is wrong")
 
     def _take(self, opcode: int, at: int, end: int) -> None:
+        if opcode == Opcode.DATA_END and self._known is not None and end < self._end:
+            raise Damaged("it says that the data ends, where more follows")
         if opcode in _BARE:
             self._run = at if self._run is None else self._run
             if end - self._run >= _BARE_PIECE:
@@ -103,6 +105,7 @@ class Scan:
             return
         self._end_run(at)
         if opcode == Opcode.DATA_END:
+            parsed(DataEnd, self._file.body(at, end))
             self._ended = True
         elif opcode == Opcode.CHUNK:
             body = chunk(self._file.body(at, end))

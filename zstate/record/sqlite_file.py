@@ -7,12 +7,12 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import quote
 
 from zstate.errors import RecordingError
 from zstate.record.channel import CDR, Channel, Record
-from zstate.record.storage import Choice
+from zstate.record.storage import Choice, Format
 from zstate.record.time_order import Part
 
 _OPTIONAL = {"offered_qos_profiles": "offered_qos_profiles", "type_description_hash": "topic_type_hash"}
@@ -22,7 +22,7 @@ _STAMPS = (-(1 << 63), (1 << 63) - 1)
 class SqliteFile:
     """The storage "sqlite3". The file is never written to; log and publish times are the same."""
 
-    format: Literal["mcap", "sqlite3"] = "sqlite3"
+    format: Format = "sqlite3"
     profile = "ros2"
     library = ""
     complete = True

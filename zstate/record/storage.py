@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from zstate.record.channel import Channel
 from zstate.record.time_order import Part
+
+Format: TypeAlias = Literal["mcap", "sqlite3"]
+"""As rosbag2 calls them."""
 
 
 class Choice(NamedTuple):
@@ -27,7 +30,7 @@ class Storage(Protocol):
     """
 
     path: Path
-    format: Literal["mcap", "sqlite3"]
+    format: Format
     size: int
     profile: str
     library: str
