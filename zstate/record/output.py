@@ -51,7 +51,7 @@ class Output:
     """An MCAP file of profile "ros2" or another. After a failure it is closed, and ends with a whole chunk.
 
     ``writer`` is MCAP's own; what it writes is in memory until ``flush``. Its public ``flush`` (since
-    mcap 1.6) ends the chunk in progress, which its ``chunk_size`` does also.
+    mcap 1.5) ends the chunk in progress, which its ``chunk_size`` does also.
     """
 
     def __init__(self, path: Path, *, overwrite: bool, profile: str = "ros2", library: str = LIBRARY) -> None:
