@@ -1,0 +1,36 @@
+"""The definitions of the messages that zstate speaks, for oracles that must be given them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+FIELDS = {
+    "builtin_interfaces/msg/Time": ("int32 sec", "uint32 nanosec"),
+    "std_msgs/msg/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "std_msgs/msg/String": ("string data",),
+    "rosgraph_msgs/msg/Clock": ("builtin_interfaces/Time clock",),
+    "sensor_msgs/msg/JointState": (
+        "std_msgs/Header header",
+        "string[] name",
+        "float64[] position",
+        "float64[] velocity",
+        "float64[] effort",
+    ),
+    "geometry_msgs/msg/Vector3": ("float64 x", "float64 y", "float64 z"),
+    "geometry_msgs/msg/Quaternion": ("float64 x 0", "float64 y 0", "float64 z 0", "float64 w 1"),
+    "geometry_msgs/msg/Transform": ("Vector3 translation", "Quaternion rotation"),
+    "geometry_msgs/msg/TransformStamped": (
+        "std_msgs/Header header",
+        "string child_frame_id",
+        "Transform transform",
+    ),
+    "tf2_msgs/msg/TFMessage": ("geometry_msgs/TransformStamped[] transforms",),
+}
+
+
+def write_messages(folder: Path, *names: str) -> None:
+    """Write ``<folder>/<package>/msg/<Type>.msg`` for each of ``names``, or for all."""
+    for name in names or FIELDS:
+        path = folder / f"{name}.msg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join(FIELDS[name]) + "\n")
