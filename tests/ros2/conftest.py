@@ -1,0 +1,40 @@
+"""What the tests with other implementations have: a router process, and a session of ours at it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+
+import pytest
+from peers import RUN, Peer, Spawn, interpreter, start_peer
+
+from zstate.net.session import Session, connect
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "ros2_peer: needs zenoh-ros2-sdk; tests/ros2/oracles.py makes it")
+    config.addinivalue_line(
+        "markers", "heavy: needs ROS 2 Kilted or pyzeros; tests/ros2/oracles.py makes them"
+    )
+
+
+@pytest.fixture
+def router(spawn: Spawn, free_port: int) -> str:
+    """The endpoint of a router process."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    child = spawn(RUN, sys.executable, "-u", "-m", "zstate", "router", "--listen", endpoint)
+    assert endpoint in child.line(), child.stderr
+    return endpoint
+
+
+@pytest.fixture
+def session(router: str) -> Iterator[Session]:
+    with connect(mode="client", endpoints=router) as session:
+        yield session
+
+
+@pytest.fixture
+def peer(request: pytest.FixtureRequest, spawn: Spawn) -> Peer:
+    """The peer that the test is parametrized with."""
+    interpreter(request.param)  # before the router is started for nothing
+    return start_peer(request.param, spawn, request.getfixturevalue("router"))

@@ -1,0 +1,63 @@
+"""ROS messages as the peers tell them: dictionaries with the names of the .msg files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.transform import Transform
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+STRING = "std_msgs/msg/String"
+CLOCK = "rosgraph_msgs/msg/Clock"
+
+XYZ, XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+
+
+def time(stamp: int) -> dict[str, int]:
+    return {"sec": stamp // 1_000_000_000, "nanosec": stamp % 1_000_000_000}
+
+
+def header(stamp: int, frame: str = "") -> dict[str, Any]:
+    return {"stamp": time(stamp), "frame_id": frame}
+
+
+def joint_state(
+    stamp: int,
+    names: Sequence[str],
+    positions: Sequence[float],
+    velocities: Sequence[float] = (),
+    efforts: Sequence[float] = (),
+) -> dict[str, Any]:
+    numbers = {"position": list(positions), "velocity": list(velocities), "effort": list(efforts)}
+    return {"header": header(stamp), "name": list(names), **numbers}
+
+
+def transform_stamped(stamp: int, parent: str, child: str, pose7: Sequence[float]) -> dict[str, Any]:
+    numbers = [float(number) for number in pose7]
+    pose = {
+        "translation": dict(zip(XYZ, numbers[:3], strict=True)),
+        "rotation": dict(zip(XYZW, numbers[3:], strict=True)),
+    }
+    return {"header": header(stamp, parent), "child_frame_id": child, "transform": pose}
+
+
+def tf_message(*transforms: dict[str, Any]) -> dict[str, Any]:
+    return {"transforms": list(transforms)}
+
+
+def edges_of(message: dict[str, Any]) -> dict[tuple[str, str], NDArray[np.float64]]:
+    """``parent_from_child`` of each transform, as matrices."""
+    return {
+        (one["header"]["frame_id"], one["child_frame_id"]): _matrix(one["transform"])
+        for one in message["transforms"]
+    }
+
+
+def _matrix(pose: dict[str, dict[str, float]]) -> NDArray[np.float64]:
+    pose7 = [*(pose["translation"][axis] for axis in XYZ), *(pose["rotation"][axis] for axis in XYZW)]
+    return Transform.from_pose7("parent", "child", pose7).matrix
