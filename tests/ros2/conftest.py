@@ -11,13 +11,6 @@ from peers import RUN, Peer, Spawn, interpreter, start_peer
 from zstate.net.session import Session, connect
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "ros2_peer: needs zenoh-ros2-sdk; tests/ros2/oracles.py makes it")
-    config.addinivalue_line(
-        "markers", "heavy: needs ROS 2 Kilted or pyzeros; tests/ros2/oracles.py makes them"
-    )
-
-
 @pytest.fixture
 def router(spawn: Spawn, free_port: int) -> str:
     """The endpoint of a router process."""
