@@ -45,12 +45,12 @@ SIGNATURES = {
     "SineSource.read": "(stamp)",
     "StatePublisher": (
         "(session, model, robot=None, wires=('native',), *, "
-        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None)"
+        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='')"
     ),
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",
     "StatePublisher.close": "()",
-    "StaticPublisher": "(session, robot, writer=None, wire='native')",
+    "StaticPublisher": "(session, robot, writer=None, wire='native', *, program='')",
     "StaticPublisher.set": "(transform)",
     "StaticPublisher.withdraw": "(child)",
     "StaticPublisher.close": "()",

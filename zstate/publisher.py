@@ -45,8 +45,8 @@ class StatePublisher(Closing):
     Whoever joins, at any time, is given the model (``robot_description``) and its fixed edges
     (``tf_static``). Samples go out on ``joint_states``; the moving edges also on ``tf``, while somebody
     reads that. ``robot`` is its name on the network, the model's name unless given. ``streams`` names
-    what this publisher writes, where another program writes the rest. A context manager; safe from any
-    thread.
+    what this publisher writes, where another program writes the rest. ``program`` is who others see
+    writing, the script's name unless given. A context manager; safe from any thread.
     """
 
     def __init__(
@@ -58,6 +58,7 @@ class StatePublisher(Closing):
         *,
         streams: Sequence[Stream] = STREAMS,
         clock: Clock | None = None,
+        program: str = "",
     ) -> None:
         self.model = model
         self.robot = check_robot(robot or model.name)
@@ -71,10 +72,13 @@ class StatePublisher(Closing):
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
         layout = Layout(coordinate_names(model), velocity_slots(model), self._edges.names)
-        writer = writer_here(self._session_id)
+        writer = writer_here(self._session_id, program)
         with ExitStack() as opening:
-            outlets = [Outlets(session, wire_named(wire), self.robot, writer, layout) for wire in wires]
-            self._outputs = [self._output(opening.enter_context(out), streams) for out in outlets]
+            outlets = [
+                opening.enter_context(Outlets(session, wire_named(wire), self.robot, writer, layout))
+                for wire in wires
+            ]
+            self._outputs = [self._output(out, streams) for out in outlets]
             self._opened = opening.pop_all()
 
     def _output(self, outlets: Outlets, streams: Sequence[Stream]) -> _Output:

@@ -27,11 +27,19 @@ class StaticPublisher(Closing):
     of a writer travel together, and a new value replaces the old one everywhere. ``close()`` withdraws
     them; the ROS wires cannot say that, so that there only late joiners do not get them any more.
     ``writer`` tells this publisher from others: unless given, the program, its process id and a random
-    number.
+    number. ``program`` is the script's name unless given.
     """
 
-    def __init__(self, session: Session, robot: str, writer: str | None = None, wire: str = "native") -> None:
-        identity = writer_here(secrets.randbits(32))
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        writer: str | None = None,
+        wire: str = "native",
+        *,
+        program: str = "",
+    ) -> None:
+        identity = writer_here(secrets.randbits(32), program)
         self.robot = check_robot(robot)
         self.writer = check_writer(_default_writer(identity) if writer is None else writer)
         if self.writer == MODEL_WRITER:
