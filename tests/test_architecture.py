@@ -24,7 +24,7 @@ FLOORS = (
     {"net", "record"},
     {"sources", "following"},
     {"publisher", "statics", "listener"},
-    {"ros1"},
+    {"ros1", "bridge"},
     {"zstate"},
     {"view", "cli"},
     {"__main__"},
