@@ -28,6 +28,7 @@ _COMMANDS = {
     "hz": ("Look", "The rate at which samples come in."),
     "check": ("Look", "What is right and wrong with a robot model."),
     "router": ("Run", "A Zenoh router."),
+    "ros1": ("Run", "A bridge to ROS 1, in either direction."),
     "up": ("Run", "Start several of these from one file."),
 }
 
