@@ -23,7 +23,7 @@ FLOORS = (
     {"model", "buffer", "wire"},
     {"net", "record"},
     {"sources", "following"},
-    {"publisher", "statics", "listener"},
+    {"publisher", "statics", "listener", "recorder", "replayer", "recording"},
     {"ros1", "bridge"},
     {"zstate"},
     {"view", "cli"},

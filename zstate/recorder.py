@@ -1,0 +1,245 @@
+"""Recorder: what robots say on the network, into MCAP files that every ROS tool opens."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from zstate.clock import SystemClock, wait_in_slices
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, MessageError
+from zstate.following.gaps import Gaps
+from zstate.following.tally import Tally
+from zstate.net.inbox import Heard, Inbox
+from zstate.net.presence import watch
+from zstate.net.session import Session
+from zstate.net.wires import wire_named
+from zstate.rate import Rate
+from zstate.record.scribe import Scribe
+from zstate.record.writer import RecordWriter
+from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.messages import Clock, Message, Sample
+from zstate.wire.ros2.topics import SHARED
+from zstate.wire.wire import Arrival, Wire
+from zstate.wire.writer import Announced
+
+FLUSH_NS = 500_000_000
+"""So often all that was heard goes to the file, where ``kill -9`` cannot reach it."""
+
+_WRITES_HZ = 20.0
+# Who starts together should be seen together: it decides where the robots stand in the file.
+_MEETING_NS = 300_000_000
+# Closing takes a second at most, subscriptions included.
+_LAST_WORDS_S = 0.5
+_JOIN_WITHIN_S = 0.9
+
+_LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
+_SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStats:
+    """Counts since the recorder opened.
+
+    ``messages`` were written, by robot and stream (the clock is of the robot "ros"); ``bytes`` is the
+    size of all ``files``. Samples were ``dropped`` by our own full ring, ``missed`` between the
+    writers' sequence numbers, ``unwritten`` for want of a description that fits; ``refused`` says why
+    others could not be written.
+    """
+
+    messages: Mapping[tuple[str, Stream], int]
+    bytes: int
+    files: tuple[Path, ...]
+    dropped: int
+    missed: int
+    refused: Mapping[str, int]
+    unwritten: int
+
+
+class Recorder(Closing):
+    """Records ``robots``, or all there are, on ``wire`` into ``path``; a context manager.
+
+    Every stream of theirs is heard, /tf too, which their publishers then have to say. A robot that was
+    chosen alone, or is the only one when the recording begins, stands in the file's root with its
+    frames as they are; others have a namespace and a frame prefix. ``max_bytes``, ``max_seconds`` and
+    ``overwrite`` are RecordWriter's. RecordingError when the file cannot be made, InvalidInput for
+    names that cannot be.
+
+    When the disk is full or gone, the recording ends by itself: ``wait`` returns, ``failure`` says why,
+    and what was written stays readable.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        path: str | os.PathLike[str],
+        robots: Sequence[str] = (),
+        *,
+        wire: str = "native",
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        self.failure: Exception | None = None
+        chosen = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
+        self._chosen = tuple(map(check_robot, chosen))
+        self._wire = wire_named(wire)
+        self._tally = Tally()
+        self._gaps = Gaps(self._tally)
+        self._programs: dict[int, str] = {}
+        self._announced: set[str] = set()
+        self._held: list[Heard] = []
+        self._begins_at: int | None = None
+        self._scribe: Scribe | None = None
+        self._closing = threading.Lock()
+        self._stop = threading.Event()
+        self._ended = threading.Event()
+        with ExitStack() as opening:
+            self._inbox = opening.enter_context(Inbox(session))
+            robot = self._chosen[0] if len(self._chosen) == 1 else ANY
+            opening.enter_context(watch(session, robot, self._on_writer, wire))
+            _subscribe(self._inbox, self._wire, self._chosen)
+            self._writer = RecordWriter(
+                path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
+            )
+            self._opened = opening.pop_all()
+        self._thread = threading.Thread(target=self._run, name="zstate recorder", daemon=True)
+        self._thread.start()
+
+    @property
+    def stats(self) -> RecorderStats:
+        """What has been written, lost and refused so far."""
+        heard, scribe, writer = self._tally.stats(), self._scribe, self._writer
+        return RecorderStats(
+            messages={} if scribe is None else scribe.messages,
+            bytes=writer.size,
+            files=writer.files,
+            dropped=heard.dropped,
+            missed=heard.missed,
+            refused=heard.refused,
+            unwritten=0 if scribe is None else scribe.unwritten,
+        )
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Block until the recording has ended, or for ``timeout_s``; whether it has ended."""
+        return wait_in_slices(self._ended, timeout_s)
+
+    def close(self) -> None:
+        """End the recording within a second: what was heard is written, and the file finished."""
+        self._stop_hearing()
+        self._stop.set()
+        self._thread.join(_JOIN_WITHIN_S)
+
+    def _stop_hearing(self) -> None:
+        with self._closing:
+            self._opened.close()
+
+    def _on_writer(self, announced: Announced, alive: bool) -> None:
+        if alive:
+            self._programs[announced.writer.session] = str(announced.writer)
+            if not self._chosen:
+                self._announced.add(announced.robot)
+
+    def _run(self) -> None:
+        try:
+            self._write_until_stopped()
+        except Exception as error:  # whatever it is, it must not pass in silence
+            self.failure = error
+            self._stop_hearing()
+        finally:
+            self._ended.set()
+
+    def _write_until_stopped(self) -> None:
+        flushed = 0
+        for now in Rate(_WRITES_HZ, SystemClock(), self._stop):
+            self._write_heard()
+            if now // FLUSH_NS != flushed:
+                flushed = now // FLUSH_NS
+                self._writer.flush()
+        self._write_heard(time.monotonic() + _LAST_WORDS_S)
+        self._writer.close()
+
+    def _write_heard(self, until_s: float = math.inf) -> None:
+        self._held += self._inbox.take()
+        if self._scribe is None:
+            self._scribe = self._new_scribe()
+        if self._scribe is None:
+            return
+        for heard in self._held:
+            if time.monotonic() < until_s:
+                self._write(self._scribe, heard)
+            else:
+                self._tally.count("dropped", len(heard.arrivals))
+        self._held = []
+
+    def _new_scribe(self) -> Scribe | None:
+        """None while it cannot be told yet which robots the recording begins with."""
+        robots = set(self._chosen) or self._robots_so_far()
+        if not self._chosen:
+            if robots and self._begins_at is None:
+                self._begins_at = time.monotonic_ns() + _MEETING_NS
+            is_met = self._begins_at is not None and time.monotonic_ns() >= self._begins_at
+            if not is_met and not self._stop.is_set():
+                return None
+        named = robots - {SHARED}
+        alone = named.pop() if len(named) == 1 else None
+        return Scribe(self._writer, self._tally.refuse, alone=alone, programs=self._programs)
+
+    def _robots_so_far(self) -> set[str]:
+        held = (heard for heard in self._held if heard.stream != "clock")
+        robots = {self._robot(heard, arrival) for heard in held for arrival in heard.arrivals}
+        return {robot for robot in robots if robot is not None} | self._announced.copy()
+
+    def _write(self, scribe: Scribe, heard: Heard) -> None:
+        if heard.overflowed:
+            self._gaps.note_overflow()
+        for arrival in heard.arrivals:
+            robot = self._robot(heard, arrival)
+            if robot is not None:
+                self._write_arrival(scribe, heard, robot, arrival)
+
+    def _write_arrival(self, scribe: Scribe, heard: Heard, robot: str, arrival: Arrival) -> None:
+        stream, stamp = heard.stream, heard.stamp
+        static_writer = self._wire.statics_writer(arrival.key) if stream == "tf_static" else None
+        if not arrival.payload and stream in _LATCHED:
+            if static_writer is not None:
+                scribe.withdraw(robot, static_writer, stamp)
+            return
+        for message in self._decode(stream, arrival, robot):
+            if isinstance(message, Sample | Clock):
+                self._gaps.note((robot, stream, message.session), message.seq)
+            scribe.take(robot, message, stamp, static_writer)
+
+    def _robot(self, heard: Heard, arrival: Arrival) -> str | None:
+        if heard.robot is not None:
+            return heard.robot
+        try:
+            return self._wire.robot_of(arrival.key)
+        except InvalidInput as error:
+            self._tally.refuse("foreign", str(error))
+            return None
+
+    def _decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+        try:
+            return self._wire.decode(stream, arrival, robot)
+        except MessageError as error:
+            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
+            return ()
+
+
+def _subscribe(inbox: Inbox, wire: Wire, robots: Sequence[str]) -> None:
+    """Hear every stream; where two robots share an expression, its keys tell them apart."""
+    for stream in (*_LATCHED, *_SAMPLES):
+        speakers: dict[str, set[str]] = {}
+        for robot in robots or (ANY,):
+            speakers.setdefault(wire.expression(robot, stream), set()).add(robot)
+        hear = inbox.hear_latched if stream in _LATCHED else inbox.hear
+        for expression, named in speakers.items():
+            hear(stream, expression, named.pop() if robots and len(named) == 1 else None)
+    inbox.hear("clock", wire.expression(robots[0] if robots else ANY, "clock"), SHARED)
