@@ -27,6 +27,7 @@ _COMMANDS = {
     "echo": ("Look", "Joint states, one document each."),
     "hz": ("Look", "The rate at which samples come in."),
     "check": ("Look", "What is right and wrong with a robot model."),
+    "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),
     "router": ("Run", "A Zenoh router."),
     "ros1": ("Run", "A bridge to ROS 1, in either direction."),
     "up": ("Run", "Start several of these from one file."),
