@@ -57,7 +57,7 @@ class Follower(ABC):
         """Put a sample into the buffer; ``overflowed`` says that our ring lost some before it."""
         self.heard = True
         with self._lock:
-            if not self._follow_session(sample.session):
+            if not self._follow_session(sample):
                 self._tally.refuse(
                     "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
                 )
@@ -111,20 +111,25 @@ class Follower(ABC):
         )
         return self._insert(sample)
 
-    def _follow_session(self, session: int) -> bool:
+    def _follow_session(self, sample: Sample) -> bool:
         """Whether samples of this session count: those of the newest writer to appear."""
+        session = sample.session
         if session in self._ended_sessions:
             return False
         if session != self._session:
             if self._session is not None:
                 self._ended_sessions.add(self._session)
                 self._early.clear()
-                self._restart()
+                self._succeed(sample)
             self._session = session
             self._next_seq = None
             self._last_late = None
             self._writer_changed()
         return True
+
+    def _succeed(self, sample: Sample) -> None:
+        """The first sample of another writer: what the old one said is another epoch."""
+        self._restart()
 
     def _count_gap(self, seq: int, overflowed: bool) -> None:
         if self._next_seq is not None and seq > self._next_seq:
@@ -144,7 +149,7 @@ class Follower(ABC):
 
     @abstractmethod
     def _restart(self) -> None:
-        """A new writer: what the old one said is another epoch."""
+        """A new epoch: forget what was said in the old one."""
 
     @abstractmethod
     def _may_begin_again(self) -> bool:
