@@ -14,7 +14,7 @@ def test_each_robot_has_a_line_a_second(spawn: Spawn):
     heard: set[str] = set()
     with standing("left"), standing("right"):
         until(lambda: heard.add(command.line().split()[0]) or heard == {"left", "right"})
-    assert "following left: joint_states" in command.stderr
+    assert "following zstate/left/joint_states" in command.stderr
     interrupted(command)
 
 
@@ -36,7 +36,7 @@ def test_a_robot_that_writes_only_transforms_is_heard_all_the_same(spawn: Spawn)
     command = started(spawn, "listen", "--json")
     with standing(streams=("tf", "tf_static", "robot_description")):
         until(lambda: json.loads(command.line())["received"] > 0)
-    assert "following rrbot: tf" in command.stderr
+    assert "following zstate/rrbot/tf" in command.stderr
 
 
 def test_it_says_what_it_waits_for(spawn: Spawn):

@@ -68,7 +68,7 @@ def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
         assert math.isclose(newest.rpy[1], 0.5, abs_tol=1e-12)
     interrupted(child)
     assert " published, " in child.line()
-    assert "heard joint_states of 'rrbot': 2 positions" in child.stderr
+    assert "heard zstate/rrbot/joint_states: 2 positions" in child.stderr
 
 
 def test_at_a_rate_publish_tells_what_became_of_it():
@@ -79,8 +79,8 @@ def test_at_a_rate_publish_tells_what_became_of_it():
 
 def test_joint_states_that_never_come_are_a_failure_with_a_hint():
     message = failure("publish", RRBOT, "--seconds", "0.3")
-    assert "waiting for joint_states of 'rrbot'" in message
-    assert "heard no joint_states of 'rrbot' in 0.3 s; `zstate ls`" in message
+    assert "waiting for zstate/rrbot/joint_states" in message
+    assert "heard nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
 
 
 def test_joint_states_of_another_model_are_told(spawn: Spawn):
@@ -97,6 +97,6 @@ def test_joint_states_of_another_model_are_told(spawn: Spawn):
 
 
 def test_an_unknown_wire_is_told_with_those_there_are():
-    message = failure("publish", RRBOT, "--source", "sine", "--wire", "carrier-pigeon")
+    message = failure("publish", RRBOT, "--source", "sine", "--wire", "carrier-pigeon", code=2)
     assert "'carrier-pigeon'" in message
     assert "'native'" in message

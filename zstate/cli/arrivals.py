@@ -26,21 +26,30 @@ class Intervals:
 
 
 class Arrivals:
-    """The last ``window`` arrivals."""
+    """The last ``window`` arrivals.
 
-    def __init__(self, window: int) -> None:
+    One writer is measured: another one is the same that has started anew, and begins a new window. Or,
+    if ``of_all``, all who write, together.
+    """
+
+    def __init__(self, window: int, *, of_all: bool = False) -> None:
         self._came: deque[int] = deque(maxlen=window)
         self._missed = 0
-        self._last: tuple[int, int] | None = None
+        self._of_all = of_all
+        self._last: dict[int, int] = {}
 
     def note(self, tapped: Tapped) -> None:
-        """Another arrival. A writer that started anew begins a new window."""
+        """Another arrival. Several samples of one message are one."""
         session, seq = tapped.sample.session, tapped.sample.seq
-        if self._last is not None and self._last[0] != session:
+        before = self._last.get(session)
+        if before == seq:
+            return
+        if before is not None:
+            self._missed += max(0, seq - before - 1)
+        elif not self._of_all:
             self._came.clear()
-        elif self._last is not None:
-            self._missed += max(0, seq - self._last[1] - 1)
-        self._last = session, seq
+            self._last.clear()
+        self._last[session] = seq
         self._came.append(tapped.came)
 
     def intervals(self) -> Intervals | None:

@@ -5,18 +5,32 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from zstate.cli.console import note
+from zstate.cli.words import words_of
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
+from zstate.publisher import StatePublisher
 from zstate.sources import JointReading, SubscribedSource
 
 
 class HeardSource(SubscribedSource):
-    """A SubscribedSource that announces the first reading and counts them all."""
+    """A SubscribedSource that announces the first reading and counts them all.
 
-    def __init__(self, session: Session, model: RobotModel, robot: str) -> None:
-        super().__init__(session, model, robot)
+    Each one is published by ``further`` as well.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        model: RobotModel,
+        robot: str,
+        wire: str,
+        *,
+        further: StatePublisher,
+    ) -> None:
+        super().__init__(session, model, robot, wire=wire)
         self.count = 0
-        self._robot = robot
+        self._further = further
+        self._place = words_of(wire).place(robot, ("joint_states",))
         self._first = self._last = 0
 
     @property
@@ -40,6 +54,7 @@ class HeardSource(SubscribedSource):
         assert reading.stamp is not None
         if not self.count:
             self._first = reading.stamp
-            note(f"heard joint_states of {self._robot!r}: {len(reading.positions)} positions")
+            note(f"heard {self._place}: {len(reading.positions)} positions")
         self._last = reading.stamp
         self.count += 1
+        self._further.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)

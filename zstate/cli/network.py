@@ -4,46 +4,92 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli.console import fail
+from zstate.cli.words import is_ros
+from zstate.errors import Unreachable
+
 if TYPE_CHECKING:
     from zstate.net.session import Session
+
+NATIVE = ("native",)
+
+# A router of this host answers in milliseconds; one elsewhere is given the library's time.
+_ROS_ROUTER_WITHIN_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """How to join the network: the session options of one command line."""
+    """How to join the network: the session options of one command line, as far as they were given."""
 
-    mode: str = "peer"
+    mode: str | None = None
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
-    config: str | None = None
+    config: str | Mapping[str, object] | None = None
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the user has said anything about it."""
+        return any((self.mode, self.connect, self.listen, self.config, os.environ.get("ZENOH_CONFIG")))
+
+    @property
+    def joins_as(self) -> str:
+        """The mode, or what the other options mean without one."""
+        # Whoever only says where to connect means a router, and peers do not pass on what others say.
+        return self.mode or ("client" if self.connect and not self.listen and not self.config else "peer")
 
 
 @contextmanager
-def open_session(network: Network) -> Generator[Session]:
-    """A session as the options say. Warnings of the library go to standard error from now on."""
+def open_session(network: Network, wires: tuple[str, ...] = NATIVE) -> Generator[Session]:
+    """A session as the options say, for commands that speak ``wires``.
+
+    Where all of these are ROS's and the options say nothing, it is a client of the router of this
+    host, where ROS nodes are. Warnings of the library go to standard error from now on.
+    """
     configured = network.config or os.environ.get("ZENOH_CONFIG")
     if network.mode == "client" and not network.connect and not configured:
         raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
     _warn_on_stderr()
-    with _connect(network) as session:
+    with _connect_to_ros(network) if all(map(is_ros, wires)) else _connect(network) as session:
         yield session
 
 
-def _connect(network: Network) -> Session:
+def _connect_to_ros(network: Network) -> Session:
+    from zstate.net.config import ROUTER_ENDPOINT
+
+    try:
+        if network.is_given:
+            return _connect(network)
+        return _connect(Network("client", (ROUTER_ENDPOINT,)), _ROS_ROUTER_WITHIN_S)
+    except Unreachable as error:
+        where = " or ".join(map(repr, error.endpoints)) or "the configured endpoints"
+        fail(
+            f"nothing answers at {where}, where the router of the ROS 2 nodes should be; start one "
+            "(`ros2 run rmw_zenoh_cpp rmw_zenohd`, or `zstate router --ros2`), or say where it is: "
+            "--connect tcp/HOST:7447"
+        )
+
+
+def _connect(network: Network, timeout_s: float = 5.0) -> Session:
     from zstate.cli.worker import Worker
     from zstate.net.session import connect
 
     # In a thread of its own: a signal ends the wait for it, which Zenoh's would not.
     return Worker(
         "zstate connect",
-        lambda: connect(network.config, mode=network.mode, endpoints=network.connect, listen=network.listen),
+        lambda: connect(
+            network.config,
+            mode=network.joins_as,
+            endpoints=network.connect,
+            listen=network.listen,
+            timeout_s=timeout_s,
+        ),
     ).result()
 
 

@@ -30,9 +30,7 @@ def session_options(command: Command) -> Command:
         config: str | None,
         **options: Any,
     ) -> Any:
-        # Whoever only says where to connect means a router, and peers do not pass on what others say.
-        chosen = mode or ("client" if connect and not listen and not config else "peer")
-        return command(network=Network(chosen, connect, listen, config), **options)
+        return command(network=Network(mode, connect, listen, config), **options)
 
     for option in reversed(_SESSION_OPTIONS):
         with_network = option(with_network)
@@ -70,6 +68,52 @@ _SESSION_OPTIONS = (
     ),
     config_option,
 )
+
+
+def _checked_wire(_: click.Context, __: click.Parameter, wires: str | tuple[str, ...]) -> Any:
+    from zstate.net.wires import wire_named
+
+    try:
+        for wire in (wires,) if isinstance(wires, str) else wires:
+            wire_named(wire)
+    except InvalidInput as error:
+        raise click.BadParameter(str(error)) from None
+    return wires
+
+
+wire_option = click.option(
+    "--wire",
+    default="native",
+    show_default=True,
+    callback=_checked_wire,
+    metavar="WIRE",
+    envvar="ZSTATE_WIRE",
+    help="What is spoken: native, ros2 (with rmw_zenoh nodes) or ros2dds (through its bridge); with "
+    "options, such as ros2:domain=5,namespace=r1.",
+)
+wires_option = click.option(
+    "--wire",
+    "wires",
+    multiple=True,
+    default=("native",),
+    show_default=True,
+    callback=_checked_wire,
+    metavar="WIRE",
+    envvar="ZSTATE_WIRE",
+    help="What is spoken, as in `--wire native --wire ros2:domain=5,namespace=r1`; the first one is also "
+    "where joint_states are heard.",
+)
+
+
+def named_robot(robot: str | None, wire: str) -> str:
+    """The robot that a command was given, or the only one that ``wire`` can mean."""
+    from zstate.cli.words import is_ros, words_of
+
+    meant = robot or words_of(wire).robot
+    if meant is None:
+        why = "; on this wire each robot has a namespace of its name" if is_ros(wire) else ""
+        raise click.UsageError(f"Missing argument 'ROBOT'{why}.")
+    return meant
 
 
 def load_robot(source: str, name: str | None) -> tuple[RobotModel, str]:

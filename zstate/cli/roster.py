@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import fail
+from zstate.cli.words import is_ros, words_of
 from zstate.closing import Closing
 
 if TYPE_CHECKING:
@@ -26,32 +25,23 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     robots = discover(session)
     wanted = tuple(info for info in robots if robot in (ANY, info.name))
     if not wanted:
-        fail(announced_text(robots) if robot == ANY else unknown_robot(robot, robots))
+        words = words_of("native")
+        fail(words.announced(robots) if robot == ANY else words.unknown(robot, robots))
     return wanted
 
 
-def announced_text(robots: Sequence[RobotInfo]) -> str:
-    """Which robots there are, for the end of a message about one that is not."""
-    if not robots:
-        return "no robot is announced; start one, for instance with `zstate publish panda --source sine`"
-    return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
-
-
-def unknown_robot(robot: str, robots: Sequence[RobotInfo]) -> str:
-    """The message for a robot that nobody announces, with near misses and those who are there."""
-    near = get_close_matches(robot, [info.name for info in robots], n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"nobody announces the robot {robot!r}{hint} ({announced_text(robots)})"
-
-
 class Roster(Closing):
-    """The robots that are announced now, kept up to date."""
+    """The robots that are announced now, kept up to date.
+
+    On a ROS wire those that ``robot`` can mean there, and by that name: ROS itself has topics only.
+    """
 
     def __init__(self, session: Session, robot: str = "*", wire: str = "native") -> None:
         from zstate.net.presence import watch
 
+        self.words = words_of(wire)
         self._announced: set[Announced] = set()
-        self._watch = watch(session, robot if wire != "native" else "*", self._note, wire)
+        self._watch = watch(session, robot if is_ros(wire) else "*", self._note, wire)
 
     def close(self) -> None:
         self._watch.close()
@@ -72,10 +62,4 @@ class Roster(Closing):
 
     def silence(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` comes (any more, if ``ended``), as far as one can tell from here."""
-        streams = self.streams(robot)
-        if not streams:
-            return unknown_robot(robot, self.robots())
-        if stream in streams:
-            return f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample comes"
-        command = "joints" if stream == "joint_states" else "publish"
-        return f"nobody writes {stream} of {robot!r}{' any more' * ended}; `zstate {command} {robot}` would"
+        return self.words.silence(robot, stream, self.robots(), ended=ended)

@@ -88,7 +88,7 @@ class Tap(Closing):
             tapped = self.next(min(left_s, _GRACE_S))
             if tapped is not None:
                 if said:
-                    note(f"heard {self.robot}: {self._stream}")
+                    note(f"heard {self._roster.words.place(self.robot, (self._stream,))}")
                 return tapped
             reason = self._roster.silence(self.robot, self._stream)
             if deadline is not None and left_s <= _GRACE_S:

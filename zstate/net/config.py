@@ -33,6 +33,30 @@ _SETTINGS: dict[str, object] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
 }
 
+ROS_ROUTER: dict[str, object] = {
+    "mode": "router",
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": True}},
+    "routing": {"router": {"peers_failover_brokering": False}},
+    "timestamping": {"enabled": True},
+    # Many nodes start at once, and are busy with that for a while.
+    "queries_default_timeout": 600_000,
+    "transport": {
+        "unicast": {
+            "open_timeout": 60_000,
+            "accept_timeout": 60_000,
+            "accept_pending": 10_000,
+            "max_sessions": 10_000,
+        },
+        "link": {"tx": {"lease": 60_000, "keep_alive": 2}},
+        "shared_memory": {"enabled": False},
+    },
+}
+"""What rmw_zenohd sets, but for where it listens: tcp/[::]:7447, which is open to the network.
+
+ROS nodes are peers. They find each other through the router's gossip, and data goes between them
+directly; the router passes on what is said between peers and clients.
+"""
+
 _ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
 _LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
 _HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})")

@@ -11,7 +11,7 @@ import click
 
 from zstate.cli.console import note, say
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_seconds, session_options
+from zstate.cli.options import checked_seconds, named_robot, session_options, wire_option
 from zstate.closing import Closing
 from zstate.errors import MessageError
 
@@ -25,7 +25,7 @@ _NAMES_WITHIN_S = 1.0
 
 
 @click.command("echo")
-@click.argument("robot")
+@click.argument("robot", required=False)
 @click.option("--once", is_flag=True, help="Print one; give up after --timeout with the reason.")
 @click.option(
     "--timeout",
@@ -39,18 +39,34 @@ _NAMES_WITHIN_S = 1.0
 @click.option("--field", metavar="NAME", help="Only this: stamp, positions, positions.JOINT, or just JOINT.")
 @click.option("--csv", "form", flag_value="csv", help="Comma-separated values below one line of names.")
 @click.option("--json", "form", flag_value="json", help="One JSON value a line.")
+@wire_option
 @session_options
 def echo_command(
-    *, network: Network, robot: str, once: bool, timeout: float, field: str | None, form: str | None
+    *,
+    network: Network,
+    robot: str | None,
+    once: bool,
+    timeout: float,
+    field: str | None,
+    form: str | None,
+    wire: str,
 ) -> None:
-    """Print the joint states of ROBOT as they come in, as YAML documents."""
+    """Print the joint states of ROBOT as they come in, as YAML documents.
+
+    \b
+    zstate echo panda
+    zstate echo panda --field panda_joint1 --csv > joint1.csv
+    zstate echo --wire ros2 --once                     # /joint_states
+    zstate echo --wire ros2:namespace=r1               # /r1/joint_states
+    """
     from zstate.cli.tap import Tap
     from zstate.clock import LONGEST_WAIT_S
 
+    heard = named_robot(robot, wire)
     with (
-        open_session(network) as session,
-        Named(session, robot) as named,
-        Tap(session, robot, "joint_states") as tap,
+        open_session(network, (wire,)) as session,
+        Named(session, heard, wire) as named,
+        Tap(session, heard, "joint_states", wire) as tap,
     ):
         show = _printer(form, field)
         tapped = tap.first(timeout if once else None)

@@ -10,7 +10,8 @@ import click
 
 from zstate.cli.console import fail, note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_seconds, session_options
+from zstate.cli.options import checked_seconds, named_robot, session_options, wire_option
+from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
     from zstate.cli.arrivals import Arrivals, Intervals
@@ -21,7 +22,7 @@ _SETTLING_S = 0.1
 
 
 @click.command("hz")
-@click.argument("robot")
+@click.argument("robot", required=False)
 @click.option(
     "--stream", type=click.Choice(["joint_states", "tf"]), default="joint_states", show_default=True
 )
@@ -44,16 +45,34 @@ _SETTLING_S = 0.1
     help="How long --once waits for the first sample.",
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@wire_option
 @session_options
 def hz_command(
-    *, network: Network, robot: str, stream: Stream, window: int, once: bool, timeout: float, as_json: bool
+    *,
+    network: Network,
+    robot: str | None,
+    stream: Stream,
+    window: int,
+    once: bool,
+    timeout: float,
+    as_json: bool,
+    wire: str,
 ) -> None:
-    """Measure, once a second, the rate at which samples of ROBOT arrive here."""
+    """Measure, once a second, the rate at which samples of ROBOT arrive here.
+
+    On ROS's side that is the rate of a topic's messages, of all nodes together.
+
+    \b
+    zstate hz panda
+    zstate hz --wire ros2                              # /joint_states
+    zstate hz --wire ros2 --stream tf --once           # /tf
+    """
     from zstate.cli.arrivals import Arrivals
     from zstate.cli.tap import Tap
 
-    with open_session(network) as session, Tap(session, robot, stream) as tap:
-        arrivals = Arrivals(window)
+    heard = named_robot(robot, wire)
+    with open_session(network, (wire,)) as session, Tap(session, heard, stream, wire) as tap:
+        arrivals = Arrivals(window, of_all=is_ros(wire))
         if once:
             _show(_measured_once(tap, arrivals, timeout), as_json=as_json)
         else:

@@ -6,7 +6,15 @@ import click
 
 from zstate.cli.console import count_text, say
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import load_robot, name_option, rate_option, seconds_option, session_options
+from zstate.cli.options import (
+    load_robot,
+    name_option,
+    rate_option,
+    seconds_option,
+    session_options,
+    wire_option,
+)
+from zstate.cli.words import words_of
 
 
 @click.command("joints")
@@ -14,13 +22,19 @@ from zstate.cli.options import load_robot, name_option, rate_option, seconds_opt
 @rate_option
 @seconds_option
 @name_option
+@wire_option
 @session_options
 def joints_command(
-    robot: str, rate: float, seconds: float | None, name: str | None, network: Network
+    *, robot: str, rate: float, seconds: float | None, name: str | None, wire: str, network: Network
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
 
     ROBOT is a name such as panda, or a URDF file. `zstate publish ROBOT` makes transforms of it.
+
+    \b
+    zstate joints panda
+    zstate joints arm.urdf --rate 500 --seconds 10
+    zstate joints panda --wire ros2                    # /joint_states, for a robot_state_publisher
     """
     from zstate.cli.publishing import run
     from zstate.publisher import StatePublisher
@@ -28,9 +42,10 @@ def joints_command(
 
     model, called = load_robot(robot, name)
     with (
-        open_session(network) as session,
-        StatePublisher(session, model, called, streams=("joint_states",)) as publisher,
+        open_session(network, (wire,)) as session,
+        StatePublisher(session, model, called, (wire,), streams=("joint_states",)) as publisher,
     ):
         joints = count_text(len(model.joint_names), "joint")
-        say(f"{called}: a sine on {joints}, {rate:g} Hz, on zstate/{called}/joint_states")
+        place = words_of(wire).place(called, ("joint_states",))
+        say(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
         run(publisher, SineSource(model), rate, seconds)

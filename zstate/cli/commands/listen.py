@@ -12,15 +12,16 @@ import click
 
 from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options
-from zstate.cli.roster import Roster, announced_text
+from zstate.cli.options import session_options, wire_option
+from zstate.cli.roster import Roster
+from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
     from zstate.cli.metered_buffer import Mark, Measure, MeteredBuffer
     from zstate.following.tally import Stats
-    from zstate.listener import TransformListener
+    from zstate.listener import Follow, TransformListener
     from zstate.net.session import Session
     from zstate.wire.keys import Stream
 
@@ -31,18 +32,28 @@ _MEETING_S = 0.3
 @click.command("listen")
 @click.argument("robot", default="*", metavar="[ROBOT]")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@wire_option
 @session_options
-def listen_command(network: Network, robot: str, as_json: bool) -> None:
+def listen_command(network: Network, robot: str, as_json: bool, wire: str) -> None:
     """Follow ROBOT, or all robots, and say once a second how their samples come in.
 
     Rate and age are measured here, latency is the median time from a sample's stamp until it can be
     looked up. The counts are those since the start: received, dropped here, missed on the way, late
-    (older than the history) and refused.
+    (older than the history) and refused. On ROS's side samples are those of /tf, of all nodes together.
+
+    \b
+    zstate listen
+    zstate listen panda --json
+    zstate listen --wire ros2:domain=5
     """
     from zstate.clock import SystemClock
     from zstate.rate import Rate
 
-    with open_session(network) as session, Roster(session) as roster, Ears(session, roster, robot) as ears:
+    with (
+        open_session(network, (wire,)) as session,
+        Roster(session, robot, wire) as roster,
+        Ears(session, roster, robot, wire) as ears,
+    ):
         forever = Event()
         forever.wait(_MEETING_S)
         for _ in Rate(1.0, SystemClock(), forever):
@@ -54,11 +65,12 @@ def listen_command(network: Network, robot: str, as_json: bool) -> None:
 class Ears(Closing):
     """A listener for each robot that is wanted and announced, opened when it appears."""
 
-    def __init__(self, session: Session, roster: Roster, robot: str) -> None:
+    def __init__(self, session: Session, roster: Roster, robot: str, wire: str) -> None:
         from zstate.wire.keys import ANY, check_robot
 
         self._robot = None if robot == ANY else check_robot(robot)
         self._session = session
+        self._wire = wire
         self._roster = roster
         self._said = ""
         self._ears: dict[str, tuple[TransformListener, MeteredBuffer, Mark]] = {}
@@ -81,19 +93,20 @@ class Ears(Closing):
         from zstate.cli.metered_buffer import MeteredBuffer
         from zstate.listener import TransformListener
 
-        follow = "joint_states" if "joint_states" in streams else "tf"
-        if follow in streams:
-            buffer = MeteredBuffer()
-            listener = TransformListener(self._session, robot, buffer, follow=follow)
-            self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
-            note(f"following {robot}: {follow}")
+        either: tuple[Follow, ...] = ("tf", "joint_states") if is_ros(self._wire) else ("joint_states", "tf")
+        for follow in either:
+            if follow in streams:
+                buffer = MeteredBuffer()
+                listener = TransformListener(self._session, robot, buffer, self._wire, follow)
+                self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
+                note(f"following {self._roster.words.place(robot, (follow,))}")
+                break
 
     def _reason(self) -> str:
         if self._robot is not None:
-            return self._roster.silence(self._robot, "joint_states")
-        return announced_text(self._roster.robots()) + ", but nothing that moves" * bool(
-            self._roster.robots()
-        )
+            return self._roster.silence(self._robot, followed(self._wire))
+        robots = self._roster.robots()
+        return self._roster.words.announced(robots) + ", but nothing that moves" * bool(robots)
 
     def measures(self) -> Iterator[tuple[str, Measure, Stats]]:
         """How the samples of each robot came in since the last call."""

@@ -12,30 +12,67 @@ import click
 from zstate.cli.console import note, say, say_json
 from zstate.cli.layout import in_columns
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options
-from zstate.cli.roster import announced_text
+from zstate.cli.options import session_options, wire_option
+from zstate.cli.words import is_ros, words_of
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
+    from zstate.net.session import Session
     from zstate.wire.writer import Writer
 
 
 @click.command("ls")
-@click.option("--json", "as_json", is_flag=True, help="One JSON array.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON array; on ROS's side one object.")
+@wire_option
 @session_options
-def ls_command(network: Network, as_json: bool) -> None:
-    """List the announced robots and, for each stream, who writes it since when."""
+def ls_command(network: Network, as_json: bool, wire: str) -> None:
+    """List the announced robots and, for each stream, who writes it since when.
+
+    On ROS's side: the nodes, and who publishes and subscribes the topics of robots' states, with QoS.
+
+    \b
+    zstate ls
+    zstate ls --json --connect tcp/192.168.1.10:7447
+    zstate ls --wire ros2:domain=5
+    """
+    with open_session(network, (wire,)) as session:
+        if is_ros(wire):
+            _list_graph(session, wire, as_json=as_json)
+        else:
+            _list_robots(session, as_json=as_json)
+
+
+def _list_graph(session: Session, wire: str, *, as_json: bool) -> None:
+    from zstate.cli.ros_graph import heard_graph
+    from zstate.cli.ros_graph_text import graph_facts, graph_text, namespaces_hint, nobody_text
+    from zstate.net.wires import wire_named
+    from zstate.wire.ros2.wire import Ros2Wire
+
+    spoken = wire_named(wire)
+    assert isinstance(spoken, Ros2Wire)
+    graph = heard_graph(session, spoken)
+    if as_json:
+        say_json(graph_facts(graph, spoken))
+    elif graph.nodes or graph.topics:
+        say(graph_text(graph, spoken))
+        hint = namespaces_hint(graph, spoken)
+        if hint:
+            note(hint)
+    else:
+        note(nobody_text(spoken))
+
+
+def _list_robots(session: Session, *, as_json: bool) -> None:
     from zstate.net.presence import discover
 
-    with open_session(network) as session:
-        robots = discover(session)
+    robots = discover(session)
     if as_json:
         say_json([_facts(robot) for robot in robots])
     elif robots:
         say("\n".join(_lines(robots)))
     else:
-        note(announced_text(robots))
+        note(words_of("native").announced(robots))
 
 
 def _lines(robots: tuple[RobotInfo, ...]) -> list[str]:

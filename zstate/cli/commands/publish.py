@@ -9,7 +9,15 @@ import click
 
 from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_rate, load_robot, name_option, seconds_option, session_options
+from zstate.cli.options import (
+    checked_rate,
+    load_robot,
+    name_option,
+    seconds_option,
+    session_options,
+    wires_option,
+)
+from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.cli.heard_source import HeardSource
@@ -20,6 +28,7 @@ if TYPE_CHECKING:
 
 _SINE_RATE_HZ = 100.0
 _DERIVED: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
+_EVERYTHING: tuple[Stream, ...] = ("joint_states", *_DERIVED)
 
 
 @click.command("publish")
@@ -38,14 +47,7 @@ _DERIVED: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
     metavar="HZ",
     help="Samples a second, exactly; default: every sample that comes in, and 100 for a sine.",
 )
-@click.option(
-    "--wire",
-    "wires",
-    multiple=True,
-    default=("native",),
-    show_default=True,
-    help="The format of the messages; may be repeated.",
-)
+@wires_option
 @seconds_option
 @name_option
 @session_options
@@ -64,30 +66,48 @@ def publish_command(
     ROBOT is a name such as panda, or a URDF file. By default follows its joint_states, which a driver
     or `zstate joints ROBOT` writes, and publishes every sample. With another source writes joint_states
     as well.
+
+    With several wires the first is followed, and the others get everything. ROS 2 nodes are met at
+    their router: where ROS 2 is spoken alone, that of this host is found; otherwise say --connect, or
+    let `zstate bridge` carry the robot over.
+
+    \b
+    zstate publish panda --source sine
+    zstate publish arm.urdf --rate 250
+    zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
+    zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
-    from zstate.publisher import STREAMS, StatePublisher
+    from zstate.cli.publishing import run
+    from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
     model, called = load_robot(robot, name)
-    streams = STREAMS if source == "sine" else _DERIVED
+    followed = wires[:1] if source == "joints" else ()
     with (
-        open_session(network) as session,
-        StatePublisher(session, model, called, wires, streams=streams) as publisher,
+        open_session(network, wires) as session,
+        StatePublisher(session, model, called, followed, streams=_DERIVED) as derived,
+        StatePublisher(session, model, called, wires[len(followed) :]) as whole,
     ):
-        _introduce(publisher, streams)
-        if source == "sine":
-            from zstate.cli.publishing import run
-
-            run(publisher, SineSource(model), rate or _SINE_RATE_HZ, seconds)
+        places = [words_of(wire).place(called, _DERIVED) for wire in followed]
+        places += [words_of(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]
+        _introduce(whole, places)
+        _mention_router(network, wires)
+        if followed:
+            _follow(session, followed[0], derived, whole, rate, seconds)
         else:
-            _follow(session, publisher, rate, seconds)
+            run(whole, SineSource(model), rate or _SINE_RATE_HZ, seconds)
 
 
-def _introduce(publisher: StatePublisher, streams: tuple[Stream, ...]) -> None:
-    model, robot = publisher.model, publisher.robot
+def _introduce(publisher: StatePublisher, places: list[str]) -> None:
+    model = publisher.model
     size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
-    say(f"publishing {robot!r} ({size}) on zstate/{robot}/{{{','.join(streams)}}}")
+    say(f"publishing {publisher.robot!r} ({size}) on {' and on '.join(places)}")
     _mention_warnings(model)
+
+
+def _mention_router(network: Network, wires: tuple[str, ...]) -> None:
+    if not network.is_given and len(set(map(is_ros, wires))) == 2:
+        note("ROS 2 nodes are met at their router: say --connect, for instance tcp/127.0.0.1:7447")
 
 
 def _mention_warnings(model: RobotModel) -> None:
@@ -95,19 +115,28 @@ def _mention_warnings(model: RobotModel) -> None:
         note(f"{count_text(len(model.findings), 'warning')} about the model; `zstate check` shows them")
 
 
-def _follow(session: Session, publisher: StatePublisher, rate: float | None, seconds: float | None) -> None:
+def _follow(  # noqa: PLR0917 - one use, in the order of what happens
+    session: Session,
+    wire: str,
+    derived: StatePublisher,
+    whole: StatePublisher,
+    rate_hz: float | None,
+    seconds: float | None,
+) -> None:
     from zstate.cli.heard_source import HeardSource
     from zstate.cli.publishing import run
 
-    robot = publisher.robot
-    note(f"waiting for joint_states of {robot!r} ...")
-    with HeardSource(session, publisher.model, robot) as source:
-        if rate is not None:
-            run(publisher, source, rate, seconds)
+    words, robot = words_of(wire), derived.robot
+    place = words.place(robot, ("joint_states",))
+    note(f"waiting for {place} ...")
+    with HeardSource(session, derived.model, robot, wire, further=whole) as source:
+        if rate_hz is not None:
+            run(derived, source, rate_hz, seconds)
         else:
-            _publish_every_sample(publisher, source, seconds)
+            _publish_every_sample(derived, source, seconds)
         if not source.count:
-            fail(f"heard no joint_states of {robot!r} in {seconds:g} s; `zstate ls` shows who writes what")
+            who = words.explained("`zstate ls` shows who writes what")
+            fail(f"heard nothing on {place} in {seconds:g} s; {who}")
 
 
 def _publish_every_sample(publisher: StatePublisher, source: HeardSource, seconds: float | None) -> None:

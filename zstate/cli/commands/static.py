@@ -11,8 +11,8 @@ import click
 
 from zstate.cli.console import fail, note, say
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options
-from zstate.cli.roster import announced_text
+from zstate.cli.options import session_options, wire_option
+from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.cli.config_file import Quaternion, StaticSection, Vector3
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 @click.option("--file", type=click.Path(exists=True, dir_okay=False), help="All [[static]] of a TOML file.")
 @click.option("--robot", metavar="NAME", help="Whose edge it is; default: the only robot announced.")
 @click.option("--writer", metavar="NAME", help="Under which name; default: this program and its process id.")
+@wire_option
 @session_options
 def static_command(
     *,
@@ -49,6 +50,7 @@ def static_command(
     file: str | None,
     robot: str | None,
     writer: str | None,
+    wire: str,
     network: Network,
 ) -> None:
     """Publish the pose of SOURCE in TARGET until Ctrl-C; then it is withdrawn.
@@ -61,6 +63,7 @@ def static_command(
     zstate static panda_hand camera --xyz 0.05 0 0.04 --rpy-deg 0 -90 0
     zstate static fleet/map r1/odom --xyz 2 1 0 --rpy-deg 0 0 90
     zstate static --file cell.toml
+    zstate static base_link laser --xyz 0.2 0 0.1 --wire ros2      # on /tf_static
     """
     from zstate.cli.config_file import StaticSection
     from zstate.clock import wait_in_slices
@@ -78,12 +81,13 @@ def static_command(
         statics = (StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw, robot),)
     if not statics:
         fail(f"{file!r} has no [[static]]")
-    with open_session(network) as session, ExitStack() as publishers:
-        for owner, edges in _by_owner(session, statics, robot).items():
-            publisher = publishers.enter_context(StaticPublisher(session, owner, writer))
+    with open_session(network, (wire,)) as session, ExitStack() as publishers:
+        owned = _by_ros_owner(statics, robot, wire) if is_ros(wire) else _by_owner(session, statics, robot)
+        for owner, edges in owned.items():
+            publisher = publishers.enter_context(StaticPublisher(session, owner, writer, wire))
             for edge in edges:
                 publisher.set(edge)
-                say(_sentence(edge, publisher))
+                say(_sentence(edge, publisher, wire))
         wait_in_slices(threading.Event())
 
 
@@ -99,22 +103,38 @@ def _by_owner(
     return edges
 
 
+def _by_ros_owner(
+    statics: tuple[StaticSection, ...], default: str | None, wire: str
+) -> dict[str, list[Transform]]:
+    """On ROS's side frames are nobody's, and a slash in the name of one is just that."""
+    edges: dict[str, list[Transform]] = {}
+    for static in statics:
+        owner = static.robot or default or words_of(wire).robot
+        if owner is None:
+            raise click.UsageError("say --robot NAME; on this wire each robot has a namespace of its name")
+        edges.setdefault(owner, []).append(static.transform())
+    return edges
+
+
 def _only_robot(session: Session) -> str:
     from zstate.net.presence import discover
 
     note("looking for the robot this belongs to ...")
     robots = discover(session)
     if len(robots) != 1:
-        fail(f"whose edge is this? Say --robot NAME ({announced_text(robots)})")
+        fail(f"whose edge is this? Say --robot NAME ({words_of('native').announced(robots)})")
     return robots[0].name
 
 
-def _sentence(edge: Transform, publisher: StaticPublisher) -> str:
+def _sentence(edge: Transform, publisher: StaticPublisher, wire: str) -> str:
     x, y, z = edge.translation
     # Adding zero turns -0 into 0.
     roll, pitch, yaw = (round(degrees(angle), 6) + 0.0 for angle in edge.rpy)
-    return (
+    pose = (
         f"pose of {edge.source} in {edge.target}: xyz [{x:g}, {y:g}, {z:g}] m, "
-        f"rpy [{roll:g}, {pitch:g}, {yaw:g}] deg, until Ctrl-C "
-        f"(robot {publisher.robot!r}, writer {publisher.writer!r})"
+        f"rpy [{roll:g}, {pitch:g}, {yaw:g}] deg"
     )
+    if is_ros(wire):
+        place = words_of(wire).place(publisher.robot, ("tf_static",))
+        return f"{pose}, on {place}; Ctrl-C ends it for those who join later"
+    return f"{pose}, until Ctrl-C (robot {publisher.robot!r}, writer {publisher.writer!r})"

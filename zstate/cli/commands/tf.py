@@ -11,8 +11,9 @@ import click
 
 from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_rate, checked_seconds, session_options
+from zstate.cli.options import checked_rate, checked_seconds, session_options, wire_option
 from zstate.cli.roster import Roster
+from zstate.cli.words import followed
 
 if TYPE_CHECKING:
     from zstate.cli.awaited_pose import AwaitedPose
@@ -62,6 +63,7 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
 )
 @click.option("--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@wire_option
 @session_options
 def tf_command(
     *,
@@ -73,21 +75,27 @@ def tf_command(
     timeout: float,
     rate: float,
     robot: str,
+    wire: str,
     as_json: bool,
 ) -> None:
     """The pose of frame B in frame A, until Ctrl-C.
 
     Says what it waits for, and prints each new answer. Frames are called by their bare names while these
     are unique, or ROBOT/FRAME. STAMP is in nanoseconds, or in seconds as printed.
+
+    \b
+    zstate tf panda_link0 panda_hand
+    zstate tf left/panda_link0 right/panda_hand --once --json
+    zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
     from zstate.cli.awaited_pose import AwaitedPose
     from zstate.listener import TransformListener
 
     show = _show_json if as_json else _show_text
     with (
-        open_session(network) as session,
-        Roster(session) as roster,
-        TransformListener(session, robot) as listener,
+        open_session(network, (wire,)) as session,
+        Roster(session, robot, wire) as roster,
+        TransformListener(session, robot, wire=wire, follow=followed(wire)) as listener,
     ):
         awaited = AwaitedPose(listener, roster, target, source)
         if not as_json:

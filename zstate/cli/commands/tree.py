@@ -13,7 +13,8 @@ import click
 from zstate.cli.console import age_text, note, rate_text, say, say_json
 from zstate.cli.layout import in_columns, tree_lines
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options
+from zstate.cli.options import session_options, wire_option
+from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -27,24 +28,35 @@ _HEADINGS = ("frame", "edge", "rate", "age", "writer")
 @click.option("--json", "form", flag_value="json", help="One JSON array of frames.")
 @click.option("--dot", "form", flag_value="dot", help="For Graphviz.")
 @click.option("--mermaid", "form", flag_value="mermaid", help="For Markdown.")
+@wire_option
 @session_options
-def tree_command(network: Network, robot: str, form: str | None) -> None:
+def tree_command(network: Network, robot: str, form: str | None, wire: str) -> None:
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 
     For each edge: its kind, the rate of its samples, the age of the newest one, and who writes it.
+
+    \b
+    zstate tree
+    zstate tree panda --dot | dot -Tsvg > tree.svg
+    zstate tree --wire ros2                            # hears /tf and /tf_static
     """
     from zstate.cli.frames import gathered_frames
+    from zstate.cli.ros_frames import gathered_ros_frames
 
-    with open_session(network) as session:
-        frames = gathered_frames(session, robot)
+    with open_session(network, (wire,)) as session:
+        if is_ros(wire):
+            frames = gathered_ros_frames(session, robot, wire)
+        else:
+            frames = gathered_frames(session, robot)
         now = time.time_ns()
-    if not frames:
+    if not frames and not is_ros(wire):
         note(_NO_FRAMES)
     if form == "json":
         say_json([_facts(frame, now) for frame in frames])
     elif frames:
         drawing = {"dot": _dot, "mermaid": _mermaid}.get(form or "")
-        say(drawing(frames) if drawing else _text(frames, now))
+        text = drawing(frames) if drawing else _text(frames, now)
+        say(words_of(wire).explained(text))
 
 
 def _text(frames: Sequence[FrameInfo], now: int) -> str:
