@@ -50,3 +50,54 @@ def test_writers_of_several_orders_are_read_in_turn():
     for names in (OURS[::-1], OURS, (*OURS[1:], OURS[0]), OURS[::-1]):
         values = [float(OURS.index(name)) for name in names]
         assert lists(order.read(state(names, values)))[0] == [0, 1, 2]
+
+
+FLOATING = ("base", "hinge")
+PARTS = (*(f"base.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")), "hinge")
+SLOTS = (0, 1, 2, 3, 4, 5, 7)
+
+
+def test_a_joint_of_several_numbers_is_read_by_the_names_of_its_parts():
+    order = JointOrder(FLOATING, PARTS, SLOTS)
+    names = (*PARTS[::-1], "lid")
+    rates = [float("nan") if name == "base.qw" else float(len(name)) for name in names]
+    numbers = order.read(state(names, [10.0 * n for n in range(9)], rates, rates))
+    expected = [10.0 * names.index(name) for name in PARTS]
+    rates_of = [float(len(PARTS[slot])) for slot in SLOTS]
+    assert lists(numbers) == [expected, rates_of, rates_of]
+
+
+def test_its_own_order_without_names_has_as_many_velocities_as_the_robot_moves():
+    state_of = JointState(0, 0, 0, order_digest(FLOATING), to_block(range(8)), to_block(range(7)))
+    assert lists(JointOrder(FLOATING, PARTS, SLOTS).read(state_of)) == [[*range(8)], [*range(7)], None]
+
+
+def test_a_joint_whose_parts_are_not_all_there_is_missing():
+    with pytest.raises(MessageError, match=r"without 'base\.qw'$"):
+        names = tuple(name for name in PARTS if name != "base.qw")
+        JointOrder(FLOATING, PARTS, SLOTS).read(state(names, [0.0] * 7))
+
+
+@pytest.mark.parametrize("names", [OURS, OURS[::-1], ("lid", *OURS)])
+def test_velocities_and_efforts_that_are_not_known_of_one_of_our_joints_are_not_read(names):
+    nan = float("nan")
+    unknown = [nan if name == "wrist" else 1.0 for name in names]
+    numbers = JointOrder(OURS).read(state(names, [1.0] * len(names), unknown, [1.0] * len(names)))
+    assert lists(numbers) == [[1.0] * 3, None, [1.0] * 3]
+    numbers = JointOrder(OURS).read(state(names, [1.0] * len(names), [1.0] * len(names), unknown))
+    assert lists(numbers) == [[1.0] * 3, [1.0] * 3, None]
+
+
+def test_velocities_that_are_not_known_of_others_joints_do_not_matter():
+    names = ("lid", *OURS)
+    rates = [float("nan"), 1.0, 2.0, 3.0]
+    assert lists(JointOrder(OURS).read(state(names, [0.0] * 4, rates)))[1] == [1.0, 2.0, 3.0]
+
+
+def test_positions_are_not_left_out_and_neither_is_nan_of_who_tells_no_names():
+    nan = float("nan")
+    named = JointOrder(OURS).read(state(OURS, [nan, 1.0, 2.0]))
+    assert np.isnan(named.positions).tolist() == [True, False, False]
+    bare = JointOrder(OURS).read(state(OURS, [0.0, 1.0, 2.0], [nan, 1.0, 2.0], said=False))
+    assert bare.velocities is not None
+    assert np.isnan(bare.velocities).tolist() == [True, False, False]

@@ -27,7 +27,9 @@ class JointOrder:
 
     A writer with the same order of joint ``names`` is read as it is. One that names its numbers in full
     may have any order and others besides; each of our ``coordinates`` must be among them, which are the
-    names unless given. ``velocity_slots`` says which coordinate each velocity stands under.
+    names unless given. ``velocity_slots`` says which coordinate each velocity stands under. NaN among the
+    velocities or efforts of such a writer is how ROS says of a joint that they are not known: then they
+    are not taken for any.
     """
 
     def __init__(
@@ -41,15 +43,12 @@ class JointOrder:
     def read(self, state: JointState) -> JointNumbers:
         """The numbers of ``state`` in our order. Raises MessageError when they are not all there."""
         pick = None if state.order == self.digest else self._pick(state.names)
-        positions = from_block(state.positions)
-        velocities, efforts = _numbers(state.velocities), _numbers(state.efforts)
-        if pick is None:
-            return JointNumbers(positions, velocities, efforts)
-        return JointNumbers(
-            positions[pick.positions],
-            None if velocities is None else velocities[pick.velocities],
-            None if efforts is None else efforts[pick.velocities],
+        numbers = JointNumbers(
+            from_block(state.positions), _numbers(state.velocities), _numbers(state.efforts)
         )
+        if pick is not None:
+            numbers = pick.of(numbers)
+        return numbers if state.names is None else _known(numbers)
 
     def _pick(self, names: tuple[str, ...] | None) -> _Pick:
         if names is None:
@@ -76,6 +75,23 @@ class _Pick(NamedTuple):
 
     positions: NDArray[np.intp]
     velocities: NDArray[np.intp]
+
+    def of(self, numbers: JointNumbers) -> JointNumbers:
+        positions, velocities, efforts = numbers
+        return JointNumbers(
+            positions[self.positions],
+            None if velocities is None else velocities[self.velocities],
+            None if efforts is None else efforts[self.velocities],
+        )
+
+
+def _known(numbers: JointNumbers) -> JointNumbers:
+    positions, velocities, efforts = numbers
+    return JointNumbers(positions, _without_nan(velocities), _without_nan(efforts))
+
+
+def _without_nan(numbers: Floats | None) -> Floats | None:
+    return None if numbers is None or np.isnan(numbers).any() else numbers
 
 
 def _numbers(block: bytes | None) -> Floats | None:
