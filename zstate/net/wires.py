@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from zstate.errors import InvalidInput
@@ -40,9 +42,10 @@ def _ros_options(text: str) -> Ros2Options:
     from zstate.wire.ros2.options import Ros2Options  # noqa: PLC0415 - as above
 
     domain = os.environ.get(DOMAIN_VARIABLE, "")
-    if not domain or "domain=" in text:
-        return Ros2Options.parse(text)
+    options = Ros2Options.parse(text)
+    if not domain or re.search(r"\bdomain\s*=", text):
+        return options
     try:
-        return Ros2Options.parse(",".join(filter(None, (f"domain={domain}", text))))
+        return replace(options, domain=int(domain) if domain.isascii() and domain.isdecimal() else domain)
     except InvalidInput as error:
         raise InvalidInput(f"{error} (the domain is that of {DOMAIN_VARIABLE})") from None

@@ -1,0 +1,81 @@
+"""Wires by the names that users give them."""
+
+import pytest
+
+from zstate.errors import InvalidInput
+from zstate.net.wires import wire_named
+from zstate.wire.native import NativeWire
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
+
+
+@pytest.fixture(autouse=True)
+def no_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+def options(name: str) -> Ros2Options:
+    wire = wire_named(name)
+    assert isinstance(wire, Ros2Wire)
+    return wire.options
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("native", NativeWire), ("ros2", Ros2Wire), ("ros2dds", Ros2DdsWire)]
+)
+def test_each_name_gives_its_wire_anew(name: str, kind: type):
+    one, other = wire_named(name), wire_named(name)
+    assert type(one) is type(other) is kind
+    assert one is not other
+    assert one.name == name
+
+
+def test_options_stand_behind_a_colon():
+    expected = Ros2Options(domain=5, namespace="r1", frame_prefix="r1/")
+    assert options("ros2:domain=5,namespace=r1,frame_prefix=r1/") == expected
+    assert options("ros2dds:namespace=r1") == Ros2Options(namespace="r1")
+    assert options("ros2:") == options("ros2") == Ros2Options()
+
+
+@pytest.mark.parametrize(
+    ("name", "variable", "domain"),
+    [
+        ("ros2", "42", 42),
+        ("ros2:namespace=r1", "42", 42),
+        ("ros2:domain=7", "42", 7),
+        ("ros2: domain = 7", "42", 7),
+        ("ros2:namespace=r1,domain=0", "42", 0),
+        ("ros2", "", 0),
+        ("ros2:domain=7", "many", 7),
+        ("native", "many", None),
+    ],
+)
+def test_the_domain_is_that_of_the_environment_unless_given(monkeypatch, name, variable, domain):
+    monkeypatch.setenv("ROS_DOMAIN_ID", variable)
+    wire = wire_named(name)
+    assert getattr(getattr(wire, "options", None), "domain", None) == domain
+
+
+@pytest.mark.parametrize("variable", ["many", "233", "-1", "1.5", "5,namespace=r1"])
+def test_a_domain_of_the_environment_that_cannot_be_names_the_variable(monkeypatch, variable: str):
+    monkeypatch.setenv("ROS_DOMAIN_ID", variable)
+    with pytest.raises(InvalidInput, match="ROS_DOMAIN_ID"):
+        wire_named("ros2")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("dds", "no wire 'dds'; known: 'native', 'ros2', 'ros2dds'"),
+        ("", "no wire ''"),
+        ("ROS2", "no wire 'ROS2'"),
+        ("ros2 ", "no wire 'ros2 '"),
+        ("native:domain=5", "no options"),
+        ("native:", "no options"),
+        ("ros2:domian=5", "did you mean 'domain'"),
+        ("ros2:domain", "key=value"),
+    ],
+)
+def test_what_is_no_wire_is_refused_with_those_there_are(name: str, said: str):
+    with pytest.raises(InvalidInput, match=said):
+        wire_named(name)
