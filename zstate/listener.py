@@ -28,9 +28,6 @@ from zstate.wire.writer import Announced
 
 Follow = Literal["joint_states", "tf"]
 
-# What the static edges of a ROS node are called that has not announced itself (yet).
-_UNNAMED = "a ROS node"
-
 
 class TransformListener(Closing):
     """Fills ``buffer`` with what a robot's publishers say; ``robot="*"`` follows every robot.
@@ -64,6 +61,7 @@ class TransformListener(Closing):
         self._names: dict[int, str] = {}
         self._followers: dict[tuple[str, int], Follower] = {}
         self._statics: dict[tuple[str, int], StaticFollower] = {}
+        self._departed: set[int] = set()
         # A model makes room for its links before it is added: no static edge may come between.
         self._rebuilding = threading.Lock()
         with ExitStack() as opening:
@@ -120,7 +118,7 @@ class TransformListener(Closing):
                     overflowed = False
 
     def _on_description(self, arrival: Arrival) -> None:
-        if not arrival.payload:
+        if self._is_withdrawn(arrival):
             return
         robot = self._robot_of(arrival.key)
         for description in self._decode("robot_description", arrival, robot):
@@ -132,12 +130,16 @@ class TransformListener(Closing):
         robot, writer = self._robot_of(arrival.key), self._wire.statics_writer(arrival.key)
         if writer == MODEL_WRITER and self._follow == "joint_states":
             return  # the model itself says the same
-        if arrival.payload:
+        if not self._is_withdrawn(arrival):
             for message in self._decode("tf_static", arrival, robot):
                 if isinstance(message, StaticTransforms):
                     self._take_statics(arrival.key, robot, writer, message)
         elif writer is not None:
             self._static_follower(arrival.key, robot, writer).withdraw()
+
+    def _is_withdrawn(self, arrival: Arrival) -> bool:
+        # In ROS nothing can be taken back: what is empty there is a broken message.
+        return not arrival.payload and not self._wire.shared
 
     def _take_statics(self, key: str, robot: str, writer: str | None, message: StaticTransforms) -> None:
         self._follower(robot, message.session).note_heard()
@@ -145,8 +147,10 @@ class TransformListener(Closing):
             if writer is not None:
                 self._static_follower(key, robot, writer).replace(message)
             else:
-                name = self._names.get(message.session, _UNNAMED)
-                self._static_follower(key, robot, name, message.session).add(message)
+                departed = [one for (_, left), one in self._statics.items() if left in self._departed]
+                # A ROS node may not have announced itself yet: told from others by its number.
+                name = self._names.get(message.session, f"a ROS node {message.session:016x}")
+                self._static_follower(key, robot, name, message.session).add(message, departed)
 
     def _static_follower(self, key: str, robot: str, writer: str, session: int = 0) -> StaticFollower:
         make = StaticFollower(robot, writer, self.buffer, self._tally)
@@ -165,8 +169,8 @@ class TransformListener(Closing):
             self._names[session] = str(announced.writer)
         else:
             self._names.pop(session, None)
-        if alive and announced.stream == "tf_static" and announced.stream in self._wire.shared:
-            self._name_statics(session)
+        if announced.stream == "tf_static" and announced.stream in self._wire.shared:
+            self._note_static_writer(session, alive=alive)
         if announced.stream != self._follow:
             return
         if self._follow not in self._wire.shared:
@@ -176,11 +180,15 @@ class TransformListener(Closing):
             if not alive:
                 del self._followers[announced.robot, session]
 
-    def _name_statics(self, session: int) -> None:
+    def _note_static_writer(self, session: int, *, alive: bool) -> None:
         with self._rebuilding:
-            for (_, writing), follower in self._statics.items():
-                if writing == session:
+            ours = [one for (_, writing), one in self._statics.items() if writing == session]
+            if alive:
+                self._departed.discard(session)
+                for follower in ours:
                     follower.name_writer(self._names[session])
+            elif ours:
+                self._departed.add(session)
 
     def _note_writer(self, follower: Follower, session: int, *, alive: bool) -> None:
         if alive:

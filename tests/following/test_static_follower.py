@@ -1,4 +1,5 @@
 import pytest
+from live import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.following.statics import StaticFollower
@@ -80,3 +81,85 @@ def test_a_writer_withdraws_only_what_is_still_its_own(following: Following):
 def test_a_full_name_may_belong_to_another_robot(following: Following):
     following.writer("site").replace(statics(("fleet/map", "odom")))
     assert following.edges() == {"r1/odom": ("fleet/map", "site")}
+
+
+def xs(following: Following) -> dict[str, float]:
+    statics = [frame for frame in following.buffer.frames() if frame.kind == "static"]
+    return {f.name: following.buffer.lookup(f.parent or "", f.name).translation[0] for f in statics}
+
+
+def at(x: float) -> tuple[float, ...]:
+    return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def test_in_ros_edges_add_up_and_the_newest_pose_counts_whoever_says_it(following: Following):
+    one, other = following.writer("one"), following.writer("other")
+    one.add(statics(("tool", "camera"), pose=at(1.0)))
+    one.add(statics(("tool", "laser"), pose=at(2.0)))
+    other.add(statics(("tool", "camera"), pose=at(3.0)))
+    assert xs(following) == {"r1/camera": 3.0, "r1/laser": 2.0}
+    one.add(statics(("tool", "camera"), pose=at(4.0)))
+    assert xs(following) == {"r1/camera": 4.0, "r1/laser": 2.0}
+    assert following.tally.stats().refused == {}
+
+
+def test_in_ros_a_writer_may_move_its_child_to_another_parent(following: Following):
+    mount = following.writer("mount")
+    mount.add(statics(("tool", "camera"), ("camera", "lens")))
+    mount.add(statics(("base", "camera")))
+    assert following.edges() == {"r1/camera": ("r1/base", "mount"), "r1/lens": ("r1/camera", "mount")}
+    assert following.tally.stats().refused == {}
+
+
+def test_in_ros_a_child_of_another_writer_is_moved_only_when_that_one_has_left(following: Following):
+    old, new = following.writer("old"), following.writer("new")
+    old.add(statics(("tool", "camera"), ("tool", "laser")))
+    new.add(statics(("base", "camera")))
+    assert following.tally.stats().refused == {"second parent": 1}
+    new.add(statics(("base", "camera")), [old])
+    assert following.edges() == {"r1/camera": ("r1/base", "new"), "r1/laser": ("r1/tool", "old")}
+    assert following.tally.stats().refused == {"second parent": 1}
+
+
+def test_a_name_that_is_learned_late_is_put_on_what_is_still_this_writers(following: Following):
+    one, other = following.writer("a ROS node 1"), following.writer("a ROS node 2")
+    one.add(statics(("tool", "camera"), ("tool", "laser"), pose=at(1.0)))
+    other.add(statics(("tool", "camera"), pose=at(2.0)))
+    one.name_writer("/one")
+    assert following.edges() == {"r1/camera": ("r1/tool", "a ROS node 2"), "r1/laser": ("r1/tool", "/one")}
+    other.name_writer("/other")
+    assert following.edges()["r1/camera"] == ("r1/tool", "/other")
+    assert xs(following) == {"r1/camera": 2.0, "r1/laser": 1.0}
+
+
+FIXED = [joint for joint in RRBOT.joints if joint.type == "fixed"]
+
+
+def own_edges(turned: float = 1.0) -> StaticTransforms:
+    poses = [[*joint.origin[:3], *(turned * number for number in joint.origin[3:])] for joint in FIXED]
+    return StaticTransforms(3, tuple((j.parent, j.child) for j in FIXED), to_block(poses))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_in_ros_what_the_model_says_too_is_neither_taken_nor_counted(following: Following, sign: float):
+    following.buffer.add_robot(RRBOT, "r1")
+    before = following.edges()
+    following.writer("rsp").add(own_edges(sign))
+    assert following.edges() == before
+    assert following.tally.stats().refused == {}
+
+
+@pytest.mark.parametrize(
+    ("edge", "reason"),
+    [
+        (("world", "base"), "second writer"),
+        (("base", "upper"), "second writer"),
+        (("cart", "base"), "second parent"),
+    ],
+)
+def test_what_contradicts_the_model_is_counted_and_not_taken(following: Following, edge, reason: str):
+    following.buffer.add_robot(RRBOT, "r1")
+    before = following.edges()
+    following.writer("wrong").add(statics(edge, pose=at(9.0)))
+    assert following.edges() == before
+    assert following.tally.stats().refused == {reason: 1}

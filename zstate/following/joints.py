@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frames import FrameInfo
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
 from zstate.following.follower import Follower
+from zstate.following.statics import are_same
 from zstate.following.tally import Tally
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.robot import Joint, RobotModel
@@ -16,9 +15,6 @@ from zstate.model.urdf import parse_urdf
 from zstate.transform import Transform
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
-
-# A static edge that is this near to the model's [m, or the sine of a turn] was computed from the same URDF.
-_SAME = 1e-6
 
 
 class JointFollower(Follower):
@@ -70,8 +66,7 @@ class JointFollower(Follower):
         if frame.kind != "static" or joint.type != "fixed" or frame.parent != parent:
             return False
         said = self._buffer.lookup(parent, frame.name)
-        known = Transform.from_pose7(parent, frame.name, joint.origin)
-        return bool(np.allclose(said.matrix, known.matrix, rtol=0.0, atol=_SAME))
+        return are_same(said, Transform.from_pose7(parent, frame.name, joint.origin))
 
     def _can_read(self, sample: Sample) -> bool:
         return self._track is not None

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate.buffer.buffer import TransformBuffer
@@ -10,6 +13,14 @@ from zstate.following.tally import Tally
 from zstate.transform import Transform
 from zstate.wire.keys import full_name
 from zstate.wire.messages import StaticTransforms, poses_from_block
+
+# A static edge that is this near to a model's [m, or the sine of a turn] was computed from the same URDF.
+_SAME = 1e-6
+
+
+def are_same(one: Transform, other: Transform) -> bool:
+    """Whether two poses of one frame are the same but for how they were computed."""
+    return bool(np.allclose(one.matrix, other.matrix, rtol=0.0, atol=_SAME))
 
 
 class StaticFollower:
@@ -38,16 +49,22 @@ class StaticFollower:
             if edge is not None:
                 self._insert(*edge, pose)
 
-    def add(self, statics: StaticTransforms) -> None:
-        """Take these edges besides those that were named before, as ROS does: nothing is withdrawn there."""
+    def add(self, statics: StaticTransforms, departed: Iterable[StaticFollower] = ()) -> None:
+        """Take these edges besides those that were named before, as ROS does: nothing is withdrawn there.
+
+        A child that a writer of ``departed`` placed on another parent may be placed anew.
+        """
         for names, pose in zip(statics.edges, poses_from_block(statics.poses), strict=True):
             edge = self._named(*names)
             if edge is not None:
-                known = self._edges.get(edge[1])
-                if known is not None and known.target != edge[0]:
-                    self._withdraw([edge[1]])
-                # There the model's own fixed edges are among those that its state publisher calls static.
+                for writer in (self, *departed):
+                    writer._give_way(*edge)
                 self._insert(*edge, pose, beside_model=True)
+
+    def _give_way(self, parent: str, child: str) -> None:
+        known = self._edges.get(child)
+        if known is not None and known.target != parent:
+            self._withdraw([child])
 
     def withdraw(self) -> None:
         """Take all of this writer's edges away."""
@@ -63,12 +80,22 @@ class StaticFollower:
     def _insert(self, parent: str, child: str, pose: ArrayLike, *, beside_model: bool = False) -> None:
         try:
             transform = Transform.from_pose7(parent, child, pose)
+        except InvalidInput as error:
+            self._refuse("bad numbers", error)
+            return
+        try:
             self._buffer.insert_static(transform, writer=self._writer)
             self._edges[child] = transform
         except InvalidInput as error:
-            reason = error.reason if isinstance(error, InsertRefused) else "bad numbers"
-            if not (beside_model and reason == "second writer"):
+            reason = error.reason if isinstance(error, InsertRefused) else "frame name"
+            if not (beside_model and reason == "second writer" and self._is_known(transform)):
                 self._refuse(reason, error)
+
+    def _is_known(self, transform: Transform) -> bool:
+        """Whether a model fixes just this edge: a ROS state publisher calls these static, too."""
+        names = transform.target, transform.source
+        known = self._buffer.lookup(*names) if self._buffer.can_lookup(*names) else None
+        return known is not None and known.kind == "static" and are_same(known, transform)
 
     def _withdraw(self, children: list[str]) -> None:
         for child in children:
