@@ -53,7 +53,7 @@ class EdgeFollower(Follower):
         edges = self._edges
         if sample.edges is not None:
             edges = self._named(sample.edges)
-            self._undescribed.update(child for _, child in edges)
+            self._take_over({child for _, child in edges} - self._undescribed)
         if not edges:
             return True  # a robot without moving parts
         poses = poses_from_block(sample.poses)
@@ -68,9 +68,22 @@ class EdgeFollower(Follower):
             self._buffer.withdraw(frame.name)
         self._undescribed = set()
 
+    def _take_over(self, children: set[str]) -> None:
+        """Edges that this writer has not said before: what one said of them that is gone is another epoch."""
+        if children:
+            others = self._others()
+            for frame in self._buffer.frames():
+                if frame.kind == "pose" and frame.name in children and frame.writer not in others:
+                    self._buffer.withdraw(frame.name)
+            self._undescribed |= children
+
     def _may_begin_again(self) -> bool:
-        others = set(self._live.values()) - {self.writer}
+        others = self._others()
         return all(frame.writer not in others for frame in self._placed())
+
+    def _others(self) -> set[str]:
+        """The names of the other writers there are."""
+        return set(self._live.values()) - {self.writer or ""}
 
     def _placed(self) -> list[FrameInfo]:
         """Our edges, without those that a model or a static writer places by now."""
