@@ -1,0 +1,137 @@
+"""What zstate's writers say in ROS 2, read by rosbags."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from wire.ros2.by_hand import (
+    STORE,
+    rosbags_cdr,
+    rosbags_joint_state,
+    rosbags_tf_message,
+    rosbags_time,
+)
+
+from zstate.errors import InvalidInput
+from zstate.wire.layout import Layout
+from zstate.wire.messages import (
+    Clock,
+    JointCommand,
+    JointState,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+    to_block,
+)
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.outlet import Address, RosOutlet
+
+STAMP = 1_700_000_000_123_456_789
+DIGEST = b"8 bytes."
+EDGES = (("base", "arm"), ("arm", "fleet/tool"))
+POSES = np.random.default_rng(3).normal(size=(2, 7))
+# A floating joint "body" before a hinge: seven and one positions, six and one velocities.
+BODY = tuple(f"body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+DRONE = Layout((*BODY, "hinge"), (0, 1, 2, 3, 4, 5, 7), EDGES)
+ARM = Layout(("a", "b"), (0, 1), EDGES)
+GID = bytes(range(16))
+
+
+def outlet(layout: Layout = ARM, gid: bytes | None = GID, prefix: str = "") -> RosOutlet:
+    names = FrameNames(Ros2Options(frame_prefix=prefix), "r1")
+    return RosOutlet("joint_states", Address("key", "token", gid), names, layout)
+
+
+def state(*blocks, names=None, stamp: int = STAMP) -> JointState:
+    said = [None if block is None else to_block(block) for block in blocks]
+    order = DIGEST if names is None else order_digest(names)
+    return JointState(stamp, 0, 1, order, *said, **({} if names is None else {"names": names}))
+
+
+@pytest.mark.parametrize("blocks", [([1.0, 2.0],), ([1.0, 2.0], [3.0, 4.0]), ([1.0, 2.0], None, [5.0, 6.0])])
+def test_joint_states_are_named_by_the_layout(blocks):
+    filled = [block or [] for block in (*blocks, None, None)][:3]
+    assert outlet().encode(state(*blocks)) == rosbags_joint_state(STAMP, "", ("a", "b"), *filled)
+
+
+def test_joint_states_that_bring_their_names_keep_them():
+    one = outlet()
+    for names in (("x",), ("y", "z", "w"), ("x",)):
+        numbers = [float(n) for n in range(len(names))]
+        expected = rosbags_joint_state(STAMP, "", names, numbers, numbers, [])
+        assert one.encode(state(numbers, numbers, names=names)) == expected
+
+
+def test_a_robot_that_floats_has_no_velocity_for_the_last_number_of_its_quaternion():
+    positions, rates = [0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0, 0.5], [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0]
+    payload = outlet(DRONE).encode(state(positions, rates, rates))
+    said = STORE.deserialize_cdr(payload, "sensor_msgs/msg/JointState")
+    assert tuple(said.name) == DRONE.coordinates
+    assert said.position.tolist() == positions
+    for block in (said.velocity, said.effort):
+        by_name = dict(zip(said.name, block.tolist(), strict=True))
+        assert math.isnan(by_name.pop("body.qw"))
+        assert list(by_name.values()) == rates
+
+
+def test_moving_edges_are_those_of_the_layout_or_of_the_message():
+    one = outlet(prefix="r1/")
+    expected = (("r1/base", "r1/arm"), ("r1/arm", "fleet/tool"))
+    sample = TransformSample(STAMP, 0, 1, DIGEST, to_block(POSES))
+    assert one.encode(sample) == rosbags_tf_message([STAMP] * 2, expected, POSES)
+    named = TransformSample(STAMP, 0, 1, order_digest(EDGES[:1]), to_block(POSES[:1]), EDGES[:1])
+    assert one.encode(named) == rosbags_tf_message([STAMP], expected[:1], POSES[:1])
+    assert one.encode(sample) == rosbags_tf_message([STAMP] * 2, expected, POSES)
+
+
+def test_static_edges_have_the_stamp_by_which_ros_means_always():
+    for count in (2, 0):
+        statics = StaticTransforms(1, EDGES[:count], to_block(POSES[:count]))
+        expected = rosbags_tf_message([0] * count, EDGES[:count], POSES[:count])
+        assert outlet().encode(statics) == expected
+
+
+def test_a_description_is_its_text_and_a_clock_its_time():
+    description = RobotDescription(1, "<robot name='ä'/>", "", (), ())
+    assert outlet().encode(description) == rosbags_cdr("std_msgs/msg/String", "<robot name='ä'/>")
+    for stamp in (0, STAMP):
+        expected = rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(stamp))
+        assert outlet().encode(Clock(stamp, 0, 1)) == expected
+
+
+@pytest.mark.parametrize("stamp", [0, 2**31 * 10**9, -(2**31) * 10**9 - 1])
+def test_a_moment_that_ros_cannot_say_is_refused(stamp: int):
+    for message in (
+        state([1.0, 2.0], stamp=stamp),
+        TransformSample(stamp, 0, 1, DIGEST, to_block(POSES)),
+    ):
+        with pytest.raises(InvalidInput, match="stamp"):
+            outlet().encode(message)
+
+
+def test_what_has_no_topic_and_numbers_that_have_no_names_are_refused():
+    with pytest.raises(InvalidInput, match="no topic for a JointCommand"):
+        outlet().encode(JointCommand(STAMP, 0, 1, DIGEST))
+    with pytest.raises(InvalidInput, match="2 names need"):
+        outlet().encode(state([1.0, 2.0, 3.0]))
+    with pytest.raises(InvalidInput, match="2 edges need"):
+        outlet().encode(TransformSample(STAMP, 0, 1, DIGEST, to_block(POSES[:1])))
+    with pytest.raises(InvalidInput, match="2 names need"):
+        outlet().encode(state([1.0, 2.0], [1.0]))
+
+
+def test_attachments_are_numbered_from_one_on_and_a_refused_message_takes_no_number():
+    one = outlet()
+    assert one.attachment(5) == struct.pack("<qqB", 1, 5, 16) + GID
+    with pytest.raises(InvalidInput):
+        one.encode(state([1.0, 2.0], stamp=0))
+    assert one.attachment(6) == struct.pack("<qqB", 2, 6, 16) + GID
+    assert outlet(gid=None).attachment(5) is None
+
+
+def test_nothing_is_withdrawn_and_no_encoding_told():
+    assert (outlet().can_withdraw, outlet().encoding) == (False, "")
+    assert (outlet().key, outlet().token) == ("key", "token")
