@@ -23,8 +23,9 @@ FLOORS = (
     {"model", "buffer", "wire"},
     {"net", "record"},
     {"sources", "following"},
-    {"publisher", "statics", "listener", "recorder", "replayer", "recording"},
-    {"ros1", "bridge"},
+    {"publisher", "statics", "listener", "recorder", "recording", "clock_publisher"},
+    {"ros1", "bridge", "replaying"},
+    {"replayer"},
     {"zstate"},
     {"view", "cli"},
     {"__main__"},
@@ -32,6 +33,12 @@ FLOORS = (
 NEIGHBOURS = {
     ("buffer", "model"),  # joint tracks are kept as positions, and become poses in a lookup
     ("cli", "view"),  # `zstate view` starts it
+}
+
+# Constructors that users look for on the class, and that are made elsewhere, loaded when they are called.
+CONSTRUCTORS = {
+    ("buffer/buffer.py", "following"),  # TransformBuffer.from_recording
+    ("buffer/buffer.py", "record"),
 }
 
 HOMES = {
@@ -127,7 +134,8 @@ def imports_that_look_up(source: Source) -> Iterator[str]:
     for top, *rest in source.imports():
         # ``from zstate import connect`` goes through the front door, ``from zstate import se3`` does not.
         room = rest[0] if rest and rest[0] in rooms else "zstate"
-        if top == "zstate" and not may_know(source.room, room):
+        is_known = may_know(source.room, room) or (source.path, room) in CONSTRUCTORS
+        if top == "zstate" and not is_known:
             yield f"{source.path} imports {room!r}"
 
 

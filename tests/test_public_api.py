@@ -16,6 +16,7 @@ NAMES = [
     "LookupFailed",
     "ModelError",
     "NoData",
+    "Recording",
     "RobotModel",
     "SineSource",
     "Stale",
@@ -80,6 +81,11 @@ SIGNATURES = {
     "TransformBuffer.wait": "(target, source, at=None, timeout_s=1.0)",
     "TransformBuffer.wait_async": "(target, source, at=None, timeout_s=1.0)",
     "TransformBuffer.frames": "()",
+    "TransformBuffer.from_recording": "(path, robot=None, *, clock=None)",
+    "Recording": "(path, robot=None)",
+    "Recording.buffer": "()",
+    "Recording.lookup_many": "(target, source, stamps)",
+    "Recording.close": "()",
     "TransformListener": (
         "(session, robot='*', buffer=None, wire='native', follow='joint_states', history_s=10.0, "
         "*, clock=None)"

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from zstate.net.presence import discover
     from zstate.net.session import connect
     from zstate.publisher import StatePublisher
+    from zstate.recording import Recording
     from zstate.sources import SineSource
     from zstate.statics import StaticPublisher
     from zstate.transform import Transform
@@ -49,6 +50,7 @@ __all__ = [
     "LookupFailed",
     "ModelError",
     "NoData",
+    "Recording",
     "RobotModel",
     "SineSource",
     "Stale",
@@ -68,6 +70,7 @@ __all__ = [
 
 _HOMES = {
     "Kinematics": "model.kinematics",
+    "Recording": "recording",
     "RobotModel": "model.robot",
     "SineSource": "sources",
     "StatePublisher": "publisher",

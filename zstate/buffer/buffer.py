@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import AsyncIterable, Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -18,7 +19,7 @@ from zstate.buffer.questions import Question, Questions, seconds
 from zstate.buffer.tracks import JointTrack
 from zstate.buffer.waiting import Waiter
 from zstate.buffer.watch import Watch
-from zstate.clock import check_stamp, wait_in_slices
+from zstate.clock import Clock, check_stamp, wait_in_slices
 from zstate.errors import LookupFailed, timed_out
 from zstate.transform import Transform
 from zstate.twist import Twist
@@ -34,6 +35,24 @@ class TransformBuffer(Questions):
     asked for the present only by ``max_age_s`` (default: the system's). Any method may be called
     from any thread.
     """
+
+    @classmethod
+    def from_recording(
+        cls, path: str | Path, robot: str | None = None, *, clock: Clock | None = None
+    ) -> TransformBuffer:
+        """A buffer that holds a whole recording, an MCAP file or a bag, of ``robot`` or of all robots.
+
+        It answers as a listener's buffer did while that was recorded; ``zstate.following.recorded``
+        tells what becomes of restarts. Messages that cannot be used are left out, and logged once for
+        each reason. Raises RecordingError, and InvalidInput when there is nothing of ``robot`` in it.
+        """
+        from zstate.following.recorded import HISTORY_S, fill  # noqa: PLC0415 - looked for here, made there
+        from zstate.record.reader import RecordReader  # noqa: PLC0415 - as above
+
+        buffer = cls(HISTORY_S, clock)
+        with RecordReader(path) as reader:
+            fill(buffer, reader, robot)
+        return buffer
 
     def lookup(
         self,

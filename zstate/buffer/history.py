@@ -129,3 +129,13 @@ def insert_together(histories: Sequence[History], stamp: int, rows: Sequence[NDA
     """One instant of several histories, none of which it is too old for."""
     for history, row in zip(histories, rows, strict=True):
         history.insert(stamp, row)
+
+
+def thin(history: History, stamps: NDArray[np.int64]) -> None:
+    """Keep the first sample, the last, and of each of ``stamps`` [ns] those around it."""
+    view = history.view
+    kept = view.kept_stamps()
+    after, before = kept.searchsorted(stamps), kept.searchsorted(stamps, "right") - 1
+    needed = np.unique(np.concatenate((after, before, (0, view.size - 1))))
+    needed = needed[(needed >= 0) & (needed < view.size)]
+    history.replace(kept[needed], view.kept_rows()[needed])

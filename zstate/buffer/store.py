@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.feeds import EdgeNames, Feed, Feeds, TooOld, second_writer
 from zstate.buffer.frames import FrameInfo, frame_info
-from zstate.buffer.history import View
+from zstate.buffer.history import View, thin
 from zstate.buffer.kernel import insert_together
 from zstate.buffer.path import TrackUse
 from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack
@@ -220,6 +220,18 @@ class Store:
             for edge in self._tree.frames.values():
                 if edge is not None and edge.track is not None and edge.track.history.view.size:
                     edge.track.history.clear()
+
+    def keep_around(self, stamps: NDArray[np.int64]) -> None:
+        """Forget all samples but the first, the last, and those that answers at ``stamps`` [ns] are made of.
+
+        Answers there stay the same, whatever else comes in meanwhile: so a history of any length fits
+        into memory for whoever asks for few instants of it.
+        """
+        with self._lock:
+            edges = [edge for edge in self._tree.frames.values() if edge is not None]
+            for track in {id(edge.track): edge.track for edge in edges}.values():
+                if track is not None:
+                    thin(track.history, stamps)
 
     def frames(self) -> tuple[FrameInfo, ...]:
         """Every frame ever named, in the order of their first mention."""
