@@ -1,0 +1,110 @@
+"""Outlets: all that one writer puts on one wire, from its announcement to its leave."""
+
+import pytest
+from live import STAMP, await_reader
+from support import until
+from wire.ros2.raw_nodes import DESCRIPTION, JOINT_STATES, Ear, key_of, tokens
+
+from zstate.errors import Closed, InvalidInput
+from zstate.net.outlets import Outlets
+from zstate.net.presence import discover, writer_here
+from zstate.net.session import connect
+from zstate.net.wires import wire_named
+from zstate.wire.layout import Layout
+from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
+
+WIRES = ("native", "ros2", "ros2dds")
+LAYOUT = Layout(("a", "b"), (0, 1))
+STATE = JointState(STAMP, 0, 1, order_digest(("a", "b")), to_block([1.0, 2.0]))
+DESCRIBED = RobotDescription(1, "<robot/>", "digest", (), ())
+KEYS = {
+    "native": ("zstate/r1/joint_states", "zstate/r1/robot_description"),
+    "ros2": (key_of(JOINT_STATES), key_of(DESCRIPTION)),
+    "ros2dds": ("joint_states", "robot_description"),
+}
+
+
+@pytest.fixture(autouse=True)
+def no_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+def outlets(session, wire: str) -> Outlets:
+    return Outlets(session, wire_named(wire), "r1", writer_here(3), LAYOUT)
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_what_is_open_is_announced_and_is_heard_until_it_closes(sessions, wire: str):
+    writer, reader = sessions
+    joints, described = KEYS[wire]
+    ear = Ear(reader, joints)
+    with outlets(writer, wire) as out:
+        stream = out.stream("joint_states")
+        out.latched("robot_description").set(DESCRIBED)
+        await_reader(writer, joints)
+        stream.put(stream.encode(STATE))
+        ear.heard(1)
+        late = Ear(reader, described, latched=True)
+        late.heard(1)
+        until(lambda: len(discover(reader, wire=wire)) == 1)
+        (robot,) = discover(reader, wire=wire)
+        assert {said for said, _ in robot.writers} == {"joint_states", "robot_description"}
+    until(lambda: discover(reader, timeout_s=0.1, wire=wire) == ())
+    assert tokens(reader) == []
+
+
+@pytest.mark.parametrize(("wire", "kinds"), [("native", ["PUT", "DELETE"]), ("ros2", ["PUT", "PUT"])])
+def test_a_value_is_withdrawn_only_where_that_can_be_said(sessions, wire: str, kinds: list[str]):
+    writer, reader = sessions
+    ear = Ear(reader, KEYS[wire][1])
+    await_reader(writer, KEYS[wire][1])
+    with outlets(writer, wire) as out:
+        latched = out.latched("robot_description")
+        latched.set(DESCRIBED)
+        latched.withdraw()
+        if wire == "ros2":
+            latched.set(DESCRIBED)
+        assert [str(sample.kind).rpartition(".")[2] for sample in ear.heard(2)] == kinds
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_readers_are_known(sessions, wire: str):
+    writer, reader = sessions
+    with outlets(writer, wire) as out:
+        stream = out.stream("joint_states")
+        assert not stream.has_readers
+        ear = Ear(reader, KEYS[wire][0])
+        until(lambda: stream.has_readers)
+    assert ear.samples == []
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_after_close_nothing_is_put_and_closing_again_does_nothing(wire: str):
+    with connect() as session:
+        out = outlets(session, wire)
+        stream, latched = out.stream("joint_states"), out.latched("robot_description")
+        out.close()
+        out.close()
+        for use in (lambda: stream.put(stream.encode(STATE)), lambda: latched.set(DESCRIBED)):
+            with pytest.raises(Closed):
+                use()
+        latched.withdraw()
+    latched.withdraw()
+
+
+def test_each_has_a_number_of_its_own_in_its_session(sessions):
+    writer, reader = sessions
+    with outlets(writer, "ros2") as one, outlets(writer, "ros2") as other:
+        for out in (one, other):
+            out.stream("joint_states")
+            out.stream("tf")
+        until(lambda: len(tokens(reader)) == 6)
+        ids = [token.split("/")[4] for token in tokens(reader)]
+        nodes = [token.split("/")[3] for token in tokens(reader)]
+    assert len(set(ids)) == 6
+    assert len(set(nodes)) == 2
+
+
+def test_what_ros_has_no_topic_for_is_refused(sessions):
+    with outlets(sessions[0], "ros2") as out, pytest.raises(InvalidInput, match="'joint_commands'"):
+        out.stream("joint_commands")

@@ -1,0 +1,220 @@
+"""The ROS wires: what is announced, heard and said, without a network."""
+
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from wire.ros2.by_hand import rosbags_joint_state
+from wire.ros2.raw_nodes import (
+    DESCRIPTION,
+    HUMBLE,
+    JOINT_STATES,
+    TF,
+    TF_STATIC,
+    TOPICS,
+    attachment,
+    gid_of,
+    key_of,
+)
+
+from zstate.errors import MessageError
+from zstate.wire.layout import Layout
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
+from zstate.wire.wire import Arrival, Place
+from zstate.wire.writer import Writer
+
+STAMP = 1_700_000_000_123_456_789
+GOOD = rosbags_joint_state(STAMP, "", ("a",), [1.0], [], [])
+GID = bytes(range(16))
+ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
+WRITER = Writer("arm driver", "host", 4, 5, 6)
+DDS_TOPICS = {
+    "joint_states": "sensor_msgs§msg§JointState",
+    "tf": "tf2_msgs§msg§TFMessage",
+    "tf_static": "tf2_msgs§msg§TFMessage",
+    "robot_description": "std_msgs§msg§String",
+}
+
+
+def wire(**options) -> Ros2Wire:
+    return Ros2Wire(Ros2Options(**options))
+
+
+def endpoint(topic, name: str, *, kind: str = "MP", namespace: str = "", hash_: str = "") -> str:
+    around = f"%{namespace}" if namespace else "%"
+    path = f"{around.rstrip('%')}%{topic[0]}"
+    return f"@ros2_lv/0/{ZID}/3/9/{kind}/%/{around}/{name}/{path}/{topic[1]}/{hash_ or topic[2]}/{topic[3]}"
+
+
+def arrival(payload: bytes = GOOD, beside: bytes | None = attachment(7, GID), key: str = "") -> Arrival:
+    return Arrival(key or key_of(JOINT_STATES), payload, "zenoh/bytes", beside)
+
+
+def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
+    voice = wire(namespace="fleet/r1", domain=5).voice("r1", WRITER, Place(ZID, 3), Layout())
+    assert voice.token == f"@ros2_lv/5/{ZID}/3/3/NN/%/%fleet%r1/arm_driver"
+    outlet = voice.outlet("joint_states", 9)
+    assert outlet.key == key_of(JOINT_STATES, "fleet/r1", 5)
+    around = f"@ros2_lv/5/{ZID}/3/9/MP/%/%fleet%r1/arm_driver/%fleet%r1%joint_states"
+    assert outlet.token == "/".join([around, *JOINT_STATES[1:]])
+    assert outlet.attachment(8) == struct.pack("<qqB", 1, 8, 16) + gid_of(outlet.token)
+    tf = voice.outlet("tf", 10)
+    assert tf.key == key_of(TF, "", 5)
+    assert tf.token.split("/")[9:] == ["%tf", *TF[1:]]
+
+
+def test_the_bridges_wire_has_plain_keys_its_own_tokens_and_nothing_beside():
+    voice = Ros2DdsWire(Ros2Options(namespace="r1")).voice("r1", WRITER, Place(ZID, 3), Layout())
+    assert voice.token is None
+    outlet = voice.outlet("tf_static", 9)
+    assert (outlet.key, outlet.attachment(8)) == ("r1/tf_static", None)
+    key = f"@/{ZID}/@ros2_lv/MP/r1§tf_static/tf2_msgs§msg§TFMessage"
+    assert outlet.token == f"{key}/:1:1:0,1:typehash={TF_STATIC[2]};"
+
+
+@pytest.mark.parametrize("topic", TOPICS)
+@pytest.mark.parametrize("written", ["", HUMBLE])
+def test_a_publisher_of_a_stream_is_announced_by_its_node_and_signed_as_its_messages(topic, written):
+    token = endpoint(topic, "rsp", hash_=written)
+    said = wire().announced(token, "r1")
+    assert said is not None
+    assert (said.robot, said.stream, str(said.writer)) == ("r1", topic[0], "/rsp")
+    assert said.writer.session == int.from_bytes(gid_of(token)[:8], "little")
+
+
+@pytest.mark.parametrize(
+    ("options", "namespace", "topic", "robot", "expected"),
+    [
+        ({}, "", JOINT_STATES, "*", "ros"),
+        ({}, "r1", JOINT_STATES, "*", None),
+        ({"namespace": "r1"}, "r1", JOINT_STATES, "*", "r1"),
+        ({"namespace": "r1"}, "", TF, "*", "ros"),
+        ({"namespace": "r1", "tf": "namespace"}, "r1", TF, "*", "r1"),
+        ({"namespace": "r1", "tf": "namespace"}, "", TF, "*", None),
+        ({"namespace": "*"}, "r7", DESCRIPTION, "*", "r7"),
+        ({"namespace": "*"}, "", TF_STATIC, "*", "ros"),
+        ({"namespace": "*"}, "r7", DESCRIPTION, "r7", "r7"),
+        ({"namespace": "*"}, "r8", DESCRIPTION, "r7", None),
+        ({"namespace": "fleet/r1"}, "", JOINT_STATES, "r1", None),
+    ],
+)
+def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespace, topic, robot, expected):
+    one = wire(**options)
+    said = one.announced(endpoint(topic, "rsp", namespace=namespace), robot)
+    assert (said and said.robot) == expected
+    if expected and robot == "*":
+        assert one.robot_of(key_of(topic, namespace)) == expected
+
+
+@pytest.mark.parametrize(
+    "token",
+    [
+        endpoint(JOINT_STATES, "rviz", kind="MS"),
+        f"@ros2_lv/0/{ZID}/3/3/NN/%/%/rsp",
+        endpoint(("joint_states", *TF[1:]), "wrong_type"),
+        endpoint(("cmd_vel", *TF[1:]), "other_topic"),
+        "@ros2_lv/0",
+        "zstate/r1/@writer/tf/x",
+    ],
+)
+def test_tokens_of_anything_else_announce_nothing(token: str):
+    assert wire().announced(token, "r1") is None
+    assert wire().announced(token, "*") is None
+
+
+@pytest.mark.parametrize("stream", DDS_TOPICS)
+def test_a_route_of_a_bridge_is_announced(stream):
+    one = Ros2DdsWire()
+    for tail in (":1:1:0,1", f":1:1:0,1:typehash={TF[2]};", ""):
+        token = f"@/{ZID}/@ros2_lv/MP/{stream}/{DDS_TOPICS[stream]}/{tail or ':0:0:1,-1'}"
+        said = one.announced(token, "r1")
+        assert said is not None
+        assert (said.robot, said.stream, said.writer.session) == ("r1", stream, 0)
+        assert str(said.writer) == f"ros2dds bridge {ZID[:8]}"
+        assert one.announced(token.replace("/MP/", "/MS/"), "r1") is None
+        assert one.announced(token.replace("§msg§", "§"), "r1") is None
+
+
+def test_messages_are_told_apart_by_the_writer_and_the_number_beside_them():
+    (state,) = wire().decode("joint_states", arrival(), "r1")
+    assert (state.session, state.seq) == (int.from_bytes(GID[:8], "little"), 7)
+    one = Ros2DdsWire()
+    said = [one.decode("joint_states", arrival(beside=None), "r1")[0] for _ in range(3)]
+    assert [(state.session, state.seq) for state in said] == [(0, 1), (0, 2), (0, 3)]
+
+
+@pytest.mark.parametrize(
+    ("beside", "reason"),
+    [
+        (None, "no attachment"),
+        (b"", "foreign"),
+        (attachment(1, GID)[:-1], "foreign"),
+        (attachment(1, GID) + b"\x00", "foreign"),
+        (b"\x0fsequence_number" + bytes(40), "foreign"),
+    ],
+)
+def test_a_message_whose_writer_is_not_told_is_refused(beside, reason: str):
+    with pytest.raises(MessageError) as caught:
+        wire().decode("joint_states", arrival(beside=beside), "r1")
+    assert caught.value.reason == reason
+
+
+def test_a_key_in_a_namespace_that_ros_does_not_have_is_foreign():
+    one = wire(namespace="*")
+    key = key_of(JOINT_STATES, "two words")
+    with pytest.raises(MessageError, match="two words") as caught:
+        one.decode("joint_states", arrival(key=key), one.robot_of(key))
+    assert caught.value.reason == "foreign"
+
+
+STREAMS = st.sampled_from(["joint_states", "tf", "tf_static", "robot_description", "clock"])
+BESIDE = st.one_of(
+    st.none(),
+    st.binary(max_size=40),
+    st.builds(
+        lambda seq, at, gid: struct.pack("<qqB16s", seq, at, 16, gid),
+        st.integers(-(2**63), 2**63 - 1),
+        st.integers(-(2**63), 2**63 - 1),
+        st.binary(min_size=16, max_size=16),
+    ),
+)
+PAYLOADS = st.one_of(
+    st.binary(max_size=80),
+    st.binary(max_size=80).map(lambda data: b"\x00\x01\x00\x00" + data),
+    st.integers(0, len(GOOD)).map(lambda end: GOOD[:end]),
+    st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)).map(
+        lambda change: GOOD[: change[0]] + bytes([change[1]]) + GOOD[change[0] + 1 :]
+    ),
+)
+KEYS = st.text(st.characters(exclude_characters="*$?#/"), min_size=1).map(lambda ns: key_of(JOINT_STATES, ns))
+
+
+@settings(max_examples=400, deadline=None)
+@given(STREAMS, st.tuples(PAYLOADS, BESIDE, KEYS), st.sampled_from(["", "*"]), st.booleans())
+def test_whatever_arrives_is_read_or_refused_with_a_reason(
+    stream, given_, namespace: str, behind_bridge: bool
+):
+    one = (Ros2DdsWire if behind_bridge else Ros2Wire)(Ros2Options(namespace=namespace))
+    come = arrival(*given_)
+    try:
+        said = one.decode(stream, come, one.robot_of(come.key))
+    except MessageError as error:
+        assert error.reason
+    else:
+        assert isinstance(said, tuple)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    st.lists(st.one_of(st.text(max_size=8), st.sampled_from(endpoint(TF, "n").split("/"))), max_size=15).map(
+        "/".join
+    ),
+    st.sampled_from(["", "r1", "*"]),
+    st.sampled_from(["r1", "*"]),
+)
+def test_whatever_is_announced_is_understood_or_passed_over(token: str, namespace: str, robot: str):
+    for one in (wire(namespace=namespace), Ros2DdsWire(Ros2Options(namespace=namespace))):
+        one.announced(token, robot)
+        one.announced(f"@/{ZID}/@ros2_lv/MP/{token}", robot)
