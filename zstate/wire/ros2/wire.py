@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache, partial
 
+from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.layout import Layout
 from zstate.wire.messages import Message
@@ -42,7 +43,7 @@ class RosVoice:
         self._layout = layout
         self._names = FrameNames(wire.options, robot)
         namespace = f"/{wire.options.namespace_of(robot)}"
-        name = wire.options.node or re.sub(r"\W|^(?=\d)", "_", writer.program, flags=re.ASCII)
+        name = wire.options.node or re.sub(r"\W|^(?=\d|$)", "_", writer.program, flags=re.ASCII)
         self._node = NodeToken(wire.options.domain, place.zid, place.number, "/", namespace, name)
         self.token = wire.node_token(self._node)
 
@@ -108,7 +109,11 @@ class Ros2Wire:
 
     def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
         session, seq = self._origin(arrival)
-        return self._hearing.messages(stream, arrival.payload, session, seq, self._frame_names(robot))
+        try:
+            names = self._frame_names(robot)
+        except InvalidInput as error:
+            raise MessageError(f"a namespace that ROS does not have: {error}", reason="foreign") from None
+        return self._hearing.messages(stream, arrival.payload, session, seq, names)
 
     def _origin(self, arrival: Arrival) -> tuple[int, int]:
         """Which start of a writer, and which of its messages."""
