@@ -1,0 +1,147 @@
+"""What speaking to ROS 2 costs: a JointState of 30 joints from arrays to bytes handed to Zenoh, and back.
+
+    python -m bench.micro.ros2_wire
+
+Thread CPU time [us] in interleaved rounds: medians, 99th percentiles, and what the median is above the put
+of the same bytes on a bare Zenoh publisher, as a difference and as a ratio. Somebody on loopback reads all
+of it. Each write comes after a pause, as in a control loop, and once more back to back. Reading is measured
+without a network: from payload and attachment to a message, and on into a listener's buffer. The native
+wire does the same beside it.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable
+from itertools import count
+
+import numpy as np
+
+from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_model
+from zstate.following.joints import JointFollower
+from zstate.following.tally import Tally
+from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.net.outlets import Outlets
+from zstate.net.presence import writer_here
+from zstate.net.session import Session
+from zstate.net.wires import wire_named
+from zstate.wire.layout import Layout
+from zstate.wire.messages import JointState, RobotDescription, Sample, order_digest, to_block
+from zstate.wire.wire import Arrival, Place
+
+JOINTS = 30
+ROUNDS = 31
+CALLS = 100
+PAUSE_S = 0.0005
+STAMP = 1_700_000_000_123_456_789
+
+Call = Callable[[], object]
+
+
+def main() -> None:
+    """Print the tables."""
+    model = chain(JOINTS)
+    print(
+        f"Python {platform.python_version()}, numpy {np.__version__}, {platform.machine()}; us of thread CPU"
+    )
+    with connect() as session, connect() as other:
+        reader = other.zenoh.declare_subscriber("**", lambda _: None)
+        for wire in ("ros2", "native"):
+            for pause_s in (PAUSE_S, 0.0):
+                how = "after a pause" if pause_s else "back to back"
+                show(f"{wire}, writing {how}", interleaved(writing(wire, session, model), pause_s))
+            show(f"{wire}, reading", interleaved(reading(wire, model), 0.0))
+        reader.undeclare()
+
+
+def chain(joints: int) -> RobotModel:
+    """A robot of hinges in a row."""
+    links = "".join(f'<link name="link_{number}"/>' for number in range(joints + 1))
+    hinges = "".join(
+        f'<joint name="left_arm_joint_{number}" type="continuous"><parent link="link_{number}"/>'
+        f'<child link="link_{number + 1}"/><axis xyz="0 0 1"/></joint>'
+        for number in range(joints)
+    )
+    return load_model(f'<robot name="chain">{links}{hinges}</robot>')
+
+
+def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
+    """The ways to write one sample of positions and velocities; what they open, the session closes."""
+    numbers, state = np.linspace(-1.0, 1.0, JOINTS), sample(model, STAMP)
+    publisher = StatePublisher(session, model, "whole", (wire,), streams=["joint_states"])
+    stream = Outlets(session, wire_named(wire), "alone", writer_here(1), layout(model)).stream("joint_states")
+    payload, beside = stream.encode(state), bytes(33)
+    bare = session.zenoh.declare_publisher(f"bench/{wire}")
+    return {
+        "raw put": lambda: bare.put(payload),
+        "raw put, attachment": lambda: bare.put(payload, attachment=beside),
+        "outlet: encode, put": lambda: stream.put(stream.encode(state)),
+        "StatePublisher.publish": lambda: publisher.publish(numbers, numbers, stamp=STAMP),
+    }
+
+
+def reading(wire: str, model: RobotModel) -> dict[str, Call]:
+    """The ways into a message, and into a buffer, of samples that follow each other."""
+    spoken = wire_named(wire)
+    outlet = spoken.voice("r1", writer_here(1), Place("1", 0), layout(model)).outlet("joint_states", 1)
+    stamps = count(STAMP, 10_000_000)
+
+    def arrivals() -> list[Arrival]:
+        payloads = [outlet.encode(sample(model, next(stamps))) for _ in range((ROUNDS + 1) * CALLS)]
+        return [Arrival(outlet.key, one, outlet.encoding, outlet.attachment(STAMP)) for one in payloads]
+
+    follower = JointFollower("r1", TransformBuffer(), Tally())
+    follower.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
+    plain, whole = iter(arrivals()), iter(arrivals())
+
+    def into_buffer() -> None:
+        for message in spoken.decode("joint_states", next(whole), "r1"):
+            assert isinstance(message, Sample)
+            follower.take(message, overflowed=False)
+
+    return {
+        "decode": lambda: spoken.decode("joint_states", next(plain), "r1"),
+        "decode, into a buffer": into_buffer,
+    }
+
+
+def layout(model: RobotModel) -> Layout:
+    """What the numbers are called."""
+    return Layout(coordinate_names(model), velocity_slots(model))
+
+
+def sample(model: RobotModel, stamp: int) -> JointState:
+    """Positions and velocities, in the model's order."""
+    block = to_block(np.linspace(-1.0, 1.0, model.position_count))
+    return JointState(stamp, 0, 1, order_digest(model.joint_names), block, block)
+
+
+def interleaved(cases: dict[str, Call], pause_s: float) -> dict[str, list[float]]:
+    """Thread CPU times [us] of each call, the cases taking turns; the first round is not counted."""
+    times: dict[str, list[float]] = {what: [] for what in cases}
+    for number in range(ROUNDS + 1):
+        for what, call in cases.items():
+            for _ in range(CALLS):
+                start = time.thread_time_ns()
+                call()
+                if number:
+                    times[what].append((time.thread_time_ns() - start) * 1e-3)
+                if pause_s:
+                    time.sleep(pause_s)
+    return times
+
+
+def show(what: str, times: dict[str, list[float]]) -> None:
+    """One table: the first row is what the others are compared with."""
+    print(f"\n{what:<36}{'median':>9}{'p99':>9}{'above':>9}{'ratio':>9}")
+    floor = float(np.median(next(iter(times.values()))))
+    for case, values in times.items():
+        median, p99 = np.percentile(values, (50, 99))
+        print(
+            f"  {case:<34}{median:>9.1f}{p99:>9.1f}{median - floor:>9.1f}{median / floor:>9.2f}", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()
