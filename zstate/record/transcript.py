@@ -103,6 +103,13 @@ class Transcript:
         """The robots that something is said of, by name; "ros" is what stands in no namespace of a bag."""
         return tuple(sorted({speaker.robot for speaker in self.speakers if speaker.robot}))
 
+    def concerning(self, robots: Collection[str] | None) -> set[Speaker]:
+        """Those who speak of ``robots`` (None: of any).
+
+        The clock belongs to every robot, and so do the transforms that stand in no namespace of a bag.
+        """
+        return {speaker for speaker in self.speakers if robots is None or _concerns(speaker, robots)}
+
     @property
     def span(self) -> tuple[int, int] | None:
         """The first and the last log time [ns] of the whole recording; None when it is empty."""
@@ -115,16 +122,8 @@ class Transcript:
         begin: int | None = None,
         end: int | None = None,
     ) -> Iterator[Said]:
-        """What was said of ``robots`` (None: of all) on ``streams``, in the order of log times.
-
-        With log times in [begin, end). The clock belongs to every robot, and so do the transforms that
-        stand in no namespace of a bag.
-        """
-        wanted = {
-            speaker
-            for speaker in self.speakers
-            if speaker.stream in streams and (robots is None or _concerns(speaker, robots))
-        }
+        """What those ``concerning`` robots said on ``streams``, in the order of log times in [begin, end)."""
+        wanted = {speaker for speaker in self.concerning(robots) if speaker.stream in streams}
         topics = {topic for topic, speakers in self._topics.items() if speakers & wanted}
         counts: Counter[Speaker] = Counter()
         # Without topics nothing is wanted, while None would mean all.

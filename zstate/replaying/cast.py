@@ -1,0 +1,175 @@
+"""Cast: everybody who speaks in one pass of a replay."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.following.tally import Tally
+from zstate.following.unmodelled import Unmodelled
+from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
+from zstate.net.session import Session
+from zstate.publisher import StatePublisher
+from zstate.record.models import joint_order
+from zstate.record.transcript import Said, Speaker
+from zstate.replaying.standing import Standing, static_key
+from zstate.replaying.verbatim import Verbatim
+from zstate.wire.keys import MODEL_WRITER, Stream
+from zstate.wire.messages import (
+    JointState,
+    Message,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+)
+
+
+class Cast(Closing):
+    """Says again what was recorded, as new writers.
+
+    Robots with one of ``models`` get a StatePublisher, which computes their transforms anew where it
+    was their own publisher that wrote them; everything else is said as it was. ``standing`` is what
+    holds from the beginning. What cannot be said is counted in ``tally``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        wires: Sequence[str],
+        speakers: Collection[Speaker],
+        *,
+        models: Mapping[str, RobotModel],
+        standing: Standing,
+        tally: Tally,
+    ) -> None:
+        self._session = session
+        self._wires = wires
+        self._tally = tally
+        self._standing = standing
+        self._modelled, self._computed = Unmodelled(), Unmodelled()
+        self._robots: dict[str, _Robot] = {}
+        self._others: dict[str, Verbatim] = {}
+        with ExitStack() as opening:
+            opening.callback(self._close_robots)
+            for robot, model in models.items():
+                self._robots[robot] = self._open(robot, model, _is_computed(robot, speakers))
+            for robot, streams in self._verbatim_streams(speakers).items():
+                self._others[robot] = Verbatim(session, wires, robot, streams)
+                opening.enter_context(self._others[robot])
+            for said in (*standing.descriptions.values(), *standing.statics):
+                self._say_counted(said)
+            self._opened = opening.pop_all()
+
+    def _open(self, robot: str, model: RobotModel, is_computed: bool) -> _Robot:
+        self._modelled.learn(robot, model)
+        if is_computed:
+            self._computed.learn(robot, model)
+        return _Robot(self._session, self._wires, robot, model, is_computed)
+
+    def _verbatim_streams(self, speakers: Iterable[Speaker]) -> dict[str, list[Stream]]:
+        streams: dict[str, list[Stream]] = {}
+        for speaker in speakers:
+            if speaker.robot:
+                found = streams.setdefault(speaker.robot, [])
+                robot = self._robots.get(speaker.robot)
+                own: Collection[Stream] = () if robot is None else robot.streams
+                if speaker.stream in ("joint_states", "tf") and speaker.stream not in (*own, *found):
+                    found.append(speaker.stream)
+        return streams
+
+    def take(self, said: Said) -> bool:
+        """Say it; whether there was something to say."""
+        if isinstance(said.message, RobotDescription | StaticTransforms):
+            changed = self._standing.take(said)
+            return changed is not None and self._say_counted(changed)
+        return self._say_counted(said)
+
+    def _say_counted(self, said: Said) -> bool:
+        try:
+            return self._say(said.speaker, said.message)
+        except MessageError as error:
+            self._tally.refuse(error.reason, f"{said.speaker.robot!r}: {error}")
+        except InvalidInput as error:
+            self._tally.refuse("not sayable", f"{said.speaker.robot!r}: {error}")
+        except ModelError as error:
+            self._tally.refuse("robot description", f"{said.speaker.robot!r}: {error}")
+        return False
+
+    def _say(self, speaker: Speaker, message: Message) -> bool:
+        robot = self._robots.get(speaker.robot)
+        if isinstance(message, StaticTransforms):
+            return self._fix(speaker, message)
+        if isinstance(message, RobotDescription):
+            return self._describe(speaker, message)
+        if isinstance(message, JointState) and robot is not None:
+            robot.publish(message)
+        elif isinstance(message, TransformSample):
+            rest = self._computed.sample(speaker.robot, message)
+            if rest is None or (robot is not None and "tf" in robot.streams):
+                return False
+            self._others[speaker.robot].say(rest)
+        elif isinstance(message, JointState):
+            self._others[speaker.robot].say(message)
+        return True
+
+    def _describe(self, speaker: Speaker, description: RobotDescription) -> bool:
+        robot = self._robots.get(speaker.robot)
+        if robot is None:
+            self._others[speaker.robot].describe(description, MODEL_WRITER)
+        elif robot.model.urdf != description.urdf:
+            model = parse_urdf(description.urdf, f"the URDF of {speaker.robot!r}")
+            robot.close()
+            self._robots[speaker.robot] = self._open(speaker.robot, model, "tf" in robot.streams)
+        return True
+
+    def _fix(self, speaker: Speaker, statics: StaticTransforms) -> bool:
+        if speaker.static_writer == MODEL_WRITER and speaker.robot in self._robots:
+            return False
+        rest = self._modelled.statics(speaker.robot, statics)
+        self._others[speaker.robot].fix(rest, static_key(speaker)[1])
+        return True
+
+    def close(self) -> None:
+        """Everybody falls silent. A second call does nothing."""
+        self._opened.close()
+
+    def _close_robots(self) -> None:
+        for robot in self._robots.values():
+            robot.close()
+
+
+class _Robot(Closing):
+    """A robot whose model is known, and its joint states."""
+
+    def __init__(
+        self, session: Session, wires: Sequence[str], robot: str, model: RobotModel, is_computed: bool
+    ) -> None:
+        self.model = model
+        self.streams: tuple[Stream, ...] = ("joint_states", "tf_static", "robot_description")
+        if is_computed:
+            self.streams += ("tf",)
+        self._order = joint_order(model)
+        self._publisher = StatePublisher(session, model, robot, wires, streams=self.streams)
+
+    def publish(self, state: JointState) -> None:
+        """Raises MessageError and InvalidInput for what cannot be said."""
+        positions, velocities, efforts = self._order.read(state)
+        self._publisher.publish(positions, velocities, efforts, state.stamp)
+
+    def close(self) -> None:
+        self._publisher.close()
+
+
+def _is_computed(robot: str, speakers: Collection[Speaker]) -> bool:
+    """Whether the transforms of a robot with a model are those that follow from its joint states.
+
+    So it is where nobody wrote others, or the writer of the joint states wrote them, too.
+    """
+    sessions: dict[Stream, set[int]] = {"tf": set(), "joint_states": set()}
+    for speaker in speakers:
+        if speaker.robot == robot and speaker.stream in sessions:
+            sessions[speaker.stream].add(speaker.session)
+    return sessions["tf"] <= sessions["joint_states"]
