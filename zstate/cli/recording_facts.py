@@ -9,22 +9,12 @@ from typing import Any
 from zstate.errors import MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.record.channel import ROBOT, Channel
+from zstate.record.channel import Channel
 from zstate.record.info import RecordingInfo
 from zstate.record.reader import RecordReader
+from zstate.record.transcript import LATCHED, Speaker
 from zstate.wire.keys import Stream
 from zstate.wire.ros2.plain import decode_string
-from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.topics import robot_of_topic, type_of
-
-
-def stream_of(channel: Channel) -> Stream | None:
-    """The stream of a robot that a channel carries, or None for any other topic."""
-    name = channel.topic.rpartition("/")[2]
-    for stream in STREAM_QOS:
-        if name == stream and channel.type_name == type_of(stream).name:
-            return stream
-    return None
 
 
 @dataclass(frozen=True)
@@ -62,18 +52,19 @@ class RecordedRobot:
 
 def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
     """The robots by name. RecordingError when a description's chunk turns out to be damaged."""
-    by_name: dict[str, list[Channel]] = {}
+    by_name: dict[str, list[tuple[Speaker, Channel]]] = {}
     for channel in info.channels:
-        if stream_of(channel) not in (None, "clock"):
-            name = channel.metadata.get(ROBOT) or robot_of_topic(channel.topic)
-            by_name.setdefault(name, []).append(channel)
+        speaker = Speaker.of(channel)
+        if speaker is not None and speaker.robot:
+            by_name.setdefault(speaker.robot, []).append((speaker, channel))
     with RecordReader(info.path) as reader:
-        return [_robot(name, reader, channels, info.duration_s) for name, channels in sorted(by_name.items())]
+        return [_robot(name, reader, said, info.duration_s) for name, said in sorted(by_name.items())]
 
 
 def other_channels(info: RecordingInfo) -> list[Channel]:
     """The clock, and what says nothing of a robot's state."""
-    return [channel for channel in info.channels if stream_of(channel) in (None, "clock")]
+    speakers = ((Speaker.of(channel), channel) for channel in info.channels)
+    return [channel for speaker, channel in speakers if speaker is None or not speaker.robot]
 
 
 def mean_rate(channel: Channel, duration_s: float) -> float | None:
@@ -81,9 +72,13 @@ def mean_rate(channel: Channel, duration_s: float) -> float | None:
     return (channel.count - 1) / duration_s if channel.count > 1 and duration_s > 0.0 else None
 
 
-def _robot(name: str, reader: RecordReader, channels: Sequence[Channel], duration_s: float) -> RecordedRobot:
-    model, fault = _model(reader, {c.topic for c in channels if stream_of(c) == "robot_description"}, name)
-    return RecordedRobot(name, model, fault, tuple(_stream(channel, duration_s) for channel in channels))
+def _robot(
+    name: str, reader: RecordReader, said: Sequence[tuple[Speaker, Channel]], duration_s: float
+) -> RecordedRobot:
+    described = {channel.topic for speaker, channel in said if speaker.stream == "robot_description"}
+    model, fault = _model(reader, described, name)
+    streams = (_stream(speaker, channel, duration_s) for speaker, channel in said)
+    return RecordedRobot(name, model, fault, tuple(streams))
 
 
 def _model(reader: RecordReader, topics: set[str], name: str) -> tuple[RobotModel | None, str]:
@@ -97,11 +92,7 @@ def _model(reader: RecordReader, topics: set[str], name: str) -> tuple[RobotMode
         return None, str(error)
 
 
-def _stream(channel: Channel, duration_s: float) -> RecordedStream:
-    stream = stream_of(channel)
-    assert stream is not None
-    is_latched = STREAM_QOS[stream].durability == "transient_local"
-    rate = None if is_latched else mean_rate(channel, duration_s)
-    names = (channel.metadata.get("zstate.writer", ""), channel.metadata.get("zstate.program", ""))
-    writer = ", ".join(filter(None, names))
-    return RecordedStream(stream, channel.topic, channel.type_name, channel.count, rate, writer)
+def _stream(speaker: Speaker, channel: Channel, duration_s: float) -> RecordedStream:
+    rate = None if speaker.stream in LATCHED else mean_rate(channel, duration_s)
+    writer = ", ".join(filter(None, (speaker.static_writer, speaker.program)))
+    return RecordedStream(speaker.stream, channel.topic, channel.type_name, channel.count, rate, writer)
