@@ -23,7 +23,6 @@ from wire.ros2.raw_nodes import (
     tokens,
 )
 
-from zstate.errors import InvalidInput
 from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -298,33 +297,3 @@ def test_the_node_may_be_named(sessions):
     with StatePublisher(sessions[0], RRBOT, wires=("ros2:node=state_publisher",)):
         until(lambda: len(tokens(sessions[1])) == 5)
         assert {one.split("/")[8] for one in tokens(sessions[1])} == {"state_publisher"}
-
-
-@pytest.mark.parametrize("stamp", [0, 2**31 * 10**9])
-def test_a_stamp_that_ros_has_no_place_for_is_refused_with_nothing_sent_on_either_wire(sessions, stamp: int):
-    writer, reader = sessions
-    native, ros = "zstate/r1/joint_states", key_of(JOINT_STATES)
-    ears = Ear(reader, native), Ear(reader, ros), Ear(reader, key_of(TF))
-    with StatePublisher(writer, RRBOT, "r1", ("native", "ros2")) as publisher:
-        for key in (native, ros, key_of(TF)):
-            await_reader(writer, key)
-        publisher.publish([0.0, 0.0], stamp=STAMP)
-        with pytest.raises(InvalidInput, match="stamp"):
-            publisher.publish([1.0, 1.0], stamp=stamp)
-        publisher.publish([2.0, 2.0], stamp=STAMP + 1)
-        for ear in ears[1:]:
-            assert [seq for seq, _, _ in ear.attachments(2)] == [1, 2]
-        assert [len(ear.heard(2)) for ear in ears] == [2, 2, 2]
-
-
-def test_a_wire_that_cannot_be_opened_leaves_nothing_of_the_others(sessions):
-    writer, reader = sessions
-    errors = []  # kept, with all that is reached from where they were raised
-    for bad in ("dds", "ros2:namespace=*", "ros2:domain=300"):
-        with pytest.raises(InvalidInput) as caught:
-            StatePublisher(writer, RRBOT, "r-1", ("ros2", bad))
-        errors.append(caught)
-    # What was announced before is known here by the time that a later token is.
-    with StatePublisher(writer, RRBOT, "r1", ("ros2:node=later",)):
-        until(lambda: any("/later/" in one for one in tokens(reader)))
-        assert {one.split("/")[8] for one in tokens(reader)} == {"later"}
