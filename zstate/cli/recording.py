@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import count_text, note
+from zstate.cli.console import count_text
 from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
@@ -58,16 +58,16 @@ class Progress:
         took = f"{now - self._began:.0f} s"
         return f"{took}  {count} messages  {rate:.1f}/s  {size_text(stats.bytes)}  {robots}{lost}"
 
-    def note_news(self) -> None:
-        """Say what has begun to be recorded, and what is waited for."""
+    def news(self) -> Iterator[str]:
+        """What has begun to be recorded since the last call, and what is waited for."""
         streams = set(self._recorder.stats.messages)
         for robot in sorted({robot for robot, _ in streams - self._noted}):
             new = sorted(stream for name, stream in streams - self._noted if name == robot)
-            note("recording the clock" if new == ["clock"] else f"recording {robot}: {', '.join(new)}")
+            yield "recording the clock" if new == ["clock"] else f"recording {robot}: {', '.join(new)}"
         self._noted |= streams
         waiting = self._awaited({robot for robot, stream in streams if stream != "clock"})
         if waiting and waiting != self._waiting and time.monotonic() - self._began > _MEETING_S:
-            note(f"waiting: {waiting}")
+            yield f"waiting: {waiting}"
             self._waiting = waiting
 
     @property

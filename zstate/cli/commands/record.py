@@ -113,7 +113,8 @@ def _show(recorder: Recorder, progress: Progress, duration: float | None) -> Non
     until = math.inf if duration is None else time.monotonic() + duration
     if not is_terminal():
         while not _is_over(recorder, until, _LINE_S):
-            progress.note_news()
+            for news in progress.news():
+                note(news)
             say(progress.line())
         return
     from rich.live import Live
@@ -121,7 +122,8 @@ def _show(recorder: Recorder, progress: Progress, duration: float | None) -> Non
 
     with Live(auto_refresh=False, transient=True) as live:
         while not _is_over(recorder, until, _REFRESH_S):
-            progress.note_news()
+            for news in progress.news():
+                live.console.print(news, markup=False, highlight=False, soft_wrap=True)
             live.update(Text(progress.line()), refresh=True)
 
 
