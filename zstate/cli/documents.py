@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeAlias, cast
 
 from zstate.errors import ModelError
-from zstate.model.catalog import load_model
+from zstate.model.urdf import parse_urdf
 from zstate.wire.messages import JointState, RobotDescription, from_block, order_digest
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ class DocumentWriter:
         self._names = description.joint_names
         self._order = order_digest(self._names)
         try:
-            self._model = load_model(description.urdf)
+            # Text and nothing else: what comes over the network opens no files and runs no xacro.
+            self._model = parse_urdf(description.urdf, "its URDF")
         except ModelError:
             self._model = None  # the names alone serve joints of one number
 
