@@ -60,8 +60,10 @@ def standing(
     streams: Sequence[Stream] = EVERYTHING,
     velocities: Sequence[float] | None = None,
     model: str = RRBOT,
+    wire: str = "native",
+    router: str = "",
 ) -> Iterator[StatePublisher]:
-    """A robot that stands still and says so a hundred times a second."""
+    """A robot that stands still and says so a hundred times a second, behind ``router`` if there is one."""
     stop = threading.Event()
 
     def publish() -> None:
@@ -69,8 +71,8 @@ def standing(
             publisher.publish(positions, velocities)
 
     with (
-        connect() as session,
-        StatePublisher(session, load_model(model), robot, streams=streams) as publisher,
+        connect(mode="client", endpoints=router) if router else connect() as session,
+        StatePublisher(session, load_model(model), robot, (wire,), streams=streams) as publisher,
     ):
         thread = threading.Thread(target=publish)
         thread.start()

@@ -33,3 +33,23 @@ def test_a_writer_that_starts_anew_begins_a_new_window():
     measured = arrivals.intervals()
     assert measured is not None
     assert (measured.rate_hz, measured.missed) == (pytest.approx(10.0), 0)
+
+
+def test_all_writers_of_a_topic_are_measured_together():
+    arrivals = Arrivals(10, of_all=True)
+    for tapped in (arrival(0, 7, session=1), arrival(40, 3, session=2), arrival(100, 8, session=1)):
+        arrivals.note(tapped)
+    arrivals.note(arrival(140, 5, session=2))  # its 4 is missing
+    measured = arrivals.intervals()
+    assert measured is not None
+    assert measured.rate_hz == pytest.approx(3 / 0.14)
+    assert (measured.window, measured.missed) == (4, 1)
+
+
+def test_several_samples_of_one_message_are_one_arrival():
+    arrivals = Arrivals(10, of_all=True)
+    for came_ms, seq in ((0, 1), (0, 1), (100, 2), (100, 2)):
+        arrivals.note(arrival(came_ms, seq))
+    measured = arrivals.intervals()
+    assert measured is not None
+    assert measured.rate_hz == pytest.approx(10.0)

@@ -12,6 +12,7 @@ import msgspec
 
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ROUTER_ENDPOINT, endpoint_list
+from zstate.net.wires import wire_named
 from zstate.rate import check_rate
 from zstate.transform import Transform
 
@@ -28,6 +29,7 @@ class RouterSection(_Section, frozen=True):
 
     listen: tuple[str, ...] = (ROUTER_ENDPOINT,)
     connect: tuple[str, ...] = ()
+    ros2: bool = False
 
     def __post_init__(self) -> None:
         endpoint_list(self.connect)
@@ -55,10 +57,15 @@ class RobotSection(_Section, frozen=True):
     name: str | None = None
     source: Literal["joints", "sine"] = "joints"
     rate: float | None = None
+    wires: tuple[str, ...] = ("native",)
 
     def __post_init__(self) -> None:
         if self.rate is not None:
             check_rate(self.rate)
+        if not self.wires:
+            raise InvalidInput("wires is empty; write for instance ['native', 'ros2']")
+        for wire in self.wires:
+            wire_named(wire)
 
 
 class StaticSection(_Section, frozen=True):

@@ -31,7 +31,7 @@ def _rows(topic: Topic) -> list[tuple[str, ...]]:
 
 
 def _qos_text(qos: Qos) -> str:
-    depth = f"last {qos.depth}" if qos.history == "keep_last" else "all"
+    depth = f"keep last {qos.depth}" if qos.history == "keep_last" else "keep all"
     return f"{qos.reliability}, {qos.durability}, {depth}".replace("_", " ")
 
 
@@ -48,9 +48,10 @@ def namespaces_hint(graph: RosGraph, wire: Ros2Wire) -> str:
     if not others or wire.options.namespace == "*":
         return ""
     kept = f"domain={wire.options.domain}," if wire.options.domain else ""
-    prefix = f"--wire {wire.name}:{kept}namespace="
-    every = f", or `{prefix}*` for each by its name" if any("/" not in name for name in others) else ""
-    return f"in namespaces: {', '.join(others)}; for one of them say `{prefix}{others[0]}`{every}"
+    spec = f"{wire.name}:{kept}namespace="
+    # quoted, for shells would take the star for files
+    every = f", or `--wire '{spec}*'` for each by its name" if any("/" not in name for name in others) else ""
+    return f"in namespaces: {', '.join(others)}; for one of them say `--wire {spec}{others[0]}`{every}"
 
 
 def nobody_text(wire: Ros2Wire) -> str:

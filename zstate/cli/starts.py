@@ -36,7 +36,7 @@ def planned(config: ConfigFile, file: Path) -> list[Start]:
             )
         names.append(name)
         rate = () if robot.rate is None else ("--rate", repr(robot.rate))
-        options = ("--name", name, "--source", robot.source, *rate)
+        options = ("--name", name, "--source", robot.source, *rate, *_repeated("--wire", robot.wires))
         starts.append(Start(name, ("publish", model, *options, *network)))
     if config.static:
         options = _static_options(config, names, file)
@@ -81,7 +81,8 @@ def _in_full(robot: str, edge: Transform) -> Transform:
 
 
 def _router_arguments(router: RouterSection) -> tuple[str, ...]:
-    return ("router", *_repeated("--listen", router.listen), *_repeated("--connect", router.connect))
+    ros2 = ("--ros2",) if router.ros2 else ()
+    return ("router", *ros2, *_repeated("--listen", router.listen), *_repeated("--connect", router.connect))
 
 
 def _network_arguments(config: ConfigFile) -> tuple[str, ...]:

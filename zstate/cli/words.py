@@ -177,4 +177,4 @@ class RosWords:
 
     @property
     def _advice(self) -> str:
-        return f"is the router the right one? `zstate ls --wire {self._spec}` shows who is there"
+        return f"are the domain and the router right? `zstate ls --wire {self._spec}` shows who is there"

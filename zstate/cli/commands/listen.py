@@ -39,7 +39,8 @@ def listen_command(network: Network, robot: str, as_json: bool, wire: str) -> No
 
     Rate and age are measured here, latency is the median time from a sample's stamp until it can be
     looked up. The counts are those since the start: received, dropped here, missed on the way, late
-    (older than the history) and refused. On ROS's side samples are those of /tf, of all nodes together.
+    (older than the history) and refused. On ROS's side it follows /tf, all nodes together; joint states
+    of a robot that is named and described.
 
     \b
     zstate listen
@@ -93,14 +94,19 @@ class Ears(Closing):
         from zstate.cli.metered_buffer import MeteredBuffer
         from zstate.listener import TransformListener
 
-        either: tuple[Follow, ...] = ("tf", "joint_states") if is_ros(self._wire) else ("joint_states", "tf")
-        for follow in either:
-            if follow in streams:
-                buffer = MeteredBuffer()
-                listener = TransformListener(self._session, robot, buffer, self._wire, follow)
-                self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
-                note(f"following {self._roster.words.place(robot, (follow,))}")
-                break
+        follow = self._followed(streams)
+        if follow in streams:
+            buffer = MeteredBuffer()
+            listener = TransformListener(self._session, robot, buffer, self._wire, follow)
+            self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
+            note(f"following {self._roster.words.place(robot, (follow,))}")
+
+    def _followed(self, streams: frozenset[Stream]) -> Follow:
+        if is_ros(self._wire) and "tf" in streams:
+            # /tf is everybody's: whoever names a robot means its joints, which a model makes sense of.
+            is_one = self._robot is not None and {"joint_states", "robot_description"} <= streams
+            return "joint_states" if is_one else "tf"
+        return "joint_states" if "joint_states" in streams else "tf"
 
     def _reason(self) -> str:
         if self._robot is not None:

@@ -55,11 +55,11 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
         say_json([_facts(frame, now) for frame in frames])
     elif frames:
         drawing = {"dot": _dot, "mermaid": _mermaid}.get(form or "")
-        text = drawing(frames) if drawing else _text(frames, now)
+        text = drawing(frames) if drawing else _text(frames, now, in_full=is_ros(wire))
         say(words_of(wire).explained(text))
 
 
-def _text(frames: Sequence[FrameInfo], now: int) -> str:
+def _text(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> str:
     by_name = {frame.name: frame for frame in frames}
     children: dict[str, list[str]] = {}
     for frame in frames:
@@ -68,7 +68,8 @@ def _text(frames: Sequence[FrameInfo], now: int) -> str:
     rows: list[tuple[str, ...]] = [_HEADINGS]
     for root in (frame.name for frame in frames if frame.parent is None):
         for guide, name in tree_lines(root, children):
-            rows.append((guide + _short(by_name[name]), *_cells(by_name[name], now)))
+            shown = name if in_full else _short(by_name[name])
+            rows.append((guide + shown, *_cells(by_name[name], now)))
     return "\n".join(in_columns(rows))
 
 

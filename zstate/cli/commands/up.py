@@ -30,6 +30,7 @@ def up_command(file: str) -> None:
     \b
     [router]                           # as `zstate router`; leave it out for none
     listen = ["tcp/0.0.0.0:7447"]
+    ros2 = true                        # in the place of rmw_zenohd; false unless given
     [network]                          # session options of all that follows
     mode = "peer"
     connect = ["tcp/192.168.1.10:7447"]
@@ -38,6 +39,7 @@ def up_command(file: str) -> None:
     name = "left"
     source = "sine"                    # or "joints", which is the default
     rate = 100.0
+    wires = ["native", "ros2"]         # "native" unless given
     [[static]]                         # as `zstate static`
     robot = "left"                     # not needed when there is one robot
     target = "panda_hand"

@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from support import until
+
+from zstate import StaticPublisher, Transform, connect
+
+pytestmark = pytest.mark.processes
+
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+# From the model: see tests/cli/test_tf.py.
+BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(SHOULDER))
+
+
+def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
+    with standing(wire="ros2", router=ros_router, streams=("tf", "tf_static")):
+        answer = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
+    assert (answer["target"], answer["source"]) == ("base", "lower")
+    assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
+
+
+def test_tf_says_what_it_waits_for_in_the_words_of_ros(spawn: Spawn, ros_router: str):
+    command = started(spawn, "tf", "base", "lower", "--rate", "20")
+    until(lambda: "waiting: nobody publishes /tf in domain 0" in command.stderr)
+    assert "`zstate ls --wire ros2`" in command.stderr
+    with standing(wire="ros2", router=ros_router):
+        assert command.line() == "pose of lower in base"
+        assert command.line().startswith("At time ")
+        assert "heard /tf: " in command.stderr
+    until(lambda: "no new sample of 'base' -> 'upper'" in command.stderr)
+    interrupted(command)
+    for unknown_to_ros in ("zstate joints", "zstate publish", "ros/"):
+        assert unknown_to_ros not in command.stderr
+
+
+def test_tf_tells_two_trees_apart_with_the_command_that_joins_them(ros_router: str):
+    with (
+        standing(wire="ros2", router=ros_router),
+        connect(mode="client", endpoints=ros_router) as session,
+        StaticPublisher(session, "ros", wire="ros2") as statics,
+    ):
+        statics.set(Transform("map", "shelf", (0.0, 0.0, 1.0), UPRIGHT))
+        message = failure("tf", "shelf", "lower", "--once", "--timeout", "1")
+    assert "`zstate static --wire ros2 map world --xyz ...`" in message
+
+
+def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros_router: str):
+    spoken = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
+    with standing("r1", wire=spoken, router=ros_router):
+        lines = zstate("tree").stdout.decode().splitlines()
+    assert lines[1].split() == ["r1/world", "root"]
+    (upper,) = (line for line in lines if "r1/upper" in line)
+    assert "pose" in upper
+    assert "Hz" in upper
+    assert upper.endswith("/r1/driver")
+    (tool,) = (line for line in lines if "r1/tool" in line)
+    assert tool.split()[-2:] == ["static", "/r1/driver"]
+
+
+def test_tree_names_a_node_that_sends_nothing(ros_router: str):
+    with (
+        standing(wire="ros2", router=ros_router, streams=("tf_static",)),
+        connect(mode="client", endpoints=ros_router) as session,
+    ):
+        token = "@ros2_lv/0/{zid}/7/8/MP/%/%/mute/%tf/tf2_msgs::msg::dds_::TFMessage_/{hash}/::,100:,:,:,,"
+        with session.zenoh.liveliness().declare_token(token.format(zid=session.zid, hash="RIHS01_0")):
+            ended = zstate("tree")
+    assert b"/mute announces ROS 2 topic /tf (domain 0), but has sent nothing" in ended.stderr
+    assert b"tool" in ended.stdout
+
+
+def test_tree_of_nobody_is_a_failure(ros_router: str):
+    assert "nobody publishes /tf in domain 5" in failure("tree", "--wire", "ros2:domain=5")
+
+
+def test_echo_needs_no_robot_and_no_description(ros_router: str):
+    with standing(wire="ros2", router=ros_router, streams=("joint_states",)):
+        document = json.loads(zstate("echo", "--once", "--json").stdout)
+    assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
+
+
+def test_echo_hears_one_namespace_or_the_robot_that_is_named(ros_router: str):
+    with (
+        standing("r1", wire="ros2:namespace=*", router=ros_router),
+        standing("r2", (0.0, 0.25), wire="ros2:namespace=*", router=ros_router),
+    ):
+        first = zstate("echo", "--wire", "ros2:namespace=r1", "--once", "--field", "elbow")
+        second = zstate("echo", "r2", "--wire", "ros2:namespace=*", "--once", "--field", "elbow")
+    assert float(first.stdout) == ELBOW
+    assert float(second.stdout) == 0.25
+
+
+def test_whoever_must_name_a_robot_is_told(ros_router: str):
+    assert "Missing argument 'ROBOT'" in failure("echo", "--wire", "native", code=2)
+    message = failure("hz", "--wire", "ros2:namespace=*", code=2)
+    assert "each robot has a namespace of its name" in message
+
+
+def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
+    with standing(wire="ros2", router=ros_router), standing(wire="ros2", router=ros_router):
+        for stream in ("tf", "joint_states"):
+            measured = json.loads(zstate("hz", "--stream", stream, "--once", "--json").stdout)
+            # Two writers wait a hundredth of a second between samples; they may be slower, never faster.
+            assert 20.0 < measured["rate_hz"] < 220.0
+            assert measured["window"] > 20
+            assert measured["missed"] == 0
+
+
+def test_listen_follows_tf_and_the_joints_of_a_robot_that_is_named(spawn: Spawn, ros_router: str):
+    with standing(wire="ros2", router=ros_router):
+        everybody, one = started(spawn, "listen", "--json"), started(spawn, "listen", "rrbot", "--json")
+        until(lambda: json.loads(everybody.line())["received"] > 0)
+        until(lambda: json.loads(one.line())["received"] > 0)
+    assert "following ROS 2 topic /tf (domain 0)" in everybody.stderr
+    assert "following ROS 2 topic /joint_states (domain 0)" in one.stderr
+
+
+def test_a_wire_that_cannot_be_is_wrong_usage_in_its_own_words():
+    message = failure("tf", "a", "b", "--wire", "ros2:domian=5", code=2)
+    assert "no option 'domian', did you mean 'domain'?" in message
+    assert "'native'" in failure("ls", "--wire", "ros3", code=2)
+
+
+# What "tcp/127.0.0.1:7447" is to others: that port belongs to whoever runs these tests.
+ELSEWHERE = """
+import sys
+import zstate.net.config as config
+config.ROUTER_ENDPOINT = sys.argv.pop(1)
+from zstate.cli.main import main
+main()
+"""
+
+
+def test_who_speaks_to_ros_alone_joins_the_router_of_this_host(
+    spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.delenv("ZSTATE_CONNECT")
+    with standing(wire="ros2:node=driver", router=ros_router):
+        command = spawn(ELSEWHERE, ros_router, "ls")
+        assert [command.line(), command.line()] == ["1 node in domain 0", "  /driver"]
+
+
+def test_a_router_that_is_not_there_is_told_with_those_that_could_be(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    command = spawn(ELSEWHERE, endpoint, "ls", "--wire", "ros2")
+    assert command.wait() == 1
+    assert f"zstate: nothing answers at {endpoint!r}" in command.stderr
+    for advice in ("ros2 run rmw_zenoh_cpp rmw_zenohd", "zstate router --ros2", "--connect"):
+        assert advice in command.stderr

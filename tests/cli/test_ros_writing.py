@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from looking import RRBOT, Spawn, interrupted, standing, started, zstate
+from support import until
+
+from zstate import TransformListener, connect, discover, load_model
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.session import Session
+from zstate.sources import SubscribedSource
+from zstate.wire.wire import Arrival
+
+pytestmark = pytest.mark.processes
+
+EVERYTHING = {"joint_states", "robot_description", "tf", "tf_static"}
+
+
+@pytest.fixture
+def client(ros_router: str):
+    with connect(mode="client", endpoints=ros_router) as session:
+        yield session
+
+
+def streams(session: Session, wire: str = "ros2") -> set[str]:
+    return {stream for info in discover(session, wire=wire) for stream, _ in info.writers}
+
+
+def test_publish_takes_the_place_of_robot_state_publisher(spawn: Spawn, ros_router: str, client: Session):
+    command = started(spawn, "publish", RRBOT)
+    assert command.line() == (
+        "publishing 'rrbot' (7 links, 2 joints) on "
+        "ROS 2 topics /robot_description, /tf_static, /tf (domain 0)"
+    )
+    assert streams(client) == EVERYTHING - {"joint_states"}
+    with (
+        TransformListener(client, wire="ros2", follow="tf") as listener,
+        standing("driver", (0.5, 0.0), wire="ros2", router=ros_router, streams=("joint_states",)),
+    ):
+        placed = listener.buffer.wait("base", "upper", timeout_s=10.0)
+    assert math.isclose(placed.rpy[1], 0.5, abs_tol=1e-12)  # the shoulder turns about y
+    assert "heard ROS 2 topic /joint_states (domain 0): 2 positions" in command.stderr
+    interrupted(command)
+
+
+def test_beside_native_joint_states_ros_is_given_everything(spawn: Spawn, ros_router: str, client: Session):
+    command = started(spawn, "publish", RRBOT, "--wire", "native", "--wire", "ros2")
+    assert command.line() == (
+        "publishing 'rrbot' (7 links, 2 joints) on zstate/rrbot/{robot_description,tf_static,tf} and on "
+        "ROS 2 topics /joint_states, /robot_description, /tf_static, /tf (domain 0)"
+    )
+    assert streams(client, "native") == EVERYTHING - {"joint_states"}
+    assert streams(client) == EVERYTHING
+    with (
+        standing(router=ros_router, positions=(0.5, -0.25), streams=("joint_states",)),
+        SubscribedSource(client, load_model(RRBOT), wire="ros2") as source,
+    ):
+        heard = next(iter(source))
+    assert list(heard.positions) == [0.5, -0.25]
+
+
+def test_a_sine_goes_out_on_all_wires(spawn: Spawn, ros_router: str, client: Session):
+    wires = ("--wire", "native", "--wire", "ros2:namespace=r1")
+    started(spawn, "publish", RRBOT, "--source", "sine", *wires).line()
+    assert streams(client, "native") == EVERYTHING
+    assert streams(client, "ros2:namespace=r1") == EVERYTHING
+
+
+def test_beside_the_native_wire_the_way_to_a_ros_router_is_told():
+    said = zstate(
+        *("publish", RRBOT, "--source", "sine", "--seconds", "0.1", "--wire", "native", "--wire", "ros2")
+    )
+    assert said.returncode == 0
+    assert b"say --connect" in said.stderr
+
+
+def test_joints_names_its_topic(spawn: Spawn, client: Session):
+    said = started(spawn, "joints", RRBOT).line()
+    assert said == "rrbot: a sine on 2 joints, 100 Hz, on ROS 2 topic /joint_states (domain 0)"
+    assert streams(client) == {"joint_states"}
+
+
+def test_a_static_edge_of_two_ros_frames_needs_no_robot(spawn: Spawn, client: Session):
+    said = started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
+    assert "on ROS 2 topic /tf_static (domain 0)" in said
+    with TransformListener(client, wire="ros2", follow="tf") as listener:
+        placed = listener.buffer.wait("r1/base", "laser", timeout_s=10.0)
+    assert placed.translation.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_what_is_written_on_topics_has_the_names_that_were_given(spawn: Spawn, client: Session):
+    heard: list[Arrival] = []
+    started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
+    with LatchedSubscriber(client, "0/tf_static/**", heard.append):
+        until(lambda: heard)
+    assert b"r1/base\0" in heard[0].payload
+    assert b"\0laser\0" in heard[0].payload
+
+
+def test_a_file_starts_robots_on_several_wires_and_the_router_of_ros(
+    spawn: Spawn, tmp_path: Path, free_port: int
+):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        f"""
+        [router]
+        listen = ["{endpoint}"]
+        ros2 = true
+        [[robot]]
+        model = "{RRBOT}"
+        source = "sine"
+        wires = ["native", "ros2:domain=5"]
+        """
+    )
+    command = started(spawn, "up", str(file))
+    until(lambda: "publishing 'rrbot'" in command.line())
+    with connect(mode="client", endpoints=endpoint) as session:
+        assert streams(session, "native") == EVERYTHING
+        assert streams(session, "ros2:domain=5") == EVERYTHING
+    interrupted(command)
