@@ -77,6 +77,7 @@ class Replayer(Closing):
         loop: bool = False,
         clock: Clock | None = None,
     ) -> None:
+        self.rate = rate
         self._session = session
         self._wires = tuple(wires)
         self._loop = loop

@@ -28,6 +28,7 @@ _COMMANDS = {
     "hz": ("Look", "The rate at which samples come in."),
     "check": ("Look", "What is right and wrong with a robot model."),
     "record": ("Record", "What robots say, into MCAP files."),
+    "replay": ("Record", "What was recorded, said again."),
     "recover": ("Record", "A complete file of a recording that was cut off."),
     "info": ("Record", "What is in a recording."),
     "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),

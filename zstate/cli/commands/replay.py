@@ -1,0 +1,154 @@
+"""zstate replay: what was recorded, said again."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli.console import fail, is_terminal, note, say
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_seconds, session_options
+from zstate.errors import InvalidInput
+
+if TYPE_CHECKING:
+    from zstate.cli.worker import Worker
+    from zstate.replayer import Replayer, ReplayReport
+
+_LINE_S = 1.0
+_REFRESH_S = 0.1
+
+
+def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
+    from zstate.replaying.pace import check_speed
+
+    try:
+        return check_speed(rate)
+    except InvalidInput as error:
+        raise click.BadParameter(str(error)) from None
+
+
+def _checked_wires(_: click.Context, __: click.Parameter, wires: tuple[str, ...]) -> tuple[str, ...]:
+    from zstate.net.wires import wire_named
+
+    try:
+        for wire in wires:
+            wire_named(wire)
+    except InvalidInput as error:
+        raise click.BadParameter(str(error)) from None
+    return wires
+
+
+@click.command("replay")
+@click.argument("file", type=click.Path(exists=True))
+@click.argument("robots", metavar="[ROBOT]...", nargs=-1)
+@click.option(
+    "--rate",
+    type=float,
+    default=1.0,
+    show_default=True,
+    callback=_checked_rate,
+    metavar="X",
+    help="Recorded seconds a second; inf: as fast as it can.",
+)
+@click.option(
+    "--start",
+    type=click.FloatRange(min=0.0),
+    default=0.0,
+    metavar="S",
+    help="Begin so long after the recording's beginning [s].",
+)
+@click.option(
+    "--duration", type=float, callback=checked_seconds, metavar="S", help="Replay so much of it [s]."
+)
+@click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
+@click.option(
+    "--wire",
+    "wires",
+    multiple=True,
+    default=("native",),
+    show_default=True,
+    callback=_checked_wires,
+    metavar="WIRE",
+    envvar="ZSTATE_WIRE",
+    help="What is spoken, as in `--wire native --wire ros2:domain=5`; may be repeated.",
+)
+@click.option("--force", is_flag=True, help="Also where somebody else writes these robots now.")
+@session_options
+def replay_command(
+    *,
+    file: str,
+    robots: tuple[str, ...],
+    rate: float,
+    start: float,
+    duration: float | None,
+    loop: bool,
+    wires: tuple[str, ...],
+    force: bool,
+    network: Network,
+) -> None:
+    """Publish what FILE holds of ROBOTs, or of all there are, with the stamps it was recorded with.
+
+    FILE is an MCAP file of `zstate record`, or a bag of ROS 2. The time of the recording is said on
+    zstate/clock, and on /clock. Not where somebody else writes the same robots now: readers could not
+    tell the two apart.
+
+    \b
+    zstate replay run.mcap
+    zstate replay run.mcap panda --rate 0.5 --start 30 --duration 10 --loop
+    zstate replay bag_folder --wire ros2:domain=5
+    """
+    from zstate.cli.replaying import introduction, live_writers
+    from zstate.replayer import Replayer
+
+    with (
+        open_session(network, wires) as session,
+        Replayer(
+            session, file, robots, wires=wires, rate=rate, start_s=start, duration_s=duration, loop=loop
+        ) as replayer,
+    ):
+        live = live_writers(session, replayer.robots, wires)
+        if live and not force:
+            fail(f"there is {'; '.join(live)} on the network already; end that first, or use --force")
+        say(introduction(replayer, file))
+        _run(replayer)
+
+
+def _run(replayer: Replayer) -> None:
+    from zstate.cli.replaying import report_text
+    from zstate.cli.worker import Worker
+
+    worker = Worker("zstate replay", replayer.run)
+    try:
+        report = _show(replayer, worker)
+    except SystemExit:
+        replayer.close()
+        say(report_text(replayer.report()))
+        raise
+    say(report_text(report))
+    if not report.samples:
+        fail("no sample was published; `zstate info` shows what the file holds")
+
+
+def _show(replayer: Replayer, worker: Worker[ReplayReport]) -> ReplayReport:
+    """Until it has ended."""
+    from zstate.cli.replaying import progress_line
+
+    if not is_terminal():
+        while (report := _result(worker, _LINE_S)) is None:
+            note(progress_line(replayer))
+        return report
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(auto_refresh=False, transient=True) as live:
+        while (report := _result(worker, _REFRESH_S)) is None:
+            live.update(Text(progress_line(replayer)), refresh=True)
+    return report
+
+
+def _result(worker: Worker[ReplayReport], timeout_s: float) -> ReplayReport | None:
+    with suppress(TimeoutError):
+        return worker.result(timeout_s)
+    return None
