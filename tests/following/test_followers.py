@@ -250,6 +250,13 @@ def test_transforms_may_name_their_edges_and_need_no_description():
     assert following.buffer.latest("r1/upper", "r1/lower") == -5
 
 
+def test_transforms_that_name_their_edges_outlast_a_description_that_comes_later():
+    following = Following(EdgeFollower)
+    following.take(following.sample(0, [0.5, 0.5], stamp=5, edges=edge_names(RRBOT)))
+    following.follower.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
+    assert following.elbow_is([0.5, 0.5], at=5)
+
+
 def test_transforms_of_another_robots_order_are_never_taken_for_this_ones():
     following = Following(EdgeFollower)
     following.take(following.sample(0, [0.5, 0.5]))

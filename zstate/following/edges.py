@@ -41,7 +41,8 @@ class EdgeFollower(Follower):
             except InvalidInput as error:
                 self._tally.refuse("robot description", str(error))
                 return
-            self._restart()
+            # What samples named in full stands for itself.
+            self._withdraw({child for _, child in self._edges} - self._undescribed)
             self._edges, self._order = edges, order
             self._insert_early()
 
@@ -64,9 +65,12 @@ class EdgeFollower(Follower):
         return sample.edges is not None or sample.order == self._order
 
     def _restart(self) -> None:
-        for frame in self._placed():
-            self._buffer.withdraw(frame.name)
+        self._withdraw(self._children())
         self._undescribed = set()
+
+    def _withdraw(self, children: set[str]) -> None:
+        for frame in self._placed(children):
+            self._buffer.withdraw(frame.name)
 
     def _take_over(self, children: set[str]) -> None:
         """Edges that this writer has not said before: what one said of them that is gone is another epoch."""
@@ -79,15 +83,18 @@ class EdgeFollower(Follower):
 
     def _may_begin_again(self) -> bool:
         others = self._others()
-        return all(frame.writer not in others for frame in self._placed())
+        return all(frame.writer not in others for frame in self._placed(self._children()))
 
     def _others(self) -> set[str]:
         """The names of the other writers there are."""
         return set(self._live.values()) - {self.writer or ""}
 
-    def _placed(self) -> list[FrameInfo]:
-        """Our edges, without those that a model or a static writer places by now."""
-        children = {child for _, child in self._edges} | self._undescribed
+    def _children(self) -> set[str]:
+        """The frames that we place."""
+        return {child for _, child in self._edges} | self._undescribed
+
+    def _placed(self, children: set[str]) -> list[FrameInfo]:
+        """Their edges, without those that a model or a static writer places by now."""
         return [frame for frame in self._buffer.frames() if frame.kind == "pose" and frame.name in children]
 
     def _writer_changed(self) -> None:
