@@ -17,6 +17,7 @@ from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, swing, swing_ra
 
 from zstate import Recording, StatePublisher, StaticPublisher, TransformBuffer, TransformListener
 from zstate.errors import InvalidInput
+from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.recorder import Recorder
@@ -347,6 +348,36 @@ def test_a_robot_is_replayed_to_ros(sessions, arm: Path):
         until(lambda: listener.buffer.can_lookup("tool", "lens"))
         stamps = np.arange(START, START + 900 * MS, 7 * MS)
         assert_same(answers(listener.buffer, stamps), answers(TransformBuffer.from_recording(arm), stamps))
+
+
+def test_a_model_that_is_replaced_midway_is_replaced_again(sessions, tmp_path: Path):
+    longer = parse_urdf(RRBOT.urdf.replace('"0 0 0.6"', '"0 0 0.9"'), "longer")
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        for second, model in ((0, RRBOT), (1, longer)):
+            tale.describe("arm", model, session=second, at=START + second * S)
+            for n in range(10):
+                stamp = START + second * S + n * 10 * MS
+                tale.joints("arm", stamp, swing(n), session=second, model=model)
+    writer, reader = sessions
+    with TransformListener(reader, "arm") as listener:
+        settle(writer, "arm")
+        with Replayer(writer, tmp_path / "r.mcap", rate=5.0) as replayer:
+            assert replayer.run().samples == 20
+        until(lambda: listener.stats.received == 20)
+        lengths = {listener.buffer.lookup("lower", "tool").translation[2]}
+    lengths.add(TransformBuffer.from_recording(tmp_path / "r.mcap").lookup("lower", "tool").translation[2])
+    assert lengths == {0.9}
+
+
+def test_what_cannot_be_said_again_is_counted(sessions, tmp_path: Path):
+    with Bag(tmp_path / "bag") as bag:
+        bag.describe()
+        for n, elbow in enumerate([0.5, math.nan, 0.25]):
+            bag.joints(START + n * MS, {"shoulder": 0.5, "elbow": elbow})
+        bag.joints(START + 4 * MS, {"shoulder": 0.5})
+    with Replayer(sessions[0], tmp_path / "bag", rate=math.inf) as replayer:
+        report = replayer.run()
+    assert (report.samples, report.refused) == (2, {"not sayable": 1, "missing joints": 1})
 
 
 def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_goes(sessions, tmp_path: Path):
