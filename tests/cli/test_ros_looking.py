@@ -4,10 +4,16 @@ import json
 import math
 
 import pytest
+from live import await_reader
 from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
 from support import until
 
 from zstate import StaticPublisher, Transform, connect
+from zstate.wire.layout import Layout
+from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.ros2.wire import Ros2Wire
+from zstate.wire.wire import Place
+from zstate.wire.writer import Writer
 
 pytestmark = pytest.mark.processes
 
@@ -81,6 +87,22 @@ def test_echo_needs_no_robot_and_no_description(ros_router: str):
     with standing(wire="ros2", router=ros_router, streams=("joint_states",)):
         document = json.loads(zstate("echo", "--once", "--json").stdout)
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
+
+
+def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router: str):
+    command = started(spawn, "echo", "--json")
+    unmeasured = JointState(
+        5, 0, 1, order_digest(("a",)), to_block([0.5]), None, to_block([math.nan]), ("a",)
+    )
+    wire = Ros2Wire()
+    with connect(mode="client", endpoints=ros_router) as session:
+        voice = wire.voice("r", Writer("driver", "", 0, 0, 1), Place(session.zid, 0), Layout())
+        outlet = voice.outlet("joint_states", 1)
+        await_reader(session, outlet.key)
+        session.zenoh.put(outlet.key, outlet.encode(unmeasured), attachment=outlet.attachment(5))
+        document = json.loads(command.line(), parse_constant=pytest.fail)
+    assert document["positions"] == {"a": 0.5}
+    assert document["efforts"] == {"a": None}
 
 
 def test_echo_hears_one_namespace_or_the_robot_that_is_named(ros_router: str):

@@ -50,7 +50,8 @@ _SESSION_OPTIONS = (
         "--mode",
         type=click.Choice(["peer", "client", "router"]),
         envvar="ZSTATE_MODE",
-        help="How to join the network; default: client with --connect alone, else peer.",
+        help="How to join the network; default: client with --connect alone, client of tcp/127.0.0.1:7447 "
+        "for a ROS wire alone, else peer.",
     ),
     click.option(
         "--connect",

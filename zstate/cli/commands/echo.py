@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from zstate.cli.console import note, say
+from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, named_robot, session_options, wire_option
 from zstate.closing import Closing
@@ -128,6 +127,15 @@ class Named(Closing):
         return self._writer.document(tapped.sample)
 
 
+def _with_nulls(value: Any) -> Any:
+    """JSON has no NaN, by which ROS drivers say that they do not measure something."""
+    if isinstance(value, dict):
+        return {name: _with_nulls(inner) for name, inner in cast("dict[str, Any]", value).items()}
+    if isinstance(value, list):
+        return [_with_nulls(inner) for inner in cast("list[Any]", value)]
+    return None if value != value else value  # noqa: PLR0124 - what NaN is known by
+
+
 def _printer(form: str | None, field: str | None) -> Callable[[Any], None]:
     from zstate.cli.document_text import Columns, field_of, yaml_text
 
@@ -136,7 +144,7 @@ def _printer(form: str | None, field: str | None) -> Callable[[Any], None]:
     def show(document: Any) -> None:
         value = document if field is None else field_of(document, field)
         if form == "json":
-            say(json.dumps(value))
+            say_json(_with_nulls(value))
         elif form == "csv":
             say("\n".join(table.lines(value, field or "")))
         elif field is not None and not isinstance(value, dict):
