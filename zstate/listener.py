@@ -17,7 +17,7 @@ from zstate.following.joints import JointFollower
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import watch
+from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
 from zstate.net.streams import CAPACITY, StreamSubscriber
 from zstate.net.wires import wire_named
@@ -77,6 +77,9 @@ class TransformListener(Closing):
         opening.enter_context(watch(session, robot, self._on_writer, wire))
         key = expression(robot, self._follow)
         opening.enter_context(StreamSubscriber(session, key, self._on_samples))
+        heard: tuple[Stream, ...] = ("robot_description", "tf_static", self._follow)
+        for announcement in announce_reader(session, self._wire, robot, heard):
+            opening.enter_context(announcement)
 
     @property
     def stats(self) -> Stats:

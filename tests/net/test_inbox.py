@@ -73,4 +73,7 @@ def test_closing_is_quick_while_nobody_takes_and_what_waits_may_still_be_taken(s
     inbox.close()
     inbox.close()
     assert time.monotonic() - began < 1.0
-    assert payloads(inbox.take())[:1] == [b"0"]
+    # How many its ring lost before them is the machine's business.
+    waiting = [int(payload) for payload in payloads(inbox.take())]
+    assert waiting
+    assert waiting == sorted(waiting)

@@ -254,7 +254,8 @@ def _check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
         raise InvalidInput(
             f"{len(edges)} edges take poses of shape ({len(edges)}, 7), at least one; got {array.shape}"
         )
-    norms: Poses = np.sqrt(np.square(array[:, 3:]).sum(axis=1))
+    # einsum, as numpy warns of an overflow in a sum of squares, and the check below refuses that anyway
+    norms: Poses = np.sqrt(np.einsum("ij,ij->i", array[:, 3:], array[:, 3:]))
     good = np.isfinite(array).all(axis=1) & (np.abs(norms - 1.0) <= QUATERNION_TOLERANCE)
     if not good.all():
         worst = int(good.argmin())

@@ -6,7 +6,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,6 +54,15 @@ class Announcement(Closing):
 def announce(session: Session, token: str) -> Announcement:
     """Keep a liveliness token, for everybody to see, until closed."""
     return Announcement(session, session.zenoh.liveliness().declare_token(token))
+
+
+def announce_reader(
+    session: Session, wire: Wire, robot: str, streams: Sequence[Stream]
+) -> list[Announcement]:
+    """Tell everybody that this program reads ``streams`` of ``robot``, on wires that tell such things."""
+    program = writer_here(0).program
+    tokens = wire.reader_tokens(robot, streams, program, session.zid, session.next_number)
+    return [announce(session, token) for token in tokens]
 
 
 def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") -> tuple[RobotInfo, ...]:

@@ -13,6 +13,7 @@ from zstate.errors import InvalidInput, MessageError, ZStateError
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
+from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
@@ -48,6 +49,7 @@ class SubscribedSource(Closing):
         self._closed = False
         key = self._wire.expression(self._robot, "joint_states")
         self._subscriber = StreamSubscriber(session, key, self._take)
+        self._announcements = announce_reader(session, self._wire, self._robot, ["joint_states"])
 
     def _take(self, arrivals: list[Arrival]) -> None:
         states = [state for arrival in arrivals for state in self._decode(arrival)]
@@ -106,6 +108,8 @@ class SubscribedSource(Closing):
 
     def close(self) -> None:
         """Stop listening; iterations end."""
+        for announcement in self._announcements:
+            announcement.close()
         self._subscriber.close()
         with self._changed:
             self._closed = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import msgspec
@@ -115,6 +115,11 @@ class NativeWire:
 
     def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> NativeVoice:
         return NativeVoice(robot, writer)
+
+    def reader_tokens(
+        self, robot: str, streams: Sequence[Stream], program: str, zid: str, number: Callable[[], int]
+    ) -> tuple[str, ...]:
+        return ()  # writers are announced, readers are not
 
     def expression(self, robot: str, stream: Stream) -> str:
         return stream_expression(robot, stream)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from zstate.wire.keys import Stream
@@ -92,6 +92,15 @@ class Wire(Protocol):
 
     def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> Voice:
         """How ``writer`` says the streams of ``robot``. InvalidInput for names that cannot be in a key."""
+        ...
+
+    def reader_tokens(
+        self, robot: str, streams: Sequence[Stream], program: str, zid: str, number: Callable[[], int]
+    ) -> tuple[str, ...]:
+        """The liveliness tokens by which ``program`` is known to read ``streams``, where the wire has that.
+
+        ``number()`` gives each thing of a session another number.
+        """
         ...
 
     def expression(self, robot: str, stream: Stream) -> str:

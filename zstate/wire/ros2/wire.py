@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
+from typing import Literal
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import ANY, Stream
@@ -27,7 +28,7 @@ from zstate.wire.ros2.hearing import RosHearing
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.outlet import Address, RosOutlet
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.topics import DdsKeys, RmwKeys, TopicKeys, robot_of_topic, type_of
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_of_topic, type_of
 from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Announced, Writer
 
@@ -37,19 +38,18 @@ STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_descrip
 class RosVoice:
     """One ROS node: a writer of one robot."""
 
-    def __init__(self, wire: Ros2Wire, robot: str, writer: Writer, place: Place, layout: Layout) -> None:
+    def __init__(self, wire: Ros2Wire, robot: str, node: NodeToken, layout: Layout) -> None:
         self._wire = wire
         self._robot = robot
         self._layout = layout
         self._names = FrameNames(wire.options, robot)
-        namespace = f"/{wire.options.namespace_of(robot)}"
-        name = wire.options.node or re.sub(r"\W|^(?=\d|$)", "_", writer.program, flags=re.ASCII)
-        self._node = NodeToken(wire.options.domain, place.zid, place.number, "/", namespace, name)
-        self.token = wire.node_token(self._node)
+        self._node = node
+        self.token = wire.node_token(node)
 
     def outlet(self, stream: Stream, number: int, name: str = "") -> RosOutlet:
-        address = self._wire.address(self._node, self._robot, stream, number)
-        return RosOutlet(stream, address, self._names, self._layout)
+        key = self._wire.key(self._robot, stream)
+        token = self._wire.endpoint_token(self._node, self._robot, stream, "MP", number)
+        return RosOutlet(stream, Address(key, token, self._wire.gid_of(token)), self._names, self._layout)
 
 
 class Ros2Wire:
@@ -72,31 +72,54 @@ class Ros2Wire:
         return RmwKeys(options)
 
     def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> RosVoice:
-        return RosVoice(self, robot, writer, place, layout)
+        return RosVoice(self, robot, self._node(robot, writer.program, place), layout)
+
+    def _node(self, robot: str, program: str, place: Place) -> NodeToken:
+        namespace = f"/{self.options.namespace_of(robot)}"
+        name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", program, flags=re.ASCII)
+        return NodeToken(self.options.domain, place.zid, place.number, "/", namespace, name)
+
+    def reader_tokens(
+        self, robot: str, streams: Sequence[Stream], program: str, zid: str, number: Callable[[], int]
+    ) -> tuple[str, ...]:
+        if robot == ANY:
+            if self.options.namespace == ANY:
+                return ()  # a subscription in the graph is to one topic, and these are any number
+            robot = SHARED
+        node = self._node(robot, program, Place(zid, number()))
+        endpoints = [self.endpoint_token(node, robot, stream, "MS", number()) for stream in streams]
+        return tuple(token for token in (self.node_token(node), *endpoints) if token is not None)
+
+    def key(self, robot: str, stream: Stream) -> str:
+        """The key to put ``stream`` of ``robot`` on."""
+        return self._keys.key(robot, stream)
 
     def node_token(self, node: NodeToken) -> str | None:
         """The token of a node of ours."""
         return node.key
 
-    def address(self, node: NodeToken, robot: str, stream: Stream, number: int) -> Address:
-        """Where ``node`` puts ``stream`` of ``robot``, as its endpoint ``number``."""
-        key = self._keys.key(robot, stream)
-        written = key.rpartition("/")[2]
-        token = EndpointToken(
+    def endpoint_token(
+        self, node: NodeToken, robot: str, stream: Stream, kind: Literal["MP", "MS"], number: int
+    ) -> str:
+        """The token by which ``node`` is known to publish ("MP") or read ("MS") ``stream`` of ``robot``."""
+        return EndpointToken(
             domain=node.domain,
             zid=node.zid,
             nid=node.nid,
             eid=number,
-            kind="MP",
+            kind=kind,
             enclave=node.enclave,
             namespace=node.namespace,
             node=node.name,
             topic=self._keys.topic(robot, stream),
             dds_type=type_of(stream).dds,
-            hash=written,
+            hash=self.key(robot, stream).rpartition("/")[2],
             qos=STREAM_QOS[stream],
         ).key
-        return Address(key, token, gid(token))
+
+    def gid_of(self, token: str) -> bytes | None:
+        """By what readers know the writer whose token this is."""
+        return gid(token)
 
     def expression(self, robot: str, stream: Stream) -> str:
         return self._keys.expression(robot, stream)
@@ -132,16 +155,17 @@ class Ros2Wire:
         return self._announced(parsed.topic, parsed.dds_type, robot, writer)
 
     def _announced(self, topic: str, dds_type: str, robot: str, writer: Writer) -> Announced | None:
+        named = robot_of_topic(topic) if robot == ANY else robot
         for stream in STREAMS:
-            if dds_type == type_of(stream).dds and self._speaks_of(topic, robot, stream):
-                return Announced(robot_of_topic(topic) if robot == ANY else robot, stream, writer)
+            if dds_type == type_of(stream).dds and self._speaks_of(topic, named, stream):
+                return Announced(named, stream, writer)
         return None
 
     def _speaks_of(self, topic: str, robot: str, stream: Stream) -> bool:
-        if robot != ANY or self.options.namespace != ANY:
-            return topic == self._keys.topic("any" if robot == ANY else robot, stream)
-        *namespace, name = topic.strip("/").split("/")
-        return name == stream and len(namespace) <= 1
+        try:
+            return topic == self._keys.topic(robot, stream)
+        except InvalidInput:
+            return False  # a namespace that ROS does not have
 
 
 class Ros2DdsWire(Ros2Wire):
@@ -162,10 +186,14 @@ class Ros2DdsWire(Ros2Wire):
     def node_token(self, node: NodeToken) -> None:
         """The bridges tell no nodes."""
 
-    def address(self, node: NodeToken, robot: str, stream: Stream, number: int) -> Address:
-        key, kind = self._keys.key(robot, stream), type_of(stream)
-        token = DdsToken(node.zid, "MP", key, kind.name, STREAM_QOS[stream], kind.hash)
-        return Address(key, token.key, None)
+    def endpoint_token(
+        self, node: NodeToken, robot: str, stream: Stream, kind: Literal["MP", "MS"], number: int
+    ) -> str:
+        ros = type_of(stream)
+        return DdsToken(node.zid, kind, self.key(robot, stream), ros.name, STREAM_QOS[stream], ros.hash).key
+
+    def gid_of(self, token: str) -> None:
+        """Nothing goes beside their messages."""
 
     def _origin(self, arrival: Arrival) -> tuple[int, int]:
         self._heard[arrival.key] += 1
