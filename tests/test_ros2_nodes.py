@@ -23,14 +23,12 @@ from wire.ros2.raw_nodes import (
     tokens,
 )
 
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.publisher import StatePublisher
-from zstate.sources import SubscribedSource
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 
@@ -299,27 +297,3 @@ def test_the_node_may_be_named(sessions):
     with StatePublisher(sessions[0], RRBOT, wires=("ros2:node=state_publisher",)):
         until(lambda: len(tokens(sessions[1])) == 5)
         assert {one.split("/")[8] for one in tokens(sessions[1])} == {"state_publisher"}
-
-
-def test_a_listener_stands_in_the_graph_as_a_node_with_its_subscriptions(sessions):
-    writer, reader = sessions
-    with TransformListener(reader, "panda", wire="ros2:namespace=r1", follow="joint_states"):
-        until(lambda: len(tokens(writer)) == 4)
-        chunks = sorted(one.split("/") for one in tokens(writer))
-    node, *subscriptions = chunks
-    assert node[5:] == ["NN", "%", "%r1", "arm_driver"]
-    assert {(one[5], one[9]) for one in subscriptions} == {
-        ("MS", "%r1%robot_description"),
-        ("MS", "%tf_static"),
-        ("MS", "%r1%joint_states"),
-    }
-    assert {one[3] for one in subscriptions} == {node[3]}
-    assert len({one[4] for one in chunks}) == 4
-    until(lambda: not tokens(writer))
-
-
-def test_a_listener_to_the_native_wire_leaves_the_graph_alone(sessions):
-    writer, reader = sessions
-    with TransformListener(reader, "panda"), SubscribedSource(reader, PANDA, "panda", wire="ros2"):
-        until(lambda: len(tokens(writer)) == 2)
-        assert {one.split("/")[5] for one in tokens(writer)} == {"NN", "MS"}
