@@ -46,6 +46,9 @@ class RecordedSource(Closing):
         except BaseException:
             self.close()
             raise
+        first, last = transcript.span or (0, 0)
+        self.duration_s = (last - first) / 1e9
+        """How long the recording is [s]: by then everything is due."""
         self._said = transcript.said((self.robot,), ("joint_states",))
         self._moved: _Moved | None = None
         self._next = self._advance(None)
