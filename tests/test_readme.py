@@ -48,7 +48,7 @@ def start() -> Iterator[Callable[[list[str]], subprocess.Popen[str]]]:
 
 
 def test_every_python_block_is_a_named_program_that_is_run_below() -> None:
-    assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py"}
+    assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py", "recording.py"}
 
 
 def test_the_publisher_and_the_lookup_find_each_other_in_two_processes(
@@ -113,6 +113,46 @@ def test_the_commands_for_routers_work_with_this_host_in_place_of_another(
     output, errors = once.communicate(timeout=DEADLINE_S)
     assert once.returncode == 0, errors
     assert "At time " in output
+
+
+@pytest.mark.robots
+def test_the_commands_for_ros_work_at_any_router(
+    start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
+) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router, publish, tf = commands()[6:9]
+    running = start([*router, "--listen", endpoint])
+    assert running.stdout
+    assert str(free_port) in running.stdout.readline()
+    start([*publish, "--connect", endpoint])
+    once = start([*tf, "--once", "--connect", endpoint])
+    output, errors = once.communicate(timeout=DEADLINE_S)
+    assert once.returncode == 0, errors
+    assert "At time " in output
+
+
+@pytest.mark.robots
+def test_a_recording_is_made_described_asked_and_played_again(
+    start: Callable[[list[str]], subprocess.Popen[str]],
+    spawn: Callable[..., Child],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    record, info, replay = commands()[9:12]
+    robot = start(["zstate", "publish", "panda", "--source", "sine"])
+    recorder = start(record)
+    assert recorder.wait(DEADLINE_S) == 0, recorder.communicate()[1]
+    robot.send_signal(signal.SIGINT)
+    robot.wait(DEADLINE_S)
+    described = start(info)
+    assert "panda" in described.communicate(timeout=DEADLINE_S)[0]
+    asked = spawn(PROGRAMS["recording.py"])
+    assert asked.line().startswith("<pose of panda_hand in panda_link0 at ")
+    assert asked.line() == "(1000, 7)"
+    assert asked.wait() == 0, asked.stderr
+    replayed = start(replay)
+    assert replayed.wait(DEADLINE_S) == 0, replayed.communicate()[1]
 
 
 def test_every_command_of_the_table_exists() -> None:

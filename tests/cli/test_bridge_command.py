@@ -7,7 +7,7 @@ from zstate import TransformListener, connect, load_model
 from zstate.model.kinematics import Kinematics
 
 pytestmark = pytest.mark.processes
-EACH = "ros2:namespace=*,frame_prefix=*/"
+EACH = "ros2:namespace=*"
 
 
 @pytest.fixture

@@ -54,8 +54,10 @@ def test_a_changed_urdf_replaces_the_robot(sessions):
             # Between the old model and the new one the frames have no parents.
             buffer = listener.buffer
             until(
-                lambda: buffer.can_lookup("lower", "tool")
-                and buffer.lookup("lower", "tool").translation[2] == 0.9
+                lambda: (
+                    buffer.can_lookup("lower", "tool")
+                    and buffer.lookup("lower", "tool").translation[2] == 0.9
+                )
             )
             publisher.publish([0.5, 0.25], stamp=STAMP + 1)
             until(lambda: listener.buffer.can_lookup("world", "tool", STAMP + 1))

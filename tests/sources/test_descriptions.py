@@ -17,7 +17,7 @@ from zstate.wire.native import ENCODINGS, encode
 KEY = "zstate/r1/robot_description"
 ENCODING = ENCODINGS[RobotDescription]
 GRIPPER = load_model("gripper")
-EACH = "ros2:namespace=*,frame_prefix=*/"
+EACH = "ros2:namespace=*"
 
 
 class Heard(list):

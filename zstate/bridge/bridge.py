@@ -25,8 +25,7 @@ _LOG = logging.getLogger("zstate")
 _TELLING: tuple[Stream, ...] = ("joint_states", "robot_description")
 
 _ADVICE = (
-    "name one, as `zstate bridge panda` does, or give each its own namespace and prefix with the wire "
-    "'ros2:namespace=*,frame_prefix=*/'"
+    "name one, as `zstate bridge panda` does, or give each its own namespace with the wire 'ros2:namespace=*'"
 )
 
 
@@ -35,7 +34,7 @@ class Bridge(Closing):
 
     Its moving transforms are derived again over there; those of ROS's /tf that belong to no model are
     not carried. ``robots`` names the robots; None is all, which needs a namespace for each: the
-    ``ros_wire`` "ros2:namespace=*,frame_prefix=*/". What a bridge has written, this one or another, is
+    ``ros_wire`` "ros2:namespace=*". What a bridge has written, this one or another, is
     never carried back, and a robot that others write on both sides is not carried, which is logged.
 
     ``on_change(robot, way)`` is called when a robot begins to be carried, or to have another model, and
@@ -150,5 +149,5 @@ def _check(ros_wire: str, robots: Sequence[str] | None) -> None:
             f"the namespace '/{options.namespace}' of ROS has room for one robot, "
             f"not for {' and '.join(map(repr, names)) or 'all'}; {_ADVICE}"
         )
-    if ANY not in options.frame_prefix and options.tf == "global":
+    if ANY not in (options.frame_prefix or ANY) and options.tf == "global":
         raise InvalidInput(f"the frames of several robots would be mixed up in /tf of ROS; {_ADVICE}")

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -26,9 +25,6 @@ if TYPE_CHECKING:
     from zstate.wire.ros2.wire import Ros2Wire
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description", "clock")
-
-_ROUND_S = 0.1
-_WITHIN_S = 1.0
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -70,7 +66,9 @@ class RosGraph:
 
 def heard_graph(session: Session, wire: Ros2Wire) -> RosGraph:
     """The graph as ``session`` hears it, in all namespaces. It may take a second where there is none."""
-    tokens = _settled_tokens(session, wire.writers_expression("*"))
+    from zstate.net.presence import living_tokens
+
+    tokens = living_tokens(session, wire.writers_expression("*"))
     parse = parse_dds_token if wire.name == "ros2dds" else parse_token
     parsed = [one for one in map(parse, sorted(tokens)) if one is not None]
     nodes = [token for token in parsed if isinstance(token, NodeToken)]
@@ -82,20 +80,6 @@ def node_name(node: NodeToken | EndpointToken) -> str:
     """The name of a node with its namespace."""
     name = node.name if isinstance(node, NodeToken) else node.node
     return f"{node.namespace.rstrip('/')}/{name}"
-
-
-def _settled_tokens(session: Session, expression: str) -> set[str]:
-    """The tokens there are. Asked until two answers are the same: links are still being made."""
-    deadline = time.monotonic() + _WITHIN_S
-    found: set[str] = set()
-    while time.monotonic() < deadline:
-        replies = session.zenoh.liveliness().get(expression, timeout=_WITHIN_S)
-        answer = {str(sample.key_expr) for sample in (reply.ok for reply in replies) if sample is not None}
-        if answer and answer == found:
-            break
-        found = answer
-        time.sleep(_ROUND_S)
-    return found
 
 
 def _topics(tokens: list[EndpointToken | DdsToken]) -> Iterator[Topic]:

@@ -71,25 +71,31 @@ def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") 
     A session that has just connected has not met everybody yet: asks until two answers in a row, a
     tenth of a second apart, name the same writers; for nobody at all it waits ``timeout_s`` [s].
     """
+    spoken = wire_named(wire)
+    tokens = living_tokens(session, spoken.writers_expression(ANY), timeout_s)
+    announced = (spoken.announced(token, ANY) for token in tokens)
+    return by_robot({one for one in announced if one is not None})
+
+
+def living_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> frozenset[str]:
+    """The liveliness tokens there are, asked for as ``discover`` does."""
     if not timeout_s > 0.0:
         raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
-    spoken = wire_named(wire)
     deadline = time.monotonic() + timeout_s
-    found: set[Announced] = set()
+    found: frozenset[str] = frozenset()
     while (remaining_s := deadline - time.monotonic()) > 0.0:
-        answer = _ask(session, spoken, remaining_s)
+        answer = _ask(session, expression, remaining_s)
         if answer and answer == found:
             break
         found = answer
         time.sleep(min(ROUND_S, max(0.0, deadline - time.monotonic())))
-    return by_robot(found)
+    return found
 
 
-def _ask(session: Session, wire: Wire, timeout_s: float) -> set[Announced]:
-    replies = session.zenoh.liveliness().get(wire.writers_expression(ANY), timeout=timeout_s)
+def _ask(session: Session, expression: str, timeout_s: float) -> frozenset[str]:
+    replies = session.zenoh.liveliness().get(expression, timeout=timeout_s)
     samples = (reply.ok for reply in replies)
-    tokens = (wire.announced(str(sample.key_expr), ANY) for sample in samples if sample is not None)
-    return {token for token in tokens if token is not None}
+    return frozenset(str(sample.key_expr) for sample in samples if sample is not None)
 
 
 def by_robot(found: Iterable[Announced]) -> tuple[RobotInfo, ...]:

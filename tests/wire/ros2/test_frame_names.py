@@ -51,6 +51,24 @@ def test_the_robot_of_the_root_namespace_keeps_its_own_frames_apart_from_nobodys
     assert shared.to_zstate("map") == "ros/map"
 
 
+@pytest.mark.parametrize("namespace", ["r1", "*"])
+def test_the_shared_tf_of_robots_in_namespaces_keeps_their_prefixes(namespace: str):
+    shared = FrameNames(Ros2Options(namespace=namespace, frame_prefix="r1/"), "ros")
+    assert shared.to_zstate("r1/world") == "r1/world"
+    assert shared.to_zstate("world") == "world"
+
+
+def test_robots_with_namespaces_of_their_own_have_prefixes_of_their_own():
+    each = FrameNames(Ros2Options(namespace="*"), "r1")
+    assert (each.to_ros("hand"), each.to_zstate("r1/hand"), each.to_zstate("map")) == (
+        "r1/hand",
+        "hand",
+        "ros/map",
+    )
+    apart = FrameNames(Ros2Options(namespace="*", tf="namespace"), "r1")
+    assert (apart.to_ros("hand"), apart.to_zstate("hand")) == ("hand", "hand")
+
+
 def test_a_name_that_is_only_the_prefix_names_no_frame_of_the_robot():
     assert names("left_").to_zstate("left_") == "ros/left_"
     assert names("r1/").to_zstate("r1/") == "r1/"

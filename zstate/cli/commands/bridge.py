@@ -28,7 +28,7 @@ _ROS_ROUTER = "tcp/127.0.0.1:7447"
     default="ros2",
     show_default=True,
     metavar="SPEC",
-    help="What ROS speaks, with options: ros2:domain=5, or ros2:namespace=*,frame_prefix=*/ for many robots.",
+    help="What ROS speaks, with options: ros2:domain=5, or ros2:namespace=* for many robots.",
 )
 @click.option(
     "--ros",

@@ -34,7 +34,8 @@ class FrameNames:
 
     def __init__(self, options: Ros2Options, robot: str) -> None:
         self._robot = robot
-        self._prefix = options.prefix_of(robot)
+        # Beside robots in a namespace, SHARED stands for the tf that all of them speak on.
+        self._prefix = "" if robot == SHARED and options.namespace else options.prefix_of(robot)
         self._edges_to_ros = lru_cache(_REMEMBERED)(partial(_renamed, self.to_ros))
         self._edges_to_zstate = lru_cache(_REMEMBERED)(partial(_renamed, self.to_zstate))
 

@@ -24,7 +24,8 @@ class Ros2Options:
 
     ``domain`` is the ROS_DOMAIN_ID. ``namespace`` is kept without outer slashes: "" is the root,
     "*" puts every robot into a namespace of its own name. ``frame_prefix`` stands before a robot's
-    own frames, as robot_state_publisher's parameter of that name; a "*" in it is the robot's name.
+    own frames, as robot_state_publisher's parameter of that name; a "*" in it is the robot's name,
+    and "*/" is what is taken where all robots have namespaces and share /tf.
     ``tf`` says whether /tf and /tf_static are "global", as tf2 has them, or in the "namespace".
     ``hash`` is "iron" for ROS 2 from Iron on, or "humble", where types have none: it decides what is
     written, readers hear both. ``node`` is the name under which a writer stands in the ROS graph; that of
@@ -80,8 +81,13 @@ class Ros2Options:
         return self.namespace
 
     def prefix_of(self, robot: str) -> str:
-        """What stands before the frames of ``robot`` on ROS's side; may be empty."""
-        return self.frame_prefix.replace(ANY, check_robot(robot))
+        """What stands before the frames of ``robot`` on ROS's side; may be empty.
+
+        Robots in namespaces of their own that share /tf are told apart there: unless given, by their names.
+        """
+        shares_tf = self.namespace == ANY and self.tf == "global"
+        prefix = self.frame_prefix or (f"{ANY}/" if shares_tf else "")
+        return prefix.replace(ANY, check_robot(robot))
 
 
 def _check_key(key: str) -> str:
