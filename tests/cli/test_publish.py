@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import math
+import time
+from pathlib import Path
 
 import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import until
+from tales import MS, START, Tale, swing
 
 from zstate import StatePublisher, TransformListener, connect, discover, load_model
 
@@ -100,3 +103,25 @@ def test_an_unknown_wire_is_told_with_those_there_are():
     message = failure("publish", RRBOT, "--source", "sine", "--wire", "carrier-pigeon", code=2)
     assert "'carrier-pigeon'" in message
     assert "'native'" in message
+
+
+def test_a_recording_is_published_as_if_it_were_now(spawn: Spawn, tmp_path: Path):
+    with Tale(tmp_path / "run.mcap", "arm") as tale:
+        tale.describe("arm")
+        for n in range(100):
+            tale.joints("arm", START + n * 10 * MS, swing(n))
+    with connect() as session, TransformListener(session, "rrbot") as listener:
+        before = time.time_ns()
+        child = started(spawn, "publish", RRBOT, "--source", str(tmp_path / "run.mcap"), "--rate", "200")
+        child.line()
+        newest = listener.buffer.wait("world", "tool", timeout_s=10.0).stamp
+        assert newest is not None
+        assert before < newest < time.time_ns()
+        assert child.line().startswith("100 samples; ")
+        assert child.wait() == 0
+
+
+def test_a_source_that_is_no_recording_is_wrong_usage():
+    assert "neither 'joints' nor 'sine' nor a recording" in failure(
+        "publish", RRBOT, "--source", "nope.mcap", code=2
+    )

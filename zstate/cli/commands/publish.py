@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -26,26 +27,34 @@ if TYPE_CHECKING:
     from zstate.publisher import StatePublisher
     from zstate.wire.keys import Stream
 
-_SINE_RATE_HZ = 100.0
+_RATE_HZ = 100.0
 _DERIVED: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
 _EVERYTHING: tuple[Stream, ...] = ("joint_states", *_DERIVED)
+
+
+def _source(_: click.Context, __: click.Parameter, source: str) -> str:
+    if source not in ("joints", "sine") and not Path(source).exists():
+        raise click.BadParameter(f"{source!r} is neither 'joints' nor 'sine' nor a recording that exists")
+    return source
 
 
 @click.command("publish")
 @click.argument("robot")
 @click.option(
     "--source",
-    type=click.Choice(["joints", "sine"]),
+    callback=_source,
     default="joints",
     show_default=True,
-    help="joints: what somebody else writes on joint_states; sine: every joint swings.",
+    metavar="joints|sine|FILE",
+    help="joints: what somebody else writes on joint_states; sine: every joint swings; FILE: the motion of a "
+    "recording, once, as if it were now.",
 )
 @click.option(
     "--rate",
     type=float,
     callback=checked_rate,
     metavar="HZ",
-    help="Samples a second, exactly; default: every sample that comes in, and 100 for a sine.",
+    help="Samples a second, exactly; default: every sample that comes in, and 100 for another source.",
 )
 @wires_option
 @seconds_option
@@ -74,6 +83,7 @@ def publish_command(
     \b
     zstate publish panda --source sine
     zstate publish arm.urdf --rate 250
+    zstate publish panda --source run.mcap
     zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
@@ -94,8 +104,10 @@ def publish_command(
         _mention_router(network, wires)
         if followed:
             _follow(session, followed[0], derived, whole, rate, seconds)
+        elif source == "sine":
+            run(whole, SineSource(model), rate or _RATE_HZ, seconds)
         else:
-            run(whole, SineSource(model), rate or _SINE_RATE_HZ, seconds)
+            _publish_recording(whole, source, rate or _RATE_HZ, seconds)
 
 
 def _introduce(publisher: StatePublisher, places: list[str]) -> None:
@@ -137,6 +149,15 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
         if not source.count:
             who = words.explained("`zstate ls` shows who writes what")
             fail(f"heard nothing on {place} in {seconds:g} s; {who}")
+
+
+def _publish_recording(publisher: StatePublisher, path: str, rate_hz: float, seconds: float | None) -> None:
+    from zstate.cli.publishing import run
+    from zstate.sources.recorded import RecordedSource
+
+    with RecordedSource(path, None, publisher.model) as source:
+        # One tick more than the recording is long, for its last sample.
+        run(publisher, source, rate_hz, seconds or source.duration_s + 1.0 / rate_hz)
 
 
 def _publish_every_sample(publisher: StatePublisher, source: HeardSource, seconds: float | None) -> None:
