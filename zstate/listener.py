@@ -62,6 +62,7 @@ class TransformListener(Closing):
         self._followers: dict[tuple[str, int], Follower] = {}
         self._statics: dict[tuple[str, int], StaticFollower] = {}
         self._departed: set[int] = set()
+        self._overflowed: set[Follower] = set()
         # A model makes room for its links before it is added: no static edge may come between.
         self._rebuilding = threading.Lock()
         with ExitStack() as opening:
@@ -112,13 +113,17 @@ class TransformListener(Closing):
         return follower
 
     def _on_samples(self, arrivals: list[Arrival]) -> None:
-        overflowed = len(arrivals) >= CAPACITY
+        if len(arrivals) >= CAPACITY:
+            self._overflowed = set(
+                list(self._followers.values())
+            )  # it may be anybody's samples that the ring lost
         for arrival in arrivals:
             robot = self._robot_of(arrival.key)
             for sample in self._decode(self._follow, arrival, robot):
                 if isinstance(sample, Sample):
-                    self._follower(robot, sample.session).take(sample, overflowed=overflowed)
-                    overflowed = False
+                    follower = self._follower(robot, sample.session)
+                    follower.take(sample, overflowed=follower in self._overflowed)
+                    self._overflowed.discard(follower)
 
     def _on_description(self, arrival: Arrival) -> None:
         if self._is_withdrawn(arrival):

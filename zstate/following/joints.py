@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frames import FrameInfo
 from zstate.buffer.tracks import JointTrack
@@ -15,6 +17,12 @@ from zstate.model.urdf import parse_urdf
 from zstate.transform import Transform
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
+
+
+@lru_cache(maxsize=16)
+def _parsed(urdf: str) -> RobotModel:
+    """The robots of a fleet are described alike, again and again: a model is the same for all of them."""
+    return parse_urdf(urdf, "its URDF")
 
 
 class JointFollower(Follower):
@@ -33,7 +41,7 @@ class JointFollower(Follower):
         with self._lock:
             try:
                 # Text and nothing else: what comes over the network opens no files and runs no xacro.
-                self._replace_model(parse_urdf(description.urdf, "its URDF"))
+                self._replace_model(_parsed(description.urdf))
             except (ModelError, InsertRefused) as error:
                 self._tally.refuse("robot description", f"{self.robot!r}: {error}")
                 return

@@ -98,6 +98,8 @@ class StaticFollower:
         return known is not None and known.kind == "static" and are_same(known, transform)
 
     def _withdraw(self, children: list[str]) -> None:
+        if not children:
+            return  # the usual case; looking at all frames of a fleet takes milliseconds
         for child in children:
             del self._edges[child]
         for child in self._still_ours().intersection(children):
