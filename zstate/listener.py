@@ -114,9 +114,8 @@ class TransformListener(Closing):
 
     def _on_samples(self, arrivals: list[Arrival]) -> None:
         if len(arrivals) >= CAPACITY:
-            self._overflowed = set(
-                list(self._followers.values())
-            )  # it may be anybody's samples that the ring lost
+            # A ring that is full has lost samples, of whoever sent any.
+            self._overflowed = set(self._followers.values())
         for arrival in arrivals:
             robot = self._robot_of(arrival.key)
             for sample in self._decode(self._follow, arrival, robot):
