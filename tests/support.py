@@ -31,6 +31,8 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
 class Stepping:
     """A clock that goes at once to where it is waited for, plus the lateness of that wait."""
 
+    domain = "system"
+
     def __init__(self, start: int = 5, lateness: dict[int, int] | None = None) -> None:
         self.stamp = start
         self.waits: list[int] = []

@@ -1,4 +1,4 @@
-"""Where "now" comes from: the system, or the hand of a test.
+"""Where "now" comes from: the system, a simulation, or the hand of a test.
 
 Nothing in ``model``, ``buffer`` or ``wire`` reads a clock by itself; it is handed one of these.
 """
@@ -18,21 +18,41 @@ _STAMP_RANGE = 2**63
 # A signal that arrives just as a lock is being waited for is not seen before that wait ends.
 LONGEST_WAIT_S = 0.5
 
+SYSTEM = "system"
+"""The domain of real time, which all machines share as far as their clocks agree."""
+
+SIMULATED = "sim"
+"""The domain of the time that a simulation or a replay tells."""
+
 
 class Clock(Protocol):
-    """Two questions about time. Stamps are integer nanoseconds since the Unix epoch."""
+    """Two questions about time. Stamps are integer nanoseconds since the Unix epoch.
+
+    Stamps of one ``domain`` may be compared, those of two say nothing of each other: it is "system", or
+    the name of a simulated time.
+    """
+
+    @property
+    def domain(self) -> str:
+        """Whose time it tells."""
+        ...
 
     def now(self) -> int:
         """The present stamp [ns]."""
         ...
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
-        """Block until ``stamp``, or until ``stop`` is set. True when the stamp was reached."""
+        """Block until ``stamp``, or until ``stop`` is set. True when the stamp was reached.
+
+        A clock that is set back may end the wait, with True, before that: ask it for the time.
+        """
         ...
 
 
 class SystemClock:
     """The wall clock of this machine."""
+
+    domain = SYSTEM
 
     def now(self) -> int:
         return time.time_ns()
@@ -45,7 +65,8 @@ class SystemClock:
 class ManualClock:
     """A clock that moves only when told to, for tests and for replay by hand."""
 
-    def __init__(self, start: int = 0) -> None:
+    def __init__(self, start: int = 0, domain: str = SYSTEM) -> None:
+        self.domain = domain
         self._now = start
         self._moved = threading.Condition()
 

@@ -9,9 +9,12 @@ ZStateError
 │   └── UnknownModel                   no model of that name                      .name .near_misses
 ├── LibraryMissing (ImportError)       something to install first
 ├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
+├── ClockMismatch                      two times that cannot be compared          .domains
+├── SecondWriter                       somebody else writes the same already      .first .robot .stream .edge
 ├── RecordingError                     a file that cannot be read or written      .path
 ├── NetworkError                       Zenoh said no
 │   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
+│   ├── NoClock (TimeoutError)         nobody tells the simulated time            .waited_s
 │   ├── PortBusy                       somebody listens there already             .endpoint
 │   └── Closed                         used after close(), or after fork
 └── LookupFailed                       .target .source .edge .requested .oldest .newest .track .rate_hz ...
@@ -28,6 +31,7 @@ A wait that ran out raises the reason it was still waiting for, as a subclass th
 """
 
 from zstate.errors.base import (
+    ClockMismatch,
     Closed,
     ConfigError,
     Found,
@@ -38,10 +42,13 @@ from zstate.errors.base import (
     MessageError,
     ModelError,
     NetworkError,
+    NoClock,
     PortBusy,
     RecordingError,
+    SecondWriter,
     UnknownModel,
     Unreachable,
+    Who,
     ZStateError,
 )
 from zstate.errors.lookup import (
@@ -60,6 +67,7 @@ from zstate.errors.lookup import (
 
 __all__ = [
     "AmbiguousFrame",
+    "ClockMismatch",
     "Closed",
     "ConfigError",
     "Disconnected",
@@ -74,14 +82,17 @@ __all__ = [
     "MessageError",
     "ModelError",
     "NetworkError",
+    "NoClock",
     "NoData",
     "PortBusy",
     "RecordingError",
+    "SecondWriter",
     "Stale",
     "UnknownFrame",
     "UnknownModel",
     "Unreachable",
     "WaitTimeout",
+    "Who",
     "ZStateError",
     "duration_text",
     "timed_out",

@@ -128,8 +128,46 @@ class PortBusy(NetworkError):
         self.endpoint = endpoint
 
 
+class NoClock(NetworkError, TimeoutError):
+    """Nobody tells the simulated time; ``waited_s`` says how long it was waited for."""
+
+    def __init__(self, message: str, *, waited_s: float) -> None:
+        super().__init__(message)
+        self.waited_s = waited_s
+
+
 class Closed(NetworkError):
     """Used after ``close()``, or in a process forked from the one that opened it."""
+
+
+class Who(Protocol):
+    """What a SecondWriter tells of the first (see ``zstate.wire.writer.Writer``)."""
+
+    @property
+    def program(self) -> str: ...
+    @property
+    def host(self) -> str: ...
+    @property
+    def pid(self) -> int: ...
+    @property
+    def since(self) -> int: ...
+
+
+class SecondWriter(ZStateError):
+    """Somebody else writes the same already, and came first.
+
+    ``first`` is who, ``robot`` and ``stream`` are what; ``edge`` is the (parent, child) that both place,
+    or None where it is the whole stream.
+    """
+
+    def __init__(
+        self, message: str, *, robot: str, stream: str, first: Who, edge: tuple[str, str] | None = None
+    ) -> None:
+        super().__init__(message)
+        self.robot = robot
+        self.stream = stream
+        self.first = first
+        self.edge = edge
 
 
 class RecordingError(ZStateError):
@@ -138,3 +176,11 @@ class RecordingError(ZStateError):
     def __init__(self, message: str, *, path: str) -> None:
         super().__init__(message)
         self.path = path
+
+
+class ClockMismatch(ZStateError):
+    """Stamps of two clocks that say nothing of each other were to be compared; ``domains`` names both."""
+
+    def __init__(self, message: str, *, domains: tuple[str, str]) -> None:
+        super().__init__(message)
+        self.domains = domains
