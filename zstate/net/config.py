@@ -23,7 +23,7 @@ CONFIG_VARIABLE = "ZENOH_CONFIG"
 ANY_LOOPBACK_PORT = "tcp/127.0.0.1:0"
 ROUTER_ENDPOINT = "tcp/127.0.0.1:7447"
 
-_SETTINGS: dict[str, object] = {
+SETTINGS: dict[str, object] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": True,
     "scouting/delay": 200,  # how long opening waits for peers where nobody answers yet
@@ -103,7 +103,7 @@ def our_config(
 ) -> zenoh.Config:
     """Our settings. Without ``timeout_s`` connecting is tried for ever and opening never fails."""
     settings = {
-        **_SETTINGS,
+        **SETTINGS,
         "mode": mode,
         "connect/endpoints": list(endpoints),
         "listen/endpoints": list(listen),
