@@ -48,7 +48,7 @@ def data_key(wire: str, robot: str, stream: str) -> str:
     return {"native": f"zstate/{robot}/{stream}", "ros2": key_of(topic), "ros2dds": stream}[wire]
 
 
-@pytest.mark.parametrize("model", [EVERY, load_model("panda")], ids=["every joint", "panda"])
+@pytest.mark.parametrize("model", [EVERY, load_model("rrbot")], ids=["every joint", "rrbot"])
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
 def test_the_answers_are_those_of_the_native_wire_bit_for_bit(sessions, model, follow: str):
     writer, reader = sessions

@@ -23,7 +23,6 @@ from wire.ros2.raw_nodes import (
     tokens,
 )
 
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
@@ -32,9 +31,8 @@ from zstate.publisher import StatePublisher
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 
-PANDA = load_model("panda")
 SEC, NANOSEC = divmod(STAMP, 10**9)
-POSITIONS = np.linspace(-0.5, 0.7, PANDA.position_count)
+POSITIONS = np.linspace(-0.5, 0.7, RRBOT.position_count)
 JOINT_STATE_MSG, TF_MSG, STRING_MSG = (
     "sensor_msgs/msg/JointState",
     "tf2_msgs/msg/TFMessage",
@@ -76,7 +74,7 @@ def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ro
     writer, reader = sessions
     joints, transforms = Ear(reader, key_of(JOINT_STATES)), Ear(reader, key_of(TF))
     rates, forces = POSITIONS * 2, POSITIONS * 3
-    with StatePublisher(writer, PANDA, wires=("ros2",)) as publisher:
+    with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
         await_reader(writer, key_of(JOINT_STATES))
         await_reader(writer, key_of(TF))
         publisher.publish(POSITIONS, rates, forces, stamp=STAMP)
@@ -84,7 +82,7 @@ def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ro
         full, bare = joints.messages(2, JOINT_STATE_MSG)
         (said, _) = transforms.messages(2, TF_MSG)
     assert (full.header.stamp.sec, full.header.stamp.nanosec) == (SEC, NANOSEC)
-    assert tuple(full.name) == PANDA.joint_names
+    assert tuple(full.name) == RRBOT.joint_names
     assert [block.tolist() for block in (full.position, full.velocity, full.effort)] == [
         POSITIONS.tolist(),
         rates.tolist(),
@@ -92,16 +90,16 @@ def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ro
     ]
     assert (bare.header.stamp.nanosec, len(bare.velocity), len(bare.effort)) == (NANOSEC + 1, 0, 0)
     assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in said.transforms} == {(SEC, NANOSEC)}
-    assert said_poses(said) == moving_poses(PANDA, POSITIONS)
+    assert said_poses(said) == moving_poses(RRBOT, POSITIONS)
 
 
 def test_who_joins_late_is_given_the_description_and_the_fixed_edges(sessions):
     writer, reader = sessions
-    with StatePublisher(writer, PANDA, wires=("ros2",)):
+    with StatePublisher(writer, RRBOT, wires=("ros2",)):
         (text,) = Ear(reader, key_of(DESCRIPTION), latched=True).messages(1, STRING_MSG)
         (statics,) = Ear(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
-    assert text.data == PANDA.urdf
-    fixed = {(j.parent, j.child): list(j.origin) for j in PANDA.joints if j.type == "fixed"}
+    assert text.data == RRBOT.urdf
+    fixed = {(j.parent, j.child): list(j.origin) for j in RRBOT.joints if j.type == "fixed"}
     assert said_poses(statics) == fixed
 
 
@@ -109,7 +107,7 @@ def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(
     writer, reader = sessions
     ears = {topic[0]: Ear(reader, key_of(topic)) for topic in (JOINT_STATES, TF)}
     before = time.time_ns()
-    with StatePublisher(writer, PANDA, wires=("ros2",)) as publisher:
+    with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
         ears |= {topic[0]: Ear(reader, key_of(topic), latched=True) for topic in (TF_STATIC, DESCRIPTION)}
         for topic in (JOINT_STATES, TF):
             await_reader(writer, key_of(topic))
@@ -127,7 +125,7 @@ def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(
 
 def test_the_graph_has_one_node_with_four_publishers_as_ros_would_announce_them(sessions):
     writer, reader = sessions
-    with StatePublisher(writer, PANDA, wires=("ros2",)):
+    with StatePublisher(writer, RRBOT, wires=("ros2",)):
         alive = endpoints(reader, 4)
         nodes = [one.split("/") for one in tokens(reader) if "/NN/" in one]
     (node,) = nodes
@@ -150,11 +148,11 @@ def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
     last = Ear(reader, "last")
     for topic in TOPICS:
         await_reader(writer, key_of(topic))
-    with StatePublisher(writer, PANDA, wires=("ros2",)) as publisher:
+    with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
         publisher.publish(POSITIONS, stamp=STAMP)
         for ear in ears:
             ear.heard(1)
-    with StaticPublisher(writer, "panda", "mount", wire="ros2") as statics:
+    with StaticPublisher(writer, "rrbot", "mount", wire="ros2") as statics:
         statics.set(Transform("tool", "camera", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
         statics.withdraw("camera")
     await_reader(writer, "last")
@@ -168,7 +166,7 @@ def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
 def test_humble_has_no_hashes(sessions):
     writer, reader = sessions
     ear = Ear(reader, key_of(JOINT_STATES, written=HUMBLE))
-    with StatePublisher(writer, PANDA, wires=("ros2:hash=humble",)) as publisher:
+    with StatePublisher(writer, RRBOT, wires=("ros2:hash=humble",)) as publisher:
         await_reader(writer, key_of(JOINT_STATES, written=HUMBLE))
         publisher.publish(POSITIONS, stamp=STAMP)
         alive = endpoints(reader, 4)
@@ -176,14 +174,14 @@ def test_humble_has_no_hashes(sessions):
         ((_, _, gid),) = ear.attachments(1)
         assert gid == gid_of("/".join(alive["%joint_states"]))
         (late,) = Ear(reader, key_of(DESCRIPTION, written=HUMBLE), latched=True).messages(1, STRING_MSG)
-        assert late.data == PANDA.urdf
+        assert late.data == RRBOT.urdf
 
 
 def test_iron_and_humble_are_said_side_by_side(sessions):
     writer, reader = sessions
     keys = [key_of(JOINT_STATES), key_of(JOINT_STATES, written=HUMBLE)]
     ears = [Ear(reader, key) for key in keys]
-    with StatePublisher(writer, PANDA, wires=("ros2", "ros2:hash=humble")) as publisher:
+    with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:hash=humble")) as publisher:
         for key in keys:
             await_reader(writer, key)
         publisher.publish(POSITIONS, stamp=STAMP)
@@ -197,7 +195,7 @@ def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.
     writer, reader = sessions
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     ear = Ear(reader, key_of(JOINT_STATES, domain=7))
-    with StatePublisher(writer, PANDA, wires=("ros2", "ros2:domain=9")) as publisher:
+    with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:domain=9")) as publisher:
         await_reader(writer, key_of(JOINT_STATES, domain=7))
         publisher.publish(POSITIONS, stamp=STAMP)
         ear.heard(1)
@@ -211,14 +209,14 @@ def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.
     [
         ("namespace=fleet/r1", "fleet/r1", ""),
         ("namespace=/r1/,tf=namespace", "r1", "r1"),
-        ("namespace=*", "panda", ""),
+        ("namespace=*", "rrbot", ""),
     ],
 )
 def test_a_namespace_stands_before_the_topics_and_around_the_node(sessions, options, namespace, tf_in):
     writer, reader = sessions
     ears = {topic[0]: Ear(reader, key_of(topic, namespace), latched=topic == DESCRIPTION) for topic in TOPICS}
     shared = [Ear(reader, key_of(topic, tf_in), latched=topic == TF_STATIC) for topic in (TF, TF_STATIC)]
-    with StatePublisher(writer, PANDA, wires=(f"ros2:{options}",)) as publisher:
+    with StatePublisher(writer, RRBOT, wires=(f"ros2:{options}",)) as publisher:
         for key in (key_of(JOINT_STATES, namespace), key_of(TF, tf_in)):
             await_reader(writer, key)
         publisher.publish(POSITIONS, stamp=STAMP)

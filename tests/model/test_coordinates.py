@@ -31,7 +31,7 @@ def test_velocities_stand_under_their_coordinates_but_none_under_the_last_of_a_q
     ]
 
 
-@pytest.mark.parametrize("model", [EVERY, *map(load_model, ("panda", "rrbot", "gripper"))])
+@pytest.mark.parametrize("model", [EVERY, *map(load_model, ("rrbot", "gripper"))])
 def test_there_are_as_many_as_numbers_each_its_own(model):
     names, slots = coordinate_names(model), velocity_slots(model)
     assert len(names) == len(set(names)) == model.position_count
