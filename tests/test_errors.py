@@ -133,6 +133,7 @@ def one_of_each() -> list[errors.ZStateError]:
         errors.UnknownModel("pand", ("panda",), "text"),
         errors.MessageError("text", reason="foreign"),
         errors.Unreachable("text", endpoints=("tcp/127.0.0.1:1",)),
+        errors.AccessDenied("text", reason="wrong CA", endpoint="tls/127.0.0.1:1"),
         errors.PortBusy("text", endpoint="tcp/127.0.0.1:1"),
         errors.RecordingError("text", path="run.mcap"),
         errors.UnknownFrame("a", "b", name="b", near_misses=("bb",)),

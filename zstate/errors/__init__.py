@@ -14,6 +14,7 @@ ZStateError
 ├── RecordingError                     a file that cannot be read or written      .path
 ├── NetworkError                       Zenoh said no
 │   ├── Unreachable (TimeoutError)     nothing answers at the endpoints           .endpoints
+│   ├── AccessDenied                   somebody answers, and lets nobody in       .reason .endpoint
 │   ├── NoClock (TimeoutError)         nobody tells the simulated time            .waited_s
 │   ├── PortBusy                       somebody listens there already             .endpoint
 │   └── Closed                         used after close(), or after fork
@@ -31,6 +32,7 @@ A wait that ran out raises the reason it was still waiting for, as a subclass th
 """
 
 from zstate.errors.base import (
+    AccessDenied,
     ClockMismatch,
     Closed,
     ConfigError,
@@ -66,6 +68,7 @@ from zstate.errors.lookup import (
 )
 
 __all__ = [
+    "AccessDenied",
     "AmbiguousFrame",
     "ClockMismatch",
     "Closed",

@@ -120,6 +120,20 @@ class Unreachable(NetworkError, TimeoutError):
         self.endpoints = tuple(endpoints)
 
 
+class AccessDenied(NetworkError):
+    """Somebody answers at ``endpoint`` and does not let this session in.
+
+    ``reason`` is one of "no TLS there", "TLS demanded", "wrong CA", "name mismatch", "their certificate
+    expired", "their certificate not yet valid", "our certificate expired", "our certificate refused",
+    "certificate demanded", "user or password", "user demanded".
+    """
+
+    def __init__(self, message: str, *, reason: str, endpoint: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.endpoint = endpoint
+
+
 class PortBusy(NetworkError):
     """Somebody listens at that endpoint already."""
 

@@ -1,0 +1,174 @@
+"""The certificate authority behind `zstate certs`: a key that signs, kept as files."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+from zstate.errors import ConfigError, InvalidInput, LibraryMissing
+from zstate.net.security import AUTHORITY, CertificateFiles
+
+try:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import (
+        Encoding,
+        NoEncryption,
+        PrivateFormat,
+        load_pem_private_key,
+    )
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError as error:
+    raise LibraryMissing(
+        f"making certificates needs the cryptography library ({error}): pip install 'zstate[certs]'"
+    ) from None
+
+AUTHORITY_DAYS = 3650
+Validity = tuple[datetime, datetime]
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """Who vouches for identities: whoever trusts ``certificate`` trusts what ``key`` has signed."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+    @classmethod
+    def in_folder(cls, folder: Path) -> Authority:
+        """The one that the folder holds, or a new one. Raises ConfigError if it is there in part."""
+        files = CertificateFiles.of(folder, AUTHORITY)
+        if not files.existing:
+            return cls._made(folder, files)
+        if len(files.existing) == 1:
+            missing = files.key if files.certificate.exists() else files.certificate
+            raise ConfigError(
+                f"{str(missing)!r} is missing beside {str(files.existing[0])!r}; identities are added where "
+                "the authority is whole: work in the folder in which it was made, or begin a new one",
+                path=str(missing),
+            )
+        return cls._read(files)
+
+    @classmethod
+    def _made(cls, folder: Path, files: CertificateFiles) -> Authority:
+        # A name of its own: two authorities of one name look as one with a bad signature.
+        name = f"zstate test authority {os.urandom(4).hex()}"
+        key = _new_key()
+        now = datetime.now(timezone.utc)
+        # From long ago, so that certificates of the past can be made for tests.
+        valid = (now - timedelta(days=AUTHORITY_DAYS), now + timedelta(days=AUTHORITY_DAYS))
+        builder = (
+            _builder(name, key, valid)
+            .issuer_name(_named(name))
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_usage(signs_certificates=True), critical=True)
+        )
+        authority = cls(builder.sign(key, hashes.SHA256()), key)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _write(files, key, authority.certificate)
+        return authority
+
+    @classmethod
+    def _read(cls, files: CertificateFiles) -> Authority:
+        try:
+            certificate = x509.load_pem_x509_certificate(files.certificate.read_bytes())
+            key = load_pem_private_key(files.key.read_bytes(), None)
+        except (OSError, ValueError, TypeError) as error:
+            raise ConfigError(
+                f"the authority in {str(files.key.parent)!r} cannot be read: {error}", path=str(files.key)
+            ) from None
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise ConfigError(
+                f"{str(files.key)!r} is not the key that `zstate certs` made for {str(files.certificate)!r}",
+                path=str(files.key),
+            )
+        return cls(certificate, key)
+
+    def check_outlives(self, last: datetime) -> None:
+        """Raise InvalidInput if a certificate valid until ``last`` were valid longer than this authority."""
+        until = self.certificate.not_valid_after_utc
+        if last > until:
+            raise InvalidInput(
+                f"the authority is valid until {until:%Y-%m-%d}, which is before {last:%Y-%m-%d}; ask for "
+                "fewer days, or begin a new folder"
+            )
+
+    def issue(self, name: str, files: CertificateFiles, hosts: Iterable[str], valid: Validity) -> None:
+        """Write a key and a certificate for ``name``, good for ``hosts``, to listen and to connect."""
+        key = _new_key()
+        issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
+        purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        builder = (
+            _builder(name, key, valid)
+            .issuer_name(self.certificate.subject)
+            .add_extension(issuer, critical=False)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs_certificates=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+            .add_extension(x509.SubjectAlternativeName(_alternatives(hosts)), critical=False)
+        )
+        _write(files, key, builder.sign(self.key, hashes.SHA256()))
+
+
+def _new_key() -> ec.EllipticCurvePrivateKey:
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def _named(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _builder(name: str, key: ec.EllipticCurvePrivateKey, valid: Validity) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(_named(name))
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(valid[0])
+        .not_valid_after(valid[1])
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _alternatives(hosts: Iterable[str]) -> list[x509.GeneralName]:
+    return [_alternative(host) for host in dict.fromkeys(hosts)]
+
+
+def _alternative(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _write(files: CertificateFiles, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    _write_new(files.key, pem, 0o600)
+    _write_new(files.certificate, certificate.public_bytes(Encoding.PEM), 0o644)
+
+
+def _write_new(path: Path, content: bytes, mode: int) -> None:
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
+    except OSError as error:
+        raise ConfigError(f"{str(path)!r} cannot be written: {error.strerror}", path=str(path)) from None

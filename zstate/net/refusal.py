@@ -1,0 +1,174 @@
+"""Why a router let nobody in. Zenoh says of all reasons the same: unable to connect."""
+
+from __future__ import annotations
+
+import re
+import socket
+import ssl
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from zstate.errors import AccessDenied, NetworkError, Unreachable
+from zstate.net.credential_files import trusting
+from zstate.net.security import Credentials
+
+ANSWERS_WITHIN_S = 2.0
+
+_REFUSES_WITHIN_S = 1.0  # the other side judges our certificate after our handshake is over
+_ADDRESS = re.compile(r"(?P<protocol>tcp|tls)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """``reason`` for programs, ``text`` for people: what happened, and what to check."""
+
+    reason: str
+    text: str
+
+
+def why_refused(endpoints: Sequence[str], credentials: Credentials | None) -> NetworkError:
+    """The error for whoever reached none of ``endpoints``: AccessDenied, or Unreachable if nobody is there.
+
+    Knocks at each of them once more, by plain sockets, which takes seconds at most.
+    """
+    refusals = {endpoint: _knock(endpoint, credentials) for endpoint in endpoints}
+    for endpoint, refusal in refusals.items():
+        if refusal is not None:
+            silent = [repr(other) for other, answer in refusals.items() if answer is None]
+            rest = f" (nothing answers at {' or '.join(silent)})" if silent else ""
+            text = f"{endpoint!r} answers and does not let this session in: {refusal.text}{rest}"
+            return AccessDenied(text, reason=refusal.reason, endpoint=endpoint)
+    where = " or ".join(map(repr, endpoints)) or "the configured endpoints"
+    return Unreachable(
+        f"nothing answers at {where}; is the router running? `zstate router`", endpoints=endpoints
+    )
+
+
+def _knock(endpoint: str, credentials: Credentials | None) -> Refusal | None:
+    """What the one behind ``endpoint`` objects to; None where nobody is, or where it cannot be asked."""
+    match = _ADDRESS.match(endpoint)
+    if match is None:
+        return None
+    try:
+        with socket.create_connection((match["host"], int(match["port"])), ANSWERS_WITHIN_S) as link:
+            if match["protocol"] == "tls":
+                return _greet(link, match["host"], credentials)
+            return _SPEAKS_TLS if _speaks_tls(link) else _of_user(credentials)
+    except (OSError, UnicodeError):
+        return None
+
+
+def _speaks_tls(link: socket.socket) -> bool:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE  # nothing is said over it
+    link.settimeout(_REFUSES_WITHIN_S)
+    try:
+        context.wrap_socket(link).close()
+    except OSError:
+        return False
+    return True
+
+
+def _greet(link: socket.socket, host: str, credentials: Credentials | None) -> Refusal:
+    try:
+        secured = _context(credentials).wrap_socket(link, server_hostname=host)
+    except ssl.SSLCertVerificationError as error:
+        return _of_their_certificate(error, host, credentials)
+    except ssl.SSLError as error:
+        return _of_alert(error, credentials) or _SPEAKS_NO_TLS
+    except OSError:
+        return _SPEAKS_NO_TLS
+    with secured:
+        return _verdict(secured, credentials)
+
+
+def _verdict(secured: ssl.SSLSocket, credentials: Credentials | None) -> Refusal:
+    secured.settimeout(_REFUSES_WITHIN_S)
+    try:
+        secured.recv(1)
+    except ssl.SSLError as error:
+        return _of_alert(error, credentials) or _of_user(credentials)
+    except OSError:
+        pass  # silence is consent: the router waits for Zenoh's first word
+    return _of_user(credentials)
+
+
+def _context(credentials: Credentials | None) -> ssl.SSLContext:
+    if credentials is None or credentials.ca is None:
+        return ssl.create_default_context()
+    return trusting(credentials)
+
+
+_SPEAKS_NO_TLS = Refusal(
+    "no TLS there",
+    "it speaks no TLS; let it listen at tls/... with a certificate (`zstate router --certs DIR "
+    "--identity NAME`), or write 'tcp/' here and leave the certificates out",
+)
+_SPEAKS_TLS = Refusal(
+    "TLS demanded",
+    "it speaks TLS only; write 'tls/' and show a certificate: --certs DIR --identity NAME, or credentials=",
+)
+_WANTS_CERTIFICATE = Refusal(
+    "certificate demanded",
+    "it demands a certificate and was shown none; give --certs DIR --identity NAME, or certificate= and key=",
+)
+_WANTS_USER = Refusal(
+    "user demanded",
+    "it takes the link and refuses the session, as one does that asks for a user; give --user NAME with the "
+    "password in ZSTATE_PASSWORD, or user= and password=",
+)
+_EXPIRED = Refusal(
+    "their certificate expired", "its certificate has expired; renew it there, and check both clocks"
+)
+_NOT_YET_VALID = Refusal(
+    "their certificate not yet valid", "its certificate is not valid yet; is this machine's clock behind?"
+)
+
+
+def _of_their_certificate(
+    error: ssl.SSLCertVerificationError, host: str, credentials: Credentials | None
+) -> Refusal:
+    # OpenSSL's numbers (x509_vfy.h).
+    if error.verify_code in (9, 10):
+        return _NOT_YET_VALID if error.verify_code == 9 else _EXPIRED
+    if error.verify_code in (62, 64):
+        return Refusal(
+            "name mismatch",
+            f"its certificate is not for {host!r}; connect to a name or address that is in it, or make one "
+            f"that is: `zstate certs DIR --identity NAME --host {host}`",
+        )
+    trusted = repr(str(credentials.ca)) if credentials and credentials.ca else "a public authority"
+    return Refusal(
+        "wrong CA",
+        f"its certificate is not signed by {trusted} ({error.verify_message}); both sides need the ca.pem of "
+        "one authority, so make their identities in one folder",
+    )
+
+
+def _of_alert(error: ssl.SSLError, credentials: Credentials | None) -> Refusal | None:
+    """What the other side said to our certificate, by the alerts of TLS (RFC 8446, section 6)."""
+    alert = (error.reason or "").partition("ALERT_")[2]
+    ours = repr(str(credentials.certificate)) if credentials and credentials.certificate else "no certificate"
+    if not alert or alert == "CERTIFICATE_REQUIRED":
+        return _WANTS_CERTIFICATE if alert else None
+    if alert == "CERTIFICATE_EXPIRED":
+        return Refusal(
+            "our certificate expired",
+            f"{ours} has expired, or is not valid yet by the router's clock; renew it, and check both clocks",
+        )
+    return Refusal(
+        "our certificate refused",
+        f"it refuses {ours} ({alert.lower().replace('_', ' ')}); make the identity in the folder in "
+        "which the router's was made",
+    )
+
+
+def _of_user(credentials: Credentials | None) -> Refusal:
+    if credentials is None or credentials.user is None:
+        return _WANTS_USER
+    return Refusal(
+        "user or password",
+        f"the user {credentials.user!r} or the password is not what it knows; check its --users file (a "
+        "router that has none refuses whoever names a user)",
+    )
