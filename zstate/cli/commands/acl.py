@@ -1,0 +1,48 @@
+"""zstate acl: the access control of a fleet, for its routers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import click
+
+from zstate.cli.console import say
+from zstate.cli.options import Command
+
+
+def _named(option: str, what: str) -> Callable[[Command], Command]:
+    return click.option(option, multiple=True, metavar="NAME", help=f"{what}; may be repeated.")
+
+
+@click.command("acl")
+@_named("--robot", "A robot: writes its own keys, reads these and the clock")
+@_named("--viewer", "Somebody who reads everything, and writes nothing")
+@_named("--operator", "A viewer who also commands joints")
+@_named("--timekeeper", "A viewer who also writes the simulated time")
+@click.option(
+    "--namespace", default="", metavar="KEY", help="The namespace of their sessions, if they have one."
+)
+def acl_command(
+    robot: tuple[str, ...],
+    viewer: tuple[str, ...],
+    operator: tuple[str, ...],
+    timekeeper: tuple[str, ...],
+    namespace: str,
+) -> None:
+    """Print who may do what in a fleet, as a router's configuration (JSON5).
+
+    What is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`), or a
+    user; that of a robot is also its name in the keys. Somebody may be several of these: a robot that
+    looks at the others is a viewer, too. The native keys are covered, not those of ROS wires.
+
+    \b
+    zstate acl --robot r1 --robot r2 --viewer desk >acl.json5
+    zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
+    """
+    from zstate.net.access import Fleet, access_text
+
+    if not any((robot, viewer, operator, timekeeper)):
+        raise click.UsageError(
+            "name somebody: --robot NAME, --viewer NAME, --operator NAME or --timekeeper NAME"
+        )
+    say(access_text(Fleet(robot, viewer, operator, timekeeper, namespace)).rstrip("\n"))

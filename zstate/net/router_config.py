@@ -1,0 +1,101 @@
+"""The configuration of a router: JSON5 that zenohd takes unchanged, and that ``zstate router`` runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, endpoint_list
+from zstate.net.json5 import json5_text
+from zstate.net.security import Credentials
+from zstate.net.thinning import Thinning
+
+_PRIVATE = ("tcp/127.", "tcp/localhost:", "tcp/[::1]:", "unixsock-stream/")
+_HEAD = "The configuration of a Zenoh router: `zenohd -c FILE.json5`, or `zstate router --config FILE.json5`."
+
+# How long peers are waited for at the start is not a router's; how it seeks other routers stands below.
+_OURS = {path: value for path, value in SETTINGS.items() if path not in ("scouting/delay", "connect/retry")}
+_SEEKING: dict[str, object] = {
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": SETTINGS["connect/retry"],
+}
+
+_COMMENTS = {
+    "listen": "Where robots, readers and other routers come to.",
+    "connect": "The routers that it joins. One that is not there yet, or no more, is sought for ever.",
+    "scouting": "Nobody is sought by multicast.",
+    "timestamping": "Samples carry their own stamps, and a router would replace those ahead of its clock.",
+    "transport/link/tx": "Whoever is silent for so long [ms] is gone, and its liveliness tokens with it.",
+    "transport/link/tls": "Encryption; with enable_mtls everybody shows a certificate of this authority.",
+    "transport/auth": "Who may connect by name and password.",
+    "transport/shared_memory": "No gain for messages this small.",
+    "downsampling": "At most so many samples a second [Hz] to each neighbour, by rule, not by key.",
+    "access_control": "Who may do what; what no rule allows is denied.",
+}
+_ROS_COMMENTS = {
+    "scouting": "As rmw_zenohd has it, from here on: ROS nodes are peers, which find each other through it.",
+    "timestamping": "Late joiners are given the past values of topics in order.",
+    "queries_default_timeout": "Many nodes start at once, and are busy with that for a while.",
+    "transport/link/tx": "",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RouterConfig:
+    """A router: where it listens, which routers it joins, whom it lets in, what it passes on.
+
+    It listens at ``tcp/127.0.0.1:7447`` unless told otherwise. ``access_control`` is that section of a
+    Zenoh configuration. With ``ros2`` the rest is as rmw_zenohd has it. With certificates everything
+    is encrypted, but for what stays on this host.
+
+    Raises InvalidInput and ConfigError for what cannot be used.
+    """
+
+    listen: tuple[str, ...] = (ROUTER_ENDPOINT,)
+    connect: tuple[str, ...] = ()
+    credentials: Credentials | None = None
+    thinning: Thinning | None = None
+    access_control: Mapping[str, object] = field(default_factory=dict[str, object])
+    ros2: bool = False
+
+    def __post_init__(self) -> None:
+        endpoint_list((*self.listen, *self.connect))
+        if self.credentials is not None:
+            exposed = [endpoint for endpoint in self.listen if not endpoint.startswith(_PRIVATE)]
+            self.credentials.check_endpoints(self.connect, exposed)
+
+    def settings(self) -> dict[str, object]:
+        """As a Zenoh configuration."""
+        told: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
+        if self.connect:
+            told |= {"connect/endpoints": list(self.connect), **_SEEKING}
+        told |= ROS_ROUTER if self.ros2 else _OURS
+        if self.credentials is not None:
+            told |= self.credentials.settings()
+        if self.thinning is not None:
+            told["downsampling"] = self.thinning.settings()
+        if self.access_control:
+            told["access_control"] = self.access_control
+        whole: dict[str, Any] = {}
+        _merge(whole, told)
+        return whole
+
+    def text(self) -> str:
+        """As commented JSON5."""
+        comments = _COMMENTS | (_ROS_COMMENTS if self.ros2 else {})
+        return json5_text(self.settings(), comments, _HEAD)
+
+
+def _merge(whole: dict[str, Any], told: Mapping[str, Any]) -> None:
+    """Put what is ``told`` by path, which may be objects, where it belongs in ``whole``."""
+    for path, value in told.items():
+        *parents, last = path.split("/")
+        place = whole
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        if isinstance(value, Mapping):
+            _merge(place.setdefault(last, {}), value)  # pyright: ignore[reportUnknownArgumentType]
+        else:
+            place[last] = value
