@@ -19,9 +19,11 @@ from zstate.model.robot import RobotModel
 from zstate.net.outlets import Outlets, StreamOutlet
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
+from zstate.net.status import StatusPublisher
 from zstate.net.wires import wire_named
 from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
+from zstate.status import Beat, PublisherStats, StreamStats
 from zstate.wire.keys import MODEL_WRITER, Stream, check_robot, wire_name
 from zstate.wire.layout import Layout
 from zstate.wire.messages import (
@@ -46,7 +48,8 @@ class StatePublisher(Closing):
     (``tf_static``). Samples go out on ``joint_states``; the moving edges also on ``tf``, while somebody
     reads that. ``robot`` is its name on the network, the model's name unless given. ``streams`` names
     what this publisher writes, where another program writes the rest. ``program`` is who others see
-    writing, the script's name unless given. A context manager; safe from any thread.
+    writing, the script's name unless given. On the native wire it says once a second how it does, to
+    those who ask (``zstate.net.status``). A context manager; safe from any thread.
     """
 
     def __init__(
@@ -69,6 +72,10 @@ class StatePublisher(Closing):
         self._edges = _MovingEdges(model, self.robot)
         self._session_id = secrets.randbits(32)
         self._seq = 0
+        self._refused = 0
+        self._last_refusal = ""
+        self._rate: Rate | None = None
+        self._wires = tuple(wires)
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
         layout = Layout(coordinate_names(model), velocity_slots(model), self._edges.names)
@@ -79,6 +86,9 @@ class StatePublisher(Closing):
                 for wire in wires
             ]
             self._outputs = [self._output(out, streams) for out in outlets]
+            if "native" in wires and {"joint_states", "tf"}.intersection(streams):
+                status = Beat(writer, lambda: self.stats).status
+                opening.enter_context(StatusPublisher(session, self.robot, writer.identity, status))
             self._opened = opening.pop_all()
 
     def _output(self, outlets: Outlets, streams: Sequence[Stream]) -> _Output:
@@ -99,6 +109,17 @@ class StatePublisher(Closing):
         """The robot's fixed edges, for readers without its model."""
         return self._edges.statics(self._session_id)
 
+    @property
+    def stats(self) -> PublisherStats:
+        """What has been published, suppressed and refused so far."""
+        streams: dict[tuple[str, Stream], StreamStats] = {
+            (wire, stream): StreamStats(outlet.samples, outlet.bytes, self._seq - outlet.samples)
+            for wire, output in zip(self._wires, self._outputs, strict=True)
+            for stream, outlet in output.outlets.items()
+        }
+        rate = None if self._rate is None else self._rate.report()
+        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate)
+
     def publish(
         self,
         positions: Positions,
@@ -114,6 +135,20 @@ class StatePublisher(Closing):
         infinity, a floating joint without a unit quaternion, a stamp that a wire cannot say, and Closed;
         then nothing was sent.
         """
+        try:
+            self._publish(positions, velocities, efforts, stamp)
+        except InvalidInput as error:
+            self._last_refusal = str(error)
+            self._refused += 1
+            raise
+
+    def _publish(
+        self,
+        positions: Positions,
+        velocities: ArrayLike | None,
+        efforts: ArrayLike | None,
+        stamp: int | None,
+    ) -> None:
         model = self.model
         numbers = (
             model.positions(positions) if isinstance(positions, Mapping) else model.check_positions(positions)
@@ -138,7 +173,7 @@ class StatePublisher(Closing):
         Each tick has an absolute deadline (see ``Rate`` for what becomes of late ones). A tick for
         which the source has nothing new sends nothing.
         """
-        rate = Rate(rate_hz, self._clock, self._stop, seconds)
+        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
         for now in rate:
             reading = source.read(now)
             if reading is not None:
@@ -161,8 +196,12 @@ class _Output:
 
     def __init__(self, outlets: Outlets, streams: Sequence[Stream], edges: _MovingEdges) -> None:
         self._edges = edges
-        self._joints = outlets.stream("joint_states") if "joint_states" in streams else None
-        self._transforms = outlets.stream("tf") if "tf" in streams else None
+        said: tuple[Stream, ...] = ("joint_states", "tf")
+        self.outlets: dict[Stream, StreamOutlet] = {
+            stream: outlets.stream(stream) for stream in said if stream in streams
+        }
+        self._joints = self.outlets.get("joint_states")
+        self._transforms = self.outlets.get("tf")
 
     def said(self, state: JointState, positions: NDArray[np.float64]) -> Iterator[tuple[StreamOutlet, bytes]]:
         """What this wire says of ``state``: the transforms only while somebody reads them."""

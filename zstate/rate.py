@@ -16,13 +16,15 @@ class RateReport:
     """What became of a commanded rate.
 
     ``rate_hz`` is what was achieved: the ticks after the first, over the time between the first and
-    the last. ``skipped`` counts ticks that were given up after a long delay.
+    the last. ``skipped`` counts ticks that were given up after a long delay, ``late`` those that began
+    more than a period after they were due.
     """
 
     commanded_hz: float
     rate_hz: float
     ticks: int
     skipped: int
+    late: int
 
 
 # A busy machine holds a process up for some milliseconds now and then; that is made up for. After a
@@ -42,6 +44,7 @@ class Rate:
         self, rate_hz: float, clock: Clock, stop: threading.Event, seconds: float | None = None
     ) -> None:
         self.rate_hz = check_rate(rate_hz)
+        self._period_ns = 1e9 / rate_hz
         if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
             raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
         self._ticks_wanted = math.inf if seconds is None else max(1, round(seconds * rate_hz))
@@ -49,6 +52,7 @@ class Rate:
         self._stop = stop
         self._ticks = 0
         self._skipped = 0
+        self._late = 0
         self._first: int | None = None
         self._last = 0
 
@@ -64,6 +68,7 @@ class Rate:
             if not self._clock.wait_until(deadline, self._stop):
                 return
             now = self._clock.now()
+            self._late += now - deadline > self._period_ns
             if now - deadline > _LONGEST_DELAY_NS:
                 due = int(min((now - start) * self.rate_hz / 1e9, self._ticks_wanted - 1))
                 self._skipped += due - tick
@@ -78,7 +83,7 @@ class Rate:
         """How it went so far."""
         span_ns = 0 if self._first is None else self._last - self._first
         achieved = (self._ticks - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
-        return RateReport(self.rate_hz, achieved, self._ticks, self._skipped)
+        return RateReport(self.rate_hz, achieved, self._ticks, self._skipped, self._late)
 
 
 def check_rate(rate_hz: float) -> float:

@@ -15,6 +15,7 @@ from zstate.wire.messages import (
     Message,
     RobotDescription,
     StaticTransforms,
+    Status,
     TransformSample,
     order_digest,
     to_block,
@@ -92,6 +93,18 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + fixstr("system"),
     ),
     "clock": (Clock(0, 1, 2), b"\x93\x00\x01\x02"),
+    "status": (
+        Status(1, 2, "warn", "driver", "nuc", 3, 0.5, 4, 5, "slow", {"refused": "6"}),
+        b"\x9b\x01\x02"
+        + b"".join(map(fixstr, ("warn", "driver", "nuc")))
+        + b"\x03\xcb"
+        + struct.pack(">d", 0.5)
+        + b"\x04\x05"
+        + fixstr("slow")
+        + b"\x81"
+        + fixstr("refused")
+        + fixstr("6"),
+    ),
 }
 MESSAGES = [message for message, _ in GOLDEN.values()]
 

@@ -56,12 +56,14 @@ class Outlets(Closing):
 
 
 class StreamOutlet:
-    """One stream of one writer."""
+    """One stream of one writer. ``samples`` and ``bytes`` count what was put."""
 
     def __init__(self, outlet: Outlet, publisher: StreamPublisher) -> None:
         self._outlet = outlet
         self._publisher = publisher
         self.encode = outlet.encode
+        self.samples = 0
+        self.bytes = 0
 
     @property
     def has_readers(self) -> bool:
@@ -71,6 +73,8 @@ class StreamOutlet:
     def put(self, payload: bytes) -> None:
         """Send what ``encode`` made of a message. Raises Closed."""
         self._publisher.put(payload, self._outlet.attachment(time.time_ns()))
+        self.samples += 1
+        self.bytes += len(payload)
 
 
 class LatchedOutlet:

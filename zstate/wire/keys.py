@@ -7,6 +7,7 @@
 ``zstate/<robot>/robot_description``        RobotDescription, latched
 ``zstate/<robot>/joint_commands``           JointCommand, to a driver
 ``zstate/<robot>/lookup``                   a queryable
+``zstate/<robot>/status/<id>``              Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<stream>/<id>``    liveliness token of one writer
 ``zstate/clock``                            Clock
 ==========================================  ==========================================
@@ -79,6 +80,16 @@ def stream_expression(robot: str, stream: Stream) -> str:
 def lookup_key(robot: str) -> str:
     """The key that answers lookups for devices without a buffer."""
     return f"zstate/{check_robot(robot)}/lookup"
+
+
+def status_key(robot: str, identity: str) -> str:
+    """The key on which one writer says how it does; ``identity`` is already one chunk."""
+    return f"zstate/{check_robot(robot)}/status/{identity}"
+
+
+def status_expression(robot: str) -> str:
+    """The key expression of every status of ``robot``, or of every robot for ``"*"``."""
+    return f"zstate/{robot if robot == ANY else check_robot(robot)}/status/*"
 
 
 def writer_key(robot: str, stream: Stream, identity: str) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from hashlib import blake2b
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -23,6 +23,7 @@ Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
+Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
 
@@ -150,6 +151,29 @@ class Clock(Message, frozen=True, array_like=True, gc=False):
     stamp: Stamp
     seq: Count
     session: Count
+
+
+class Status(Message, frozen=True, array_like=True, gc=False):
+    """How a writer does.
+
+    ``level`` is "ok"; "warn" when it is late or some of what it was given cannot be said; "error" when
+    none of it can; "stale" when it was given nothing new. ``text`` says why. ``rate_hz`` counts the
+    samples of the last second, ``sent`` all of them, ``late`` the ticks that began more than a period
+    after they were due; ``values`` is what else there is to know. ``stamp`` [ns] is by the system's
+    clock of ``host``, also where samples carry simulated time.
+    """
+
+    stamp: Stamp
+    session: Count
+    level: Level
+    program: str
+    host: str
+    pid: Count
+    rate_hz: float
+    sent: Count
+    late: Count
+    text: str = ""
+    values: dict[str, str] = {}
 
 
 def _check_numbers(*blocks: bytes | None) -> None:

@@ -26,6 +26,7 @@ from zstate.wire.messages import (
     Message,
     RobotDescription,
     StaticTransforms,
+    Status,
     TransformSample,
 )
 from zstate.wire.wire import Arrival, Place
@@ -42,6 +43,7 @@ _TYPES: tuple[type[Message], ...] = (
     StaticTransforms,
     RobotDescription,
     Clock,
+    Status,
 )
 ENCODINGS: dict[type[Message], str] = {kind: f"zstate/{kind.__name__};v={VERSION}" for kind in _TYPES}
 STREAM_TYPES: dict[Stream, type[Message]] = {

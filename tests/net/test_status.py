@@ -1,0 +1,211 @@
+"""How publishers do, as others hear it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import ExitStack, suppress
+
+import numpy as np
+import pytest
+from live import RRBOT, await_reader
+from support import Child, until
+
+from zstate.errors import Closed, InvalidInput
+from zstate.net.presence import discover
+from zstate.net.session import Session, connect
+from zstate.net.status import StatusPublisher, watch_status
+from zstate.net.streams import StreamPublisher
+from zstate.publisher import StatePublisher
+from zstate.sources import JointReading, SineSource
+from zstate.wire.messages import Status
+from zstate.wire.native import ENCODINGS
+
+OK = Status(1, 2, "ok", "driver", "nuc", 3, 100.0, 4, 0)
+
+
+class Heard:
+    """Every status of ``robot``, and when it came [s]."""
+
+    def __init__(self, session: Session, robot: str = "*") -> None:
+        self.statuses: list[tuple[str, Status]] = []
+        self.times: list[float] = []
+        self.watch = watch_status(session, robot, self._note)
+
+    def _note(self, robot: str, status: Status) -> None:
+        self.times.append(time.monotonic())
+        self.statuses.append((robot, status))
+
+    @property
+    def levels(self) -> set[str]:
+        return {status.level for _, status in self.statuses}
+
+    def last(self) -> Status:
+        return self.statuses[-1][1]
+
+
+def status_threads() -> int:
+    return sum(thread.name == "zstate status" for thread in threading.enumerate())
+
+
+def test_a_publisher_says_once_a_second_how_it_does(sessions):
+    heard = Heard(sessions[1])
+    with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as publisher:
+        running = threading.Thread(target=publisher.run, args=(SineSource(RRBOT), 50.0))
+        running.start()
+        until(lambda: len(heard.statuses) >= 3)
+        (writer,) = {said for robot in discover(sessions[1]) for _, said in robot.writers}
+    running.join()
+    robot, status = heard.statuses[-1]
+    assert robot == "r1"
+    assert (status.program, status.pid, status.session) == ("driver", writer.pid, writer.session)
+    assert status.sent > 0
+    assert status.values["commanded"] == "50 Hz"
+    periods = np.diff(heard.times)
+    # The medium may hold one up; it does not catch up in a burst, nor fall behind for long.
+    assert 0.5 < np.mean(periods) < 2.0
+
+
+def test_it_ends_with_its_publisher_and_leaves_no_thread(sessions):
+    before = status_threads()
+    heard = Heard(sessions[1])
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        publisher.publish([0.0, 0.0])
+        until(lambda: heard.statuses)
+        assert status_threads() == before + 1
+    assert status_threads() == before
+    with StatePublisher(sessions[0], RRBOT, "r2"):
+        until(lambda: heard.statuses[-1][0] == "r2")
+    names = [robot for robot, _ in heard.statuses]
+    assert names == sorted(names), "r1 spoke after its publisher was closed"
+
+
+def test_who_comes_later_hears_of_the_last_second_alone(sessions):
+    asked = threading.Semaphore(0)
+
+    def status() -> Status:
+        asked.release()
+        return OK
+
+    with StatusPublisher(sessions[0], "r1", "me", status):
+        assert asked.acquire(timeout=5.0)
+        heard = Heard(sessions[1], "r1")
+        assert asked.acquire(timeout=5.0)
+        until(lambda: heard.statuses)
+        assert len(heard.statuses) == 1
+
+
+def test_a_publisher_that_stands_still_is_stale(sessions):
+    heard = Heard(sessions[1], "r1")
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        publisher.publish([0.0, 0.0])
+        until(lambda: "stale" in heard.levels)
+        assert "nothing was published for" in heard.last().text
+        until(lambda: publisher.publish([0.0, 0.0]) or heard.last().level == "ok")
+
+
+class Slow:
+    """A source that takes longer than a period of 100 Hz."""
+
+    def __init__(self) -> None:
+        self._pause = threading.Event()
+
+    def read(self, stamp: int) -> JointReading:
+        self._pause.wait(0.03)
+        return JointReading(np.zeros(2))
+
+
+def test_a_publisher_that_cannot_keep_its_rate_warns(sessions):
+    heard = Heard(sessions[1], "r1")
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        running = threading.Thread(target=publisher.run, args=(Slow(), 100.0))
+        running.start()
+        until(lambda: "warn" in heard.levels)
+    running.join()
+    warning = next(status for _, status in heard.statuses if status.level == "warn")
+    assert "100 Hz are more than this process keeps" in warning.text
+    assert warning.late > 0
+
+
+def test_a_publisher_whose_samples_are_refused_tells_the_reason(sessions):
+    heard = Heard(sessions[1], "r1")
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+
+        def is_in_error() -> bool:
+            with suppress(InvalidInput):
+                publisher.publish([0.0, float("nan")])
+            return "error" in heard.levels
+
+        until(is_in_error)
+    assert "nan" in heard.last().text
+
+
+WRITER = """
+    import sys
+    from zstate import StatePublisher, connect, load_model
+    with connect() as session, StatePublisher(session, load_model("rrbot"), "r1"):
+        print("here")
+        sys.stdin.readline()
+"""
+
+
+def test_a_process_that_is_gone_says_nothing_more(spawn):
+    with connect() as session:
+        heard = Heard(session)
+        child: Child = spawn(WRITER)
+        child.line()
+        until(lambda: heard.statuses)
+        child.kill()
+        until(lambda: not discover(session, 0.2))
+        with StatePublisher(session, RRBOT, "r2"):
+            until(lambda: len([robot for robot, _ in heard.statuses if robot == "r2"]) == 2)
+    names = [robot for robot, _ in heard.statuses]
+    assert names == sorted(names), "r1 spoke after its process was killed"
+
+
+def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
+    heard = Heard(sessions[1], "r1")
+    key = "zstate/r1/status/me"
+    with ExitStack() as opened:
+        said = {
+            encoding: opened.enter_context(StreamPublisher(sessions[0], key, encoding))
+            for encoding in ("", ENCODINGS[Status])
+        }
+        await_reader(sessions[0], key)
+        for stream in said.values():
+            stream.put(b"\xff\x00 noise")
+        until(lambda: sum(heard.watch.refused.values()) == 2)
+    assert heard.watch.refused == {"foreign": 1, "malformed": 1}
+    assert not heard.statuses
+
+
+def test_after_its_session_is_gone_it_ends_by_itself():
+    before = status_threads()
+    with connect() as session:
+        publisher = StatusPublisher(session, "r1", "me", lambda: OK)
+    until(lambda: status_threads() == before)
+    publisher.close()
+
+
+@pytest.mark.parametrize("streams", [("robot_description",), ("tf_static",)])
+def test_a_publisher_of_what_does_not_change_has_no_status(sessions, streams):
+    before = status_threads()
+    with StatePublisher(sessions[0], RRBOT, "r1", streams=streams):
+        assert status_threads() == before
+
+
+def test_a_ros_wire_carries_none(sessions, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    before = status_threads()
+    with StatePublisher(sessions[0], RRBOT, "r1", ("ros2",)):
+        assert status_threads() == before
+
+
+def test_a_closed_publisher_counts_what_it_refused_before(sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        publisher.publish([0.0, 0.0])
+        with pytest.raises(InvalidInput):
+            publisher.publish([0.0])
+    with pytest.raises(Closed):
+        publisher.publish([0.0, 0.0])
+    assert (publisher.stats.sent, publisher.stats.refused) == (1, 1)

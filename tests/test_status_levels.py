@@ -1,0 +1,77 @@
+"""What the counts of a publisher say of how it does."""
+
+from __future__ import annotations
+
+import pytest
+
+from zstate.rate import RateReport
+from zstate.status import Beat, PublisherStats, Verdict, verdict
+from zstate.wire.writer import Writer
+
+SECOND = 1_000_000_000
+OK = Verdict("ok")
+
+
+def counts(
+    sent: int = 0,
+    *,
+    refused: int = 0,
+    refusal: str = "",
+    rate_hz: float | None = None,
+    late: int = 0,
+    skipped: int = 0,
+) -> PublisherStats:
+    rate = None if rate_hz is None else RateReport(rate_hz, rate_hz, sent, skipped, late)
+    return PublisherStats(sent, refused, refusal, {}, rate)
+
+
+def test_a_publisher_that_publishes_in_time_is_well():
+    assert verdict(counts(5), counts(6), quiet_ns=0) == OK
+    assert verdict(counts(5, rate_hz=100.0), counts(105, rate_hz=100.0), quiet_ns=0) == OK
+
+
+def test_one_that_has_nothing_new_to_say_is_stale_after_two_seconds():
+    assert verdict(counts(5), counts(5), quiet_ns=2 * SECOND) == OK
+    level, text = verdict(counts(5), counts(5), quiet_ns=2 * SECOND + 1)
+    assert (level, text) == ("stale", "nothing was published for 2.0 s")
+    assert verdict(counts(), counts(), quiet_ns=3 * SECOND).text.endswith("since this publisher opened")
+
+
+def test_a_slow_rate_that_was_asked_for_is_not_stale_before_two_periods():
+    slow = counts(5, rate_hz=0.25)
+    assert verdict(slow, slow, quiet_ns=8 * SECOND) == OK
+    assert verdict(slow, slow, quiet_ns=8 * SECOND + 1).level == "stale"
+
+
+def test_ticks_that_were_late_or_skipped_since_the_last_time_are_a_warning():
+    before = counts(100, rate_hz=100.0, late=3, skipped=1)
+    level, text = verdict(before, counts(140, rate_hz=100.0, late=43, skipped=21), quiet_ns=0)
+    assert level == "warn"
+    assert "40 ticks late and 20 skipped: 100 Hz" in text
+    assert verdict(before, counts(200, rate_hz=100.0, late=3, skipped=1), quiet_ns=0) == OK
+
+
+def test_the_ticks_of_an_earlier_run_are_not_those_of_this_one():
+    before = counts(100, rate_hz=100.0, late=50, skipped=20)
+    assert verdict(before, counts(110, rate_hz=10.0), quiet_ns=0) == OK
+
+
+@pytest.mark.parametrize(("sent", "level", "share"), [(3, "warn", "2 of 5"), (0, "error", "2 of 2")])
+def test_samples_that_cannot_be_published_are_a_warning_and_an_error_when_there_are_no_others(
+    sent: int, level: str, share: str
+):
+    now = counts(10 + sent, refused=2, refusal="joint 'elbow' is nan")
+    assert verdict(counts(10), now, quiet_ns=0) == (
+        level,
+        f"{share} samples cannot be published: joint 'elbow' is nan",
+    )
+
+
+def test_a_status_tells_who_how_much_and_what_is_commanded():
+    read = [counts(), counts(7, rate_hz=50.0, late=2)]
+    beat = Beat(Writer("driver", "nuc", 412, 5, 9), lambda: read.pop(0))
+    status = beat.status()
+    assert (status.program, status.host, status.pid, status.session) == ("driver", "nuc", 412, 9)
+    assert (status.sent, status.late) == (7, 2)
+    assert status.rate_hz > 7.0  # less than a second has passed
+    assert status.values == {"refused": "0", "commanded": "50 Hz", "skipped": "0"}

@@ -1,0 +1,96 @@
+"""Status: how writers do, said once a second to those who ask, on the native wire."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+
+import zenoh
+
+from zstate.closing import Closing
+from zstate.errors import Closed, MessageError
+from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.wire.keys import robot_of, status_expression, status_key
+from zstate.wire.messages import Status
+from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.wire import Arrival
+
+PERIOD_S = 1.0
+JOIN_WITHIN_S = 0.5
+
+
+class StatusPublisher(Closing):
+    """Asks ``status()`` once a second, from a thread of its own, and says it while somebody reads it.
+
+    So it goes on when what it tells of stands still, and ends with the process.
+    """
+
+    def __init__(self, session: Session, robot: str, identity: str, status: Callable[[], Status]) -> None:
+        self._session = session
+        self._status = status
+        self._stop = threading.Event()
+        self._publisher = StreamPublisher(session, status_key(robot, identity), ENCODINGS[Status])
+        self._thread = threading.Thread(target=self._run, name="zstate status", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Say no more. A second call does nothing."""
+        self._stop.set()
+        self._publisher.close()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_WITHIN_S)
+
+    def _run(self) -> None:
+        due = time.monotonic() + PERIOD_S
+        while not self._stop.wait(max(0.0, due - time.monotonic())):
+            try:
+                self._say()
+            except (Closed, zenoh.ZError):
+                return
+            # After a pause (a suspended laptop) one status is enough.
+            due = max(due + PERIOD_S, time.monotonic())
+
+    def _say(self) -> None:
+        self._session.check()
+        status = self._status()
+        if self._publisher.has_readers:
+            self._publisher.put(encode(status))
+
+
+class StatusWatch(Closing):
+    """Hears every status of ``robot`` ("*": of all robots); ``refused`` counts what was none, by reason."""
+
+    def __init__(self, session: Session, robot: str, callback: Callable[[str, Status], None]) -> None:
+        self.refused: Counter[str] = Counter()
+        self._callback = callback
+        self._subscriber = StreamSubscriber(session, status_expression(robot), self._take)
+
+    def _take(self, arrivals: list[Arrival]) -> None:
+        for arrival in arrivals:
+            status = self._decode(arrival)
+            if status is not None:
+                self._callback(robot_of(arrival.key), status)
+
+    def _decode(self, arrival: Arrival) -> Status | None:
+        try:
+            return decode(arrival.payload, arrival.encoding, Status)
+        except MessageError as error:
+            self.refused[error.reason] += 1
+            return None
+
+    def close(self) -> None:
+        """Stop within a second. A second call does nothing."""
+        self._subscriber.close()
+
+
+def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusWatch:
+    """Call ``callback(robot, status)`` with what each publisher of ``robot`` says of itself, once a second.
+
+    They begin within a second. It is called from one thread. A process that is frozen or gone says
+    nothing: look at the age of what it said last. Said on the native wire alone; ROS's diagnostics are
+    not among the messages that zstate speaks.
+    """
+    return StatusWatch(session, robot, callback)
