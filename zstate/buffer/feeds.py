@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from zstate.buffer.tracks import PoseTrack
+from zstate.buffer.tracks import ClockOffsets, PoseTrack
 from zstate.buffer.tree import Edge, Tree
 from zstate.errors import InsertRefused
 
@@ -24,8 +24,9 @@ class TooOld(Exception):
 class Feeds:
     """The tracks behind the edges that are inserted as poses. Used under the buffer's lock."""
 
-    def __init__(self, tree: Tree, span_ns: int) -> None:
+    def __init__(self, tree: Tree, span_ns: int, clock_offsets: ClockOffsets) -> None:
         self._tree = tree
+        self._clock_offsets = clock_offsets
         self._span_ns = span_ns
         self._known: dict[tuple[EdgeNames, ...], Feed] = {}
         self._version = -1
@@ -96,6 +97,7 @@ class Feeds:
         return track
 
     def _attach(self, track: PoseTrack) -> None:
+        track.clock_offsets = self._clock_offsets
         for index, (parent, child) in enumerate(track.edges):
             self._tree.attach(Edge(parent, child, "pose", track=track, index=index))
 

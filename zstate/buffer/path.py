@@ -15,7 +15,7 @@ from zstate import se3
 from zstate.buffer.cells import Between, Cell
 from zstate.buffer.history import View
 from zstate.buffer.steps import Motion, Step, Values, chain_motion, chain_pose
-from zstate.buffer.tracks import JointTrack, Track, coverage
+from zstate.buffer.tracks import JointTrack, Track, coverage, of_track
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, Stale
 from zstate.transform import Kind, Transform
 
@@ -157,8 +157,7 @@ class Path:
             rate_hz=facts.rate_hz,
             writer=use.track.writer,
         )
-        failure.track = use.track.name
-        return failure
+        return of_track(failure, use.track)
 
     def blame(self, at: int, views: Sequence[View], predict_ns: int = 0) -> LookupFailed:
         """Which track cannot answer at ``at``: too young, then empty, then not there yet."""
@@ -205,8 +204,7 @@ class Path:
             rate_hz=rate_hz,
             writer=use.track.writer,
         )
-        failure.track = use.track.name
-        return failure
+        return of_track(failure, use.track)
 
     def _no_rate(self, views: Sequence[View]) -> LookupFailed:
         lonely = [number for number, view in enumerate(views) if view.size < 2]

@@ -11,7 +11,16 @@ from zstate.buffer.store import Store
 from zstate.buffer.tracks import Track
 from zstate.buffer.waiting import Waiter
 from zstate.clock import Clock, check_stamp
-from zstate.errors import AmbiguousFrame, InFuture, InPast, InvalidInput, LookupFailed, Stale, UnknownFrame
+from zstate.errors import (
+    AmbiguousFrame,
+    ClockMismatch,
+    InFuture,
+    InPast,
+    InvalidInput,
+    LookupFailed,
+    Stale,
+    UnknownFrame,
+)
 from zstate.transform import Transform
 
 # So many pairs of frames are remembered compiled; more than any program asks for on purpose.
@@ -103,6 +112,13 @@ class Questions(Store):
         return transform
 
     def _refuse_stale(self, path: Path, transform: Transform, max_age_s: float) -> None:
+        kept = self.domain.name
+        if path.uses and kept is not None and kept != self.clock.domain:
+            raise ClockMismatch(
+                f"max_age_s was given, but the stamps here are {kept!r} time and the clock tells "
+                f"{self.clock.domain!r} time; give the listener, or the buffer, a clock of {kept!r} time",
+                domains=(kept, self.clock.domain),
+            )
         age_s = transform.age(self.clock)
         if path.uses and age_s > max_age_s:
             raise path.stale(transform.stamp, age_s, max_age_s)

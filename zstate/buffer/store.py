@@ -9,12 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate.buffer.domain import Domain
 from zstate.buffer.feeds import EdgeNames, Feed, Feeds, TooOld, second_writer
 from zstate.buffer.frames import FrameInfo, frame_info
 from zstate.buffer.history import View, thin
 from zstate.buffer.kernel import insert_together
 from zstate.buffer.path import TrackUse
-from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack
+from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack
 from zstate.buffer.tree import Edge, Tree
 from zstate.buffer.waiting import WaitingRoom
 from zstate.clock import Clock, SystemClock, check_stamp
@@ -36,6 +37,10 @@ class Store:
             raise InvalidInput(f"history_s is a positive number of seconds, not {history_s!r}")
         self.history_s = history_s
         self.clock: Clock = clock or SystemClock()
+        self.domain = Domain(None if clock is None else clock.domain)
+        """Whose time its stamps are."""
+        self.clock_offsets: ClockOffsets = {}
+        """By writer: what tells how far its clock is ahead of this one. Filled by whoever measures that."""
         self.ignored = 0
         """How many samples were older than the history reaches."""
         self._span_ns = round(history_s * 1e9)
@@ -43,7 +48,7 @@ class Store:
         self._writes = 0
         self._tree = Tree()
         self._room = WaitingRoom(self._tree)
-        self._feeds = Feeds(self._tree, self._span_ns)
+        self._feeds = Feeds(self._tree, self._span_ns, self.clock_offsets)
 
     def add_robot(
         self, model: RobotModel, prefix: str = "", *, interpolation: Interpolation = "linear"
@@ -56,6 +61,7 @@ class Store:
         """
         prefix = prefix.removesuffix("/")
         track = JointTrack(model, prefix, self._span_ns, interpolation)
+        track.clock_offsets = self.clock_offsets
         with self._lock, self._tree.untouched_on_error():
             if prefix and self._tree.robots.get(prefix) is not None:
                 raise InsertRefused(

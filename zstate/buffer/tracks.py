@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import View
 from zstate.buffer.kernel import History
+from zstate.errors import LookupFailed
 from zstate.model.edges import EdgeForm, EdgeTable
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 
 Interpolation = Literal["linear", "hermite"]
+
+
+class Offset(NamedTuple):
+    """How far another clock is ahead of the one here, and how far off that may be [ns]."""
+
+    offset_ns: int
+    uncertainty_ns: int
+
+
+ClockOffsets: TypeAlias = dict[str, Callable[[], Offset | None]]
 
 
 class JointTrack:
@@ -34,6 +46,7 @@ class JointTrack:
         self.forms = self._table.forms
         self.interpolation = interpolation
         self.writer: str | None = None
+        self.clock_offsets: ClockOffsets = {}
         self.history = History(model.position_count, span_ns)
         # Quaternions of floating joints have to be looked at and normalised.
         self._plain = all(form.kind != "floating" for form in self.forms)
@@ -109,6 +122,7 @@ class PoseTrack:
     def __init__(self, edges: tuple[tuple[str, str], ...], span_ns: int, writer: str | None) -> None:
         self.edges = edges
         self.writer = writer
+        self.clock_offsets: ClockOffsets = {}
         self.history = History(7 * len(edges), span_ns)
 
     def __repr__(self) -> str:
@@ -133,6 +147,19 @@ class PoseTrack:
 
 
 Track: TypeAlias = JointTrack | PoseTrack
+
+
+F = TypeVar("F", bound=LookupFailed)
+
+
+def of_track(failure: F, track: Track) -> F:
+    """The same failure, with what is known of the track behind it and its writer's clock."""
+    failure.track = track.name
+    ask = None if track.writer is None else track.clock_offsets.get(track.writer)
+    offset = None if ask is None else ask()
+    if offset is not None:
+        failure.clock_offset_ns, failure.clock_uncertainty_ns = offset
+    return failure
 
 
 @dataclass(frozen=True, slots=True)

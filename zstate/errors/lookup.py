@@ -18,6 +18,10 @@ def duration_text(nanoseconds: int) -> str:
     return f"{nanoseconds} ns"
 
 
+# An offset of clocks that is smaller than this does not explain why there is no answer.
+_WORTH_SAYING_NS = 1_000_000
+
+
 class LookupFailed(ZStateError):
     """A question the buffer cannot answer, with what it knows.
 
@@ -25,7 +29,12 @@ class LookupFailed(ZStateError):
     ``requested``, ``oldest`` and ``newest`` are stamps [ns]; ``track`` (whose history it is), ``rate_hz``
     and ``writer`` belong to the edge; each is None when it does not apply. The text is built when it is
     read: a failed lookup in a control loop costs little. ``note`` says what else there is to know.
+    ``clock_offset_ns`` is how far the clock of the edge's writer is ahead of the one here, where that was
+    measured, and ``clock_uncertainty_ns`` how far off that may be.
     """
+
+    clock_offset_ns: int | None = None
+    clock_uncertainty_ns: int | None = None
 
     def __init__(
         self,
@@ -58,6 +67,14 @@ class LookupFailed(ZStateError):
     def explanation(self) -> str:
         """What happened, with which values, and what to do."""
         raise NotImplementedError
+
+    def _clock_text(self) -> str:
+        """What the clock of the writer has to do with it; empty where it is not known to have."""
+        offset, uncertainty = self.clock_offset_ns, self.clock_uncertainty_ns or 0
+        if offset is None or abs(offset) < max(_WORTH_SAYING_NS, uncertainty):
+            return ""
+        size = f"{duration_text(abs(offset))} {'ahead of' if offset > 0 else 'behind'}"
+        return f"the clock of {self.writer!r} is {size} this one (± {duration_text(uncertainty)})"
 
     def _edge_text(self) -> str:
         if self.edge is None:
@@ -153,6 +170,7 @@ class InFuture(LookupFailed):
         return (
             f"asked {_span(self.requested, self.newest)} after the newest sample of {self._edge_text()}; "
             "wait for it (timeout_s=...), ask for the newest instant (at=None), or predict (predict_s=...)"
+            f"{_also(self._clock_text())}"
         )
 
 
@@ -163,7 +181,7 @@ class InPast(LookupFailed):
         return (
             f"asked {_span(self.oldest, self.requested)} before the oldest sample of {self._edge_text()}; "
             f"the history there spans {_span(self.newest, self.oldest)}: start the listener earlier or give "
-            "the buffer more history_s"
+            f"the buffer more history_s{_also(self._clock_text())}"
         )
 
 
@@ -198,10 +216,13 @@ class Stale(LookupFailed):
         self.max_age_s = max_age_s
 
     def explanation(self) -> str:
+        if self.clock_offset_ns is None:
+            clocks = ", and do the clocks of both machines agree?"
+        else:
+            clocks = f"? {self._clock_text()}".rstrip()
         return (
             f"the newest answer is {duration_text(round(self.age_s * 1e9))} old, {self.max_age_s:g} s are "
-            f"allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`), and do the "
-            "clocks of both machines agree?"
+            f"allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`){clocks}"
         )
 
 
@@ -237,6 +258,10 @@ def timed_out(reason: LookupFailed, waited_s: float) -> WaitTimeout:
 
 def _span(later: int | None, earlier: int | None) -> str:
     return "some time" if later is None or earlier is None else duration_text(later - earlier)
+
+
+def _also(text: str) -> str:
+    return f"; {text}" if text else ""
 
 
 def _any_of(names: Sequence[str]) -> str:

@@ -1,0 +1,44 @@
+"""Domain: whose time the stamps of a buffer are."""
+
+from __future__ import annotations
+
+import threading
+
+
+class Domain:
+    """Stamps of two clocks that say nothing of each other must not meet in one buffer.
+
+    Which time it is is decided by the clock that the buffer was given, else by the first robot that
+    says whose time it keeps.
+    """
+
+    def __init__(self, given: str | None = None) -> None:
+        self._given = given
+        self._kept: dict[str, str] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def name(self) -> str | None:
+        """Its name: "system", or that of a simulated time; None while it is open."""
+        return self._given or next(iter(list(self._kept.values())), None)
+
+    def objection(self, robot: str, domain: str) -> str:
+        """Why stamps of ``robot``, which keeps the time ``domain``, may not come in; empty when they may.
+
+        A robot whose wire does not tell its time, ``domain=""``, is taken to keep the same.
+        """
+        with self._lock:
+            self._kept.pop(robot, None)
+            held = self.name
+            if not domain or held is None or held == domain:
+                if domain:
+                    self._kept[robot] = domain
+                return ""
+            if self._given is not None:
+                holder = f"the clock here tells {held!r} time"
+            else:
+                holder = f"{next(iter(self._kept))!r}, which is in the same buffer, keeps {held!r} time"
+        return (
+            f"{robot!r} keeps {domain!r} time, but {holder}; stamps of the two cannot be compared: "
+            "give them buffers of their own, or all of them one clock"
+        )
