@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from zstate.clock import Clock
+from zstate.clock import SYSTEM, Clock
 from zstate.errors import InvalidInput
 
 
@@ -31,9 +31,14 @@ class RateReport:
 # longer pause (a debugger, a suspended laptop) a burst of old ticks would help nobody.
 _LONGEST_DELAY_NS = 100_000_000
 
+# A simulated time comes in steps, which are long when it runs fast.
+_LONGEST_STEP_NS = 1_000_000_000
+
 
 class Rate:
     """Iterate to get the stamp [ns] of each tick; the k-th deadline is ``start + k / rate_hz``.
+
+    Of simulated time, which comes in steps, a tick's stamp is its deadline, and 1 s is a long delay.
 
     Late ticks follow at once, so the rate stays exact; after a delay of more than 0.1 s the deadlines
     that passed meanwhile are skipped and counted. A clock that is set back is followed. Ends when
@@ -49,6 +54,8 @@ class Rate:
             raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
         self._ticks_wanted = math.inf if seconds is None else max(1, round(seconds * rate_hz))
         self._clock = clock
+        self._is_stepping = clock.domain != SYSTEM
+        self._longest_delay_ns = _LONGEST_STEP_NS if self._is_stepping else _LONGEST_DELAY_NS
         self._stop = stop
         self._ticks = 0
         self._skipped = 0
@@ -69,10 +76,13 @@ class Rate:
                 return
             now = self._clock.now()
             self._late += now - deadline > self._period_ns
-            if now - deadline > _LONGEST_DELAY_NS:
+            if now - deadline > self._longest_delay_ns:
                 due = int(min((now - start) * self.rate_hz / 1e9, self._ticks_wanted - 1))
                 self._skipped += due - tick
                 tick = due
+                deadline = start + round(tick * 1e9 / self.rate_hz)
+            if self._is_stepping:
+                now = min(now, deadline)
             self._first = now if self._first is None else self._first
             self._last = now
             self._ticks += 1
