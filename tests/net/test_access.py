@@ -1,0 +1,219 @@
+"""The access control of a fleet, as a router enforces it: r1 and r2 are robots, the others look."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+import zenoh
+from live import RRBOT, UPRIGHT, Tap
+from support import a_free_port, until
+
+from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
+from zstate.errors import InvalidInput
+from zstate.net.access import Fleet, access_control, access_text
+from zstate.net.session import Session
+from zstate.publisher import STREAMS
+
+FLEET = Fleet(("r1", "r2"), ("desk",), ("hand",), ("simulator",))
+USERS = (*FLEET.names, "stranger")
+
+
+class Site:
+    """A router with users, and sessions that come to it."""
+
+    def __init__(self, folder: Any, fleet: Fleet) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+        users = folder / "users.txt"
+        users.write_text("".join(f"{name}:secret\n" for name in USERS))
+        self.opened = ExitStack()
+        self.settings = {
+            "mode": "router",
+            "listen": {"endpoints": [self.endpoint]},
+            "scouting": {"multicast": {"enabled": False}},
+            "timestamping": {"enabled": False},
+            "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
+            "access_control": access_control(fleet),
+        }
+        self.opened.enter_context(connect(self.settings))
+
+    def join(self, user: str, **more: object) -> Session:
+        """A client who is ``user``."""
+        settings = {
+            "mode": "client",
+            "connect": {"endpoints": [self.endpoint], "timeout_ms": 5000},
+            "scouting": {"multicast": {"enabled": False}},
+            "transport": {"auth": {"usrpwd": {"user": user, "password": "secret"}}},
+            **more,
+        }
+        return self.opened.enter_context(connect(settings))
+
+
+@contextmanager
+def a_site(folder: Any, fleet: Fleet) -> Iterator[Site]:
+    site = Site(folder, fleet)
+    with site.opened:
+        yield site
+
+
+@pytest.fixture
+def site(tmp_path) -> Iterator[Site]:
+    with a_site(tmp_path, FLEET) as one:
+        yield one
+
+
+WRITES = [
+    ("r1", "zstate/r1/joint_states", True),
+    ("r1", "zstate/r1/joint_commands", True),
+    ("r1", "zstate/r2/joint_states", False),
+    ("r1", "zstate/*/joint_states", False),
+    ("r1", "zstate/$*1/joint_states", False),
+    ("r1", "zstate/**", False),
+    ("r1", "zstate/clock", False),
+    ("desk", "zstate/r1/joint_states", False),
+    ("desk", "zstate/r1/joint_commands", False),
+    ("desk", "zstate/clock", False),
+    ("hand", "zstate/r1/joint_commands", True),
+    ("hand", "zstate/r1/joint_states", False),
+    ("simulator", "zstate/clock", True),
+    ("simulator", "zstate/r1/joint_states", False),
+    ("stranger", "zstate/r1/joint_states", False),
+]
+
+
+def test_each_writes_what_is_theirs_and_nothing_else(site: Site):
+    tap = Tap(site.join("desk"), "zstate/**")
+    writers = {user: site.join(user) for user in USERS}
+    allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
+
+    def heard() -> set[tuple[bytes, str]]:
+        return {(arrival.payload, arrival.key) for arrival in tap.arrivals}
+
+    def all_is_heard_ten_times() -> bool:
+        for user, key, _ in WRITES:
+            writers[user].zenoh.put(key, user.encode())
+        return heard() >= allowed and len(tap.arrivals) >= 10 * len(allowed)
+
+    until(all_is_heard_ten_times)
+    assert heard() == allowed
+
+
+def test_a_viewer_who_comes_late_is_told_everything(site: Site):
+    robot = site.join("r1")
+    with (
+        StatePublisher(robot, RRBOT, "r1") as publisher,
+        StaticPublisher(robot, "r1", "mount") as mount,
+    ):
+        mount.set(Transform("base", "camera", (0.0, 0.0, 1.0), UPRIGHT))
+        viewer = site.join("desk")
+        (info,) = discover(viewer)
+        assert info.name == "r1"
+        assert {stream for stream, _ in info.writers} == set(STREAMS)
+        with TransformListener(viewer, "*") as model, TransformListener(viewer, "r1", follow="tf") as poses:
+            for listener in (model, poses):
+                assert listener.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
+                until(lambda reader=listener: publish_and_look(publisher, reader))
+
+
+def publish_and_look(publisher: StatePublisher, listener: TransformListener) -> bool:
+    publisher.publish([0.1, 0.2])
+    return listener.buffer.can_lookup("base", "lower")
+
+
+def test_a_robot_hears_its_own_keys_and_the_clock_only(site: Site):
+    taps = {user: Tap(site.join(user), "zstate/r1/joint_commands") for user in ("r1", "r2", "stranger")}
+    clock = Tap(site.join("r2"), "zstate/clock")
+    hand, simulator = site.join("hand"), site.join("simulator")
+
+    def all_is_heard_ten_times() -> bool:
+        hand.zenoh.put("zstate/r1/joint_commands", b"go")
+        simulator.zenoh.put("zstate/clock", b"tick")
+        return min(len(taps["r1"].arrivals), len(clock.arrivals)) >= 10
+
+    until(all_is_heard_ten_times)
+    assert (taps["r2"].arrivals, taps["stranger"].arrivals) == ([], [])
+
+
+def test_a_robot_that_is_a_viewer_too_sees_the_others(tmp_path):
+    with (
+        a_site(tmp_path, Fleet(("r1", "r2"), ("r2",))) as site,
+        StatePublisher(site.join("r1"), RRBOT, "r1"),
+    ):
+        assert [info.name for info in discover(site.join("r2"))] == ["r1"]
+
+
+def test_what_answers_lookups_is_asked_by_viewers_and_stands_under_its_own_robot(site: Site):
+    robot, other, viewer = site.join("r1"), site.join("r2"), site.join("desk")
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(query.key_expr, b"here")
+
+    robot.zenoh.declare_queryable("zstate/r1/lookup", answer)
+    other.zenoh.declare_queryable("zstate/$*1/lookup", answer)
+
+    def answers() -> list[str]:
+        replies = viewer.zenoh.get("zstate/r1/lookup", target=zenoh.QueryTarget.ALL, timeout=1.0)
+        return [reply.ok.payload.to_string() for reply in replies if reply.ok]
+
+    until(answers)
+    assert answers() == ["here"]
+
+
+def test_a_namespace_stands_before_every_key(tmp_path):
+    with (
+        a_site(tmp_path, Fleet(("r1",), ("desk",), namespace="hall/east")) as site,
+        StatePublisher(site.join("r1", namespace="hall/east"), RRBOT, "r1") as publisher,
+        TransformListener(site.join("desk", namespace="hall/east"), "r1") as listener,
+    ):
+        until(lambda: publish_and_look(publisher, listener))
+        assert discover(site.join("desk"), 0.2) == ()  # looks where nobody is
+
+
+def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    settings = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "access_control": access_control(Fleet(("r1",), ("desk",))),
+    }
+    with (
+        connect(settings),
+        connect(mode="client", endpoints=endpoint) as one,
+        connect(mode="client", endpoints=endpoint) as other,
+        StatePublisher(one, RRBOT, "r1"),
+    ):
+        assert discover(other, 0.3) == ()
+
+
+def test_the_text_says_the_same_to_zenoh():
+    parsed = json.loads(str(zenoh.Config.from_json5(access_text(FLEET))))["access_control"]
+    said = access_control(FLEET)
+    for section in ("rules", "subjects", "policies"):
+        named = [{k: v for k, v in one.items() if v is not None} for one in parsed[section]]
+        assert named == said[section]
+    assert (parsed["enabled"], parsed["default_permission"]) == (True, "deny")
+
+
+def test_only_the_rules_that_somebody_has_are_there():
+    rules = [rule["id"] for rule in access_control(Fleet(viewers=("desk", "desk")))["rules"]]
+    assert rules == ["viewers read", "viewers are given"]
+
+
+@pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])
+def test_a_name_that_cannot_be_one_is_refused(name: str):
+    with pytest.raises(InvalidInput, match="cannot be the name of an identity"):
+        Fleet((name,))
+
+
+@pytest.mark.parametrize("namespace", ["/hall", "hall/", "a//b", "h*", "@x"])
+def test_a_namespace_that_cannot_stand_before_keys_is_refused(namespace: str):
+    with pytest.raises(InvalidInput, match="is not made of chunks"):
+        Fleet(("r1",), namespace=namespace)
+
+
+def test_a_fleet_of_nobody_is_refused():
+    with pytest.raises(InvalidInput, match="nobody is named"):
+        Fleet()
