@@ -36,7 +36,7 @@ NAMES = [
 
 SIGNATURES = {
     "load_model": "(source, *, xacro_args=None)",
-    "connect": "(config=None, *, mode='peer', endpoints=(), listen=(), timeout_s=5.0)",
+    "connect": ("(config=None, *, mode='peer', endpoints=(), listen=(), timeout_s=5.0, credentials=None)"),
     "discover": "(session, timeout_s=1.0, *, wire='native')",
     "Kinematics": "(model)",
     "Kinematics.edge_poses": "(positions, out=None)",
@@ -46,12 +46,12 @@ SIGNATURES = {
     "SineSource.read": "(stamp)",
     "StatePublisher": (
         "(session, model, robot=None, wires=('native',), *, "
-        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='')"
+        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='', takeover=False)"
     ),
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",
     "StatePublisher.close": "()",
-    "StaticPublisher": "(session, robot, writer=None, wire='native', *, program='')",
+    "StaticPublisher": "(session, robot, writer=None, wire='native', *, program='', takeover=False)",
     "StaticPublisher.set": "(transform)",
     "StaticPublisher.withdraw": "(child)",
     "StaticPublisher.close": "()",

@@ -43,7 +43,7 @@ def test_an_endpoint_in_the_wrong_form_is_refused_with_the_right_one(endpoint: s
 
 
 def test_arguments_that_cannot_be_used_are_named():
-    with pytest.raises(InvalidInput, match="'peer', 'client', 'router'"):
+    with pytest.raises(InvalidInput, match="'peer', 'loopback', 'lan', 'client', 'router'"):
         connect(mode="broker")
     with pytest.raises(InvalidInput, match="'client' needs endpoints"):
         connect(mode="client")

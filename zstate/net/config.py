@@ -10,13 +10,14 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias
 
 import zenoh
 
 from zstate.errors import ConfigError, InvalidInput
+from zstate.net.security import Credentials
 
-Mode = Literal["peer", "client", "router"]
+Mode = Literal["peer", "loopback", "lan", "client", "router"]
 ConfigSource: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | zenoh.Config"
 
 CONFIG_VARIABLE = "ZENOH_CONFIG"
@@ -90,44 +91,80 @@ def _advice(address: str, protocol: str = "tcp") -> str:
     return f"write '{protocol}/host:port', for instance 'tcp/192.168.1.10:7447'"
 
 
-def check_mode(mode: str) -> Mode:
-    """``mode`` if it is one. Raises InvalidInput naming all of them."""
-    for known in get_args(Mode):
-        if mode == known:
-            return known
-    raise InvalidInput(f"{mode!r} is not a mode; the modes are {', '.join(map(repr, get_args(Mode)))}")
-
-
 def our_config(
-    mode: Mode, endpoints: Sequence[str], listen: Sequence[str], timeout_s: float | None = None
+    mode: Mode,
+    endpoints: Sequence[str],
+    listen: Sequence[str],
+    timeout_s: float | None = None,
+    credentials: Credentials | None = None,
 ) -> zenoh.Config:
     """Our settings. Without ``timeout_s`` connecting is tried for ever and opening never fails."""
-    settings = {
-        **SETTINGS,
-        "mode": mode,
-        "connect/endpoints": list(endpoints),
-        "listen/endpoints": list(listen),
-        "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
-        "connect/exit_on_failure": timeout_s is not None,
-    }
-    config = zenoh.Config()
+    return _told(
+        zenoh.Config(),
+        {
+            **SETTINGS,
+            **_mode(mode),
+            **_secured(credentials),
+            "connect/endpoints": list(endpoints),
+            "listen/endpoints": list(listen),
+            "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
+            "connect/exit_on_failure": timeout_s is not None,
+        },
+    )
+
+
+def given_config(
+    source: ConfigSource,
+    mode: Mode,
+    endpoints: Sequence[str],
+    listen: Sequence[str],
+    credentials: Credentials | None = None,
+) -> zenoh.Config:
+    """The user's configuration; credentials, endpoints and a mode other than "peer" replace what it says."""
+    told = {**({} if mode == "peer" else _mode(mode)), **_secured(credentials)}
+    if endpoints:
+        told["connect/endpoints"] = list(endpoints)
+    if listen:
+        told["listen/endpoints"] = list(listen)
+    return _told(_load(source), told)
+
+
+def _mode(mode: Mode) -> dict[str, object]:
+    if mode == "lan":
+        return {"mode": "peer", "scouting/multicast/enabled": True, "scouting/gossip/enabled": True}
+    return {"mode": "peer" if mode == "loopback" else mode}
+
+
+def _secured(credentials: Credentials | None) -> dict[str, object]:
+    return {} if credentials is None else credentials.settings()
+
+
+def _told(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return config
 
 
-def given_config(
-    source: ConfigSource, mode: Mode, endpoints: Sequence[str], listen: Sequence[str]
-) -> zenoh.Config:
-    """The user's configuration; endpoints and a mode other than "peer" replace what it says."""
-    config = _load(source)
-    if mode != "peer":
-        config.insert_json5("mode", json.dumps(mode))
-    if endpoints:
-        config.insert_json5("connect/endpoints", json.dumps(list(endpoints)))
-    if listen:
-        config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-    return config
+def endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
+    """Where it says to connect, as far as that is a plain list."""
+    found = json.loads(config.get_json("connect/endpoints"))
+    return tuple(e for e in found if isinstance(e, str)) if isinstance(found, list) else ()  # pyright: ignore[reportUnknownVariableType]
+
+
+def credentials_in(config: zenoh.Config) -> Credentials | None:
+    """What it shows to those it connects to, if that is of the kind that ``connect`` takes."""
+    tls: dict[str, Any] = json.loads(config.get_json("transport/link/tls"))
+    user: dict[str, Any] = json.loads(config.get_json("transport/auth/usrpwd"))
+    try:
+        return Credentials(
+            user=user["user"],
+            password=user["password"],
+            ca=tls["root_ca_certificate"],
+            certificate=tls["connect_certificate"],
+            key=tls["connect_private_key"],
+        )
+    except ConfigError:
+        return None
 
 
 def _load(source: ConfigSource) -> zenoh.Config:

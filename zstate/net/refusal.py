@@ -118,6 +118,11 @@ _WANTS_USER = Refusal(
     "it takes the link and refuses the session, as one does that asks for a user; give --user NAME with the "
     "password in ZSTATE_PASSWORD, or user= and password=",
 )
+_OF_ANOTHER_AUTHORITY = Refusal(
+    "wrong CA",
+    "its certificate is signed by no public authority, and this session was given no other to trust; give "
+    "--certs DIR --identity NAME, or credentials= with the ca.pem of the authority that signed it",
+)
 _EXPIRED = Refusal(
     "their certificate expired", "its certificate has expired; renew it there, and check both clocks"
 )
@@ -138,11 +143,12 @@ def _of_their_certificate(
             f"its certificate is not for {host!r}; connect to a name or address that is in it, or make one "
             f"that is: `zstate certs DIR --identity NAME --host {host}`",
         )
-    trusted = repr(str(credentials.ca)) if credentials and credentials.ca else "a public authority"
+    if credentials is None or credentials.ca is None:
+        return _OF_ANOTHER_AUTHORITY
     return Refusal(
         "wrong CA",
-        f"its certificate is not signed by {trusted} ({error.verify_message}); both sides need the ca.pem of "
-        "one authority, so make their identities in one folder",
+        f"its certificate is not signed by {str(credentials.ca)!r} ({error.verify_message}); both sides need the "
+        "ca.pem of one authority: make their identities in one folder",
     )
 
 

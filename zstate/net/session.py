@@ -10,6 +10,7 @@ import math
 import os
 import re
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
@@ -17,19 +18,26 @@ from typing import Any, Protocol
 import zenoh
 
 from zstate.closing import Closing
-from zstate.errors import Closed, InvalidInput, NetworkError, PortBusy, Unreachable
+from zstate.errors import Closed, ConfigError, InvalidInput, NetworkError, PortBusy
 from zstate.net.config import (
     ANY_LOOPBACK_PORT,
     CONFIG_VARIABLE,
-    ROUTER_ENDPOINT,
     ConfigSource,
     Mode,
-    check_mode,
+    credentials_in,
     endpoint_list,
+    endpoints_in,
     given_config,
     our_config,
 )
+from zstate.net.modes import (
+    check_credentials,
+    check_mode,
+    check_stays_here,
+    listening,
+)
 from zstate.net.rendezvous import Rendezvous, rendezvous_address
+from zstate.net.security import Credentials
 
 CLOSE_WITHIN_S = 0.8
 
@@ -41,6 +49,7 @@ def connect(
     endpoints: str | Sequence[str] = (),
     listen: str | Sequence[str] = (),
     timeout_s: float = 5.0,
+    credentials: Credentials | None = None,
 ) -> Session:
     """Join the network.
 
@@ -50,21 +59,40 @@ def connect(
     - ``"peer"``: a direct link to each of ``endpoints``, kept up for ever whether or not somebody
       answers yet, and to whoever comes to ``listen``. Peers do not pass on what others say: two of them
       that share nothing but a router hear nothing of each other, so towards routers be a client;
+    - ``"loopback"``: the same, and an endpoint that leaves this host is refused;
+    - ``"lan"``: a peer that listens on every interface, at any port unless ``listen`` says where, and
+      finds the others of this mode by multicast (224.0.0.224:7446). **It is open to whoever reaches this
+      host**, unless there are ``credentials``. Where multicast is blocked it is alone: give the ``endpoints``
+      of one that listens at a known port, and all who do meet each other through it;
     - ``"client"``: everything goes through the first of ``endpoints`` that answers, within
-      ``timeout_s`` [s]; once lost it is sought for ever;
+      ``timeout_s`` [s]; once lost, all of them are sought for ever;
     - ``"router"``: clients and peers connect to ``listen`` (tcp/127.0.0.1:7447 unless given).
 
-    ``config`` is a Zenoh configuration (a JSON5 file, a mapping or a ``zenoh.Config``), taken as it is;
-    without one, the file named by the environment variable ``ZENOH_CONFIG``. ``endpoints``, ``listen``
-    and a ``mode`` other than "peer" then replace what it says.
+    ``credentials`` say who this session is and whom it trusts. With certificates every endpoint is
+    tls/... or quic/... .
 
-    Raises InvalidInput or ConfigError for what cannot be used, Unreachable, PortBusy, NetworkError.
+    ``config`` is a Zenoh configuration (a JSON5 file, a mapping or a ``zenoh.Config``), taken as it is;
+    without one, the file named by the environment variable ``ZENOH_CONFIG``. ``endpoints``, ``listen``,
+    ``credentials`` and a ``mode`` other than "peer" then replace what it says.
+
+    Raises InvalidInput or ConfigError for what cannot be used, Unreachable where nobody answers,
+    AccessDenied where somebody does and refuses, PortBusy, NetworkError. Only a client learns that it is
+    refused: the other modes go on trying.
     """
     checked = _check(mode, endpoints, listen, timeout_s)
+    if credentials is not None:
+        _check_credentials(credentials, checked[1], checked[2])
     source = config if config is not None else os.environ.get(CONFIG_VARIABLE) or None
-    if source is not None:
-        return Session(_open(given_config(source, *checked), checked[1]))
-    return _connect(*checked, timeout_s)
+    if source is None:
+        return _connect(*checked, timeout_s, credentials)
+    if mode == "loopback":
+        raise ConfigError(
+            "mode 'loopback' stays on this host, and a Zenoh configuration could leave it; drop the "
+            f"configuration ({CONFIG_VARIABLE} names one, too), or the mode",
+            path="mode",
+        )
+    given = given_config(source, *checked, credentials)
+    return Session(_open(given, checked[1] or endpoints_in(given), credentials or credentials_in(given)))
 
 
 def _check(
@@ -72,24 +100,48 @@ def _check(
 ) -> tuple[Mode, tuple[str, ...], tuple[str, ...]]:
     if not (math.isfinite(timeout_s) and timeout_s > 0.0):
         raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
-    return check_mode(mode), endpoint_list(endpoints), endpoint_list(listen)
+    checked = check_mode(mode), endpoint_list(endpoints), endpoint_list(listen)
+    if checked[0] == "loopback":
+        check_stays_here((*checked[1], *checked[2]))
+    return checked
 
 
-def _connect(mode: Mode, endpoints: Sequence[str], listen: Sequence[str], timeout_s: float) -> Session:
-    if mode == "client":
-        if not endpoints:
-            raise InvalidInput("mode 'client' needs endpoints=, for instance 'tcp/192.168.1.10:7447'")
-        return Session(_open(our_config(mode, endpoints, listen, timeout_s), endpoints))
-    if mode == "router":
-        return Session(_open(our_config(mode, endpoints, listen or [ROUTER_ENDPOINT]), endpoints))
-    if endpoints or listen:
-        return Session(_open(our_config(mode, endpoints, listen or [ANY_LOOPBACK_PORT]), endpoints))
-    return _connect_on_this_host()
+def _check_credentials(credentials: Credentials, endpoints: Sequence[str], listen: Sequence[str]) -> None:
+    from zstate.net.credential_files import check_files  # noqa: PLC0415  # loads ssl, which few need
+
+    credentials.check_endpoints(endpoints, listen)
+    check_files(credentials)
 
 
-def _connect_on_this_host() -> Session:
+def _connect(
+    mode: Mode,
+    endpoints: Sequence[str],
+    listen: Sequence[str],
+    timeout_s: float,
+    credentials: Credentials | None,
+) -> Session:
+    if mode == "client" and not endpoints:
+        raise InvalidInput("mode 'client' needs endpoints=, for instance 'tcp/192.168.1.10:7447'")
+    if mode in ("peer", "loopback") and not (endpoints or listen):
+        return _connect_on_this_host(mode, credentials)
+    where = listening(mode, listen, credentials)
+    check_credentials(mode, credentials, where)
+    within = timeout_s if mode == "client" else None
+    return Session(_open(our_config(mode, endpoints, where, within, credentials), endpoints, credentials))
+
+
+def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
+    if credentials is not None:
+        raise ConfigError(
+            "programs of one host meet without credentials; say whom these are for: endpoints= or "
+            "listen=, with mode 'client' towards a router",
+            path="credentials",
+        )
+    host, port = rendezvous_address()
+    if mode == "loopback":
+        check_stays_here([f"tcp/{host}:{port}"])
     # The lobby first: while the rendezvous is silent, opening a session takes half a second longer.
-    rendezvous = Rendezvous(rendezvous_address(), _open_lobby)
+    rendezvous = Rendezvous((host, port), _open_lobby)
     try:
         raw = _open(our_config("peer", [rendezvous.endpoint], [ANY_LOOPBACK_PORT]), ())
     except BaseException:
@@ -102,14 +154,16 @@ def _open_lobby(endpoint: str) -> zenoh.Session:
     return zenoh.open(our_config("peer", (), [endpoint]))
 
 
-def _open(config: zenoh.Config, endpoints: Sequence[str]) -> zenoh.Session:
+def _open(
+    config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None = None
+) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise _explained(str(error), endpoints) from None
+        raise _explained(str(error), endpoints, credentials) from None
 
 
-def _explained(text: str, endpoints: Sequence[str]) -> NetworkError:
+def _explained(text: str, endpoints: Sequence[str], credentials: Credentials | None) -> NetworkError:
     """Zenoh has one error for everything; its text tells them apart."""
     busy = re.search(r"bound to (\S+?):? .*Address already in use", text)
     if busy:
@@ -118,10 +172,9 @@ def _explained(text: str, endpoints: Sequence[str]) -> NetworkError:
             endpoint=busy[1],
         )
     if "Unable to connect" in text:
-        where = " or ".join(repr(endpoint) for endpoint in endpoints) or "the configured endpoints"
-        return Unreachable(
-            f"nothing answers at {where}; is the router running? `zstate router`", endpoints=endpoints
-        )
+        from zstate.net.refusal import why_refused  # noqa: PLC0415  # loads ssl, which few need
+
+        return why_refused(endpoints, credentials)
     return NetworkError(f"Zenoh cannot open a session: {_without_places(text)}")
 
 
@@ -149,6 +202,7 @@ class Session(Closing):
         self._lock = threading.Lock()
         self._numbers = itertools.count()
         self.zid = str(raw.zid())
+        self.opened_at = time.monotonic()
 
     def __repr__(self) -> str:
         return f"Session({self.zid}{', closed' if self._closed else ''})"
