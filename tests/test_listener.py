@@ -31,8 +31,8 @@ def test_both_ways_of_following_agree_with_kinematics_at_every_stamp(sessions, m
     stamps = [STAMP + number * PERIOD for number in range(20)]
     with (
         StatePublisher(writer, model, "r1") as publisher,
-        TransformListener(reader, "r1") as joints,
-        TransformListener(reader, "r1", follow="tf") as transforms,
+        TransformListener(reader, "r1", history_on_join=False) as joints,
+        TransformListener(reader, "r1", follow="tf", history_on_join=False) as transforms,
     ):
         settle(writer, "r1", "joint_states", "tf")
         for stamp in stamps:

@@ -46,7 +46,7 @@ SIGNATURES = {
     "SineSource.read": "(stamp)",
     "StatePublisher": (
         "(session, model, robot=None, wires=('native',), *, "
-        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='', takeover=False)"
+        "streams=('joint_states', 'tf', 'tf_static', 'robot_description'), clock=None, program='', takeover=False, cache_s=2.0)"
     ),
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",
@@ -88,7 +88,7 @@ SIGNATURES = {
     "Recording.close": "()",
     "TransformListener": (
         "(session, robot='*', buffer=None, wire='native', follow='joint_states', history_s=10.0, "
-        "*, clock=None)"
+        "*, clock=None, history_on_join=True)"
     ),
     "TransformListener.robots": "()",
     "TransformListener.close": "()",

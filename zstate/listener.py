@@ -16,6 +16,7 @@ from zstate.following.follower import Follower
 from zstate.following.joints import JointFollower
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
+from zstate.net.history import PastReader
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
@@ -34,7 +35,9 @@ class TransformListener(Closing):
 
     Frames are called ``robot/frame`` in the buffer, and answer to their bare names while those are
     unique. ``follow="joint_states"`` takes joint positions and the model and does the kinematics here;
-    ``follow="tf"`` takes ready transforms and needs no model. A context manager.
+    ``follow="tf"`` takes ready transforms and needs no model. With ``history_on_join`` the buffer learns
+    from the publishers of the native wire what they said in the seconds before (``StatePublisher``'s
+    ``cache_s``). A context manager.
 
     What cannot be used is counted in ``stats``, reported once through ``logging``, and never stops
     the stream.
@@ -50,6 +53,7 @@ class TransformListener(Closing):
         history_s: float = 10.0,
         *,
         clock: Clock | None = None,
+        history_on_join: bool = True,
     ) -> None:
         if follow not in ("joint_states", "tf"):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
@@ -57,6 +61,7 @@ class TransformListener(Closing):
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         self._wire = wire_named(wire)
         self._follow: Follow = follow
+        self._recalls = history_on_join
         self._tally = Tally()
         self._names: dict[int, str] = {}
         self._followers: dict[tuple[str, int], Follower] = {}
@@ -65,6 +70,7 @@ class TransformListener(Closing):
         self._overflowed: set[Follower] = set()
         # A model makes room for its links before it is added: no static edge may come between.
         self._rebuilding = threading.Lock()
+        self._past: PastReader | None = None
         with ExitStack() as opening:
             self._open(session, wire, opening)
             self._opened = opening.pop_all()
@@ -75,9 +81,13 @@ class TransformListener(Closing):
         opening.enter_context(LatchedSubscriber(session, key, self._on_description))
         key = expression(robot, "tf_static")
         opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
-        opening.enter_context(watch(session, robot, self._on_writer, wire))
         key = expression(robot, self._follow)
         opening.enter_context(StreamSubscriber(session, key, self._on_samples))
+        if self._recalls and self._wire.name == "native":
+            self._past = PastReader(session, self._on_past, self._note_broken)
+            opening.enter_context(self._past)
+        # After the subscription: who is asked for the past then has everything newer sent to us.
+        opening.enter_context(watch(session, robot, self._on_writer, wire))
         heard: tuple[Stream, ...] = ("robot_description", "tf_static", self._follow)
         for announcement in announce_reader(session, self._wire, robot, heard):
             opening.enter_context(announcement)
@@ -124,6 +134,19 @@ class TransformListener(Closing):
                     follower.take(sample, overflowed=follower in self._overflowed)
                     self._overflowed.discard(follower)
 
+    def _on_past(self, arrivals: list[Arrival]) -> bool:
+        robot = self._robot_of(arrivals[0].key)
+        samples = [
+            sample
+            for arrival in arrivals
+            for sample in self._decode(self._follow, arrival, robot)
+            if isinstance(sample, Sample)
+        ]
+        return bool(samples) and self._follower(robot, samples[-1].session).take_past(samples)
+
+    def _note_broken(self, key: str, error: MessageError) -> None:
+        self._tally.refuse(error.reason, f"{key}: {error}")
+
     def _on_description(self, arrival: Arrival) -> None:
         if self._is_withdrawn(arrival):
             return
@@ -167,7 +190,7 @@ class TransformListener(Closing):
         try:
             return self._wire.decode(stream, arrival, robot)
         except MessageError as error:
-            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
+            self._note_broken(arrival.key, error)
             return ()
 
     def _on_writer(self, announced: Announced, alive: bool) -> None:
@@ -180,6 +203,8 @@ class TransformListener(Closing):
             self._note_static_writer(session, alive=alive)
         if announced.stream != self._follow:
             return
+        if alive and self._past is not None:
+            self._past.ask(self._wire.expression(announced.robot, self._follow), session)
         if self._follow not in self._wire.shared:
             self._note_writer(self._follower(announced.robot, session), session, alive=alive)
         elif (announced.robot, session) in self._followers:

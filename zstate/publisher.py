@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.closing import Closing
-from zstate.errors import Closed, InvalidInput
+from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
+from zstate.moving_edges import MovingEdges
+from zstate.net.claims import Claim
+from zstate.net.history import Memory, answer_past
+from zstate.net.clock_offset import ClockService
 from zstate.net.outlets import Outlets, StreamOutlet
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
@@ -24,16 +27,17 @@ from zstate.net.wires import wire_named
 from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
 from zstate.status import Beat, PublisherStats, StreamStats
-from zstate.wire.keys import MODEL_WRITER, Stream, check_robot, wire_name
+from zstate.wire.keys import MODEL_WRITER, Stream, check_robot
 from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
     StaticTransforms,
-    TransformSample,
+    from_block,
     order_digest,
     to_block,
 )
+from zstate.wire.writer import Announced, Writer
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """What a robot's state consists of on the network."""
@@ -48,8 +52,15 @@ class StatePublisher(Closing):
     (``tf_static``). Samples go out on ``joint_states``; the moving edges also on ``tf``, while somebody
     reads that. ``robot`` is its name on the network, the model's name unless given. ``streams`` names
     what this publisher writes, where another program writes the rest. ``program`` is who others see
-    writing, the script's name unless given. On the native wire it says once a second how it does, to
-    those who ask (``zstate.net.status``). A context manager; safe from any thread.
+    writing, the script's name unless given.
+
+    Where somebody else who lives writes one of its streams on the native wire, SecondWriter is raised and
+    names the first; of two that open at once the later one gets it from ``publish``, and is closed by it.
+    With ``takeover`` it writes nevertheless, and readers follow whoever came last.
+
+    On the native wire it says once a second how it does, to
+    those who ask (``zstate.net.status``); and it remembers the last ``cache_s`` seconds of samples for
+    listeners that join (``zstate.net.history``; 0 for none). A context manager; safe from any thread.
     """
 
     def __init__(
@@ -62,6 +73,8 @@ class StatePublisher(Closing):
         streams: Sequence[Stream] = STREAMS,
         clock: Clock | None = None,
         program: str = "",
+        takeover: bool = False,
+        cache_s: float = 2.0,
     ) -> None:
         self.model = model
         self.robot = check_robot(robot or model.name)
@@ -69,7 +82,7 @@ class StatePublisher(Closing):
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._opened = ExitStack()
-        self._edges = _MovingEdges(model, self.robot)
+        self._edges = MovingEdges(model, self.robot)
         self._session_id = secrets.randbits(32)
         self._seq = 0
         self._refused = 0
@@ -81,6 +94,10 @@ class StatePublisher(Closing):
         layout = Layout(coordinate_names(model), velocity_slots(model), self._edges.names)
         writer = writer_here(self._session_id, program)
         with ExitStack() as opening:
+            self._claim = self._claimed(session, writer, streams, opening) if not takeover else None
+            if "native" in wires and self._clock.domain == SYSTEM:
+                # Before anybody is told of this writer: who is told asks what time it is here.
+                opening.enter_context(ClockService(session, self.robot, writer, self._clock))
             outlets = [
                 opening.enter_context(Outlets(session, wire_named(wire), self.robot, writer, layout))
                 for wire in wires
@@ -89,7 +106,33 @@ class StatePublisher(Closing):
             if "native" in wires and {"joint_states", "tf"}.intersection(streams):
                 status = Beat(writer, lambda: self.stats).status
                 opening.enter_context(StatusPublisher(session, self.robot, writer.identity, status))
+            self.memory = self._remembering(session, streams, cache_s, opening)
             self._opened = opening.pop_all()
+
+    def _remembering(
+        self, session: Session, streams: Sequence[Stream], cache_s: float, opening: ExitStack
+    ) -> Memory | None:
+        if cache_s == 0.0 or "native" not in self._wires:
+            return None
+        memory = Memory(cache_s, self.model.position_count + 2 * self.model.velocity_count)
+        output = self._outputs[self._wires.index("native")]
+        for stream, say in output.sayings.items():
+            if stream in streams:
+                service = answer_past(session, self.robot, stream, memory, say)
+                opening.enter_context(service)
+        return memory
+
+    def _claimed(
+        self, session: Session, writer: Writer, streams: Sequence[Stream], opening: ExitStack
+    ) -> Claim | None:
+        # In ROS several writers of a topic are normal, and nobody could be refused.
+        if "native" not in self._wires or not streams:
+            return None
+        wanted = [
+            Announced(self.robot, stream, writer, MODEL_WRITER if stream == "tf_static" else "")
+            for stream in streams
+        ]
+        return opening.enter_context(Claim(session, wanted))
 
     def _output(self, outlets: Outlets, streams: Sequence[Stream]) -> _Output:
         if "robot_description" in streams:
@@ -102,7 +145,12 @@ class StatePublisher(Closing):
         """What late joiners are told of the robot."""
         model = self.model
         return RobotDescription(
-            self._session_id, model.urdf, model.digest, model.joint_names, self._edges.names
+            self._session_id,
+            model.urdf,
+            model.digest,
+            model.joint_names,
+            self._edges.names,
+            self._clock.domain,
         )
 
     def statics(self) -> StaticTransforms:
@@ -132,8 +180,8 @@ class StatePublisher(Closing):
         ``positions`` [rad] or [m] are in the order of ``model.joint_names``, or a mapping of joint names
         that has all of them; ``velocities`` per second and ``efforts`` [Nm] or [N] likewise in that order
         where they are known. Raises InvalidInput for wrong counts, unknown or missing names, NaN and
-        infinity, a floating joint without a unit quaternion, a stamp that a wire cannot say, and Closed;
-        then nothing was sent.
+        infinity, a floating joint without a unit quaternion, a stamp that a wire cannot say, and Closed
+        and SecondWriter; then nothing was sent.
         """
         try:
             self._publish(positions, velocities, efforts, stamp)
@@ -160,18 +208,30 @@ class StatePublisher(Closing):
         with self._lock:
             if self._stop.is_set():
                 raise Closed(f"the publisher of {self.robot!r} is closed")
+            self._yield_to_the_first()
             head = (stamp, self._seq, self._session_id)
             state = JointState(*head, self._joint_order, to_block(numbers), rates, forces)
             said = [one for output in self._outputs for one in output.said(state, numbers)]
             self._seq += 1
+            if self.memory is not None:
+                # First: who hears nothing of this sample yet can then be told of it.
+                self.memory.keep(state)
             for outlet, payload in said:
                 outlet.put(payload)
+
+    def _yield_to_the_first(self) -> None:
+        try:
+            if self._claim is not None:
+                self._claim.check()
+        except SecondWriter:
+            self._opened.close()  # also what late joiners would be given
+            raise
 
     def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
         """Publish what ``source`` reads, at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
 
         Each tick has an absolute deadline (see ``Rate`` for what becomes of late ones). A tick for
-        which the source has nothing new sends nothing.
+        which the source has nothing new sends nothing. Raises SecondWriter.
         """
         self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
         for now in rate:
@@ -194,7 +254,7 @@ class StatePublisher(Closing):
 class _Output:
     """The streams of one wire."""
 
-    def __init__(self, outlets: Outlets, streams: Sequence[Stream], edges: _MovingEdges) -> None:
+    def __init__(self, outlets: Outlets, streams: Sequence[Stream], edges: MovingEdges) -> None:
         self._edges = edges
         said: tuple[Stream, ...] = ("joint_states", "tf")
         self.outlets: dict[Stream, StreamOutlet] = {
@@ -208,38 +268,20 @@ class _Output:
         if self._joints is not None:
             yield self._joints, self._joints.encode(state)
         if self._transforms is not None and self._transforms.has_readers:
-            poses = to_block(self._edges.poses(positions))
-            sample = TransformSample(state.stamp, state.seq, state.session, self._edges.order, poses)
-            yield self._transforms, self._transforms.encode(sample)
+            yield self._transforms, self._transforms.encode(self._edges.sample(state, positions))
+
+    @property
+    def sayings(self) -> dict[Stream, Callable[[JointState], bytes]]:
+        """How this wire says of a state again what it said when that was new."""
+
+        def say_transforms(state: JointState) -> bytes:
+            return self.outlets["tf"].encode(self._edges.sample(state, from_block(state.positions)))
+
+        says: dict[Stream, Callable[[JointState], bytes]] = {"tf": say_transforms}
+        return says if self._joints is None else {**says, "joint_states": self._joints.encode}
 
 
 def _check_streams(streams: Sequence[Stream]) -> None:
     for stream in streams:
         if stream not in STREAMS:
             raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")
-
-
-class _MovingEdges:
-    """The edges of a model as they are called on the network, moving and fixed apart."""
-
-    def __init__(self, model: RobotModel, robot: str) -> None:
-        self._table = EdgeTable(model)
-        forms = self._table.forms
-        names = [(wire_name(robot, form.parent), wire_name(robot, form.child)) for form in forms]
-        fixed = [form.kind == "fixed" for form in forms]
-        self._rows = np.flatnonzero(~np.array(fixed, dtype=np.bool_))
-        self.names = tuple(names[row] for row in self._rows)
-        self.order = order_digest(self.names)
-        self._fixed_names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if is_fixed)
-        self._fixed_poses = [form.origin for form in forms if form.kind == "fixed"]
-
-    def check(self, positions: NDArray[np.float64]) -> None:
-        """Raise InvalidInput for a floating joint's quaternion that is not of unit length."""
-        self._table.normalised(positions)
-
-    def poses(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``parent_from_child`` of each of ``names``: (n, 7)."""
-        return self._table.poses(positions).take(self._rows, axis=0)
-
-    def statics(self, session: int) -> StaticTransforms:
-        return StaticTransforms(session, self._fixed_names, to_block(self._fixed_poses))

@@ -5,14 +5,17 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Sequence
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InsertRefused, InvalidInput, MessageError
+from zstate.following.absent import Absent
 from zstate.following.tally import Tally
 from zstate.wire.messages import RobotDescription, Sample
 
 # So many samples are kept that arrive before the robot is described, which takes milliseconds.
 _EARLY = 1024
+_EARLY_PAST = 20_000
 
 
 class Follower(ABC):
@@ -29,6 +32,8 @@ class Follower(ABC):
         self._next_seq: int | None = None
         self._last_late: Sample | None = None
         self._early: deque[Sample] = deque(maxlen=_EARLY)
+        self._past: list[Sample] = []
+        self._absent = Absent()
         self._lock = threading.RLock()
         buffer.name_robot(robot)
 
@@ -68,6 +73,36 @@ class Follower(ABC):
             else:
                 self._keep_early(sample)
 
+    def take_past(self, samples: Sequence[Sample]) -> bool:
+        """Put what its writer said before into the buffer: some of its samples, oldest first.
+
+        Only what is missing is taken, and it counts for nothing else. What is known grows backwards from
+        what was heard, so that nothing is ever interpolated across a gap that is about to be filled. Says
+        whether still older ones are wanted.
+        """
+        self.heard = True
+        for sample in reversed(samples):
+            with self._lock:  # one by one: what is live need not wait for all of it
+                if not self._follow_session(sample):
+                    return False
+                if sample.seq in self._absent and not self._recall(sample):
+                    return False
+                self._absent.stop_at(sample.seq)
+        return bool(self._absent)
+
+    def _recall(self, sample: Sample) -> bool:
+        """Whether an older one would be taken, too."""
+        if not self._can_read(sample):
+            self._past.append(sample)
+            return len(self._past) < _EARLY_PAST
+        try:
+            taken = self._insert(sample)
+        except (InvalidInput, MessageError) as error:
+            self._refuse(error)
+            return False
+        self._tally.count("recalled", int(taken))
+        return taken
+
     def _keep_early(self, sample: Sample) -> None:
         if len(self._early) == _EARLY:
             self._refuse_undescribed()
@@ -81,6 +116,10 @@ class Follower(ABC):
                 self._insert_counted(sample)
             else:
                 self._refuse_undescribed()
+        past, self._past = self._past, []
+        for sample in past:
+            if not (self._can_read(sample) and self._recall(sample)):
+                break
 
     def _refuse_undescribed(self) -> None:
         self._tally.refuse("no description", f"{self.robot!r}: no robot_description fits its samples")
@@ -89,10 +128,13 @@ class Follower(ABC):
         try:
             taken = self._insert(sample) or self._begin_again(sample)
         except (InvalidInput, MessageError) as error:
-            reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
-            self._tally.refuse(reason, f"{self.robot!r}: {error}")
+            self._refuse(error)
         else:
             self._tally.count("received" if taken else "late")
+
+    def _refuse(self, error: InvalidInput | MessageError) -> None:
+        reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
+        self._tally.refuse(reason, f"{self.robot!r}: {error}")
 
     def _begin_again(self, sample: Sample) -> bool:
         """A new epoch with this sample, if it shows that the writer's clock was set back.
@@ -122,6 +164,8 @@ class Follower(ABC):
                 self._early.clear()
                 self._succeed(sample)
             self._session = session
+            self._past.clear()
+            self._absent = Absent()
             self._next_seq = None
             self._last_late = None
             self._writer_changed()
@@ -132,7 +176,10 @@ class Follower(ABC):
         self._restart()
 
     def _count_gap(self, seq: int, overflowed: bool) -> None:
-        if self._next_seq is not None and seq > self._next_seq:
+        if self._next_seq is None:
+            self._absent.stop_at(seq)
+        elif seq > self._next_seq:
+            self._absent.add(self._next_seq, seq)
             self._tally.count("dropped" if overflowed else "missed", seq - self._next_seq)
         self._next_seq = max(seq + 1, self._next_seq or 0)
 

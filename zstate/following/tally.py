@@ -16,6 +16,7 @@ class Stats:
 
     ``received`` samples were taken; ``dropped`` by our own full ring, ``missed`` between the writer's
     sequence numbers; ``late`` ones were older than the history; ``refused`` says why others were not used.
+    ``recalled`` samples were said before we listened, and their writer still knew them.
     """
 
     received: int
@@ -23,6 +24,7 @@ class Stats:
     missed: int
     late: int
     refused: dict[str, int]
+    recalled: int = 0
 
 
 class Tally:
@@ -35,7 +37,7 @@ class Tally:
         self._noted: set[str] = set()
 
     def count(self, what: str, number: int = 1) -> None:
-        """Add to one of received, dropped, missed, late."""
+        """Add to one of received, dropped, missed, late, recalled."""
         with self._lock:
             self._counts[what] += number
 
@@ -45,7 +47,8 @@ class Tally:
             self._refused[reason] += 1
             first = self._refused[reason] == 1
         if first:
-            _LOG.warning("refused (%s): %s; further ones are only counted", reason, text)
+            facts = {"event": "refused", "reason": reason}
+            _LOG.warning("refused (%s): %s; further ones are only counted", reason, text, extra=facts)
 
     def note(self, event: str, text: str) -> None:
         """Log the first event of its kind."""
@@ -59,4 +62,4 @@ class Tally:
         """All counts now."""
         with self._lock:
             counts = (self._counts[what] for what in ("received", "dropped", "missed", "late"))
-            return Stats(*counts, refused=dict(self._refused))
+            return Stats(*counts, refused=dict(self._refused), recalled=self._counts["recalled"])

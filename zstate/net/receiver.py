@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import zenoh
 
@@ -15,15 +15,17 @@ JOIN_WITHIN_S = 0.8
 
 Ring: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Sample]"
 
+T = TypeVar("T")
 
-class Subscribed(Undeclarable, Protocol):
-    """A Zenoh subscriber of any kind that delivers into a channel."""
+
+class Subscribed(Undeclarable, Protocol[T]):
+    """A Zenoh subscriber or queryable of any kind that delivers into a channel."""
 
     @property
-    def handler(self) -> zenoh.Handler[zenoh.Sample]: ...
+    def handler(self) -> zenoh.Handler[T]: ...
 
 
-class Receiver:
+class Receiver(Generic[T]):
     """Hands what arrives to ``on_batch``, everything that waits at once, oldest first.
 
     A ring of ``capacity`` lies between: when it is full the oldest samples are lost. A batch that
@@ -35,8 +37,8 @@ class Receiver:
     def __init__(
         self,
         session: Session,
-        subscribed: Subscribed,
-        on_batch: Callable[[list[zenoh.Sample]], None],
+        subscribed: Subscribed[T],
+        on_batch: Callable[[list[T]], None],
         capacity: int,
     ) -> None:
         self.full_batches = 0
@@ -67,7 +69,7 @@ class Receiver:
                 return  # undeclared, or the session was closed
             self._hand_over(batch)
 
-    def _hand_over(self, batch: list[zenoh.Sample]) -> None:
+    def _hand_over(self, batch: list[T]) -> None:
         if len(batch) >= self._capacity:
             self.full_batches += 1
         if self._closed:

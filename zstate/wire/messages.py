@@ -176,6 +176,17 @@ class Status(Message, frozen=True, array_like=True, gc=False):
     values: dict[str, str] = {}
 
 
+class Past(Message, frozen=True, array_like=True, gc=False):
+    """Samples that were sent before, oldest first, each as it was sent under ``encoding``.
+
+    ``before`` is the ``seq`` of the first of them: what to ask for next; None when nothing older is kept.
+    """
+
+    encoding: str
+    samples: tuple[bytes, ...]
+    before: Count | None = None
+
+
 def _check_numbers(*blocks: bytes | None) -> None:
     for block in blocks:
         if block is not None and len(block) % 8:

@@ -24,6 +24,7 @@ from zstate.wire.messages import (
     JointCommand,
     JointState,
     Message,
+    Past,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -44,6 +45,7 @@ _TYPES: tuple[type[Message], ...] = (
     RobotDescription,
     Clock,
     Status,
+    Past,
 )
 ENCODINGS: dict[type[Message], str] = {kind: f"zstate/{kind.__name__};v={VERSION}" for kind in _TYPES}
 STREAM_TYPES: dict[Stream, type[Message]] = {
@@ -87,7 +89,8 @@ class NativeOutlet:
     def __init__(self, robot: str, stream: Stream, writer: Writer, name: str) -> None:
         self.key = stream_key(robot, stream, name)
         self.encoding = ENCODINGS[STREAM_TYPES[stream]]
-        self.token = None if stream == "clock" else writer_key(robot, stream, writer.identity)
+        said = Announced(robot, stream, writer, name if stream == "tf_static" else "")
+        self.token = None if stream == "clock" else writer_key(robot, stream, said.identity)
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
@@ -140,8 +143,7 @@ class NativeWire:
 
     def announced(self, token: str, robot: str) -> Announced | None:
         try:
-            name, stream, identity = parse_writer_key(token)
-            return Announced(name, stream, Writer.parse(identity))
+            return Announced.parse(*parse_writer_key(token))
         except InvalidInput:
             return None
 

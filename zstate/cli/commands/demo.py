@@ -92,7 +92,7 @@ def _look(
     buffer = MeteredBuffer()
     with (
         open_session(Network(listen=(endpoint,))) as session,
-        TransformListener(session, robot, buffer) as listener,
+        TransformListener(session, robot, buffer, history_on_join=False) as listener,
     ):
         note(f"waiting for {robot!r} ...")
         if not _has_begun(buffer.meter, ended):

@@ -87,7 +87,7 @@ class Ears(Closing):
                 self._open(info.name, self._roster.streams(info.name))
         reason = "" if self._ears else self._reason()
         if reason and reason != self._said:
-            note(f"waiting: {reason}")
+            note(f"waiting: {reason}", event="waiting", robot=self._robot)
         self._said = reason
 
     def _open(self, robot: str, streams: frozenset[Stream]) -> None:
@@ -97,9 +97,11 @@ class Ears(Closing):
         follow = self._followed(streams)
         if follow in streams:
             buffer = MeteredBuffer()
-            listener = TransformListener(self._session, robot, buffer, self._wire, follow)
+            listener = TransformListener(
+                self._session, robot, buffer, self._wire, follow, history_on_join=False
+            )
             self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
-            note(f"following {self._roster.words.place(robot, (follow,))}")
+            note(f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot)
 
     def _followed(self, streams: frozenset[Stream]) -> Follow:
         if is_ros(self._wire) and "tf" in streams:

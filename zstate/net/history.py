@@ -1,0 +1,229 @@
+"""History on join: what a writer said in the last seconds, for whoever begins to listen.
+
+A writer remembers its last samples, and answers a query on the key of the stream, page by page, the
+newest first::
+
+    zstate/<robot>/joint_states?session=<session>;before=<seq>
+
+The answer is one ``Past`` of at most 32 kB; without ``before`` it is the newest, without ``session`` that
+of any writer. A reader asks for the next page when it has one: so no more than a page is ever under way
+to it, which fits into the queues between, and no live sample of anybody waits behind it. Page by page its
+history grows backwards from the present, without a gap at any moment.
+"""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+
+import zenoh
+
+from zstate.closing import Closing
+from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.net.receiver import JOIN_WITHIN_S
+from zstate.net.service import Answer, Service
+from zstate.net.session import Session
+from zstate.net.streams import arrival_of
+from zstate.wire.keys import Stream, stream_key
+from zstate.wire.messages import JointState, Past
+from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
+from zstate.wire.wire import Arrival
+
+PAGE_BYTES = 32_000
+PAGE_SAMPLES = 256
+"""So many make a page where samples are small: then a page takes well below a millisecond to make."""
+
+MOST_BYTES = 8_000_000
+TIMEOUT_S = 1.0
+_OVERHEAD = 300
+"""What a remembered sample takes besides its numbers [bytes]."""
+
+_IN_FLIGHT = 4
+_MOST_PAGES = 4096
+
+
+class Memory:
+    """The samples of one writer of the last ``span_s`` seconds before the newest, by their stamps.
+
+    At most as many as fit into 8 MB, ``numbers`` numbers in each. One thread at a time remembers; any
+    thread may ask meanwhile.
+    """
+
+    def __init__(self, span_s: float, numbers: int) -> None:
+        if not 0.0 < span_s < 1e9:
+            raise InvalidInput(f"cache_s is a number of seconds, 0 for no cache; not {span_s!r}")
+        self.span_s = span_s
+        self._span_ns = round(span_s * 1e9)
+        self._states: deque[JointState] = deque(maxlen=MOST_BYTES // (8 * numbers + _OVERHEAD))
+
+    def keep(self, state: JointState) -> None:
+        """Remember ``state``, whose ``seq`` is one more than that of the last."""
+        states, stamp = self._states, state.stamp
+        if states:
+            limit = stamp - self._span_ns
+            if stamp < states[-1].stamp - self._span_ns:
+                states.clear()  # the clock was set back
+            else:
+                while states[0].stamp < limit:
+                    states.popleft()
+        states.append(state)
+
+    def since(self, seq: int) -> list[JointState]:
+        """What is remembered from the sample ``seq`` on."""
+        states = self._states.copy()  # at once: the writer goes on meanwhile
+        first = seq - states[0].seq if states else 0
+        return list(islice(states, max(0, first), None))
+
+    def before(self, seq: int | None, count: int) -> tuple[list[JointState], bool]:
+        """The last ``count`` samples before ``seq``, or the newest, and whether there are older ones."""
+        states = self._states.copy()
+        if not states:
+            return [], False
+        end = len(states) if seq is None else min(max(0, seq - states[0].seq), len(states))
+        first = max(0, end - count)
+        return list(islice(states, first, end)), first > 0
+
+
+def answer_past(
+    session: Session, robot: str, stream: Stream, memory: Memory, say: Callable[[JointState], bytes]
+) -> Service:
+    """Answer on the key of ``stream`` with what ``memory`` holds, each sample as ``say`` says it there."""
+    encoding = ENCODINGS[STREAM_TYPES[stream]]
+
+    def answer(parameters: Mapping[str, str]) -> Answer | None:
+        before = parameters.get("before", "")
+        states, more = memory.before(int(before) if _is_count(before) else None, PAGE_SAMPLES)
+        if not states or parameters.get("session", str(states[0].session)) != str(states[0].session):
+            return None  # another writer of this key is asked
+        samples = _page(states, say)
+        first = states[-len(samples)].seq
+        older = more or len(samples) < len(states)
+        past = Past(encoding, samples, first if older else None)
+        return Answer(encode(past), ENCODINGS[Past])
+
+    return Service(session, stream_key(robot, stream), answer)
+
+
+def _page(states: Sequence[JointState], say: Callable[[JointState], bytes]) -> tuple[bytes, ...]:
+    """The newest of ``states`` as they are said, as many as fit into a page, at least one."""
+    samples: list[bytes] = []
+    room = PAGE_BYTES
+    for state in reversed(states):
+        samples.append(say(state))
+        room -= len(samples[-1])
+        if room < len(samples[-1]):
+            break
+    return tuple(reversed(samples))
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdecimal() and len(text) <= 19
+
+
+@dataclass(eq=False)
+class _Asked:
+    """One writer who is asked, and how far that has come."""
+
+    key: str
+    writer: int
+    before: int | None = None
+    pages: int = 0
+    replies: list[zenoh.Sample] = field(default_factory=list[zenoh.Sample])
+
+
+class PastReader(Closing):
+    """Asks writers what they said before, all of them from one thread.
+
+    ``on_page(arrivals)`` is called from that thread, page by page from the newest to the oldest; the
+    arrivals of a page are oldest first. It says whether older ones are wanted. Who does not answer is
+    not asked again; a page that cannot be read goes to ``on_error``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        on_page: Callable[[list[Arrival]], bool],
+        on_error: Callable[[str, MessageError], None],
+    ) -> None:
+        self._session = session
+        self._on_page = on_page
+        self._on_error = on_error
+        self._events: queue.SimpleQueue[tuple[_Asked, bool] | None] = queue.SimpleQueue()
+        self._waiting: deque[_Asked] = deque()
+        self._in_flight = 0
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="zstate past", daemon=True)
+        self._thread.start()
+
+    def ask(self, key: str, writer: int) -> None:
+        """Ask the writer whose session that is for what it said on ``key``. Returns at once."""
+        self._events.put((_Asked(key, writer), False))
+
+    def _run(self) -> None:
+        while (event := self._events.get()) is not None and not self._closed:
+            asked, has_answered = event
+            if has_answered:
+                self._in_flight -= 1
+            if not has_answered or self._hand_over(asked):
+                self._waiting.append(asked)
+            while self._waiting and self._in_flight < _IN_FLIGHT:
+                self._send(self._waiting.popleft())
+
+    def _send(self, asked: _Asked) -> None:
+        selector = f"{asked.key}?session={asked.writer}"
+        if asked.before is not None:
+            selector += f";before={asked.before}"
+        asked.replies = []
+        try:
+            self._get(selector, asked)
+            self._in_flight += 1
+        except (zenoh.ZError, Closed):
+            self._closed = True  # with the session
+
+    def _get(self, selector: str, asked: _Asked) -> None:
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                asked.replies.append(reply.ok)
+
+        # Called in a thread of Zenoh's, which a list and a queue do not hold up.
+        handler = zenoh.handlers.Callback(take, lambda: self._events.put((asked, True)), indirect=False)
+        self._session.zenoh.get(
+            selector,
+            handler,
+            timeout=TIMEOUT_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            # Replies travel as their queries do: behind all that is live, and sooner lost than waited for.
+            priority=zenoh.Priority.DATA_LOW,
+            congestion_control=zenoh.CongestionControl.DROP,
+        )
+
+    def _hand_over(self, asked: _Asked) -> bool:
+        """Whether there is another page to ask for."""
+        if not asked.replies:
+            return False
+        page = arrival_of(asked.replies[0])
+        try:
+            past = decode(page.payload, page.encoding, Past)
+        except MessageError as error:
+            self._on_error(page.key, error)
+            return False
+        arrivals = [Arrival(page.key, sample, past.encoding) for sample in past.samples]
+        is_wanted = self._on_page(arrivals)
+        asked.pages += 1
+        goes_back = past.before is not None and (asked.before is None or past.before < asked.before)
+        asked.before = past.before
+        return is_wanted and goes_back and asked.pages < _MOST_PAGES
+
+    def close(self) -> None:
+        """Stop asking, within a second. A second call does nothing."""
+        self._closed = True
+        self._events.put(None)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_WITHIN_S)

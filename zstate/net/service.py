@@ -1,0 +1,125 @@
+"""Service: questions on one key, answered by one thread of ours."""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import NamedTuple, TypeAlias
+
+import zenoh
+
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, Unreachable, ZStateError
+from zstate.net.receiver import Receiver
+from zstate.net.session import Session
+from zstate.transform import Transform
+from zstate.wire.json import from_json
+from zstate.wire.keys import lookup_key
+from zstate.wire.questions import LookupQuestion, error_from_json
+
+CAPACITY = 64
+"""So many questions wait. When more come the oldest are lost, and who asked is told that nobody answers."""
+
+Queries: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Query]"
+
+
+class Answer(NamedTuple):
+    """What is answered, and under which Zenoh encoding; an error travels as Zenoh's own error reply."""
+
+    payload: bytes
+    encoding: str
+    is_error: bool = False
+
+
+class Service(Closing):
+    """Answers whoever asks on ``key``, until it is closed.
+
+    ``answer(parameters)`` is called from one thread of this service, question after question; None is
+    no answer. What it raises is counted in ``failures``, and the first is reported to
+    ``threading.excepthook``. Neither a slow answer nor a flood of questions delays Zenoh or those who
+    publish: what finds no room is lost, and ``overflows`` counts how often that may have been so.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        key: str,
+        answer: Callable[[Mapping[str, str]], Answer | None],
+        capacity: int = CAPACITY,
+    ) -> None:
+        self.answered = 0
+        self._key = key
+        self._answer = answer
+        ring: Queries = zenoh.handlers.RingChannel(capacity)
+        queryable = session.zenoh.declare_queryable(key, ring)
+        self._receiver = Receiver(session, queryable, self._answer_all, capacity)
+
+    @property
+    def overflows(self) -> int:
+        """How often the room for questions was found full: some may have been lost there."""
+        return self._receiver.full_batches
+
+    @property
+    def failures(self) -> int:
+        """How often ``answer`` raised, batches of questions that came together counted once."""
+        return self._receiver.failures
+
+    def _answer_all(self, queries: list[zenoh.Query]) -> None:
+        failure: Exception | None = None
+        for query in queries:
+            # Leaving tells the one who asks that this was all.
+            with query:
+                try:
+                    self._answer_one(query)
+                except Exception as error:  # raised again when the others have their answers
+                    failure = error
+        if failure is not None:
+            raise failure
+
+    def _answer_one(self, query: zenoh.Query) -> None:
+        answer = self._answer(parameters_of(str(query.parameters)))
+        if answer is None:
+            return
+        with suppress(zenoh.ZError):  # who asked, or the session, is gone
+            if answer.is_error:
+                query.reply_err(answer.payload, encoding=answer.encoding)
+            else:
+                query.reply(self._key, answer.payload, encoding=answer.encoding)
+            self.answered += 1
+
+    def close(self) -> None:
+        """Answer no more, within a second. A second call does nothing."""
+        self._receiver.close()
+
+
+def parameters_of(text: str) -> dict[str, str]:
+    """The parameters of a selector, ``name=value;name=value``, as Zenoh writes them after the ``?``."""
+    pairs = (part.partition("=") for part in text.split(";") if part)
+    return {name: value for name, _, value in pairs}
+
+
+def ask_lookup(
+    session: Session, robot: str, target: str, source: str, at: int | None = None, *, timeout_s: float = 1.0
+) -> Transform:
+    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns], or the newest there is.
+
+    Asks whoever answers for ``robot``, for instance `zstate publish`; needs no buffer here. Raises what
+    ``TransformBuffer.lookup`` raised there, and Unreachable when nobody answers within ``timeout_s``.
+    """
+    if not timeout_s > 0.0:
+        raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
+    key = lookup_key(robot)
+    selector = f"{key}?{LookupQuestion(target, source, at).parameters()}"
+    error: ZStateError = Unreachable(
+        f"nobody answers at {key!r} within {timeout_s:g} s; run `zstate publish {robot}`, or a LookupService",
+        endpoints=(key,),
+    )
+    for reply in session.zenoh.get(selector, timeout=timeout_s):
+        if reply.ok is not None:
+            return from_json(reply.ok.payload.to_bytes())
+        if reply.err is not None and str(reply.err.encoding) == "application/json":
+            error = error_from_json(reply.err.payload.to_bytes())
+    raise error

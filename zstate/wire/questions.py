@@ -1,0 +1,86 @@
+"""Lookups asked for by name: the question in a selector's parameters, a refusal in JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import msgspec
+
+import zstate.errors
+from zstate.clock import check_stamp
+from zstate.errors import InvalidInput, LookupFailed, NetworkError, ZStateError
+
+_NAMES = ("target", "source", "at")
+_FORM = "ask target=FRAME;source=FRAME, and at=NANOSECONDS for another instant than the newest"
+
+
+@dataclass(frozen=True, slots=True)
+class LookupQuestion:
+    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns]; None is the newest there is."""
+
+    target: str
+    source: str
+    at: int | None = None
+
+    @classmethod
+    def parse(cls, parameters: Mapping[str, str]) -> LookupQuestion:
+        """What the parameters of a selector ask. Raises InvalidInput naming what is wrong with them."""
+        for name in parameters:
+            if name not in _NAMES:
+                raise InvalidInput(f"a lookup has no parameter {name!r}; {_FORM}")
+        for name in ("target", "source"):
+            if not parameters.get(name):
+                raise InvalidInput(f"a lookup needs the parameter {name!r}; {_FORM}")
+        at = parameters.get("at")
+        return cls(parameters["target"], parameters["source"], None if at is None else _stamp(at))
+
+    def parameters(self) -> str:
+        """The same as the parameters of a selector. Raises InvalidInput for what cannot stand there."""
+        for frame in (self.target, self.source):
+            if not frame or ";" in frame:
+                raise InvalidInput(f"the frame name {frame!r} is empty or has a ';', and cannot be asked for")
+        asked = f"target={self.target};source={self.source}"
+        return asked if self.at is None else f"{asked};at={check_stamp(self.at)}"
+
+
+def _stamp(text: str) -> int:
+    digits = text.removeprefix("-")
+    if not (digits.isascii() and digits.isdecimal() and len(digits) <= 19):
+        raise InvalidInput(f"the parameter 'at' is {text!r}, not a stamp: whole nanoseconds since 1970")
+    return check_stamp(int(text))
+
+
+def error_to_json(error: ZStateError) -> bytes:
+    """``{"error": class name, "message": text, ...}``, with every attribute of the error."""
+    facts = {name: value for name, value in vars(error).items() if not name.startswith("_")}
+    return msgspec.json.encode({**facts, "error": type(error).__name__, "message": str(error)})
+
+
+def error_from_json(text: bytes) -> ZStateError:
+    """The error that ``error_to_json`` wrote; a NetworkError with what was said for any other text."""
+    try:
+        facts = msgspec.json.decode(text, type=dict[str, object])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return NetworkError(f"refused, for a reason that is not JSON: {text[:200]!r}")
+    kind = getattr(zstate.errors, str(facts.pop("error", "")), None)
+    message = str(facts.pop("message", ""))
+    if isinstance(kind, type) and issubclass(kind, ZStateError):
+        error = kind.__new__(kind, message)
+        error.__dict__.update({name: _frozen(value) for name, value in facts.items()})
+        if not issubclass(kind, LookupFailed) or _can_explain(error):
+            return error
+    return NetworkError(f"refused: {message}")
+
+
+def _frozen(value: object) -> object:
+    return tuple(cast("list[object]", value)) if isinstance(value, list) else value
+
+
+def _can_explain(error: ZStateError) -> bool:
+    # Their text is made of their facts, which a stranger may have left out.
+    try:
+        return bool(str(error))
+    except Exception:  # whatever a stranger's facts lead to
+        return False
