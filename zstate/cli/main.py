@@ -34,6 +34,7 @@ _COMMANDS = {
     "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),
     "router": ("Run", "A Zenoh router."),
     "acl": ("Run", "Who may do what behind a router, for its configuration."),
+    "certs": ("Run", "Certificates for tests: an authority and identities."),
     "ros1": ("Run", "A bridge to ROS 1, in either direction."),
     "up": ("Run", "Start several of these from one file."),
 }

@@ -16,6 +16,7 @@ from zstate.cli.words import is_ros
 from zstate.errors import Unreachable
 
 if TYPE_CHECKING:
+    from zstate.net.security import Credentials
     from zstate.net.session import Session
 
 NATIVE = ("native",)
@@ -32,11 +33,13 @@ class Network:
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config: str | Mapping[str, object] | None = None
+    credentials: Credentials | None = None
 
     @property
     def is_given(self) -> bool:
         """Whether the user has said anything about it."""
-        return any((self.mode, self.connect, self.listen, self.config, os.environ.get("ZENOH_CONFIG")))
+        said = (self.mode, self.connect, self.listen, self.config, self.credentials)
+        return any(said) or bool(os.environ.get("ZENOH_CONFIG"))
 
     @property
     def joins_as(self) -> str:
@@ -89,6 +92,7 @@ def _connect(network: Network, timeout_s: float = 5.0) -> Session:
             endpoints=network.connect,
             listen=network.listen,
             timeout_s=timeout_s,
+            credentials=network.credentials,
         ),
     ).result()
 

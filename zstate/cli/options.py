@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from zstate.cli.identity import credentials_given, identity_options
 from zstate.cli.network import Network
 from zstate.errors import InvalidInput
 
@@ -28,9 +29,14 @@ def session_options(command: Command) -> Command:
         connect: tuple[str, ...],
         listen: tuple[str, ...],
         config: str | None,
+        certs: str | None,
+        identity: str | None,
+        user: str | None,
+        password_file: str | None,
         **options: Any,
     ) -> Any:
-        return command(network=Network(mode, connect, listen, config), **options)
+        credentials = credentials_given(certs, identity, user, password_file)
+        return command(network=Network(mode, connect, listen, config, credentials), **options)
 
     for option in reversed(_SESSION_OPTIONS):
         with_network = option(with_network)
@@ -48,10 +54,11 @@ config_option = click.option(
 _SESSION_OPTIONS = (
     click.option(
         "--mode",
-        type=click.Choice(["peer", "client", "router"]),
+        type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
         envvar="ZSTATE_MODE",
-        help="How to join the network; default: client with --connect alone, client of tcp/127.0.0.1:7447 "
-        "for a ROS wire alone, else peer.",
+        help="How to join the network: loopback never leaves this host, lan is open to the local network and "
+        "found by multicast; default: client with --connect alone, client of tcp/127.0.0.1:7447 for a ROS "
+        "wire alone, else peer.",
     ),
     click.option(
         "--connect",
@@ -68,6 +75,7 @@ _SESSION_OPTIONS = (
         help="Where to listen, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
     config_option,
+    *identity_options,
 )
 
 

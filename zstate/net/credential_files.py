@@ -18,7 +18,7 @@ def check_files(credentials: Credentials) -> None:
             _check_readable(file)
     for secret in (credentials.key, credentials.users):
         if secret is not None:
-            _check_private(secret)
+            check_private(secret)
     if credentials.ca is not None:
         trusting(credentials)
     if credentials.users is not None:
@@ -40,6 +40,17 @@ def trusting(credentials: Credentials) -> ssl.SSLContext:
     return context
 
 
+def check_private(file: File) -> None:
+    """Raise ConfigError if every user of this machine can read or write the file."""
+    mode = Path(file).stat().st_mode & 0o777
+    if mode & _OTHERS:
+        raise ConfigError(
+            f"{_name(file)} is open to every user of this machine (mode {mode:03o}); it is a secret: "
+            f"`chmod 600 {file}`",
+            path=str(file),
+        )
+
+
 def _load_pair(context: ssl.SSLContext, certificate: File, key: File | None) -> None:
     try:
         # A password is asked for on the terminal unless one is given.
@@ -59,16 +70,6 @@ def _check_readable(file: File) -> None:
     except OSError as error:
         hint = "; do you need another user or group to read it?" if isinstance(error, PermissionError) else ""
         raise ConfigError(f"{_name(file)} cannot be read: {error.strerror}{hint}", path=str(file)) from None
-
-
-def _check_private(file: File) -> None:
-    mode = Path(file).stat().st_mode & 0o777
-    if mode & _OTHERS:
-        raise ConfigError(
-            f"{_name(file)} is open to every user of this machine (mode {mode:03o}); it is a secret: "
-            f"`chmod 600 {file}`",
-            path=str(file),
-        )
 
 
 def _check_users(file: File) -> None:

@@ -147,8 +147,8 @@ def _of_their_certificate(
         return _OF_ANOTHER_AUTHORITY
     return Refusal(
         "wrong CA",
-        f"its certificate is not signed by {str(credentials.ca)!r} ({error.verify_message}); both sides need the "
-        "ca.pem of one authority: make their identities in one folder",
+        f"its certificate is not signed by {str(credentials.ca)!r} ({error.verify_message}); both sides "
+        "need the ca.pem of one authority: make their identities in one folder",
     )
 
 

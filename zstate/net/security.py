@@ -77,7 +77,15 @@ class Credentials:
             raise ConfigError("these credentials are empty; give user and password, ca, or users", path="")
 
     @classmethod
-    def from_folder(cls, folder: File, name: str) -> Credentials:
+    def from_folder(
+        cls,
+        folder: File,
+        name: str,
+        *,
+        user: str | None = None,
+        password: str | None = None,
+        users: File | None = None,
+    ) -> Credentials:
         """What ``zstate certs`` wrote for ``name``. Raises ConfigError naming those that are there."""
         files = CertificateFiles.of(folder, name)
         if len(files.existing) < 2:
@@ -88,7 +96,14 @@ class Credentials:
                 f"{there}; `zstate certs {folder} --identity {name}` makes one for tests",
                 path=str(files.certificate),
             )
-        return cls(ca=Path(folder) / f"{AUTHORITY}.pem", certificate=files.certificate, key=files.key)
+        return cls(
+            ca=Path(folder) / f"{AUTHORITY}.pem",
+            certificate=files.certificate,
+            key=files.key,
+            user=user,
+            password=password,
+            users=users,
+        )
 
     def check_endpoints(self, endpoints: Iterable[str], listen: Iterable[str]) -> None:
         """Raise ConfigError for an endpoint that these credentials cannot protect."""

@@ -133,8 +133,8 @@ def _connect(
 def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
     if credentials is not None:
         raise ConfigError(
-            "programs of one host meet without credentials; say whom these are for: endpoints= or "
-            "listen=, with mode 'client' towards a router",
+            "programs of one host meet without credentials; say whom these are for: endpoints= "
+            "(--connect) or listen= (--listen)",
             path="credentials",
         )
     host, port = rendezvous_address()

@@ -1,0 +1,48 @@
+"""zstate certs: a test authority, and the identities of robots, routers and people."""
+
+from __future__ import annotations
+
+import click
+
+from zstate.cli.console import note, say
+
+
+@click.command("certs")
+@click.argument("folder", metavar="DIR", type=click.Path(file_okay=False))
+@click.option(
+    "--identity", "identities", multiple=True, required=True, metavar="NAME", help="Whom; may be repeated."
+)
+@click.option(
+    "--host",
+    "hosts",
+    multiple=True,
+    metavar="HOST",
+    help="A name or address at which it is reached, besides localhost, 127.0.0.1 and ::1; may be repeated.",
+)
+@click.option(
+    "--days", type=click.IntRange(min=1), default=365, show_default=True, help="How long they are valid."
+)
+def certs_command(folder: str, identities: tuple[str, ...], hosts: tuple[str, ...], days: int) -> None:
+    """Make certificates for tests: an authority in DIR, and an identity for each NAME.
+
+    A second call adds identities to the authority that is there. Nothing is ever overwritten. Whoever
+    listens is checked by the host it is reached at, so give a router its --host.
+
+    \b
+    zstate certs fleet --identity router --host 192.168.1.10
+    zstate certs fleet --identity robot1 --identity viewer
+    zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router
+    zstate listen --connect tls/192.168.1.10:7447 --certs fleet --identity viewer
+    """
+    from zstate.net.certificates import issue_identities
+    from zstate.net.security import AUTHORITY, CertificateFiles
+
+    authority = CertificateFiles.of(folder, AUTHORITY)
+    for name, files in issue_identities(folder, identities, hosts=hosts, days=days).items():
+        say(f"{name}: {files.certificate} and {files.key}, for {days} days")
+    note(
+        f"These are for tests: whoever has {authority.key} can be anybody. In production keep it off every "
+        "robot and router, or better, let your own authority sign (common name = identity, for TLS servers "
+        f"and clients). A machine needs {authority.certificate}, its own .pem and its own .key, and new ones "
+        "before these expire."
+    )
