@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from zstate.errors import InvalidInput
 from zstate.net.access import check_namespace
-from zstate.wire.keys import Stream, check_robot, stream_key
+from zstate.wire.keys import Stream, stream_key
 
 THINNED: tuple[Stream, ...] = ("joint_states", "tf")
 """The streams whose samples may be left out: each is followed by a newer one."""
@@ -23,7 +23,7 @@ class Thinning:
     the samples left out as missed. Raises InvalidInput.
     """
 
-    rates_hz: Mapping[Stream, float]
+    rates_hz: Mapping[str, float]
     robots: tuple[str, ...]
     interfaces: tuple[str, ...] = ()
     namespace: str = ""
@@ -50,5 +50,6 @@ class Thinning:
     def _rules(self) -> Iterator[dict[str, object]]:
         prefix = f"{self.namespace}/" if self.namespace else ""
         for robot in dict.fromkeys(self.robots):
-            for stream, rate_hz in self.rates_hz.items():
-                yield {"key_expr": prefix + stream_key(check_robot(robot), stream), "freq": rate_hz}
+            for stream in THINNED:
+                if stream in self.rates_hz:
+                    yield {"key_expr": prefix + stream_key(robot, stream), "freq": self.rates_hz[stream]}

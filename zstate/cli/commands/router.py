@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 import threading
+from typing import TYPE_CHECKING
 
 import click
 
 from zstate.cli.console import note, say
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import config_option
+
+if TYPE_CHECKING:
+    from zstate.net.router_config import RouterConfig
+    from zstate.net.thinning import Thinning
 
 
 @click.command("router")
@@ -20,28 +25,119 @@ from zstate.cli.options import config_option
     help="Where clients come to; default: tcp/127.0.0.1:7447. May be repeated.",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router to join; may be repeated.")
+@click.option(
+    "--acl",
+    type=click.Path(exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Who may do what: what `zstate acl` prints.",
+)
+@click.option(
+    "--downsample",
+    multiple=True,
+    metavar="STREAM=HZ",
+    help="At most HZ samples a second of joint_states or tf to each neighbour; may be repeated.",
+)
+@click.option("--robot", multiple=True, metavar="NAME", help="Whose streams those are; may be repeated.")
+@click.option(
+    "--wan", multiple=True, metavar="INTERFACE", help="Downsample there only, such as wwan0; may be repeated."
+)
+@click.option("--namespace", default="", metavar="KEY", help="The namespace of those robots' sessions.")
 @click.option("--ros2", is_flag=True, help="With the settings of rmw_zenohd, in its place.")
 @config_option
-def router_command(listen: tuple[str, ...], connect: tuple[str, ...], ros2: bool, config: str | None) -> None:
+@click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5), and run nothing.")
+def router_command(
+    *,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    acl: str | None,
+    downsample: tuple[str, ...],
+    robot: tuple[str, ...],
+    wan: tuple[str, ...],
+    namespace: str,
+    ros2: bool,
+    config: str | None,
+    only_print: bool,
+) -> None:
     """Run a Zenoh router until Ctrl-C.
 
     By default it serves this host alone; `--listen tcp/0.0.0.0:7447` opens it to the network. Other
-    commands reach it with `--connect tcp/HOST:7447`.
+    commands reach it with `--connect tcp/HOST:7447`. What `--print` prints, zenohd takes as it is.
 
     \b
     zstate router --listen tcp/0.0.0.0:7447
+    zstate router --connect tcp/fleet.example:7447 --downsample joint_states=10 --robot r1 --wan wwan0
+    zstate router --listen tcp/0.0.0.0:7447 --print >router.json5
     zstate router --ros2                               # for ROS 2 nodes of this host
     zstate router --ros2 --listen "tcp/[::]:7447"      # for everybody, as rmw_zenohd
     """
-    from zstate.clock import wait_in_slices
-    from zstate.net.config import CONFIG_VARIABLE, ROS_ROUTER, ROUTER_ENDPOINT
+    file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
+    if file:
+        made = {"--ros2": ros2, "--acl": acl, "--downsample": downsample, "--print": only_print}
+        _refuse_beside(file, [option for option, is_given in made.items() if is_given])
+        _run(Network("router", connect, listen, config), listen, file)
+        return
+    settings = _settings(listen, connect, acl, _thinning(downsample, robot, wan, namespace), ros2=ros2)
+    if only_print:
+        say(settings.text().rstrip("\n"))
+    else:
+        _run(Network("router", config=settings.settings()), settings.listen)
 
-    if ros2 and config:
-        raise click.UsageError("--ros2 is a configuration of its own; give that, or --config")
-    file = None if ros2 else config or os.environ.get(CONFIG_VARIABLE)
-    where = listen or (() if file else (ROUTER_ENDPOINT,))
-    with open_session(Network("router", connect, where, ROS_ROUTER if ros2 else config)) as session:
-        say(f"router {session.zid} listens at {', '.join(where) or f'what {file!r} says'}")
-        if where == (ROUTER_ENDPOINT,):
+
+def _refuse_beside(file: str, options: list[str]) -> None:
+    if options:
+        raise click.UsageError(
+            f"{' and '.join(options)} and the file {file!r} (--config, ZENOH_CONFIG) exclude each other: the "
+            "file is the whole configuration; write it into that"
+        )
+
+
+def _settings(
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    acl: str | None,
+    thinning: Thinning | None,
+    *,
+    ros2: bool,
+) -> RouterConfig:
+    from zstate.net.access_file import read_access_control
+    from zstate.net.config import ROUTER_ENDPOINT
+    from zstate.net.router_config import RouterConfig
+
+    return RouterConfig(
+        listen=listen or (ROUTER_ENDPOINT,),
+        connect=connect,
+        thinning=thinning,
+        access_control=read_access_control(acl) if acl else {},
+        ros2=ros2,
+    )
+
+
+def _thinning(
+    downsample: tuple[str, ...], robots: tuple[str, ...], interfaces: tuple[str, ...], namespace: str
+) -> Thinning | None:
+    from zstate.net.thinning import Thinning
+
+    if not downsample:
+        if robots or interfaces or namespace:
+            raise click.UsageError("--robot, --wan and --namespace say what --downsample STREAM=HZ is for")
+        return None
+    return Thinning(dict(map(_stream_rate, downsample)), robots, interfaces, namespace)
+
+
+def _stream_rate(text: str) -> tuple[str, float]:
+    stream, _, rate = text.partition("=")
+    try:
+        return stream, float(rate)
+    except ValueError:
+        raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
+
+
+def _run(network: Network, listen: tuple[str, ...], file: str = "") -> None:
+    from zstate.clock import wait_in_slices
+    from zstate.net.config import ROUTER_ENDPOINT
+
+    with open_session(network) as session:
+        say(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
+        if listen == (ROUTER_ENDPOINT,):
             note("it serves this host alone; --listen tcp/0.0.0.0:7447 opens it to the network")
         wait_in_slices(threading.Event())
