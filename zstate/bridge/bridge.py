@@ -106,6 +106,7 @@ class Bridge(Closing):
                 robot,
                 _named(native),
                 _named(ros),
+                extra={"event": "conflict", "robot": robot},
             )
 
     def _end(self, robot: str) -> None:

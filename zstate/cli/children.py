@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 
+from zstate.cli.logs import text_in
 from zstate.closing import Closing
 
 END_WITHIN_S = 0.8
@@ -77,7 +78,7 @@ class ChildCommand(Closing):
     def _follow_errors(self) -> None:
         for line in self._process.stderr or ():
             if line.strip():
-                self.last_error = line.strip()
+                self.last_error = text_in(line.strip())
                 self._on_line(line.rstrip("\n"))
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from zstate.cli import logs
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
@@ -24,9 +25,12 @@ def say_json(value: Any) -> None:
     click.echo(json.dumps(value))
 
 
-def note(text: str) -> None:
-    """What goes on: waiting, and the end of waiting. Not part of the result."""
-    click.echo(text, err=True)
+def note(text: str, *, event: str = "note", robot: str | None = None) -> None:
+    """What goes on: waiting, and the end of waiting. Not part of the result.
+
+    ``event`` and ``robot`` are for programs that read ``--log-format json``.
+    """
+    logs.write(text, event=event, robot=robot)
 
 
 def fail(text: str) -> NoReturn:

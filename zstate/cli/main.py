@@ -12,6 +12,7 @@ from typing import NoReturn
 
 import click
 
+from zstate.cli import logs
 from zstate.errors import ZStateError
 
 # name: (section of the help, what it does); zstate.cli.commands.<name> holds the command <name>_command.
@@ -51,6 +52,8 @@ class Commands(click.Group):
             return None
         command = getattr(import_module(f"zstate.cli.commands.{cmd_name}"), f"{cmd_name}_command")
         assert isinstance(command, click.Command)
+        if logs.log_format_option not in command.params:
+            command.params.append(logs.log_format_option)
         return command
 
     def resolve_command(
@@ -100,6 +103,7 @@ def group(ctx: click.Context, until_eof: bool) -> None:
 
 def main() -> NoReturn:
     """Run the command line and exit: 0, 1 for what failed, 2 for wrong usage, 130 after Ctrl-C."""
+    logs.use_format_of_environment()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _end)
     try:
@@ -132,4 +136,4 @@ def _usage_text(error: click.UsageError) -> str:
 
 
 def _complain(text: str) -> None:
-    click.echo(f"zstate: {text}", err=True)
+    logs.write(text, level="error", event="failed")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import fail
+from zstate.cli.logs import warn_on_standard_error
 from zstate.cli.words import is_ros
 from zstate.errors import Unreachable
 
@@ -58,7 +58,7 @@ def open_session(network: Network, wires: tuple[str, ...] = NATIVE) -> Generator
     configured = network.config or os.environ.get("ZENOH_CONFIG")
     if network.mode == "client" and not network.connect and not configured:
         raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
-    _warn_on_stderr()
+    warn_on_standard_error()
     with _connect_to_ros(network) if all(map(is_ros, wires)) else _connect(network) as session:
         yield session
 
@@ -95,15 +95,3 @@ def _connect(network: Network, timeout_s: float = 5.0) -> Session:
             credentials=network.credentials,
         ),
     ).result()
-
-
-class _Stderr(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        # Looked up at each record: a live table puts itself in the place of standard error.
-        click.echo(f"zstate: {record.getMessage()}", err=True)
-
-
-def _warn_on_stderr() -> None:
-    logger = logging.getLogger("zstate")
-    logger.addHandler(_Stderr(logging.WARNING))
-    logger.propagate = False
