@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -17,6 +18,7 @@ from zstate.errors import InvalidInput
 from zstate.net.access import Fleet, access_control, access_text
 from zstate.net.session import Session
 from zstate.publisher import STREAMS
+from zstate.wire import keys
 
 FLEET = Fleet(("r1", "r2"), ("desk",), ("hand",), ("simulator",))
 USERS = (*FLEET.names, "stranger")
@@ -123,7 +125,7 @@ def publish_and_look(publisher: StatePublisher, listener: TransformListener) -> 
     return listener.buffer.can_lookup("base", "lower")
 
 
-def test_a_robot_hears_its_own_keys_and_the_clock_only(site: Site):
+def test_a_robot_hears_no_samples_of_others_but_the_clock(site: Site):
     taps = {user: Tap(site.join(user), "zstate/r1/joint_commands") for user in ("r1", "r2", "stranger")}
     clock = Tap(site.join("r2"), "zstate/clock")
     hand, simulator = site.join("hand"), site.join("simulator")
@@ -137,12 +139,22 @@ def test_a_robot_hears_its_own_keys_and_the_clock_only(site: Site):
     assert (taps["r2"].arrivals, taps["stranger"].arrivals) == ([], [])
 
 
-def test_a_robot_that_is_a_viewer_too_sees_the_others(tmp_path):
+def test_a_robot_sees_who_the_others_are_and_their_static_edges(site: Site):
     with (
-        a_site(tmp_path, Fleet(("r1", "r2"), ("r2",))) as site,
         StatePublisher(site.join("r1"), RRBOT, "r1"),
+        TransformListener(site.join("r2"), "r1", follow="tf") as listener,
     ):
         assert [info.name for info in discover(site.join("r2"))] == ["r1"]
+        assert listener.buffer.wait("world", "base", timeout_s=5.0).kind == "static"
+
+
+def test_a_robot_that_is_a_viewer_too_sees_the_others_move(tmp_path):
+    with (
+        a_site(tmp_path, Fleet(("r1", "r2"), ("r2",))) as site,
+        StatePublisher(site.join("r1"), RRBOT, "r1") as publisher,
+        TransformListener(site.join("r2"), "r1") as listener,
+    ):
+        until(lambda: publish_and_look(publisher, listener))
 
 
 def test_what_answers_lookups_is_asked_by_viewers_and_stands_under_its_own_robot(site: Site):
@@ -186,6 +198,15 @@ def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
         StatePublisher(one, RRBOT, "r1"),
     ):
         assert discover(other, 0.3) == ()
+
+
+def test_every_chunk_that_wildcards_go_past_is_named():
+    chunks = set(re.findall(r"/(@\w+)/", keys.__doc__ or "")) | {"@adv"}
+    assert len(chunks) >= 2
+    for rule in access_control(Fleet(("r1",), ("desk",)))["rules"]:
+        if rule["id"] in ("r1 writes", "viewers read"):
+            root = rule["key_exprs"][0].removesuffix("/**")
+            assert {f"{root}/**/{chunk}/**" for chunk in chunks} <= set(rule["key_exprs"])
 
 
 def test_the_text_says_the_same_to_zenoh():

@@ -2,8 +2,8 @@
 
 What nobody is allowed is denied. Zenoh allows a message when a rule's key expression includes that of
 the message, so that a robot cannot write to others by a wildcard either. ``**`` goes past chunks
-that begin with ``@``: late joiners ask under ``@adv``, presence stands under ``@writer``, and both are
-named apart.
+that begin with ``@``, which are named apart: late joiners ask under ``@adv``, presence stands under
+``@writer``, and clocks are compared under ``@clock``.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from dataclasses import dataclass
 
 from zstate.errors import InvalidInput
 from zstate.net.json5 import json5_text
-from zstate.wire.keys import ANY, CLOCK_KEY, check_robot
+from zstate.wire.keys import CLOCK_KEY, check_robot
 
 Rule = dict[str, object]
 
 _SAYS = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
 _ASKS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+_APART = ("@adv", "@writer", "@clock")
 _IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 _HEAD = """\
@@ -35,8 +36,9 @@ It is read when the router starts."""
 class Fleet:
     """Who is who behind a router, by name: the common name of a certificate, or a user.
 
-    A robot writes its own keys, reads these, and the clock. A viewer reads everything and writes
-    nothing; an operator, moreover, commands joints. A timekeeper, moreover, writes the simulated time.
+    A robot writes its own keys and reads these; of others it reads who they are, their static edges,
+    which it must not contradict, and the simulated time. A viewer reads everything and writes nothing; an
+    operator, moreover, commands joints. A timekeeper, moreover, writes the simulated time.
     Somebody may be several of these. ``namespace`` is that of the sessions behind the router, if they
     have one. Raises InvalidInput for names that cannot be names of identities.
     """
@@ -118,8 +120,8 @@ def _subjects(name: str) -> tuple[Rule, Rule]:
 
 def _roles(name: str, fleet: Fleet) -> Iterator[str]:
     if name in fleet.robots:
-        yield from (f"{name} {does}" for does in ("writes", "reads", "is given"))
-        yield "robots are asked"
+        yield from (f"{name} writes", f"{name} reads", f"{name} is given")
+        yield from ("robots read", "robots are given", "robots are asked")
     if name in (*fleet.viewers, *fleet.operators, *fleet.timekeepers):
         yield from ("viewers read", "viewers are given")
     if name in fleet.operators:
@@ -130,23 +132,26 @@ def _roles(name: str, fleet: Fleet) -> Iterator[str]:
 
 def _rules(fleet: Fleet) -> Iterator[Rule]:
     """Ingress is what somebody sends to the router, egress what the router passes on to them."""
-    prefix = f"{fleet.namespace}/" if fleet.namespace else ""
-    everything, clock = _under(f"{prefix}zstate"), f"{prefix}{CLOCK_KEY}"
+    root = f"{fleet.namespace}/zstate" if fleet.namespace else "zstate"
+    everything, clock = _under(root), root.removesuffix("zstate") + CLOCK_KEY
+    shared = (f"{root}/*/tf_static/*", f"{root}/*/tf_static/*/@adv/**", f"{root}/*/@writer/**", clock)
     for robot in dict.fromkeys(fleet.robots):
-        own = _under(f"{prefix}zstate/{check_robot(robot)}")
+        own = _under(f"{root}/{check_robot(robot)}")
         yield _rule(f"{robot} writes", "ingress", _SAYS, own)
-        yield _rule(f"{robot} reads", "ingress", _ASKS, (*own, clock))
-        yield _rule(f"{robot} is given", "egress", _SAYS, (*own, clock))
+        yield _rule(f"{robot} reads", "ingress", _ASKS, own)
+        yield _rule(f"{robot} is given", "egress", _SAYS, own)
+    yield _rule("robots read", "ingress", _ASKS, shared)
+    yield _rule("robots are given", "egress", _SAYS, shared)
     # What is asked of all robots at once is asked of each; only its own is in what it answers.
     yield _rule("robots are asked", "egress", _ASKS, everything)
     yield _rule("viewers read", "ingress", _ASKS, everything)
     yield _rule("viewers are given", "egress", _SAYS, everything)
-    yield _rule("operators command", "ingress", ("put",), (f"{prefix}zstate/{ANY}/joint_commands",))
+    yield _rule("operators command", "ingress", ("put",), (f"{root}/*/joint_commands",))
     yield _rule("timekeepers write", "ingress", ("put",), (clock,))
 
 
 def _under(key: str) -> tuple[str, ...]:
-    return (f"{key}/**", f"{key}/**/@adv/**", f"{key}/**/@writer/**")
+    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _APART))
 
 
 def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Rule:
