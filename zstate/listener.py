@@ -14,8 +14,10 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.following.edges import EdgeFollower
 from zstate.following.follower import Follower
 from zstate.following.joints import JointFollower
+from zstate.following.off_clock import OffClock
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
+from zstate.following.writer_clocks import WriterClocks
 from zstate.net.history import PastReader
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
@@ -39,8 +41,9 @@ class TransformListener(Closing):
     from the publishers of the native wire what they said in the seconds before (``StatePublisher``'s
     ``cache_s``). A context manager.
 
-    What cannot be used is counted in ``stats``, reported once through ``logging``, and never stops
-    the stream.
+    All robots in a buffer keep one time, that of ``clock`` where it is given; robots of a simulation want
+    a ``SimulatedClock``. What cannot be used is counted in ``stats``, reported once through ``logging``,
+    and never stops the stream.
     """
 
     def __init__(  # noqa: PLR0917 - the order is that of the published contract
@@ -59,10 +62,14 @@ class TransformListener(Closing):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
         self.robot = robot
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
+        if clock is not None:
+            self.buffer.use_clock(clock)
         self._wire = wire_named(wire)
         self._follow: Follow = follow
         self._recalls = history_on_join
         self._tally = Tally()
+        self._off_clock = OffClock(self.buffer, self._tally, is_described=not self._wire.shared)
+        self._clocks: WriterClocks | None = None
         self._names: dict[int, str] = {}
         self._followers: dict[tuple[str, int], Follower] = {}
         self._statics: dict[tuple[str, int], StaticFollower] = {}
@@ -86,6 +93,8 @@ class TransformListener(Closing):
         if self._recalls and self._wire.name == "native":
             self._past = PastReader(session, self._on_past, self._note_broken)
             opening.enter_context(self._past)
+        if not self._wire.shared:
+            self._clocks = opening.enter_context(WriterClocks(session, self.buffer))
         # After the subscription: who is asked for the past then has everything newer sent to us.
         opening.enter_context(watch(session, robot, self._on_writer, wire))
         heard: tuple[Stream, ...] = ("robot_description", "tf_static", self._follow)
@@ -126,6 +135,7 @@ class TransformListener(Closing):
         if len(arrivals) >= CAPACITY:
             # A ring that is full has lost samples, of whoever sent any.
             self._overflowed = set(self._followers.values())
+        earliest, latest = self._off_clock.look()
         for arrival in arrivals:
             robot = self._robot_of(arrival.key)
             for sample in self._decode(self._follow, arrival, robot):
@@ -133,6 +143,8 @@ class TransformListener(Closing):
                     follower = self._follower(robot, sample.session)
                     follower.take(sample, overflowed=follower in self._overflowed)
                     self._overflowed.discard(follower)
+                    if not earliest <= sample.stamp <= latest:
+                        self._off_clock.note(robot, self._names.get(sample.session), sample)
 
     def _on_past(self, arrivals: list[Arrival]) -> bool:
         robot = self._robot_of(arrivals[0].key)
@@ -203,6 +215,8 @@ class TransformListener(Closing):
             self._note_static_writer(session, alive=alive)
         if announced.stream != self._follow:
             return
+        if self._clocks is not None:
+            self._clocks.note(announced, alive=alive)
         if alive and self._past is not None:
             self._past.ask(self._wire.expression(announced.robot, self._follow), session)
         if self._follow not in self._wire.shared:

@@ -17,8 +17,8 @@ from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.robot import RobotModel
 from zstate.moving_edges import MovingEdges
 from zstate.net.claims import Claim
-from zstate.net.history import Memory, answer_past
 from zstate.net.clock_offset import ClockService
+from zstate.net.history import Memory, answer_past
 from zstate.net.outlets import Outlets, StreamOutlet
 from zstate.net.presence import writer_here
 from zstate.net.session import Session

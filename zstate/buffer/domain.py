@@ -22,6 +22,14 @@ class Domain:
         """Its name: "system", or that of a simulated time; None while it is open."""
         return self._given or next(iter(list(self._kept.values())), None)
 
+    def of(self, robot: str) -> str | None:
+        """The time that ``robot`` keeps; None while it has not said so."""
+        return self._kept.get(robot)
+
+    def decide(self, domain: str) -> None:
+        """Be of this time from now on, whatever robots say."""
+        self._given = domain
+
     def objection(self, robot: str, domain: str) -> str:
         """Why stamps of ``robot``, which keeps the time ``domain``, may not come in; empty when they may.
 

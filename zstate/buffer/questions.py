@@ -114,14 +114,18 @@ class Questions(Store):
     def _refuse_stale(self, path: Path, transform: Transform, max_age_s: float) -> None:
         kept = self.domain.name
         if path.uses and kept is not None and kept != self.clock.domain:
-            raise ClockMismatch(
-                f"max_age_s was given, but the stamps here are {kept!r} time and the clock tells "
-                f"{self.clock.domain!r} time; give the listener, or the buffer, a clock of {kept!r} time",
-                domains=(kept, self.clock.domain),
-            )
+            raise _mismatch(kept, self.clock, "max_age_s was given")
         age_s = transform.age(self.clock)
         if path.uses and age_s > max_age_s:
             raise path.stale(transform.stamp, age_s, max_age_s)
+
+    def use_clock(self, clock: Clock) -> None:
+        """Tell ages by ``clock``, and take stamps of its time only. Raises ClockMismatch for another time."""
+        kept = self.domain.name
+        if kept not in (None, clock.domain):
+            raise _mismatch(kept, clock, "another clock was given")
+        self.clock = clock
+        self.domain.decide(clock.domain)
 
     def _path(self, target: str, source: str) -> Path:
         cached = self._paths.get((target, source))
@@ -133,6 +137,14 @@ class Questions(Store):
                 self._paths = {}
             self._paths[target, source] = (self._tree.version, path)
         return path
+
+
+def _mismatch(kept: str, clock: Clock, occasion: str) -> ClockMismatch:
+    return ClockMismatch(
+        f"{occasion}, but the stamps in this buffer are {kept!r} time and the clock tells {clock.domain!r} "
+        f"time; give the buffer, or the listener, a clock of {kept!r} time",
+        domains=(kept, clock.domain),
+    )
 
 
 def _is_final(question: Question, reason: LookupFailed) -> bool:

@@ -32,6 +32,8 @@ class EdgeFollower(Follower):
 
     def describe(self, description: RobotDescription) -> None:
         self.heard = True
+        if not self._keeps_our_time(description):
+            return
         with self._lock:
             order = order_digest(description.moving_edges)
             if order == self._order:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import SYSTEM
 from zstate.errors import InsertRefused, InvalidInput, MessageError
 from zstate.following.absent import Absent
 from zstate.following.tally import Tally
@@ -16,6 +17,9 @@ from zstate.wire.messages import RobotDescription, Sample
 # So many samples are kept that arrive before the robot is described, which takes milliseconds.
 _EARLY = 1024
 _EARLY_PAST = 20_000
+
+# Simulated time that goes back by more was set back: nothing on the way holds a sample up by that much.
+_SET_BACK_NS = 100_000_000
 
 
 class Follower(ABC):
@@ -34,6 +38,9 @@ class Follower(ABC):
         self._early: deque[Sample] = deque(maxlen=_EARLY)
         self._past: list[Sample] = []
         self._absent = Absent()
+        self._objection = ""
+        self._is_simulated = False
+        self._newest: int | None = None
         self._lock = threading.RLock()
         buffer.name_robot(robot)
 
@@ -62,6 +69,9 @@ class Follower(ABC):
         """Put a sample into the buffer; ``overflowed`` says that our ring lost some before it."""
         self.heard = True
         with self._lock:
+            if self._objection:
+                self._tally.refuse("clock domain", self._objection)
+                return
             if not self._follow_session(sample):
                 self._tally.refuse(
                     "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
@@ -83,7 +93,7 @@ class Follower(ABC):
         self.heard = True
         for sample in reversed(samples):
             with self._lock:  # one by one: what is live need not wait for all of it
-                if not self._follow_session(sample):
+                if self._objection or not self._follow_session(sample):
                     return False
                 if sample.seq in self._absent and not self._recall(sample):
                     return False
@@ -126,7 +136,10 @@ class Follower(ABC):
 
     def _insert_counted(self, sample: Sample) -> None:
         try:
-            taken = self._insert(sample) or self._begin_again(sample)
+            if self._is_simulated and self._went_back(sample.stamp):
+                taken = self._begin_again(sample) or self._insert(sample)
+            else:
+                taken = self._insert(sample) or self._begin_again(sample)
         except (InvalidInput, MessageError) as error:
             self._refuse(error)
         else:
@@ -135,6 +148,26 @@ class Follower(ABC):
     def _refuse(self, error: InvalidInput | MessageError) -> None:
         reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
         self._tally.refuse(reason, f"{self.robot!r}: {error}")
+
+    def _keeps_our_time(self, description: RobotDescription) -> bool:
+        """Whether stamps of this robot may stand beside those of the others in the buffer."""
+        domain = self._buffer.domain
+        objection = domain.objection(self.robot, description.clock)
+        with self._lock:
+            if objection and not self._objection:
+                self._restart()  # what came before its description was of that time, too
+                self._early.clear()
+            self._objection = objection
+            self._is_simulated = (description.clock or domain.name or SYSTEM) != SYSTEM
+        if objection:
+            self._tally.refuse("clock domain", objection)
+        return not objection
+
+    def _went_back(self, stamp: int) -> bool:
+        """Whether simulated time was set back: long before a sample would be too old for the history."""
+        newest = stamp if self._newest is None else self._newest
+        self._newest = max(stamp, newest)
+        return stamp < newest - _SET_BACK_NS
 
     def _begin_again(self, sample: Sample) -> bool:
         """A new epoch with this sample, if it shows that the writer's clock was set back.
@@ -146,7 +179,7 @@ class Follower(ABC):
             return False
         if not self._may_begin_again():
             return False
-        self._last_late = None
+        self._last_late, self._newest = None, sample.stamp
         self._restart()
         self._tally.note(
             f"{self.robot} back", f"the clock of {self.robot!r} went back: its history begins anew"
@@ -167,7 +200,7 @@ class Follower(ABC):
             self._past.clear()
             self._absent = Absent()
             self._next_seq = None
-            self._last_late = None
+            self._last_late = self._newest = None
             self._writer_changed()
         return True
 

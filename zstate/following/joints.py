@@ -36,7 +36,7 @@ class JointFollower(Follower):
 
     def describe(self, description: RobotDescription) -> None:
         self.heard = True
-        if description.digest == self._digest:
+        if not self._keeps_our_time(description) or description.digest == self._digest:
             return
         with self._lock:
             try:

@@ -16,7 +16,8 @@ class Stats:
 
     ``received`` samples were taken; ``dropped`` by our own full ring, ``missed`` between the writer's
     sequence numbers; ``late`` ones were older than the history; ``refused`` says why others were not used.
-    ``recalled`` samples were said before we listened, and their writer still knew them.
+    ``recalled`` samples were said before we listened, and their writer still knew them; ``off_clock`` had
+    stamps more than a minute from the clock here, and were used all the same.
     """
 
     received: int
@@ -25,6 +26,7 @@ class Stats:
     late: int
     refused: dict[str, int]
     recalled: int = 0
+    off_clock: int = 0
 
 
 class Tally:
@@ -37,7 +39,7 @@ class Tally:
         self._noted: set[str] = set()
 
     def count(self, what: str, number: int = 1) -> None:
-        """Add to one of received, dropped, missed, late, recalled."""
+        """Add to one of received, dropped, missed, late, recalled, off_clock."""
         with self._lock:
             self._counts[what] += number
 
@@ -62,4 +64,5 @@ class Tally:
         """All counts now."""
         with self._lock:
             counts = (self._counts[what] for what in ("received", "dropped", "missed", "late"))
-            return Stats(*counts, refused=dict(self._refused), recalled=self._counts["recalled"])
+            others = {what: self._counts[what] for what in ("recalled", "off_clock")}
+            return Stats(*counts, refused=dict(self._refused), **others)

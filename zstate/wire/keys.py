@@ -9,6 +9,7 @@
 ``zstate/<robot>/lookup``                   a queryable
 ``zstate/<robot>/status/<id>``              Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<stream>/<id>``    liveliness token of one writer
+``zstate/<robot>/@clock/<id>``              a queryable: what time it is by that writer's clock
 ``zstate/clock``                            Clock
 ==========================================  ==========================================
 """
@@ -110,6 +111,24 @@ def parse_writer_key(key: str) -> tuple[str, Stream, str]:
             if chunks[3] == stream:
                 return chunks[1], stream, chunks[4]
     raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@writer/<stream>/<identity>'")
+
+
+def clock_key(robot: str, identity: str) -> str:
+    """The key on which one writer tells what time it is; ``identity`` is already one chunk."""
+    return f"zstate/{check_robot(robot)}/@clock/{identity}"
+
+
+def clock_expression(robot: str) -> str:
+    """The key expression of the clocks of all writers of ``robot``, or of every robot for ``"*"``."""
+    return f"zstate/{robot if robot == ANY else check_robot(robot)}/@clock/*"
+
+
+def parse_clock_key(key: str) -> tuple[str, str]:
+    """Robot and identity in a ``clock_key``. Raises InvalidInput for any other key."""
+    chunks = key.split("/")
+    if len(chunks) == 4 and chunks[0] == "zstate" and chunks[2] == "@clock":
+        return chunks[1], chunks[3]
+    raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@clock/<identity>'")
 
 
 def robot_of(key: str) -> str:

@@ -134,7 +134,8 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
     """What the robot is: its URDF, and what a reader without a URDF parser needs of it.
 
     ``joint_names`` is the order of joint samples, ``moving_edges`` that of transform samples;
-    ``clock`` is the domain of all stamps: "system" or the name of a simulated one.
+    ``clock`` is the domain of all stamps: "system", the name of a simulated one, or empty where the wire
+    does not tell.
     """
 
     session: Count
@@ -146,7 +147,7 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
 
 
 class Clock(Message, frozen=True, array_like=True, gc=False):
-    """Simulated time."""
+    """What time it is: simulated, or by the clock of a writer that was asked."""
 
     stamp: Stamp
     seq: Count

@@ -86,7 +86,7 @@ def test_frames_are_called_as_in_zstate():
 
 def test_a_description_is_known_by_its_text():
     one, same, other = (heard("robot_description", rosbags_cdr("std_msgs/msg/String", t))[0] for t in "xxy")
-    assert one == same == RobotDescription(77, "x", one.digest, (), ())
+    assert one == same == RobotDescription(77, "x", one.digest, (), (), clock="")
     assert other.digest != one.digest
 
 

@@ -78,7 +78,7 @@ def _by_stamp(said: RosTransforms, edges: Edges) -> Iterator[tuple[int, Edges, b
 
 def _description(urdf: str, session: int) -> RobotDescription:
     digest = blake2b(urdf.encode(), digest_size=8).hexdigest()
-    return RobotDescription(session, urdf, digest, joint_names=(), moving_edges=())
+    return RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock="")
 
 
 def _dated(stamp: int) -> int:

@@ -1,0 +1,84 @@
+"""OffClock: samples whose stamps are far from the time here. They are used like any other, and named."""
+
+from __future__ import annotations
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import SYSTEM, stamp_text
+from zstate.errors import duration_text
+from zstate.following.tally import Tally
+from zstate.wire.messages import Sample, TransformSample
+
+FAR_NS = 60_000_000_000
+"""A sample was not held up for so long by any network, and clocks that disagree so much were never set."""
+
+_HOUR_NS = 3_600_000_000_000
+_DAY_NS = 24 * _HOUR_NS
+_UNITS = (("seconds", 1_000_000_000), ("milliseconds", 1_000_000), ("microseconds", 1_000))
+_EVERYTHING = (-(2**63), 2**63)
+
+
+class OffClock:
+    """Counts them in ``off_clock``, and logs the first of each start of a writer.
+
+    ``is_described`` says that robots tell whose time they keep, so that one which has not yet may.
+    """
+
+    def __init__(self, buffer: TransformBuffer, tally: Tally, *, is_described: bool) -> None:
+        self._buffer = buffer
+        self._tally = tally
+        self._is_described = is_described
+        self._reported: set[int] = set()
+
+    def look(self) -> tuple[int, int]:
+        """The stamps [ns] between which nothing need be noted, as of now."""
+        clock = self._buffer.clock
+        if clock.domain != SYSTEM:
+            return _EVERYTHING
+        now = clock.now()
+        return now - FAR_NS, now + FAR_NS
+
+    def note(self, robot: str, writer: str | None, sample: Sample) -> None:
+        """A sample outside of that."""
+        if not self._keeps_system_time(robot, sample):
+            return
+        self._tally.count("off_clock")
+        if sample.session not in self._reported:
+            self._reported.add(sample.session)
+            self._tally.note(f"off clock {sample.session}", self._text(robot, writer, sample.stamp))
+
+    def _keeps_system_time(self, robot: str, sample: Sample) -> bool:
+        kept = self._buffer.domain.of(robot)
+        if kept is None and self._is_described:
+            # Whose time it is stands in the description, which is on its way, or will never come.
+            return isinstance(sample, TransformSample) and sample.edges is not None
+        return kept is None or kept == SYSTEM
+
+    def _text(self, robot: str, writer: str | None, stamp: int) -> str:
+        now = self._buffer.clock.now()
+        who = f", which {writer} writes," if writer else ""
+        return (
+            f"samples of {robot!r}{who} are stamped {_size(stamp - now)} this machine's time "
+            f"({stamp_text(stamp)}): {likely_cause(stamp, now)}; they are used and counted in off_clock"
+        )
+
+
+def likely_cause(stamp: int, now: int) -> str:
+    """What makes writers stamp ``stamp`` when it is ``now`` [ns]."""
+    for unit, scale in _UNITS:
+        if abs(stamp * scale - now) < _DAY_NS:
+            return f"the writer gives {unit} where nanoseconds are meant"
+    if abs(stamp) < 3650 * _DAY_NS:
+        return (
+            "1970 and after: the writer stamps with the time since it was switched on, its machine has no "
+            "clock that was set, or this is simulated time (then both sides need `--clock sim`)"
+        )
+    hours, rest = divmod(stamp - now + FAR_NS, _HOUR_NS // 2)
+    if rest < 2 * FAR_NS and abs(hours) <= 28:
+        return "whole hours: the writer takes its local time for UTC, or the other way round"
+    return "the clock of one of the two machines was never set (NTP); or what comes is a recording"
+
+
+def _size(offset_ns: int) -> str:
+    size = abs(offset_ns)
+    said = f"{size / _DAY_NS:.1f} days" if size >= 2 * _DAY_NS else duration_text(size)
+    return f"{said} {'after' if offset_ns > 0 else 'before'}"

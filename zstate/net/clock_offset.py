@@ -1,0 +1,194 @@
+"""Clock offsets: how far the clock of a writer is ahead of the one here, measured over the network.
+
+A writer answers whoever asks on ``zstate/<robot>/@clock/<identity>`` with the time by which it stamps.
+The answer was given somewhere between the question and its arrival here; taken for the middle, it is wrong
+by at most half of that round trip, and the shortest of several is the one to believe (as NTP does). Writers
+on simulated time do not answer: that is everybody's.
+"""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import zenoh
+
+from zstate.buffer.tracks import Offset
+from zstate.clock import Clock, SystemClock
+from zstate.closing import Closing
+from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.net.service import Answer, Service
+from zstate.net.session import Session
+from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
+from zstate.wire.messages import Clock as Time
+from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.writer import Writer
+
+AGAIN_S = 30.0
+"""So old a measurement is repeated when it is asked for."""
+
+_MEETING_S = 0.05
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class ClockOffset:
+    """The clock of ``writer`` is ``offset_ns`` ahead of the one here, plus or minus ``uncertainty_ns``.
+
+    ``round_trip_ns`` is the shortest there was, from the question to the answer.
+    """
+
+    robot: str
+    writer: Writer
+    offset_ns: int
+    uncertainty_ns: int
+    round_trip_ns: int
+
+
+class ClockService(Service):
+    """Tells whoever asks what time it is by the ``clock`` of one writer of ``robot``."""
+
+    def __init__(self, session: Session, robot: str, writer: Writer, clock: Clock) -> None:
+        def answer(_: object) -> Answer:
+            return Answer(encode(Time(clock.now(), self.answered, writer.session)), ENCODINGS[Time])
+
+        super().__init__(session, clock_key(robot, writer.identity), answer)
+
+
+def measure_offsets(
+    session: Session,
+    robot: str,
+    rounds: int = 8,
+    *,
+    clock: Clock | None = None,
+    timeout_s: float = 0.5,
+) -> tuple[ClockOffset, ...]:
+    """How far the clock of each writer of ``robot`` ("*": of all robots) is ahead of ``clock``, sorted.
+
+    ``clock`` is this machine's unless given. The best of so many ``rounds`` counts. None is there when
+    nobody answers within ``timeout_s``. Raises InvalidInput and Closed.
+    """
+    if rounds < 1 or not timeout_s > 0.0:
+        raise InvalidInput(f"rounds is 1 or more and timeout_s is positive; got {rounds} and {timeout_s}")
+    expression = clock_expression(robot)
+    return tuple(sorted(_best(session, expression, rounds, clock or SystemClock(), timeout_s)))
+
+
+def _best(
+    session: Session, expression: str, rounds: int, clock: Clock, timeout_s: float
+) -> Iterator[ClockOffset]:
+    best: dict[str, ClockOffset] = {}
+    deadline = time.monotonic() + timeout_s
+    while rounds:
+        heard = list(_round(session, expression, clock, timeout_s))
+        if heard:
+            rounds -= 1
+        elif best or time.monotonic() > deadline:
+            break
+        else:
+            time.sleep(_MEETING_S)  # a session that has just connected has not met everybody yet
+        for one in heard:
+            key = clock_key(one.robot, one.writer.identity)
+            if key not in best or one.round_trip_ns < best[key].round_trip_ns:
+                best[key] = one
+    yield from best.values()
+
+
+def _round(session: Session, expression: str, clock: Clock, timeout_s: float) -> Iterator[ClockOffset]:
+    asked_ns, now = time.monotonic_ns(), clock.now()
+    replies = session.zenoh.get(
+        expression,
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=timeout_s,
+    )
+    for reply in replies:
+        round_trip_ns = time.monotonic_ns() - asked_ns
+        if reply.ok is not None:
+            told = _told(reply.ok)
+            if told is not None:
+                robot, writer, stamp = told
+                half = round_trip_ns // 2
+                yield ClockOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
+
+
+def _told(sample: zenoh.Sample) -> tuple[str, Writer, int] | None:
+    """Who says what time it is; None for what is no answer of ours."""
+    try:
+        robot, identity = parse_clock_key(str(sample.key_expr))
+        time_there = decode(sample.payload.to_bytes(), str(sample.encoding), Time)
+        return robot, Writer.parse(identity), time_there.stamp
+    except (InvalidInput, MessageError):
+        return None
+
+
+class OffsetMeter(Closing):
+    """Measures the clocks of writers as often as somebody wants to know, in a thread of its own.
+
+    The thread lives no longer than there is something to measure.
+    """
+
+    def __init__(self, session: Session, clock: Clock) -> None:
+        self._session = session
+        self._clock = clock
+        self._wanted: deque[_Measured] = deque()
+        self._lock = threading.Lock()
+        self._is_running = False
+        self._is_open = True
+
+    def follow(self, robot: str, writer: Writer) -> Callable[[], Offset | None]:
+        """What tells how far the clock of ``writer`` is ahead: measured now, and when asked after 30 s."""
+        measured = _Measured(self, clock_key(robot, writer.identity))
+        measured()
+        return measured
+
+    def want(self, measured: _Measured) -> None:
+        """Measure, as soon as what was wanted before is done."""
+        with self._lock:
+            if not self._is_open:
+                return
+            self._wanted.append(measured)
+            if not self._is_running:
+                self._is_running = True
+                threading.Thread(target=self._run, name="zstate clock offsets", daemon=True).start()
+
+    def close(self) -> None:
+        """Measure no more. A second call does nothing."""
+        with self._lock:
+            self._is_open = False
+            self._wanted.clear()
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._wanted:
+                    self._is_running = False
+                    return
+                measured = self._wanted.popleft()
+            try:
+                for found in _best(self._session, measured.key, 8, self._clock, 0.5):
+                    measured.offset = Offset(found.offset_ns, found.uncertainty_ns)
+            except (Closed, zenoh.ZError):
+                self.close()  # the session is gone
+
+
+class _Measured:
+    """The offset of one writer's clock, as far as it is known."""
+
+    def __init__(self, meter: OffsetMeter, key: str) -> None:
+        self.key = key
+        self.offset: Offset | None = None
+        self._meter = meter
+        self._wanted_s = -AGAIN_S
+
+    def __call__(self) -> Offset | None:
+        now_s = time.monotonic()
+        if now_s - self._wanted_s >= AGAIN_S:
+            self._wanted_s = now_s
+            self._meter.want(self)
+        return self.offset
