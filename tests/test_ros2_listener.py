@@ -92,7 +92,8 @@ def test_writers_are_named_by_their_nodes_also_when_they_are_announced_late(sess
 def test_writers_of_every_distribution_are_heard(sessions, written: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
-        RosNode(writer, "rsp").publisher(DESCRIPTION, written).text(RRBOT.urdf)
+        described = RosNode(writer, "rsp").publisher(DESCRIPTION, written)
+        described.text(RRBOT.urdf)
         driver = RosNode(writer, "driver").publisher(JOINT_STATES, written).announce().await_reader()
         driver.joints(STAMP, NAMES, [0.5, 0.25])
         pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
@@ -254,7 +255,8 @@ def test_a_namespace_is_heard_alone_and_the_root_alone(sessions):
         TransformListener(reader, "root", wire="ros2") as root,
     ):
         node = RosNode(writer, "rsp", "/r1")
-        node.publisher(DESCRIPTION, namespace="r1").text(RRBOT.urdf)
+        described = node.publisher(DESCRIPTION, namespace="r1")
+        described.text(RRBOT.urdf)
         driver = node.publisher(JOINT_STATES, namespace="r1").announce().await_reader()
         driver.joints(STAMP, NAMES, [0.5, 0.25])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
