@@ -31,7 +31,10 @@ SETTINGS: dict[str, object] = {
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
     "transport/link/tx/lease": 3000,
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    # A connection that was cut comes back within a second of the heal: TCP asks again after one second,
+    # then a new attempt follows. Two round trips and those of TLS must fit into one.
+    "transport/unicast/open_timeout": 1800,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
 }
 
 ROS_ROUTER: dict[str, object] = {

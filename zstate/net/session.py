@@ -1,4 +1,4 @@
-"""The connection to the network; the only place that opens Zenoh."""
+"""The connection to the network."""
 
 # pyright: reportUnknownMemberType=false
 # zenoh's stubs leave the return types of some methods out
@@ -37,7 +37,9 @@ from zstate.net.modes import (
     listening,
 )
 from zstate.net.rendezvous import Rendezvous, rendezvous_address
+from zstate.net.runtime import open_zenoh
 from zstate.net.security import Credentials
+from zstate.net.twin import Twin
 
 CLOSE_WITHIN_S = 0.8
 
@@ -92,7 +94,7 @@ def connect(
             path="mode",
         )
     given = given_config(source, *checked, credentials)
-    return Session(_open(given, checked[1] or endpoints_in(given), credentials or credentials_in(given)))
+    return _session(given, checked[1] or endpoints_in(given), credentials or credentials_in(given))
 
 
 def _check(
@@ -127,7 +129,11 @@ def _connect(
     where = listening(mode, listen, credentials)
     check_credentials(mode, credentials, where)
     within = timeout_s if mode == "client" else None
-    return Session(_open(our_config(mode, endpoints, where, within, credentials), endpoints, credentials))
+    return _session(our_config(mode, endpoints, where, within, credentials), endpoints, credentials)
+
+
+def _session(config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None) -> Session:
+    return Session(_open(config, endpoints, credentials), twin=Twin.of(config, credentials))
 
 
 def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
@@ -151,14 +157,14 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
 
 
 def _open_lobby(endpoint: str) -> zenoh.Session:
-    return zenoh.open(our_config("peer", (), [endpoint]))
+    return open_zenoh(our_config("peer", (), [endpoint]))
 
 
 def _open(
     config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None = None
 ) -> zenoh.Session:
     try:
-        return zenoh.open(config)
+        return open_zenoh(config)
     except zenoh.ZError as error:
         raise _explained(str(error), endpoints, credentials) from None
 
@@ -194,7 +200,9 @@ class Session(Closing):
     Safe to use from any thread, but not in a process forked from the one that connected.
     """
 
-    def __init__(self, raw: zenoh.Session, rendezvous: Rendezvous | None = None) -> None:
+    def __init__(
+        self, raw: zenoh.Session, rendezvous: Rendezvous | None = None, *, twin: Twin | None = None
+    ) -> None:
         self._raw = raw
         self._rendezvous = rendezvous
         self._pid = os.getpid()
@@ -203,6 +211,7 @@ class Session(Closing):
         self._numbers = itertools.count()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
+        self.twin = twin
 
     def __repr__(self) -> str:
         return f"Session({self.zid}{', closed' if self._closed else ''})"
