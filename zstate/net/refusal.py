@@ -14,7 +14,7 @@ from zstate.net.security import Credentials
 
 ANSWERS_WITHIN_S = 2.0
 
-_REFUSES_WITHIN_S = 1.0  # the other side judges our certificate after our handshake is over
+_REFUSES_WITHIN_S = 1.0  # judged is our certificate after our part of the handshake is over
 _ADDRESS = re.compile(r"(?P<protocol>tcp|tls)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
 
 
@@ -71,6 +71,7 @@ def _speaks_tls(link: socket.socket) -> bool:
 
 
 def _greet(link: socket.socket, host: str, credentials: Credentials | None) -> Refusal:
+    link.settimeout(_REFUSES_WITHIN_S)
     try:
         secured = _context(credentials).wrap_socket(link, server_hostname=host)
     except ssl.SSLCertVerificationError as error:

@@ -1,0 +1,216 @@
+"""What somebody is told whom a router does not let in, by real routers that run in a process of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+from support import Child, a_free_port
+
+from zstate.errors import AccessDenied, Unreachable
+from zstate.net.certificates import issue_identities
+from zstate.net.security import Credentials
+from zstate.net.session import connect
+
+ROUTERS = """
+    import sys
+    from pathlib import Path
+    from zstate.net.security import Credentials
+    from zstate.net.session import connect
+    folder, *endpoints = sys.argv[1:]
+    users = Path(folder) / "users"
+    kinds = (
+        Credentials.from_folder(folder, "router"),
+        Credentials.from_folder(folder, "router", users=users),
+        Credentials.from_folder(folder, "expired"),
+        Credentials.from_folder(folder, "early"),
+        Credentials(users=users),
+        None,
+    )
+    sessions = [connect(mode="router", listen=e, credentials=c) for e, c in zip(endpoints, kinds)]
+    print("ready")
+    sys.stdin.readline()
+"""
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Routers, by what they are, and the folders of two authorities."""
+
+    folder: Path
+    strangers: Path
+    ports: dict[str, int]
+
+    def tls(self, kind: str, host: str = "127.0.0.1") -> str:
+        return f"tls/{host}:{self.ports[kind]}"
+
+    def tcp(self, kind: str) -> str:
+        return f"tcp/127.0.0.1:{self.ports[kind]}"
+
+    def identity(self, name: str, user: str | None = None, password: str | None = None) -> Credentials:
+        return Credentials.from_folder(self.folder, name, user=user, password=password)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    now, two_days = datetime.now(timezone.utc), timedelta(days=2)
+    folder, strangers = tmp_path_factory.mktemp("fleet"), tmp_path_factory.mktemp("strangers")
+    issue_identities(folder, ["router", "r1"])
+    issue_identities(folder, ["expired"], days=1, valid_from=now - two_days)
+    issue_identities(folder, ["early"], days=1, valid_from=now + two_days)
+    issue_identities(strangers, ["r1"])
+    (folder / "users").touch(0o600)
+    (folder / "users").write_text("alice:wonder\nbob:build:it\n")
+    names = ("mtls", "mtls and users", "expired", "early", "users", "open")
+    fleet = Fleet(folder, strangers, {name: a_free_port() for name in names})
+    is_plain = {"users", "open"}
+    endpoints = [fleet.tcp(name) if name in is_plain else fleet.tls(name) for name in names]
+    child = Child(ROUTERS, str(folder), *endpoints)
+    try:
+        assert child.line() == "ready"
+        yield fleet
+    finally:
+        child.kill()
+
+
+def denied(endpoint: str, credentials: Credentials | None) -> tuple[str, str]:
+    """The reason and the text."""
+    with pytest.raises(AccessDenied) as caught:
+        connect(mode="client", endpoints=endpoint, credentials=credentials, timeout_s=0.2)
+    assert caught.value.endpoint == endpoint
+    assert str(caught.value).startswith(f"{endpoint!r} answers and does not let this session in: ")
+    return caught.value.reason, str(caught.value)
+
+
+def lets_in(endpoint: str, credentials: Credentials | None) -> bool:
+    with connect(mode="client", endpoints=endpoint, credentials=credentials) as session:
+        return bool(list(session.zenoh.info.routers_zid()))
+
+
+def test_the_right_ones_are_let_in(fleet: Fleet):
+    assert lets_in(fleet.tls("mtls"), fleet.identity("r1"))
+    assert lets_in(fleet.tls("mtls", "localhost"), fleet.identity("r1"))
+    assert lets_in(fleet.tcp("users"), Credentials(user="alice", password="wonder"))
+    assert lets_in(fleet.tcp("users"), Credentials(user="bob", password="build:it"))
+    assert lets_in(fleet.tls("mtls and users"), fleet.identity("r1", "alice", "wonder"))
+
+
+def test_plain_tcp_towards_tls(fleet: Fleet):
+    reason, text = denied(fleet.tcp("mtls"), None)
+    assert reason == "TLS demanded"
+    assert "write 'tls/'" in text
+    assert "--certs" in text
+
+
+def test_tls_towards_plain_tcp(fleet: Fleet):
+    reason, text = denied(fleet.tls("open"), fleet.identity("r1"))
+    assert reason == "no TLS there"
+    assert "zstate router --certs" in text
+
+
+def test_a_router_of_another_authority(fleet: Fleet):
+    reason, text = denied(fleet.tls("mtls"), Credentials.from_folder(fleet.strangers, "r1"))
+    assert reason == "wrong CA"
+    assert f"not signed by '{fleet.strangers / 'ca.pem'}'" in text
+
+
+def test_tls_without_an_authority_of_ones_own(fleet: Fleet):
+    reason, text = denied(fleet.tls("mtls"), None)
+    assert reason == "wrong CA"
+    assert "--certs DIR" in text
+
+
+def test_a_certificate_of_another_authority(fleet: Fleet):
+    stranger = Credentials(
+        ca=fleet.folder / "ca.pem", certificate=fleet.strangers / "r1.pem", key=fleet.strangers / "r1.key"
+    )
+    reason, text = denied(fleet.tls("mtls"), stranger)
+    assert reason == "our certificate refused"
+    assert f"refuses '{fleet.strangers / 'r1.pem'}'" in text
+
+
+def test_no_certificate(fleet: Fleet):
+    reason, text = denied(fleet.tls("mtls"), Credentials(ca=fleet.folder / "ca.pem"))
+    assert reason == "certificate demanded"
+    assert "--identity NAME" in text
+
+
+@pytest.mark.parametrize("name", ["expired", "early"])
+def test_a_certificate_out_of_its_time(fleet: Fleet, name: str):
+    reason, text = denied(fleet.tls("mtls"), fleet.identity(name))
+    assert reason == "our certificate expired"
+    assert f"'{fleet.folder / name}.pem' has expired, or is not valid yet" in text
+    assert "clocks" in text
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected", "hint"),
+    [
+        ("expired", "their certificate expired", "renew it there"),
+        ("early", "their certificate not yet valid", "clock behind"),
+    ],
+)
+def test_a_router_whose_certificate_is_out_of_its_time(fleet: Fleet, kind: str, expected: str, hint: str):
+    reason, text = denied(fleet.tls(kind), fleet.identity("r1"))
+    assert reason == expected
+    assert hint in text
+
+
+@pytest.mark.parametrize(("user", "password"), [("eve", "wonder"), ("alice", "wander")])
+@pytest.mark.parametrize("kind", ["users", "mtls and users"])
+def test_a_wrong_user_or_password(fleet: Fleet, kind: str, user: str, password: str):
+    plain = kind == "users"
+    given = Credentials(user=user, password=password) if plain else fleet.identity("r1", user, password)
+    reason, text = denied(fleet.tcp(kind) if plain else fleet.tls(kind), given)
+    assert reason == "user or password"
+    assert f"the user {user!r} or the password" in text
+    assert password not in text
+
+
+def test_no_user_where_one_is_asked_for(fleet: Fleet):
+    reason, text = denied(fleet.tcp("users"), None)
+    assert reason == "user demanded"
+    assert "ZSTATE_PASSWORD" in text
+
+
+def test_a_user_where_nobody_knows_any(fleet: Fleet):
+    reason, text = denied(fleet.tcp("open"), Credentials(user="alice", password="wonder"))
+    assert reason == "user or password"
+    assert "a router that has none refuses whoever names a user" in text
+
+
+def test_a_router_at_a_host_that_is_not_in_its_certificate(fleet: Fleet, spawn, free_port: int):
+    endpoint = f"tls/127.0.0.2:{free_port}"
+    spawn(ROUTERS, str(fleet.folder), endpoint).line()
+    reason, text = denied(endpoint, fleet.identity("r1"))
+    assert reason == "name mismatch"
+    assert "--host 127.0.0.2" in text
+
+
+def test_a_configuration_of_zenoh_that_shows_the_wrong_certificate_is_told_the_same(fleet: Fleet):
+    config = {
+        "mode": "client",
+        "connect": {"endpoints": [fleet.tls("mtls")], "timeout_ms": 200, "exit_on_failure": True},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {"link": {"tls": {"root_ca_certificate": str(fleet.strangers / "ca.pem")}}},
+    }
+    with pytest.raises(AccessDenied) as caught:
+        connect(config)
+    assert caught.value.reason == "wrong CA"
+
+
+def test_where_nobody_listens_there_is_no_refusal_and_of_two_the_one_that_refuses_is_told(
+    fleet: Fleet, free_port: int
+):
+    nobody = f"tls/127.0.0.1:{free_port}"
+    with pytest.raises(Unreachable, match="nothing answers"):
+        connect(mode="client", endpoints=nobody, credentials=fleet.identity("r1"), timeout_s=0.2)
+    with pytest.raises(AccessDenied) as caught:
+        both = [nobody, fleet.tls("mtls")]
+        connect(mode="client", endpoints=both, credentials=fleet.identity("expired"), timeout_s=0.2)
+    assert caught.value.endpoint == fleet.tls("mtls")
+    assert f"nothing answers at '{nobody}'" in str(caught.value)

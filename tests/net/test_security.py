@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from zstate.errors import ConfigError
+from zstate.net.certificates import issue_identities
+from zstate.net.security import Credentials
+from zstate.net.session import connect
+
+HERE = "tls/127.0.0.1:1"
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the identities r1 and r2."""
+    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    folder = tmp_path_factory.mktemp("fleet")
+    issue_identities(folder, ["r1", "r2"])
+    return folder
+
+
+def refusal(credentials: Credentials, **arguments: object) -> str:
+    with pytest.raises(ConfigError) as caught:
+        connect(credentials=credentials, **{"mode": "client", "endpoints": HERE, **arguments})  # type: ignore[arg-type]
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({}, "are empty"),
+        ({"user": "alice"}, "a user and no password"),
+        ({"password": "x"}, "a password and no user"),
+        ({"user": "", "password": "x"}, "not empty"),
+        ({"user": "a:b", "password": "x"}, "no ':'"),
+        ({"ca": "ca.pem", "certificate": "r1.pem"}, "a certificate and no key"),
+        ({"ca": "ca.pem", "key": "r1.key"}, "a key and no certificate"),
+        ({"certificate": "r1.pem", "key": "r1.key"}, "a certificate and no ca"),
+    ],
+)
+def test_credentials_that_lack_a_part_say_which(arguments: dict[str, str], text: str):
+    with pytest.raises(ConfigError) as caught:
+        Credentials(**arguments)
+    assert text in str(caught.value)
+
+
+def test_a_password_is_not_shown_where_credentials_are():
+    assert "wonder" not in repr(Credentials(user="alice", password="wonder"))
+
+
+def test_a_folder_without_the_identity_says_which_it_has(fleet: Path):
+    assert Credentials.from_folder(fleet, "r1").certificate == fleet / "r1.pem"
+    with pytest.raises(ConfigError, match=r"no identity 'r3'.*are 'r1', 'r2'; .*zstate certs"):
+        Credentials.from_folder(fleet, "r3")
+    with pytest.raises(ConfigError, match="there are none"):
+        Credentials.from_folder(fleet / "elsewhere", "r1")
+
+
+def test_an_endpoint_that_shows_no_certificate_is_refused(fleet: Path):
+    text = refusal(Credentials.from_folder(fleet, "r1"), endpoints="tcp/10.0.0.1:7447")
+    assert "'tcp/10.0.0.1:7447' is not encrypted" in text
+    assert "write 'tls/10.0.0.1:7447'" in text
+
+
+def test_listening_with_encryption_needs_a_certificate(fleet: Path):
+    text = refusal(Credentials(ca=fleet / "ca.pem"), mode="router", endpoints=(), listen=HERE)
+    assert f"listening at '{HERE}' needs a certificate" in text
+    with pytest.raises(ConfigError, match="needs a certificate"):
+        connect(mode="router", listen=HERE)
+
+
+def test_a_router_with_a_name_and_no_users_would_let_nobody_in():
+    text = refusal(Credentials(user="alice", password="x"), mode="router", endpoints=())
+    assert "let nobody in" in text
+
+
+def test_programs_of_one_host_meet_without_credentials():
+    for mode in ("peer", "loopback"):
+        assert "endpoints=" in refusal(Credentials(user="a", password="b"), mode=mode, endpoints=())
+
+
+def test_files_that_are_missing_are_named(fleet: Path):
+    for part in ("ca", "certificate", "key"):
+        files = {"ca": fleet / "ca.pem", "certificate": fleet / "r1.pem", "key": fleet / "r1.key"}
+        text = refusal(Credentials(**{**files, part: fleet / "nothing"}))
+        assert "nothing' cannot be read: No such file" in text
+
+
+def test_files_that_are_something_else_are_named(fleet: Path, tmp_path: Path):
+    other = tmp_path / "other"
+    other.write_text("hello")
+    other.chmod(0o600)
+    assert "holds no certificate" in refusal(Credentials(ca=other))
+    ca, certificate = fleet / "ca.pem", fleet / "r1.pem"
+    text = refusal(Credentials(ca=ca, certificate=certificate, key=other))
+    assert "other' are not a certificate and its unencrypted key" in text
+    text = refusal(Credentials(ca=ca, certificate=certificate, key=fleet / "r2.key"))
+    assert "do not belong together" in text
+
+
+def test_a_key_with_a_password_is_refused_and_nobody_is_asked_for_it(fleet: Path, tmp_path: Path):
+    serialization = pytest.importorskip("cryptography.hazmat.primitives.serialization")
+    key = serialization.load_pem_private_key((fleet / "r1.key").read_bytes(), None)
+    locked = tmp_path / "locked.key"
+    encryption = serialization.BestAvailableEncryption(b"secret")
+    locked.write_bytes(
+        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
+    )
+    locked.chmod(0o600)
+    text = refusal(Credentials(ca=fleet / "ca.pem", certificate=fleet / "r1.pem", key=locked))
+    assert "unencrypted key" in text
+
+
+def test_secrets_that_everybody_can_read_are_refused(fleet: Path, tmp_path: Path):
+    key, users = tmp_path / "r1.key", tmp_path / "users"
+    key.write_bytes((fleet / "r1.key").read_bytes())
+    users.write_text("alice:wonder\n")
+    for secret in (key, users):
+        secret.chmod(0o644)
+    text = refusal(Credentials(ca=fleet / "ca.pem", certificate=fleet / "r1.pem", key=key))
+    assert "mode 644" in text
+    assert f"chmod 600 {key}" in text
+    assert f"chmod 600 {users}" in refusal(Credentials(users=users), endpoints="tcp/127.0.0.1:1")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads every file")
+def test_a_file_that_is_not_ours_to_read_is_named(fleet: Path, tmp_path: Path):
+    hidden = tmp_path / "ca.pem"
+    hidden.touch(0o000)
+    assert "another user or group" in refusal(Credentials(ca=hidden))
+
+
+@pytest.mark.parametrize(
+    ("lines", "text"),
+    [
+        ("alice\n", "line 1: write user:password"),
+        ("alice:wonder\n# nobody\n", "line 2: write user:password; comments"),
+        ("alice:\n", "line 1: write user:password"),
+        (":wonder\n", "line 1: write user:password"),
+        ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' stands in line 1"),
+        ("\n", "names no user"),
+    ],
+)
+def test_a_file_of_users_that_zenoh_would_take_wrongly_is_refused_with_its_line(
+    tmp_path: Path, lines: str, text: str
+):
+    users = tmp_path / "users"
+    users.write_text(lines)
+    users.chmod(0o600)
+    assert text in refusal(Credentials(users=users), mode="router", endpoints=())
