@@ -121,11 +121,12 @@ class Unreachable(NetworkError, TimeoutError):
 
 
 class AccessDenied(NetworkError):
-    """Somebody answers at ``endpoint`` and does not let this session in.
+    """Somebody answers at ``endpoint`` and does not let this session in, or drops what it writes.
 
-    ``reason`` is one of "no TLS there", "TLS demanded", "wrong CA", "name mismatch", "their certificate
-    expired", "their certificate not yet valid", "our certificate expired", "our certificate refused",
-    "certificate demanded", "user or password", "user demanded".
+    ``reason`` is "not allowed to write", and then ``endpoint`` is the key; or one of "no TLS there", "TLS
+    demanded", "wrong CA", "name mismatch", "their certificate expired", "their certificate not yet
+    valid", "our certificate expired", "our certificate refused", "certificate demanded", "user or
+    password", "user demanded".
     """
 
     def __init__(self, message: str, *, reason: str, endpoint: str) -> None:

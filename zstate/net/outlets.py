@@ -8,6 +8,7 @@ from contextlib import ExitStack, suppress
 from zstate.closing import Closing
 from zstate.errors import Closed
 from zstate.net.latched import LatchedPublisher
+from zstate.net.permission import check_may_write
 from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
@@ -27,6 +28,8 @@ class Outlets(Closing):
         self._session = session
         place = Place(session.zid, session.next_number())
         self._voice = wire.voice(robot, writer, place, layout or Layout())
+        self._robot = robot
+        self._is_permitted = wire.name != "native"  # what others are permitted, theirs have to say
         self._opened = ExitStack()
         if self._voice.token is not None:
             self._opened.enter_context(announce(session, self._voice.token))
@@ -49,6 +52,13 @@ class Outlets(Closing):
         self._opened.enter_context(publisher)
         if outlet.token is not None:
             self._opened.enter_context(announce(self._session, outlet.token))
+            self._check_permission(outlet.token)
+
+    def _check_permission(self, token: str) -> None:
+        # One stands for all: they are of the same robot.
+        if not self._is_permitted:
+            check_may_write(self._session, self._robot, token)
+            self._is_permitted = True
 
     def close(self) -> None:
         """Withdraw from all of it. A second call does nothing."""

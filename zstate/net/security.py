@@ -105,6 +105,14 @@ class Credentials:
             users=users,
         )
 
+    @property
+    def identity(self) -> str:
+        """Whom others take this session for, in words; empty where it only knows whom to trust."""
+        shown = [f"user {self.user!r}"] if self.user else []
+        if self.certificate is not None:
+            shown.append(f"the certificate {str(self.certificate)!r}")
+        return " with ".join(shown)
+
     def check_endpoints(self, endpoints: Iterable[str], listen: Iterable[str]) -> None:
         """Raise ConfigError for an endpoint that these credentials cannot protect."""
         for endpoint in (*endpoints, *listen):
