@@ -85,7 +85,10 @@ def test_closing_one_writer_leaves_the_other_ones_edges(sessions):
 
 def test_an_edge_that_another_writer_took_over_stays_when_the_first_one_leaves(sessions):
     writer, reader = sessions
-    with TransformListener(reader, "r1") as listener, StaticPublisher(writer, "r1", "new") as new:
+    with (
+        TransformListener(reader, "r1") as listener,
+        StaticPublisher(writer, "r1", "new", takeover=True) as new,
+    ):
         with StaticPublisher(writer, "r1", "old") as old:
             old.set(edge("tool", "camera", 1.0))
             old.set(edge("tool", "laser", 1.0))

@@ -61,7 +61,8 @@ class Replayer(Closing):
 
     Robots whose model was recorded go through a StatePublisher, the others are said as they were. Raises
     RecordingError, and InvalidInput for robots and times that the recording does not have. A context
-    manager; ``run`` replays, other threads may pause and seek.
+    manager; ``run`` replays, other threads may pause and seek. It raises SecondWriter where somebody
+    writes one of the robots now, but with ``takeover``.
     """
 
     def __init__(
@@ -76,11 +77,13 @@ class Replayer(Closing):
         duration_s: float | None = None,
         loop: bool = False,
         clock: Clock | None = None,
+        takeover: bool = False,
     ) -> None:
         self.rate = rate
         self._session = session
         self._wires = tuple(wires)
         self._loop = loop
+        self._takeover = takeover
         self._clock: Clock = clock or SystemClock()
         self._pace = Pace(self._clock, rate)
         self._lateness = Lateness()
@@ -199,6 +202,7 @@ class Replayer(Closing):
                 models=self._models,
                 standing=standing,
                 tally=self._tally,
+                takeover=self._takeover,
             ) as cast,
             ClockPublisher(self._session, self._wires) as clock,
         ):

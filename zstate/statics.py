@@ -10,6 +10,7 @@ from urllib.parse import quote
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
+from zstate.net.claims import Claim, check_edge
 from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
@@ -17,7 +18,7 @@ from zstate.net.wires import wire_named
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
-from zstate.wire.writer import Writer
+from zstate.wire.writer import Announced, Writer
 
 
 class StaticPublisher(Closing):
@@ -28,6 +29,10 @@ class StaticPublisher(Closing):
     them; the ROS wires cannot say that, so that there only late joiners do not get them any more.
     ``writer`` tells this publisher from others: unless given, the program, its process id and a random
     number. ``program`` is the script's name unless given.
+
+    On the native wire SecondWriter is raised, and names the first, where somebody else who lives writes
+    under the same name, and by ``set`` for a frame that another static writer of any robot places; not
+    with ``takeover``.
     """
 
     def __init__(
@@ -38,6 +43,7 @@ class StaticPublisher(Closing):
         wire: str = "native",
         *,
         program: str = "",
+        takeover: bool = False,
     ) -> None:
         identity = writer_here(secrets.randbits(32), program)
         self.robot = check_robot(robot)
@@ -50,21 +56,30 @@ class StaticPublisher(Closing):
         self._check = TransformBuffer()
         self._lock = threading.Lock()
         self._closed = False
+        self._session = session
+        self._announced = Announced(self.robot, "tf_static", identity, self.writer)
+        self._claim: Claim | None = None
         with ExitStack() as opening:
-            self._outlets = opening.enter_context(Outlets(session, wire_named(wire), robot, identity))
-            self._latched = self._outlets.latched("tf_static", self.writer)
-            opening.pop_all()
+            if wire == "native" and not takeover:  # in ROS static edges are everybody's
+                self._claim = opening.enter_context(Claim(session, [self._announced]))
+            outlets = opening.enter_context(Outlets(session, wire_named(wire), robot, identity))
+            self._latched = outlets.latched("tf_static", self.writer)
+            self._opened = opening.pop_all()
 
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
 
         Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges,
-        InvalidInput for names that cannot be frames, and Closed.
+        InvalidInput for names that cannot be frames, SecondWriter and Closed.
         """
         parent = full_name(self.robot, transform.target)
         child = full_name(self.robot, transform.source)
         with self._lock:
             self._check_open()
+            if self._claim is not None:
+                self._claim.check()
+                if child not in self._edges:
+                    check_edge(self._session, self._announced, (parent, child))
             self._check.insert_static(
                 Transform(parent, child, transform.translation, transform.rotation), writer=self.writer
             )
@@ -101,7 +116,7 @@ class StaticPublisher(Closing):
                 return
             self._closed = True
             self._latched.withdraw()
-            self._outlets.close()
+            self._opened.close()
 
 
 def _default_writer(identity: Writer) -> str:

@@ -211,7 +211,7 @@ def test_another_model_replaces_the_first(world, here, there):
         StatePublisher(session, RRBOT, "r1", (here,)),
     ):
         until(lambda: "tool" in frames(listener))
-        with StatePublisher(session, GRIPPER, "r1", (here,)) as publisher:
+        with StatePublisher(session, GRIPPER, "r1", (here,), takeover=True) as publisher:
             until(lambda: len(world.changes) == 2)
             pair = GRIPPER.root, GRIPPER.links[-1]
             until(lambda: publisher.publish(still) or listener.buffer.can_lookup(*pair))

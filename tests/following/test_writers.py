@@ -140,7 +140,7 @@ def test_of_two_writers_at_once_the_newer_is_followed_and_the_other_counted(sess
         settle(writer, "r1")
         first.publish([1.0, 1.0], stamp=1)
         assert received(listener, 1)
-        with StatePublisher(writer, RRBOT, "r1") as second:
+        with StatePublisher(writer, RRBOT, "r1", takeover=True) as second:
             for stamp in range(2, 12, 2):
                 second.publish([2.0, 2.0], stamp=stamp)
                 first.publish([1.0, 1.0], stamp=stamp + 1)

@@ -75,10 +75,11 @@ class Carrier(Closing):
         robot, source, target = self.robot, self.source, self.target
         with ExitStack() as opening:
             publisher = opening.enter_context(
-                StatePublisher(target.session, model, robot, (target.wire,), program=PROGRAM)
+                # Beside other bridges, too; which way a robot is carried was decided before.
+                StatePublisher(target.session, model, robot, (target.wire,), program=PROGRAM, takeover=True)
             )
             statics = opening.enter_context(
-                StaticPublisher(target.session, robot, wire=target.wire, program=PROGRAM)
+                StaticPublisher(target.session, robot, wire=target.wire, program=PROGRAM, takeover=True)
             )
             opening.enter_context(StaticCarrier(source.session, model, statics, self._tally, source.wire))
             readings = opening.enter_context(SubscribedSource(source.session, model, robot, wire=source.wire))

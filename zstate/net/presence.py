@@ -15,6 +15,7 @@ import zenoh
 from zstate.closing import Closing
 from zstate.errors import InvalidInput
 from zstate.net.receiver import Receiver, Ring
+from zstate.net.router_losses import RouterLosses
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, Stream
@@ -84,7 +85,7 @@ def living_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> 
     deadline = time.monotonic() + timeout_s
     found: frozenset[str] = frozenset()
     while (remaining_s := deadline - time.monotonic()) > 0.0:
-        answer = _ask(session, expression, remaining_s)
+        answer = tokens_now(session, expression, remaining_s)
         if answer and answer == found:
             break
         found = answer
@@ -92,7 +93,8 @@ def living_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> 
     return found
 
 
-def _ask(session: Session, expression: str, timeout_s: float) -> frozenset[str]:
+def tokens_now(session: Session, expression: str, timeout_s: float) -> frozenset[str]:
+    """The liveliness tokens that are known where this session is connected, within ``timeout_s`` [s]."""
     replies = session.zenoh.liveliness().get(expression, timeout=timeout_s)
     samples = (reply.ok for reply in replies)
     return frozenset(str(sample.key_expr) for sample in samples if sample is not None)
@@ -109,15 +111,23 @@ def by_robot(found: Iterable[Announced]) -> tuple[RobotInfo, ...]:
 class Watch(Closing):
     """Follows the writers of ``robot`` ("*": of all robots), those already there included.
 
-    ``callback(announced, alive)`` is called from one thread. Losing the last router takes every writer
-    behind it away as well. ``foreign`` counts tokens that announce no stream of a robot.
+    ``callback(announced, alive)`` is called from one thread. Losing a router takes every writer behind it
+    away as well: for those ``on_cut_off(announced)`` is called instead, if it is given. ``foreign`` counts
+    tokens that announce no stream of a robot.
     """
 
     def __init__(
-        self, session: Session, robot: str, callback: Callable[[Announced, bool], None], wire: Wire
+        self,
+        session: Session,
+        robot: str,
+        callback: Callable[[Announced, bool], None],
+        wire: Wire,
+        on_cut_off: Callable[[Announced], None] | None = None,
     ) -> None:
         self.foreign = 0
         self._callback = callback
+        self._on_cut_off = on_cut_off
+        self._routers = None if on_cut_off is None else RouterLosses(session)
         self._robot = robot
         self._wire = wire
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
@@ -126,20 +136,30 @@ class Watch(Closing):
         self._receiver = Receiver(session, tokens, self._hand_over, CAPACITY)
 
     def _hand_over(self, batch: list[zenoh.Sample]) -> None:
+        gone = any(sample.kind == zenoh.SampleKind.DELETE for sample in batch)
+        cut_off = gone and self._routers is not None and self._routers.happened_just_now()
         for sample in batch:
             announced = self._wire.announced(str(sample.key_expr), self._robot)
             if announced is None:
                 self.foreign += 1
+            elif cut_off and self._on_cut_off is not None and sample.kind == zenoh.SampleKind.DELETE:
+                self._on_cut_off(announced)
             else:
                 self._callback(announced, sample.kind == zenoh.SampleKind.PUT)
 
     def close(self) -> None:
         """Stop within a second. A second call does nothing."""
+        if self._routers is not None:
+            self._routers.close()
         self._receiver.close()
 
 
 def watch(
-    session: Session, robot: str, callback: Callable[[Announced, bool], None], wire: str = "native"
+    session: Session,
+    robot: str,
+    callback: Callable[[Announced, bool], None],
+    wire: str = "native",
+    on_cut_off: Callable[[Announced], None] | None = None,
 ) -> Watch:
-    """Call ``callback(announced, alive)`` for each writer there is, comes or goes."""
-    return Watch(session, robot, callback, wire_named(wire))
+    """Call ``callback(announced, alive)`` for each writer there is, comes or goes; see ``Watch``."""
+    return Watch(session, robot, callback, wire_named(wire), on_cut_off)

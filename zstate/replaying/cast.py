@@ -33,6 +33,7 @@ class Cast(Closing):
     Robots with one of ``models`` get a StatePublisher, which computes their transforms anew where it
     was their own publisher that wrote them; everything else is said as it was. ``standing`` is what
     holds from the beginning. What cannot be said is counted in ``tally``.
+    Raises SecondWriter for robots with a model that somebody else writes now, but with ``takeover``.
     """
 
     def __init__(
@@ -44,9 +45,11 @@ class Cast(Closing):
         models: Mapping[str, RobotModel],
         standing: Standing,
         tally: Tally,
+        takeover: bool = False,
     ) -> None:
         self._session = session
         self._wires = wires
+        self._takeover = takeover
         self._tally = tally
         self._standing = standing
         self._modelled, self._computed = Unmodelled(), Unmodelled()
@@ -67,7 +70,7 @@ class Cast(Closing):
         self._modelled.learn(robot, model)
         if is_computed:
             self._computed.learn(robot, model)
-        return _Robot(self._session, self._wires, robot, model, is_computed)
+        return _Robot(self._session, self._wires, robot, model, is_computed, self._takeover)
 
     def _verbatim_streams(self, speakers: Iterable[Speaker]) -> dict[str, list[Stream]]:
         streams: dict[str, list[Stream]] = {}
@@ -144,15 +147,23 @@ class Cast(Closing):
 class _Robot(Closing):
     """A robot whose model is known, and its joint states."""
 
-    def __init__(
-        self, session: Session, wires: Sequence[str], robot: str, model: RobotModel, is_computed: bool
+    def __init__(  # noqa: PLR0917 - one use, just above
+        self,
+        session: Session,
+        wires: Sequence[str],
+        robot: str,
+        model: RobotModel,
+        is_computed: bool,
+        takeover: bool,
     ) -> None:
         self.model = model
         self.streams: tuple[Stream, ...] = ("joint_states", "tf_static", "robot_description")
         if is_computed:
             self.streams += ("tf",)
         self._order = joint_order(model)
-        self._publisher = StatePublisher(session, model, robot, wires, streams=self.streams)
+        self._publisher = StatePublisher(
+            session, model, robot, wires, streams=self.streams, takeover=takeover
+        )
 
     def publish(self, state: JointState) -> None:
         """Raises MessageError and InvalidInput for what cannot be said."""

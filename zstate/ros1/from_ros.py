@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from zstate.closing import Closing
-from zstate.errors import Closed, InsertRefused, InvalidInput, MessageError
+from zstate.errors import Closed, InsertRefused, InvalidInput, MessageError, SecondWriter
 from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
@@ -104,6 +104,8 @@ class FromRos(Closing):
             self._refuse(error.reason, message, error)
         except InvalidInput as error:
             self._refuse("bad numbers", message, error)
+        except SecondWriter as error:
+            self._refuse("second writer", message, error)
         except Closed:
             pass  # it came while we were leaving
 
@@ -129,6 +131,8 @@ class FromRos(Closing):
                     self._tally.refuse(error.reason, f"/tf_static of {writer_of(message)!r}: {error}")
                 except InvalidInput as error:
                     self._tally.refuse("bad numbers", f"/tf_static of {writer_of(message)!r}: {error}")
+                except SecondWriter as error:
+                    self._tally.refuse("second writer", f"/tf_static of {writer_of(message)!r}: {error}")
                 except Closed:
                     return
 

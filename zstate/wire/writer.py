@@ -43,8 +43,35 @@ class Writer:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """What a liveliness token says: ``writer`` writes ``stream`` of ``robot``."""
+    """What a liveliness token says: ``writer`` writes ``stream`` of ``robot``.
+
+    ``name`` is the one under which it writes static edges; empty for other streams, and where the wire
+    does not tell.
+    """
 
     robot: str
     stream: Stream
     writer: Writer
+    name: str = ""
+
+    @property
+    def identity(self) -> str:
+        """Writer and name in one chunk of a key."""
+        named = f",{quote(self.name, safe='')}" if self.name else ""
+        return self.writer.identity + named
+
+    @classmethod
+    def parse(cls, robot: str, stream: Stream, identity: str) -> Announced:
+        """What a token with this ``identity`` says. Raises InvalidInput for anything else."""
+        fields = identity.split(",")
+        name = unquote(fields.pop()) if len(fields) == 6 and stream == "tf_static" else ""
+        return cls(robot, stream, Writer.parse(",".join(fields)), name)
+
+    def excludes(self, other: Announced) -> bool:
+        """Whether only one of the two writers can be meant: both say the same, and neither knows the other.
+
+        Several writers of static edges have a name each; whose name is not known may be any.
+        """
+        same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
+        is_one = self.stream != "tf_static" or bool(self.name)
+        return same and is_one and self.writer.session != other.writer.session

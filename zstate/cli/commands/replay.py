@@ -105,7 +105,15 @@ def replay_command(
     with (
         open_session(network, wires) as session,
         Replayer(
-            session, file, robots, wires=wires, rate=rate, start_s=start, duration_s=duration, loop=loop
+            session,
+            file,
+            robots,
+            wires=wires,
+            rate=rate,
+            start_s=start,
+            duration_s=duration,
+            loop=loop,
+            takeover=force,
         ) as replayer,
     ):
         live = live_writers(session, replayer.robots, wires)
