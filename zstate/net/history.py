@@ -66,14 +66,12 @@ class Memory:
     def keep(self, state: JointState) -> None:
         """Remember ``state``, whose ``seq`` is one more than that of the last."""
         states, stamp = self._states, state.stamp
-        if states:
-            limit = stamp - self._span_ns
-            if stamp < states[-1].stamp - self._span_ns:
-                states.clear()  # the clock was set back
-            else:
-                while states[0].stamp < limit:
-                    states.popleft()
+        limit = stamp - self._span_ns
+        if states and states[-1].stamp - self._span_ns > stamp:
+            states.clear()  # the clock was set back
         states.append(state)
+        while states[0].stamp < limit:
+            states.popleft()
 
     def since(self, seq: int) -> list[JointState]:
         """What is remembered from the sample ``seq`` on."""

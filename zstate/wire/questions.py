@@ -67,7 +67,9 @@ def error_from_json(text: bytes) -> ZStateError:
     kind = getattr(zstate.errors, str(facts.pop("error", "")), None)
     message = str(facts.pop("message", ""))
     if isinstance(kind, type) and issubclass(kind, ZStateError):
-        error = kind.__new__(kind, message)
+        # Not by the constructor, which differs from error to error.
+        error = kind.__new__(kind)
+        error.args = (message,)
         error.__dict__.update({name: _frozen(value) for name, value in facts.items()})
         if not issubclass(kind, LookupFailed) or _can_explain(error):
             return error

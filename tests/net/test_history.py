@@ -1,0 +1,215 @@
+"""What a writer remembers, and how readers get it."""
+
+from __future__ import annotations
+
+import pytest
+from live import SECOND, STAMP
+from support import until
+
+from zstate.errors import InvalidInput, MessageError
+from zstate.net.history import MOST_BYTES, PAGE_BYTES, PAGE_SAMPLES, Memory, PastReader, answer_past
+from zstate.net.service import Answer, Service
+from zstate.net.session import Session
+from zstate.wire.messages import JointState, Past
+from zstate.wire.native import ENCODINGS, decode, encode
+from zstate.wire.wire import Arrival
+
+KEY = "zstate/r1/joint_states"
+ORDER = bytes(8)
+MS = SECOND // 1000
+
+
+def state(seq: int, stamp: int | None = None, session: int = 7, numbers: int = 2) -> JointState:
+    return JointState(STAMP + seq * MS if stamp is None else stamp, seq, session, ORDER, bytes(8 * numbers))
+
+
+def remembering(count: int, span_s: float = 1e6, numbers: int = 2, session: int = 7) -> Memory:
+    memory = Memory(span_s, numbers)
+    for seq in range(count):
+        memory.keep(state(seq, session=session, numbers=numbers))
+    return memory
+
+
+def seqs(states: list[JointState]) -> list[int]:
+    return [one.seq for one in states]
+
+
+def test_exactly_the_span_before_the_newest_is_remembered():
+    memory = remembering(100, span_s=0.010)
+    assert seqs(memory.since(0)) == list(range(89, 100))
+    assert seqs(memory.since(97)) == [97, 98, 99]
+    assert memory.since(100) == []
+
+
+def test_pages_go_back_from_the_newest():
+    memory = remembering(10)
+    assert [(seqs(page), more) for page, more in (memory.before(None, 4), memory.before(6, 4))] == [
+        ([6, 7, 8, 9], True),
+        ([2, 3, 4, 5], True),
+    ]
+    assert [(seqs(page), more) for page, more in (memory.before(2, 4), memory.before(0, 4))] == [
+        ([0, 1], False),
+        ([], False),
+    ]
+    assert seqs(memory.before(10**15, 4)[0]) == [6, 7, 8, 9]
+    assert Memory(1.0, 2).before(None, 4) == ([], False)
+
+
+def test_after_a_clock_was_set_back_only_what_came_then_is_remembered():
+    memory = remembering(10, span_s=1.0)
+    memory.keep(state(10, STAMP - 3600 * SECOND))
+    memory.keep(state(11, STAMP - 3600 * SECOND + MS))
+    assert seqs(memory.since(0)) == [10, 11]
+
+
+def test_after_a_clock_was_set_forward_only_what_came_then_is_remembered():
+    memory = remembering(10, span_s=1.0)
+    memory.keep(state(10, STAMP + 3600 * SECOND))
+    assert seqs(memory.since(0)) == [10]
+
+
+def test_a_stamp_slightly_back_forgets_nothing():
+    memory = remembering(10, span_s=1.0)
+    memory.keep(state(10, STAMP - 85_000))
+    assert seqs(memory.since(0)) == list(range(11))
+
+
+def test_memory_is_bounded_whatever_the_stamps_say():
+    memory = Memory(1e6, 100_000)
+    for seq in range(100):
+        memory.keep(state(seq, STAMP, numbers=1))
+    kept = seqs(memory.since(0))
+    assert kept == list(range(100 - len(kept), 100))
+    assert 1 <= len(kept) <= MOST_BYTES // 800_000
+
+
+@pytest.mark.parametrize("span_s", [-1.0, 0.0, float("nan"), float("inf")])
+def test_a_span_that_is_none_is_refused(span_s: float):
+    with pytest.raises(InvalidInput, match="cache_s"):
+        Memory(span_s, 2)
+
+
+class Heard:
+    """The pages that came."""
+
+    def __init__(self, session: Session, most: int = 1000) -> None:
+        self.pages: list[list[Arrival]] = []
+        self.errors: list[MessageError] = []
+        self._most = most
+        self.reader = PastReader(session, self._take, lambda _, error: self.errors.append(error))
+
+    def _take(self, arrivals: list[Arrival]) -> bool:
+        self.pages.append(arrivals)
+        return len(self.pages) < self._most
+
+    def seqs(self) -> list[list[int]]:
+        return [
+            [decode(one.payload, one.encoding, JointState).seq for one in page] for page in list(self.pages)
+        ]
+
+
+def await_answers(session: Session) -> None:
+    until(lambda: any(reply.ok for reply in session.zenoh.get(KEY, timeout=5.0)))
+
+
+def test_a_reader_gets_every_sample_as_it_was_sent_the_newest_page_first(sessions: tuple[Session, Session]):
+    writer, reader = sessions
+    memory = remembering(PAGE_SAMPLES + 3)
+    heard = Heard(reader)
+    with answer_past(writer, "r1", "joint_states", memory, encode), heard.reader:
+        await_answers(reader)
+        heard.reader.ask(KEY, 7)
+        until(lambda: len(heard.pages) == 2)
+    assert heard.seqs() == [list(range(3, PAGE_SAMPLES + 3)), [0, 1, 2]]
+    assert heard.pages[1] == [Arrival(KEY, encode(state(seq)), ENCODINGS[JointState]) for seq in range(3)]
+
+
+def test_a_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Session]):
+    writer, reader = sessions
+    for numbers in (100, 10_000):
+        memory = remembering(100, numbers=numbers)
+        heard = Heard(reader, most=3)
+        with answer_past(writer, "r1", "joint_states", memory, encode), heard.reader:
+            await_answers(reader)
+            heard.reader.ask(KEY, 7)
+            until(lambda heard=heard: len(heard.pages) == 3)
+        sizes = [sum(len(one.payload) for one in page) for page in heard.pages]
+        assert all(size <= PAGE_BYTES for size in sizes) if numbers == 100 else sizes[0] > PAGE_BYTES
+        assert len(heard.pages[0]) == (PAGE_BYTES // len(heard.pages[0][0].payload) or 1)
+        newest_first = [seq for page in heard.seqs() for seq in reversed(page)]
+        assert newest_first == list(range(99, 99 - len(newest_first), -1))
+
+
+def test_each_writer_of_a_key_is_asked_for_itself(sessions: tuple[Session, Session]):
+    writer, reader = sessions
+    one, other = remembering(3, session=7), remembering(5, session=8)
+    heard = Heard(reader)
+    with (
+        answer_past(writer, "r1", "joint_states", one, encode),
+        answer_past(writer, "r1", "joint_states", other, encode),
+        heard.reader,
+    ):
+        await_answers(reader)
+        for session in (7, 8, 9):
+            heard.reader.ask(KEY, session)
+        until(lambda: len(heard.pages) == 2)
+    assert sorted(heard.seqs()) == [[0, 1, 2], [0, 1, 2, 3, 4]]
+
+
+def test_more_writers_than_are_asked_at_once_all_have_their_turn(sessions: tuple[Session, Session]):
+    writer, reader = sessions
+    memory = remembering(2)
+    heard = Heard(reader)
+    with answer_past(writer, "r1", "joint_states", memory, encode), heard.reader:
+        await_answers(reader)
+        for _ in range(30):
+            heard.reader.ask(KEY, 7)
+        until(lambda: len(heard.pages) == 30)
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        (Answer(b"\x93", ENCODINGS[Past]), "truncated"),
+        (Answer(encode(state(0)), ENCODINGS[JointState]), "foreign"),
+    ],
+)
+def test_an_answer_that_is_none_is_told_and_ends_the_asking(sessions, answer: Answer, reason: str):
+    writer, reader = sessions
+    heard = Heard(reader)
+    with Service(writer, KEY, lambda _: answer), heard.reader:
+        await_answers(reader)
+        heard.reader.ask(KEY, 7)
+        until(lambda: len(heard.errors) == 1)
+    assert (heard.errors[0].reason, heard.pages) == (reason, [])
+
+
+def test_a_writer_that_always_names_the_same_older_page_is_not_asked_for_ever(sessions):
+    writer, reader = sessions
+    page = encode(Past(ENCODINGS[JointState], (encode(state(5)),), 5))
+    asked: list[str] = []
+
+    def answer(parameters):
+        asked.append(parameters.get("before", ""))
+        return Answer(page, ENCODINGS[Past])
+
+    heard = Heard(reader)
+    with Service(writer, KEY, answer), heard.reader:
+        await_answers(reader)
+        asked.clear()
+        heard.reader.ask(KEY, 7)
+        until(lambda: len(heard.pages) == 2)
+        heard.reader.ask(KEY, 8)
+        until(lambda: len(heard.pages) == 4)
+    assert asked == ["", "5", "", "5"]
+
+
+def test_who_does_not_answer_costs_no_thread_and_closing_does_not_wait_for_it(sessions):
+    writer, reader = sessions
+    queryable = writer.zenoh.declare_queryable(KEY)
+    heard = Heard(reader)
+    heard.reader.ask(KEY, 7)
+    heard.reader.close()
+    heard.reader.close()
+    assert (heard.pages, heard.errors) == ([], [])
+    queryable.undeclare()

@@ -1,0 +1,90 @@
+"""Lookups asked for by name."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zstate.errors import InFuture, InvalidInput, NetworkError, UnknownFrame, Unreachable
+from zstate.wire.questions import LookupQuestion, error_from_json, error_to_json
+
+
+def test_what_is_asked_is_read_back():
+    for asked in (LookupQuestion("map", "r1/tool"), LookupQuestion("a", "b", -5)):
+        pairs = dict(part.split("=") for part in asked.parameters().split(";"))
+        assert LookupQuestion.parse(pairs) == asked
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({}, "needs the parameter 'target'"),
+        ({"target": "a"}, "needs the parameter 'source'"),
+        ({"target": "a", "source": ""}, "needs the parameter 'source'"),
+        ({"target": "a", "source": "b", "time": "1"}, "no parameter 'time'"),
+        ({"target": "a", "source": "b", "at": "now"}, "'at' is 'now'"),
+        ({"target": "a", "source": "b", "at": ""}, "'at' is ''"),
+        ({"target": "a", "source": "b", "at": "1.5"}, "'at' is '1.5'"),
+        ({"target": "a", "source": "b", "at": "9" * 19}, "stamp"),
+        ({"target": "a", "source": "b", "at": "9" * 30}, "'at' is '999"),
+    ],
+)
+def test_a_bad_parameter_is_named(parameters: dict[str, str], said: str):
+    with pytest.raises(InvalidInput, match=said):
+        LookupQuestion.parse(parameters)
+
+
+@pytest.mark.parametrize("frame", ["", "a;b"])
+def test_a_frame_that_no_selector_can_say_is_refused(frame: str):
+    with pytest.raises(InvalidInput, match="cannot be asked for"):
+        LookupQuestion("a", frame).parameters()
+
+
+FUTURE = InFuture("a", "b", edge=("a", "b"), requested=7, oldest=1, newest=3, rate_hz=100.0, writer="arm")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        FUTURE,
+        UnknownFrame("a", "hnad", name="hnad", near_misses=("hand",), frame_count=3),
+        InvalidInput("too few"),
+        Unreachable("nobody", endpoints=("tcp/1.2.3.4:7447",)),
+    ],
+)
+def test_an_error_keeps_its_class_its_text_and_its_facts(error):
+    back = error_from_json(error_to_json(error))
+    assert type(back) is type(error)
+    assert str(back) == str(error)
+    assert vars(back) == vars(error)
+
+
+def test_an_error_in_json_names_its_class_its_text_and_its_facts():
+    said = json.loads(error_to_json(FUTURE))
+    assert (said["error"], said["message"]) == ("InFuture", str(FUTURE))
+    assert (said["edge"], said["requested"], said["newest"]) == (["a", "b"], 7, 3)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"Timeout",
+        b"[]",
+        b'{"error": "InFuture", "message": "late"}',
+        b'{"error": "LookupFailed", "message": "late"}',
+        b'{"error": "duration_text", "message": "late"}',
+        b'{"error": "SystemExit", "message": "late"}',
+    ],
+)
+def test_whatever_else_somebody_answers_is_a_network_error_with_what_was_said(text: bytes):
+    error = error_from_json(text)
+    assert type(error) is NetworkError
+    assert ("late" if b"late" in text else repr(text)) in str(error)
+
+
+@given(st.binary(max_size=100))
+def test_no_bytes_crash_the_reader_of_errors(text: bytes):
+    assert str(error_from_json(text))
