@@ -68,6 +68,10 @@ def _transient_local() -> dict[str, Any]:
     }
 
 
+# A publisher that nobody holds any more would take its latched value with it.
+_ALIVE: list[RosPublisher] = []
+
+
 class RosPublisher:
     """One topic of one node: announced on its own, which may be later than what it says."""
 
@@ -78,6 +82,7 @@ class RosPublisher:
         self.publisher = zenoh.ext.declare_advanced_publisher(
             session.zenoh, key, **(_transient_local() if latched else {})
         )
+        _ALIVE.append(self)
 
     def announce(self) -> RosPublisher:
         self._alive = self._session.zenoh.liveliness().declare_token(self.token)
@@ -112,6 +117,7 @@ class RosPublisher:
         if self._alive is not None:
             self._alive.undeclare()
         self.publisher.undeclare()
+        _ALIVE.remove(self)
 
 
 class RosNode:
