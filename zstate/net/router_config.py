@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from zstate.errors import ConfigError
 from zstate.net.config import ROS_ROUTER, ROUTER_ENDPOINT, SETTINGS, endpoint_list
 from zstate.net.json5 import json5_text
+from zstate.net.modes import check_credentials
 from zstate.net.security import Credentials
 from zstate.net.thinning import Thinning
 
@@ -47,8 +49,8 @@ class RouterConfig:
     """A router: where it listens, which routers it joins, whom it lets in, what it passes on.
 
     It listens at ``tcp/127.0.0.1:7447`` unless told otherwise. ``access_control`` is that section of a
-    Zenoh configuration. With ``ros2`` the rest is as rmw_zenohd has it. With certificates everything
-    is encrypted, but for what stays on this host.
+    Zenoh configuration, for which somebody has to be asked for names. With ``ros2`` the rest is as
+    rmw_zenohd has it. With certificates everything is encrypted, but for what stays on this host.
 
     Raises InvalidInput and ConfigError for what cannot be used.
     """
@@ -62,9 +64,20 @@ class RouterConfig:
 
     def __post_init__(self) -> None:
         endpoint_list((*self.listen, *self.connect))
+        check_credentials("router", self.credentials, self.listen)
         if self.credentials is not None:
             exposed = [endpoint for endpoint in self.listen if not endpoint.startswith(_PRIVATE)]
             self.credentials.check_endpoints(self.connect, exposed)
+        if self.access_control and not self._asks_for_names:
+            raise ConfigError(
+                "there is access control, and nobody is asked for a name: everybody would be denied; give "
+                "the router certificates (--certs DIR --identity NAME), users (--users FILE), or both",
+                path="access_control",
+            )
+
+    @property
+    def _asks_for_names(self) -> bool:
+        return self.credentials is not None and bool(self.credentials.certificate or self.credentials.users)
 
     def settings(self) -> dict[str, object]:
         """As a Zenoh configuration."""

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import note, say
+from zstate.cli.identity import router_identity_options
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import config_option
 
 if TYPE_CHECKING:
     from zstate.net.router_config import RouterConfig
+    from zstate.net.security import Credentials
     from zstate.net.thinning import Thinning
 
 
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
 )
 @click.option("--namespace", default="", metavar="KEY", help="The namespace of those robots' sessions.")
 @click.option("--ros2", is_flag=True, help="With the settings of rmw_zenohd, in its place.")
+@router_identity_options
 @config_option
 @click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5), and run nothing.")
 def router_command(
@@ -57,6 +60,7 @@ def router_command(
     ros2: bool,
     config: str | None,
     only_print: bool,
+    credentials: Credentials | None,
 ) -> None:
     """Run a Zenoh router until Ctrl-C.
 
@@ -64,7 +68,7 @@ def router_command(
     commands reach it with `--connect tcp/HOST:7447`. What `--print` prints, zenohd takes as it is.
 
     \b
-    zstate router --listen tcp/0.0.0.0:7447
+    zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router --acl acl.json5
     zstate router --connect tcp/fleet.example:7447 --downsample joint_states=10 --robot r1 --wan wwan0
     zstate router --listen tcp/0.0.0.0:7447 --print >router.json5
     zstate router --ros2                               # for ROS 2 nodes of this host
@@ -74,13 +78,15 @@ def router_command(
     if file:
         made = {"--ros2": ros2, "--acl": acl, "--downsample": downsample, "--print": only_print}
         _refuse_beside(file, [option for option, is_given in made.items() if is_given])
-        _run(Network("router", connect, listen, config), listen, file)
+        _run(Network("router", connect, listen, config, credentials), listen, file)
         return
-    settings = _settings(listen, connect, acl, _thinning(downsample, robot, wan, namespace), ros2=ros2)
+    thinning = _thinning(downsample, robot, wan, namespace)
+    router = _router(listen, connect, credentials, acl, thinning, ros2=ros2)
     if only_print:
-        say(settings.text().rstrip("\n"))
+        say(router.text().rstrip("\n"))
     else:
-        _run(Network("router", config=settings.settings()), settings.listen)
+        network = Network("router", config=router.settings(), credentials=credentials)
+        _run(network, router.listen)
 
 
 def _refuse_beside(file: str, options: list[str]) -> None:
@@ -91,25 +97,22 @@ def _refuse_beside(file: str, options: list[str]) -> None:
         )
 
 
-def _settings(
+def _router(
     listen: tuple[str, ...],
     connect: tuple[str, ...],
+    credentials: Credentials | None,
     acl: str | None,
     thinning: Thinning | None,
     *,
     ros2: bool,
 ) -> RouterConfig:
     from zstate.net.access_file import read_access_control
-    from zstate.net.config import ROUTER_ENDPOINT
+    from zstate.net.modes import listening
     from zstate.net.router_config import RouterConfig
 
-    return RouterConfig(
-        listen=listen or (ROUTER_ENDPOINT,),
-        connect=connect,
-        thinning=thinning,
-        access_control=read_access_control(acl) if acl else {},
-        ros2=ros2,
-    )
+    where = listening("router", listen, credentials)
+    access = read_access_control(acl) if acl else {}
+    return RouterConfig(where, connect, credentials, thinning, access, ros2)
 
 
 def _thinning(
@@ -134,10 +137,11 @@ def _stream_rate(text: str) -> tuple[str, float]:
 
 def _run(network: Network, listen: tuple[str, ...], file: str = "") -> None:
     from zstate.clock import wait_in_slices
-    from zstate.net.config import ROUTER_ENDPOINT
+    from zstate.net.modes import listening
 
     with open_session(network) as session:
         say(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
-        if listen == (ROUTER_ENDPOINT,):
-            note("it serves this host alone; --listen tcp/0.0.0.0:7447 opens it to the network")
+        if listen == (default := listening("router", (), network.credentials)):
+            opened = default[0].replace("127.0.0.1", "0.0.0.0")
+            note(f"it serves this host alone; --listen {opened} opens it to the network")
         wait_in_slices(threading.Event())
