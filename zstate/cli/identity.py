@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -13,9 +15,11 @@ from zstate.errors import ConfigError
 if TYPE_CHECKING:
     from zstate.net.security import Credentials
 
+Command = TypeVar("Command", bound=Callable[..., Any])
+
 PASSWORD_VARIABLE = "ZSTATE_PASSWORD"
 
-identity_options = (
+_OPTIONS = (
     click.option(
         "--certs",
         type=click.Path(exists=True, file_okay=False),
@@ -43,7 +47,7 @@ identity_options = (
         help="A file that only you can read; its first line is the password of --user.",
     ),
 )
-users_option = click.option(
+_USERS = click.option(
     "--users",
     type=click.Path(exists=True, dir_okay=False),
     metavar="FILE",
@@ -52,12 +56,42 @@ users_option = click.option(
 )
 
 
-def credentials_given(
+def identity_options(command: Command) -> Command:
+    """Give a command the options of who it is; it gets them as ``credentials``."""
+    return _with_credentials(command, _OPTIONS)
+
+
+def router_identity_options(command: Command) -> Command:
+    """The same, and who may connect."""
+    return _with_credentials(command, (*_OPTIONS, _USERS))
+
+
+def _with_credentials(command: Command, options: Sequence[Callable[[Any], Any]]) -> Command:
+    @functools.wraps(command)
+    def with_credentials(
+        *,
+        certs: str | None,
+        identity: str | None,
+        user: str | None,
+        password_file: str | None,
+        users: str | None = None,
+        **others: Any,
+    ) -> Any:
+        credentials = _credentials(certs, identity, user, password_file, users)
+        return command(credentials=credentials, **others)
+
+    decorated: Any = with_credentials
+    for option in reversed(options):
+        decorated = option(decorated)
+    return decorated
+
+
+def _credentials(
     certs: str | None,
     identity: str | None,
     user: str | None,
     password_file: str | None,
-    users: str | None = None,
+    users: str | None,
 ) -> Credentials | None:
     """What these options mean. Raises UsageError for half a pair, ConfigError for what cannot be used."""
     if (certs is None) != (identity is None):

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from zstate.cli.identity import credentials_given, identity_options
+from zstate.cli.identity import identity_options
 from zstate.cli.network import Network
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
+    from zstate.net.security import Credentials
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -29,13 +30,9 @@ def session_options(command: Command) -> Command:
         connect: tuple[str, ...],
         listen: tuple[str, ...],
         config: str | None,
-        certs: str | None,
-        identity: str | None,
-        user: str | None,
-        password_file: str | None,
+        credentials: Credentials | None,
         **options: Any,
     ) -> Any:
-        credentials = credentials_given(certs, identity, user, password_file)
         return command(network=Network(mode, connect, listen, config, credentials), **options)
 
     for option in reversed(_SESSION_OPTIONS):
@@ -75,7 +72,7 @@ _SESSION_OPTIONS = (
         help="Where to listen, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
     config_option,
-    *identity_options,
+    identity_options,
 )
 
 

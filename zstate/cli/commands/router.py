@@ -107,10 +107,11 @@ def _router(
     ros2: bool,
 ) -> RouterConfig:
     from zstate.net.access_file import read_access_control
-    from zstate.net.modes import listening
+    from zstate.net.modes import check_credentials, listening
     from zstate.net.router_config import RouterConfig
 
     where = listening("router", listen, credentials)
+    check_credentials("router", credentials, where)
     access = read_access_control(acl) if acl else {}
     return RouterConfig(where, connect, credentials, thinning, access, ros2)
 
