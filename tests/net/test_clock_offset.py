@@ -1,0 +1,171 @@
+"""How far the clocks of writers are ahead, asked over real sessions."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from live import RRBOT, settle
+from support import a_free_port, until
+
+from zstate.clock import ManualClock
+from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
+from zstate.listener import TransformListener
+from zstate.net.clock_offset import OffsetMeter, measure_offsets
+from zstate.net.session import connect
+from zstate.publisher import StatePublisher
+from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+class Ahead:
+    """The system's clock, and so much more."""
+
+    domain = "system"
+
+    def __init__(self, ahead_ns: int) -> None:
+        self.ahead_ns = ahead_ns
+
+    def now(self) -> int:
+        return time.time_ns() + self.ahead_ns
+
+    def wait_until(self, stamp, stop):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("ahead_ns", [0, 1_200 * MS, -3_600 * SECOND])
+def test_the_offset_is_known_to_half_of_a_round_trip(sessions, ahead_ns):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, "r1", clock=Ahead(ahead_ns), program="driver"):
+        (found,) = measure_offsets(reader, "r1", timeout_s=5.0)
+    assert abs(found.offset_ns - ahead_ns) <= found.uncertainty_ns
+    assert found.uncertainty_ns == found.round_trip_ns // 2
+    assert (found.robot, found.writer.program) == ("r1", "driver")
+
+
+def test_it_is_known_as_well_through_a_router():
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    with (
+        connect(mode="router", listen=endpoint),
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
+    ):
+        (found,) = measure_offsets(reader, "*", timeout_s=5.0)
+        assert abs(found.offset_ns - SECOND) <= found.uncertainty_ns
+
+
+def test_it_is_measured_by_the_clock_that_was_given(sessions):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, "r1", clock=ManualClock(10 * SECOND)):
+        (found,) = measure_offsets(reader, "r1", clock=ManualClock(4 * SECOND), timeout_s=5.0)
+    # Neither of the two moves: the middle of the round trip is all that is added to the question.
+    assert found.offset_ns == 6 * SECOND - found.uncertainty_ns
+
+
+def test_each_writer_of_each_robot_answers_for_itself(sessions):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
+        StatePublisher(writer, RRBOT, "r2", clock=Ahead(2 * SECOND)),
+        StatePublisher(writer, RRBOT, "r3", clock=ManualClock(0, "sim")),
+    ):
+        until(lambda: len(measure_offsets(reader, "*")) == 2)
+        first, second = measure_offsets(reader, "*")
+    assert (first.robot, second.robot) == ("r1", "r2")
+    assert first.offset_ns < 1_500 * MS < second.offset_ns
+
+
+def test_who_answers_nonsense_or_not_at_all_is_passed_over(sessions):
+    writer, reader = sessions
+    key = "zstate/r1/@clock/somebody"
+    queryable = writer.zenoh.declare_queryable(key, lambda query: query.reply(key, b"noon"))
+    assert measure_offsets(reader, "r1", timeout_s=0.3) == ()
+    queryable.undeclare()
+    assert measure_offsets(reader, "r9", timeout_s=0.1) == ()
+
+
+def test_what_cannot_be_asked_is_refused(sessions):
+    for wrong in ({"rounds": 0}, {"timeout_s": 0.0}):
+        with pytest.raises(InvalidInput, match="rounds is 1 or more"):
+            measure_offsets(sessions[0], "r1", **wrong)
+    sessions[0].close()
+    with pytest.raises(Closed):
+        measure_offsets(sessions[0], "r1")
+
+
+def test_the_key_of_a_clock_says_whose_it_is():
+    assert clock_expression("*") == "zstate/*/@clock/*"
+    assert parse_clock_key(clock_key("r1", "driver,host,1,2,3")) == ("r1", "driver,host,1,2,3")
+    for other in ("zstate/r1/@writer/clock", "zstate/r1/tf", "r1/x/@clock/y"):
+        with pytest.raises(InvalidInput, match="is not of the form"):
+            parse_clock_key(other)
+
+
+def test_a_failed_lookup_tells_of_the_writers_clock_when_that_is_off(sessions):
+    writer, reader = sessions
+    clock = Ahead(1_200 * MS)
+    with (
+        TransformListener(reader, "r1") as listener,
+        StatePublisher(writer, RRBOT, "r1", clock=clock, program="driver") as publisher,
+    ):
+        settle(writer, "r1")
+        publisher.publish([0.0, 0.0])
+        stamp = listener.buffer.wait("world", "tool", timeout_s=5.0).stamp
+
+        def refusal(at: int):
+            return listener.buffer.explain("world", "tool", at)
+
+        until(lambda: refusal(stamp + 1).clock_offset_ns is not None)
+        for at, kind in ((stamp + 1, InFuture), (stamp - 1, InPast)):
+            reason = refusal(at)
+            assert type(reason) is kind
+            assert abs(reason.clock_offset_ns - 1_200 * MS) <= reason.clock_uncertainty_ns
+            assert "the clock of 'driver@" in str(reason)
+            assert "' is 1.2 s ahead of this one (± " in str(reason)
+        listener.buffer.clock = ManualClock(stamp + 60 * SECOND)
+        with pytest.raises(
+            Stale, match=r"alive \(`zstate ls`\)\? the clock of 'driver@\S+ pid \d+' is 1\.2 s"
+        ):
+            listener.buffer.lookup("world", "tool", max_age_s=1.0)
+        publisher.close()
+        until(lambda: refusal(stamp + 1).clock_offset_ns is None)
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_a_clock_that_agrees_is_known_and_not_worth_a_word(sessions, follow):
+    writer, reader = sessions
+    with (
+        TransformListener(reader, "r1", follow=follow) as listener,
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+    ):
+        settle(writer, "r1", follow)
+        publisher.publish([0.0, 0.0])
+        stamp = listener.buffer.wait("world", "tool", timeout_s=5.0).stamp
+        explain = listener.buffer.explain
+        until(lambda: explain("world", "tool", stamp + 1).clock_offset_ns is not None)
+        reason = explain("world", "tool", stamp + 1)
+        assert abs(reason.clock_offset_ns) <= reason.clock_uncertainty_ns
+        assert "the clock of" not in str(reason)
+
+
+def test_a_measurement_is_made_once_however_often_it_is_asked_for(sessions):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)), OffsetMeter(reader, Ahead(0)) as meter:
+        until(lambda: measure_offsets(reader, "r1"))
+        (known,) = measure_offsets(reader, "r1")
+        ask = meter.follow("r1", known.writer)
+        until(lambda: ask() is not None)
+        first = ask()
+        assert all(ask() is first for _ in range(1000))
+
+
+def test_a_meter_whose_session_is_gone_falls_silent(sessions):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, "r1"), OffsetMeter(reader, Ahead(0)) as meter:
+        until(lambda: measure_offsets(reader, "r1"))
+        (known,) = measure_offsets(reader, "r1")
+        reader.close()
+        assert meter.follow("r1", known.writer)() is None
