@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, ModelError, Unreachable
 from zstate.following.tally import Tally
-from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -21,7 +20,8 @@ from zstate.ros1.hearing import Hearing
 from zstate.ros1.messages import JointStateWriter, TransformsWriter
 from zstate.ros1.names import FrameNames
 from zstate.ros1.node import Node, Ros
-from zstate.wire.joint_order import JointNumbers, JointOrder
+from zstate.sources.states import StateReader
+from zstate.wire.joint_order import JointNumbers
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import JointState, RobotDescription, StaticTransforms, poses_from_block
 
@@ -128,7 +128,7 @@ class _Robot:
         self.model = model
         self.digest = model.digest
         self.joints = JointStateWriter(ros, model)
-        self._order = JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
+        self._states = StateReader(model)
         self._table = EdgeTable(model)
         forms = self._table.forms
         self._rows = [row for row, form in enumerate(forms) if form.kind != "fixed"]
@@ -141,13 +141,7 @@ class _Robot:
 
     def read(self, state: JointState) -> JointNumbers:
         """The numbers of a sample. Raises MessageError and InvalidInput for what cannot be used."""
-        numbers = self._order.read(state)
-        self._table.normalised(self.model.check_positions(numbers.positions))
-        if numbers.velocities is not None:
-            self.model.check_velocities(numbers.velocities)
-        if numbers.efforts is not None:
-            self.model.check_efforts(numbers.efforts)
-        return numbers
+        return self._states.read(state)
 
     def transforms(self, stamp: int, positions: NDArray[np.float64]) -> Any:
         return self._transforms.message(stamp, self._table.poses(positions).take(self._rows, axis=0))

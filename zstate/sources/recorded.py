@@ -8,12 +8,11 @@ from pathlib import Path
 
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ZStateError
-from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
-from zstate.record.models import joint_order
 from zstate.record.reader import RecordReader
 from zstate.record.transcript import Said, Transcript
 from zstate.sources.source import JointReading
+from zstate.sources.states import StateReader
 from zstate.wire.joint_order import JointNumbers
 from zstate.wire.messages import JointState
 
@@ -36,9 +35,7 @@ class RecordedSource(Closing):
 
     def __init__(self, path: str | Path, robot: str | None, model: RobotModel) -> None:
         self.refused: Counter[str] = Counter()
-        self._model = model
-        self._table = EdgeTable(model)
-        self._order = joint_order(model)
+        self._states = StateReader(model)
         self._reader = RecordReader(path)
         try:
             transcript = Transcript(self._reader, self._count)
@@ -77,8 +74,7 @@ class RecordedSource(Closing):
             if moved is not None and moved.is_late(said):
                 continue
             try:
-                numbers = self._order.read(said.message)
-                self._check(numbers)
+                numbers = self._states.read(said.message)
             except MessageError as error:
                 self._refuse(error.reason, error)
             except InvalidInput as error:
@@ -86,14 +82,6 @@ class RecordedSource(Closing):
             else:
                 return said, numbers
         return None
-
-    def _check(self, numbers: JointNumbers) -> None:
-        # All that ``StatePublisher.publish`` would refuse, for that would end its ``run``.
-        self._table.normalised(self._model.check_positions(numbers.positions))
-        if numbers.velocities is not None:
-            self._model.check_velocities(numbers.velocities)
-        if numbers.efforts is not None:
-            self._model.check_efforts(numbers.efforts)
 
     def _refuse(self, reason: str, error: ZStateError) -> None:
         self._count(reason, str(error))

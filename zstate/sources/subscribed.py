@@ -10,15 +10,13 @@ from collections.abc import Iterator, Sequence
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ZStateError
-from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.sources.source import JointReading
-from zstate.wire.joint_order import JointNumbers, JointOrder
+from zstate.sources.states import StateReader
 from zstate.wire.messages import JointState, Message
 from zstate.wire.wire import Arrival
 
@@ -39,9 +37,7 @@ class SubscribedSource(Closing):
         self, session: Session, model: RobotModel, robot: str | None = None, *, wire: str = "native"
     ) -> None:
         self.refused: dict[str, int] = {}
-        self._model = model
-        self._table = EdgeTable(model)
-        self._order = JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
+        self._states = StateReader(model)
         self._robot = robot or model.name
         self._wire = wire_named(wire)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
@@ -68,21 +64,12 @@ class SubscribedSource(Closing):
     def _read(self, state: Message) -> JointReading | None:
         assert isinstance(state, JointState)
         try:
-            numbers = self._order.read(state)
-            self._check(numbers)
+            numbers = self._states.read(state)
         except MessageError as error:
             return self._refuse(error.reason, error)
         except InvalidInput as error:
             return self._refuse("bad numbers", error)
         return JointReading(*numbers, stamp=state.stamp)
-
-    def _check(self, numbers: JointNumbers) -> None:
-        # All that ``StatePublisher.publish`` would refuse, for that would end its ``run``.
-        self._table.normalised(self._model.check_positions(numbers.positions))
-        if numbers.velocities is not None:
-            self._model.check_velocities(numbers.velocities)
-        if numbers.efforts is not None:
-            self._model.check_efforts(numbers.efforts)
 
     def _refuse(self, reason: str, error: ZStateError) -> None:
         if reason not in self.refused:
