@@ -30,6 +30,7 @@ _COMMENTS = {
     "scouting": "Nobody is sought by multicast.",
     "timestamping": "Samples carry their own stamps, and a router would replace those ahead of its clock.",
     "transport/link/tx": "Whoever is silent for so long [ms] is gone, and its liveliness tokens with it.",
+    "transport/unicast": "How long the opening of a connection may take [ms] before it is tried anew.",
     "transport/link/tls": "Encryption; with enable_mtls everybody shows a certificate of this authority.",
     "transport/auth": "Who may connect by name and password.",
     "transport/shared_memory": "No gain for messages this small.",
@@ -41,6 +42,7 @@ _ROS_COMMENTS = {
     "timestamping": "Late joiners are given the past values of topics in order.",
     "queries_default_timeout": "Many nodes start at once, and are busy with that for a while.",
     "transport/link/tx": "",
+    "transport/unicast": "",
 }
 
 

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import zenoh
+from parts import DEPLOY, Deployment
+from support import until
+
+from zstate import StatePublisher, connect, discover, load_model
+from zstate.errors import AccessDenied
+from zstate.net.security import Credentials
+
+pytestmark = pytest.mark.processes
+
+
+def test_its_robot_moves_through_its_router_and_the_reader_sees_it(deployment: Deployment, spawn: Any):
+    deployment.start_router(spawn).line()
+    deployment.start(spawn, "robot").line()
+    assert deployment.is_healthy("robot")
+    assert deployment.is_healthy("reader")
+    assert "r1" in deployment.start(spawn, "reader").line()
+
+
+def test_a_health_check_fails_without_the_router_and_without_the_robot(deployment: Deployment, spawn: Any):
+    assert not deployment.is_healthy("robot")
+    deployment.start_router(spawn).line()
+    assert not deployment.is_healthy("reader")
+
+
+def test_its_router_lets_nobody_else_write(deployment: Deployment, spawn: Any):
+    deployment.start_router(spawn).line()
+    endpoint = f"tls/localhost:{deployment.port}"
+
+    def join(name: str) -> Any:
+        credentials = Credentials.from_folder(deployment.certs, name)
+        return connect(mode="client", endpoints=endpoint, credentials=credentials)
+
+    model = load_model("rrbot")
+    with join("r1") as robot, join("r2") as other, join("desk") as viewer, StatePublisher(robot, model, "r1"):
+        until(lambda: [info.name for info in discover(viewer)] == ["r1"])
+        for session in (other, viewer):
+            with pytest.raises(AccessDenied, match="'r1 writes'"):
+                StatePublisher(session, model, "r1")
+        assert discover(other, 0.3) == ()  # r2 is nobody here
+
+
+def test_nobody_comes_in_without_a_certificate(deployment: Deployment, spawn: Any):
+    deployment.start_router(spawn).line()
+    ca = Credentials(ca=deployment.certs / "ca.pem")
+    with pytest.raises(AccessDenied, match="demands a certificate"):
+        connect(mode="client", endpoints=f"tls/localhost:{deployment.port}", credentials=ca)
+
+
+def test_every_service_starts_again_and_waits_for_the_router(deployment: Deployment):
+    for name, service in deployment.services.items():
+        assert service["restart"] == "unless-stopped"
+        if name != "router":
+            assert service["depends_on"]["router"]["condition"] == "service_healthy"
+            assert service["build"] == ".."
+
+
+def test_each_container_has_its_own_key_only(deployment: Deployment):
+    for name, service in deployment.services.items():
+        identity = service.get("environment", {}).get("ZSTATE_IDENTITY", "router")
+        keys = [volume for volume in service["volumes"] if volume.split(":")[0].endswith(".key")]
+        assert keys == [f"./certs/{identity}.key:/certs/{identity}.key:ro"], name
+        assert all(volume.endswith(":ro") for volume in service["volumes"])
+
+
+@pytest.mark.parametrize("name", ["router.json5", "site-router.json5"])
+def test_zenoh_takes_every_configuration(name: str):
+    zenoh.Config.from_json5((DEPLOY / name).read_text())
