@@ -136,6 +136,36 @@ def test_a_robot_of_many_samples_is_learned_page_by_page_through_a_router(
                 assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
+def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
+    spawn: Callable[..., Child], free_port: int
+):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = spawn(ROUTER, endpoint)
+    router.line()
+    with (
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+        StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher,
+        TransformListener(reader, "r1", history_s=100.0) as listener,
+    ):
+        settle(writer, "r1")
+        publish(publisher, 0, 10)
+        until(knows(listener, 0, 9))
+        router.kill()
+        until(lambda: not list(reader.zenoh.info.routers_zid()))
+        until(lambda: not list(writer.zenoh.info.routers_zid()))
+        publish(publisher, 10, 500)
+        assert not knows(listener, 10)()
+        spawn(ROUTER, endpoint).line()
+        settle(writer, "r1")
+        publish(publisher, 500, 501)
+        until(knows(listener, 500))
+        until(knows(listener, *range(501)))
+        for number in range(501):
+            answer = listener.buffer.lookup("world", "tool", STAMP + number * PERIOD)
+            assert answer.kind == "exact"
+
+
 def test_no_more_is_asked_for_than_the_buffer_keeps(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher:

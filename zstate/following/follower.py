@@ -87,18 +87,22 @@ class Follower(ABC):
         """Put what its writer said before into the buffer: some of its samples, oldest first.
 
         Only what is missing is taken, and it counts for nothing else. What is known grows backwards from
-        what was heard, so that nothing is ever interpolated across a gap that is about to be filled. Says
-        whether still older ones are wanted.
+        the newest, so that who joins never has a gap that is about to be filled. Says whether still older
+        ones are wanted.
         """
         self.heard = True
         for sample in reversed(samples):
             with self._lock:  # one by one: what is live need not wait for all of it
                 if self._objection or not self._follow_session(sample):
                     return False
-                if sample.seq in self._absent and not self._recall(sample):
+                if self._lacks(sample.seq) and not self._recall(sample):
                     return False
                 self._absent.stop_at(sample.seq)
-        return bool(self._absent)
+        return bool(self._absent) or self._lacks(samples[0].seq - 1)
+
+    def _lacks(self, seq: int) -> bool:
+        # After a cut the past may come before the first live sample, which shows the gap.
+        return seq in self._absent or (self._next_seq is not None and seq >= self._next_seq)
 
     def _recall(self, sample: Sample) -> bool:
         """Whether an older one would be taken, too."""
