@@ -4,12 +4,14 @@ import math
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import until
 from tales import MS, START, Tale, swing
 
-from zstate import StatePublisher, TransformListener, connect, discover, load_model
+from zstate import NoData, StatePublisher, Transform, TransformListener, connect, discover, load_model
+from zstate.net.service import ask_lookup
 
 pytestmark = pytest.mark.processes
 
@@ -72,6 +74,28 @@ def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
     interrupted(child)
     assert " published, " in child.line()
     assert "heard zstate/rrbot/joint_states: 2 positions" in child.stderr
+
+
+@pytest.mark.parametrize("source", ["joints", "sine"])
+def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, source: str):
+    publisher = started(spawn, "publish", RRBOT, "--source", source)
+    publisher.line()
+    if source == "joints":
+        started(spawn, "joints", RRBOT).line()
+
+    def answer() -> Transform | None:
+        try:
+            return ask_lookup(session, "rrbot", "world", "tool")
+        except NoData:
+            return None
+
+    with connect() as session, TransformListener(session, "rrbot") as listener:
+        until(answer)
+        told = answer()
+        assert told is not None
+        heard = listener.buffer.lookup("world", "tool", told.stamp, timeout_s=5.0)
+        assert np.allclose(told.pose7, heard.pose7, rtol=0.0, atol=1e-12)
+    interrupted(publisher)
 
 
 def test_at_a_rate_publish_tells_what_became_of_it():

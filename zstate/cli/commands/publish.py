@@ -76,6 +76,9 @@ def publish_command(
     or `zstate joints ROBOT` writes, and publishes every sample. With another source writes joint_states
     as well.
 
+    On the native wire it remembers the last seconds for whoever joins, and answers lookups on
+    zstate/ROBOT/lookup, for devices without a buffer.
+
     With several wires the first is followed, and the others get everything. ROS 2 nodes are met at
     their router: where ROS 2 is spoken alone, that of this host is found; otherwise say --connect, or
     let `zstate bridge` carry the robot over.
@@ -87,7 +90,7 @@ def publish_command(
     zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
-    from zstate.cli.publishing import run
+    from zstate.cli.publishing import answering_lookups, run
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
@@ -97,6 +100,7 @@ def publish_command(
         open_session(network, wires) as session,
         StatePublisher(session, model, called, followed, streams=_DERIVED) as derived,
         StatePublisher(session, model, called, wires[len(followed) :]) as whole,
+        answering_lookups(session, derived, whole),
     ):
         places = [words_of(wire).place(called, _DERIVED) for wire in followed]
         places += [words_of(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]
