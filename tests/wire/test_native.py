@@ -13,6 +13,7 @@ from zstate.wire.messages import (
     JointCommand,
     JointState,
     Message,
+    Past,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -104,6 +105,10 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + b"\x81"
         + fixstr("refused")
         + fixstr("6"),
+    ),
+    "past": (
+        Past("e", (b"ab", b""), 5),
+        b"\x93" + fixstr("e") + b"\x92" + b"\xc4\x02ab" + b"\xc4\x00" + b"\x05",
     ),
 }
 MESSAGES = [message for message, _ in GOLDEN.values()]

@@ -1,8 +1,8 @@
 """The native key space: one prefix for each robot, one chunk for its name.
 
 ==========================================  ==========================================
-``zstate/<robot>/joint_states``             JointState, each sample
-``zstate/<robot>/tf``                       TransformSample, each sample
+``zstate/<robot>/joint_states``             JointState, each sample; a query gets a Past, the last ones
+``zstate/<robot>/tf``                       TransformSample, each sample; likewise
 ``zstate/<robot>/tf_static/<writer>``       StaticTransforms, latched
 ``zstate/<robot>/robot_description``        RobotDescription, latched
 ``zstate/<robot>/joint_commands``           JointCommand, to a driver
