@@ -5,7 +5,7 @@ from contextlib import ExitStack
 
 import pytest
 import zenoh
-from looking import RRBOT, Spawn, failure, interrupted, started
+from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import until
 
 from zstate import TransformListener, connect
@@ -77,3 +77,48 @@ def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
     file = tmp_path / "zenoh.json5"
     file.write_text("{}")
     assert "--config" in failure("router", "--ros2", "--config", str(file), code=2)
+
+
+def test_it_runs_what_it_prints(spawn: Spawn, free_port: int, tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    printed = zstate("router", "--listen", endpoint, "--print")
+    file = tmp_path / "router.json5"
+    file.write_bytes(printed.stdout)
+    assert started(spawn, "router", "--config", str(file)).line().endswith(f"listens at what '{file}' says")
+    with connect(mode="client", endpoints=endpoint) as session:
+        assert session.zenoh.info.routers_zid()
+
+
+def test_it_thins_streams_towards_its_neighbours(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    options = ("--downsample", "joint_states=5", "--robot", "rrbot", "--wan", "lo")
+    started(spawn, "router", "--listen", endpoint, *options).line()
+    started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint).line()
+    with (
+        connect(mode="client", endpoints=endpoint) as session,
+        TransformListener(session, "rrbot") as listener,
+    ):
+        until(lambda: listener.stats.received >= 5)
+        # A hundred a second are written; what was left out on the way is counted.
+        assert listener.stats.missed > 10 * listener.stats.received
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--downsample", "tf"), "write STREAM=HZ"),
+        (("--downsample", "tf=fast"), "write STREAM=HZ"),
+        (("--wan", "wwan0"), "--downsample"),
+    ],
+)
+def test_half_of_a_downsampling_is_wrong_usage(options: tuple[str, ...], text: str):
+    assert text in failure("router", *options, code=2)
+
+
+def test_a_file_is_the_whole_configuration(tmp_path):
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{}")
+    for option in (("--print",), ("--downsample", "tf=1", "--robot", "r1"), ("--acl", str(file))):
+        message = failure("router", "--config", str(file), *option, code=2)
+        assert option[0] in message
+        assert "exclude each other" in message
