@@ -88,9 +88,10 @@ SIGNATURES = {
     "Recording.close": "()",
     "TransformListener": (
         "(session, robot='*', buffer=None, wire='native', follow='joint_states', history_s=10.0, "
-        "*, clock=None, history_on_join=True)"
+        "*, clock=None, history_on_join=True, on_event=None)"
     ),
     "TransformListener.robots": "()",
+    "TransformListener.events": "()",
     "TransformListener.close": "()",
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Literal
 
@@ -12,6 +12,7 @@ from zstate.clock import Clock
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.following.edges import EdgeFollower
+from zstate.following.events import Event, Events
 from zstate.following.follower import Follower
 from zstate.following.joints import JointFollower
 from zstate.following.off_clock import OffClock
@@ -44,6 +45,9 @@ class TransformListener(Closing):
     All robots in a buffer keep one time, that of ``clock`` where it is given; robots of a simulation want
     a ``SimulatedClock``. What cannot be used is counted in ``stats``, reported once through ``logging``,
     and never stops the stream.
+
+    ``on_event(event)`` is called, from a thread of its own, when a writer joins, leaves, is restarted or
+    cut off and comes back, falls silent, or fights with another one: see ``Event``.
     """
 
     def __init__(  # noqa: PLR0917 - the order is that of the published contract
@@ -57,6 +61,7 @@ class TransformListener(Closing):
         *,
         clock: Clock | None = None,
         history_on_join: bool = True,
+        on_event: Callable[[Event], None] | None = None,
     ) -> None:
         if follow not in ("joint_states", "tf"):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
@@ -78,7 +83,10 @@ class TransformListener(Closing):
         # A model makes room for its links before it is added: no static edge may come between.
         self._rebuilding = threading.Lock()
         self._past: PastReader | None = None
+        self._heard: tuple[Stream, ...] = ("robot_description", "tf_static", follow)
         with ExitStack() as opening:
+            events = Events(self._heard, follow, self._wire.shared, on_event)
+            self._events = opening.enter_context(events)
             self._open(session, wire, opening)
             self._opened = opening.pop_all()
 
@@ -96,9 +104,8 @@ class TransformListener(Closing):
         if not self._wire.shared:
             self._clocks = opening.enter_context(WriterClocks(session, self.buffer))
         # After the subscription: who is asked for the past then has everything newer sent to us.
-        opening.enter_context(watch(session, robot, self._on_writer, wire))
-        heard: tuple[Stream, ...] = ("robot_description", "tf_static", self._follow)
-        for announcement in announce_reader(session, self._wire, robot, heard):
+        opening.enter_context(watch(session, robot, self._on_writer, wire, self._on_cut_off))
+        for announcement in announce_reader(session, self._wire, robot, self._heard):
             opening.enter_context(announcement)
 
     @property
@@ -109,6 +116,14 @@ class TransformListener(Closing):
     def robots(self) -> tuple[str, ...]:
         """The robots that were heard so far, sorted by name."""
         return tuple(sorted({robot.robot for robot in list(self._followers.values()) if robot.heard}))
+
+    def events(self) -> tuple[Event, ...]:
+        """What happened to the writers lately: the last 1024 events, oldest first.
+
+        Without ``on_event`` nobody looks how long a writer has been silent: none is "stale", and one that
+        froze before it vanished has "left".
+        """
+        return self._events.recent()
 
     def close(self) -> None:
         """Stop listening; the buffer keeps what it has. A second call does nothing."""
@@ -143,6 +158,7 @@ class TransformListener(Closing):
                     follower = self._follower(robot, sample.session)
                     follower.take(sample, overflowed=follower in self._overflowed)
                     self._overflowed.discard(follower)
+                    self._events.note_sample(robot, sample.session)
                     if not earliest <= sample.stamp <= latest:
                         self._off_clock.note(robot, self._names.get(sample.session), sample)
 
@@ -178,6 +194,7 @@ class TransformListener(Closing):
                     self._take_statics(arrival.key, robot, writer, message)
         elif writer is not None:
             self._static_follower(arrival.key, robot, writer).withdraw()
+            self._events.note_statics(robot, writer, frozenset())
 
     def _is_withdrawn(self, arrival: Arrival) -> bool:
         # In ROS nothing can be taken back: what is empty there is a broken message.
@@ -187,7 +204,9 @@ class TransformListener(Closing):
         self._follower(robot, message.session).note_heard()
         with self._rebuilding:
             if writer is not None:
-                self._static_follower(key, robot, writer).replace(message)
+                follower = self._static_follower(key, robot, writer)
+                follower.replace(message)
+                self._events.note_statics(robot, writer, follower.children)
             else:
                 departed = [one for (_, left), one in self._statics.items() if left in self._departed]
                 # A ROS node may not have announced itself yet: told from others by its number.
@@ -195,7 +214,7 @@ class TransformListener(Closing):
                 self._static_follower(key, robot, name, message.session).add(message, departed)
 
     def _static_follower(self, key: str, robot: str, writer: str, session: int = 0) -> StaticFollower:
-        make = StaticFollower(robot, writer, self.buffer, self._tally)
+        make = StaticFollower(robot, writer, self.buffer, self._tally, self._events.note_second_edge)
         return self._statics.setdefault((key, session), make)
 
     def _decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
@@ -206,6 +225,14 @@ class TransformListener(Closing):
             return ()
 
     def _on_writer(self, announced: Announced, alive: bool) -> None:
+        self._events.note_writer(announced, alive)
+        self._follow_writer(announced, alive=alive)
+
+    def _on_cut_off(self, announced: Announced) -> None:
+        self._events.note_cut_off(announced)
+        self._follow_writer(announced, alive=False)
+
+    def _follow_writer(self, announced: Announced, *, alive: bool) -> None:
         session = announced.writer.session
         if alive:
             self._names[session] = str(announced.writer)

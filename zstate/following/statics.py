@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,8 @@ from zstate.wire.messages import StaticTransforms, poses_from_block
 # A static edge that is this near to a model's [m, or the sine of a turn] was computed from the same URDF.
 _SAME = 1e-6
 
+_CONFLICTS = ("second writer", "second parent")
+
 
 def are_same(one: Transform, other: Transform) -> bool:
     """Whether two poses of one frame are the same but for how they were computed."""
@@ -24,14 +26,27 @@ def are_same(one: Transform, other: Transform) -> bool:
 
 
 class StaticFollower:
-    """Holds in a buffer what one writer of static edges says now: no edge more, none less."""
+    """Holds in a buffer what one writer of static edges says now: no edge more, none less.
 
-    def __init__(self, robot: str, writer: str, buffer: TransformBuffer, tally: Tally) -> None:
+    ``children`` are the frames that it places, or would if they were not refused. Where another one
+    keeps it from placing a child, ``on_conflict(robot, writer, child, text)`` is called.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        writer: str,
+        buffer: TransformBuffer,
+        tally: Tally,
+        on_conflict: Callable[[str, str, str, str], None] | None = None,
+    ) -> None:
         self._robot = robot
         self._writer = writer
         self._buffer = buffer
         self._tally = tally
+        self._on_conflict = on_conflict
         self._edges: dict[str, Transform] = {}
+        self.children: frozenset[str] = frozenset()
 
     def name_writer(self, writer: str) -> None:
         """Who the writer is, if that is learned later than what it says."""
@@ -44,6 +59,7 @@ class StaticFollower:
         """Take these edges; withdraw those that are named no more, or on another parent."""
         named = [self._named(*edge) for edge in statics.edges]
         wanted = {edge[1]: edge[0] for edge in named if edge is not None}
+        self.children = frozenset(wanted)
         self._withdraw([child for child, edge in self._edges.items() if wanted.get(child) != edge.target])
         for edge, pose in zip(named, poses_from_block(statics.poses), strict=True):
             if edge is not None:
@@ -68,6 +84,7 @@ class StaticFollower:
 
     def withdraw(self) -> None:
         """Take all of this writer's edges away."""
+        self.children = frozenset()
         self._withdraw(list(self._edges))
 
     def _named(self, parent: str, child: str) -> tuple[str, str] | None:
@@ -90,6 +107,8 @@ class StaticFollower:
             reason = error.reason if isinstance(error, InsertRefused) else "frame name"
             if not (beside_model and reason == "second writer" and self._is_known(transform)):
                 self._refuse(reason, error)
+                if reason in _CONFLICTS and self._on_conflict is not None:
+                    self._on_conflict(self._robot, self._writer, child, str(error))
 
     def _is_known(self, transform: Transform) -> bool:
         """Whether a model fixes just this edge: a ROS state publisher calls these static, too."""

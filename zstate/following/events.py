@@ -1,0 +1,237 @@
+"""Events: who begins and ceases to write what a listener hears, and how that came."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+from zstate.closing import Closing
+from zstate.errors import duration_text
+from zstate.following.placements import Placements
+from zstate.following.teller import Teller
+from zstate.following.vigil import Vigil
+from zstate.wire.keys import Stream
+from zstate.wire.writer import Announced, Writer
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back"]
+
+KEPT = 1024
+_FORMER = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something happened to the ``writer`` of a stream of ``robot``, as seen here ``at`` [ns], system time.
+
+    - "joined": it writes from now on; "restarted": the same program on the same host did before;
+    - "left": it was closed, or its process ended, while the network stands;
+    - "cut off": the router through which it was heard is lost, or it had gone silent before it went: it
+      may write still. "back": it is there again, the same one;
+    - "stale": it is announced, but for ten of its periods (half a second at least) no sample has come:
+      frozen, or its source is. "resumed": samples come again;
+    - "conflict": another one writes the same stream, or places the same frame.
+
+    ``writer`` is None where it is not announced; ``text`` says all of it.
+    """
+
+    kind: Kind
+    robot: str
+    stream: Stream
+    writer: Writer | None
+    at: int
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+_Place = tuple[str, Stream, str]
+
+
+class Events(Closing):
+    """The events of one listener, which hears the streams ``heard`` and the samples of ``followed``.
+
+    ``on_event`` is called with each from a thread of its own, which is there for it alone; without it
+    nothing is stale, and who went silent first has "left". Any thread may note.
+    """
+
+    def __init__(
+        self,
+        heard: Collection[Stream],
+        followed: Stream,
+        shared: Collection[Stream],
+        on_event: Callable[[Event], None] | None = None,
+    ) -> None:
+        self._heard = frozenset(heard)
+        self._followed: Stream = followed
+        # In ROS parts of tf are everybody's; two programs that move the same joints are not meant.
+        self._alone = self._heard - (frozenset(shared) - {"joint_states"})
+        self._kept: deque[Event] = deque(maxlen=KEPT)
+        self._alive: dict[_Place, dict[int, Announced]] = {}
+        self._former: OrderedDict[tuple[_Place, str, str], Writer] = OrderedDict()
+        self._fought: OrderedDict[tuple[str, str, int, str], None] = OrderedDict()
+        self._placements = Placements()
+        self._lock = threading.Lock()
+        self._vigil = Vigil()
+        self._teller = None if on_event is None else Teller(on_event, self._look)
+
+    def recent(self) -> tuple[Event, ...]:
+        """The last 1024 events, oldest first."""
+        with self._lock:
+            return tuple(self._kept)
+
+    @property
+    def failures(self) -> int:
+        """How often ``on_event`` raised."""
+        return 0 if self._teller is None else self._teller.failures
+
+    def close(self) -> None:
+        """Tell no more, also from inside ``on_event``. A second call does nothing."""
+        if self._teller is not None:
+            self._teller.close()
+
+    def note_writer(self, announced: Announced, alive: bool) -> None:
+        """A writer is announced, or is no more."""
+        if announced.stream in self._heard:
+            with self._lock:
+                if alive:
+                    self._come(announced)
+                else:
+                    self._go(announced, "left")
+
+    def note_cut_off(self, announced: Announced) -> None:
+        """A writer is not announced any more, together with the router it was heard through."""
+        if announced.stream in self._heard:
+            with self._lock:
+                self._go(announced, "cut off")
+
+    def note_sample(self, robot: str, session: int) -> None:
+        """A sample of the followed stream has come."""
+        if self._teller is not None:
+            silent_s = self._vigil.hear((robot, session), time.monotonic())
+            if silent_s is not None:
+                with self._lock:
+                    self._tell_of_silence("resumed", robot, session, silent_s)
+
+    def note_second_edge(self, robot: str, name: str, child: str, text: str) -> None:
+        """The static edge by which the writer ``name`` places ``child`` was refused: another one does."""
+        with self._lock:
+            self._fight(robot, name, child, text)
+
+    def note_statics(self, robot: str, name: str, children: frozenset[str]) -> None:
+        """The frames that the static writer ``name`` of ``robot`` places now, by their full names."""
+        with self._lock:
+            for child, others in self._placements.replace((robot, name), children):
+                who = " and ".join(f"{other!r} of {of!r}" for of, other in others)
+                text = f"{name!r} of {robot!r} places {child!r}, and so does {who}"
+                self._fight(robot, name, child, text)
+
+    def _fight(self, robot: str, name: str, child: str, text: str) -> None:
+        announced = next(iter(self._alive.get((robot, "tf_static", name), {}).values()), None)
+        key = (robot, name, 0 if announced is None else announced.writer.session, child)
+        if key not in self._fought:
+            writer = None if announced is None else announced.writer
+            self._add("conflict", robot, "tf_static", writer, text)
+        _remember(self._fought, key, None)
+
+    def _look(self, now_s: float) -> float:
+        stale, next_s = self._vigil.look(now_s)
+        if stale:
+            with self._lock:
+                for (robot, session), silent_s in stale.items():
+                    self._tell_of_silence("stale", robot, session, silent_s)
+        return next_s
+
+    def _come(self, announced: Announced) -> None:
+        place, writer = _place(announced), announced.writer
+        others = self._alive.setdefault(place, {})
+        if writer.session in others:
+            return
+        rivals = [other.writer for other in others.values() if other.excludes(announced)]
+        others[writer.session] = announced
+        key = (place, writer.program, writer.host)
+        before = self._former.get(key)
+        _remember(self._former, key, writer)
+        self._tell_of_coming(announced, before)
+        if rivals and announced.stream in self._alone:
+            text = f"{_who(announced)}, and so does {rivals[-1]}; readers follow whoever came last"
+            self._add("conflict", announced.robot, announced.stream, writer, text)
+        if announced.stream == self._followed:
+            self._vigil.begin((announced.robot, writer.session))
+
+    def _tell_of_coming(self, announced: Announced, before: Writer | None) -> None:
+        writer = announced.writer
+        if before is None:
+            self._add("joined", announced.robot, announced.stream, writer, _who(announced))
+        elif before.session == writer.session:
+            self._add("back", announced.robot, announced.stream, writer, f"{_who(announced)}: it is back")
+        else:
+            was = f", pid {before.pid} before" if before.pid else ""
+            text = f"{_who(announced)} anew: it was restarted{was}"
+            self._add("restarted", announced.robot, announced.stream, writer, text)
+
+    def _go(self, announced: Announced, kind: Literal["left", "cut off"]) -> None:
+        place, writer = _place(announced), announced.writer
+        others = self._alive.get(place, {})
+        if others.pop(writer.session, None) is None:
+            return
+        if not others:
+            del self._alive[place]
+            self._placements.replace((announced.robot, announced.name), frozenset())
+        is_followed = announced.stream == self._followed
+        was_stale = is_followed and self._vigil.end((announced.robot, writer.session))
+        who = f"{announced.robot!r}: {writer} "
+        what = _what(announced)
+        if kind == "cut off":
+            text = f"{who}is cut off from us: the router is lost through which its {what} came"
+        elif was_stale:
+            kind, text = "cut off", f"{who}went silent, and is gone: frozen, or cut off from the network"
+        else:
+            text = f"{who}has left: it does not write {what} any more"
+        self._add(kind, announced.robot, announced.stream, writer, text)
+
+    def _tell_of_silence(
+        self, kind: Literal["stale", "resumed"], robot: str, session: int, silent_s: float
+    ) -> None:
+        announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+        if announced is None:
+            return
+        lasting = duration_text(round(silent_s * 1e9))
+        if kind == "stale":
+            text = f"for {lasting}, though it is announced: it is frozen, or given nothing new"
+        else:
+            text = f"for {lasting}; now samples come again"
+        text = f"{robot!r}: {announced.writer} said nothing on {self._followed} {text}"
+        self._add(kind, robot, self._followed, announced.writer, text)
+
+    def _add(self, kind: Kind, robot: str, stream: Stream, writer: Writer | None, text: str) -> None:
+        event = Event(kind, robot, stream, writer, time.time_ns(), text)
+        self._kept.append(event)
+        if self._teller is not None:
+            self._teller.tell(event)
+
+
+def _remember(known: OrderedDict[K, V], key: K, value: V) -> None:
+    known[key] = value
+    known.move_to_end(key)
+    while len(known) > _FORMER:
+        known.popitem(last=False)
+
+
+def _place(announced: Announced) -> _Place:
+    return announced.robot, announced.stream, announced.name
+
+
+def _what(announced: Announced) -> str:
+    return f"static edges as {announced.name!r}" if announced.name else announced.stream
+
+
+def _who(announced: Announced) -> str:
+    return f"{announced.robot!r}: {announced.writer} writes {_what(announced)}"
