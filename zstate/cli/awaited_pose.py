@@ -54,8 +54,16 @@ class AwaitedPose:
         reason = self._listener.buffer.explain(*self._frames, transform.stamp + 1)
         edge = "" if reason is None or reason.edge is None else f" of {' -> '.join(map(repr, reason.edge))}"
         writer = "" if reason is None or reason.writer is None else f", which {reason.writer} wrote"
-        age = duration_text(time.time_ns() - transform.stamp)
-        return self._words.explained(f"no new sample{edge}{writer}: the newest is {age} old")
+        age_s = self.age_s(transform)
+        old = "" if age_s is None else f": the newest is {duration_text(round(age_s * 1e9))} old"
+        return self._words.explained(f"no new sample{edge}{writer}{old}")
+
+    def age_s(self, transform: Transform) -> float | None:
+        """How old an answer is [s]; None for a static one, and by a clock that does not tell its time."""
+        buffer = self._listener.buffer
+        if transform.stamp is None or buffer.domain.name not in (None, buffer.clock.domain):
+            return None
+        return transform.age(buffer.clock)
 
     def _say_once(self, reason: LookupFailed) -> None:
         hint = self._hint(reason)

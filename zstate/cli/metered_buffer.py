@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from statistics import median
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
+from zstate.clock import Clock, SystemClock
 
 # Enough for a median, bounded for a demo that runs for days.
 _KEPT = 100_000
@@ -33,7 +34,7 @@ class Measure:
 
     ``rate_hz`` counts arrivals here; ``latency_s`` is the median time from a sample's stamp until it
     could be looked up, by the clocks of both machines; ``age_s`` is that of the newest sample now. None
-    without samples.
+    without samples, and where the clock here does not tell their time.
     """
 
     rate_hz: float
@@ -44,7 +45,8 @@ class Measure:
 class Meter:
     """Measures what comes in. One thread notes, another one measures. ``has_begun`` is set at the first."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock | None = None) -> None:
+        self._clock: Clock = clock or SystemClock()
         self.has_begun = threading.Event()
         self._lock = threading.Lock()
         self._delays: deque[int] = deque(maxlen=_KEPT)
@@ -54,7 +56,7 @@ class Meter:
     def note(self, stamp: int) -> None:
         """A sample of this stamp [ns] can be looked up now."""
         with self._lock:
-            self._delays.append(time.time_ns() - stamp)
+            self._delays.append(self._clock.now() - stamp)
             self._newest = stamp
             self._count += 1
         self.has_begun.set()
@@ -72,16 +74,23 @@ class Meter:
         return Measure(
             (until.count - since.count) / passed_s if passed_s > 0.0 else 0.0,
             median(delays) * 1e-9 if delays else None,
-            None if newest is None else (time.time_ns() - newest) * 1e-9,
+            None if newest is None else (self._clock.now() - newest) * 1e-9,
         )
 
 
 class MeteredBuffer(TransformBuffer):
     """A TransformBuffer whose ``meter`` notes when each sample of a robot can be looked up."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.meter = Meter()
+    def __init__(self, clock: Clock | None = None) -> None:
+        super().__init__(clock=clock)
+        self.meter = Meter(clock)
+
+    def measure(self, since: Mark, until: Mark) -> Measure:
+        """How samples came in between two marks of ``meter``."""
+        measure = self.meter.measure(since, until)
+        if self.domain.name in (None, self.clock.domain):
+            return measure
+        return replace(measure, latency_s=None, age_s=None)
 
     def insert_joints(
         self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None

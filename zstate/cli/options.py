@@ -156,6 +156,22 @@ def checked_seconds(_: click.Context, __: click.Parameter, seconds: float | None
     return seconds
 
 
+_CLOCKS = click.Choice(["system", "sim"])
+
+clock_option = click.option(
+    "--clock",
+    type=_CLOCKS,
+    default="system",
+    show_default=True,
+    envvar="ZSTATE_CLOCK",
+    help="What stamps and paces: the system's time, or the simulated time told on zstate/clock or /clock.",
+)
+reading_clock_option = click.option(
+    "--clock",
+    type=_CLOCKS,
+    envvar="ZSTATE_CLOCK",
+    help="Take robots of this time only, and tell ages by it; default: as the first robot keeps it.",
+)
 rate_option = click.option(
     "--rate",
     type=float,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 
+from zstate.clock import SIMULATED, ManualClock
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.following.tally import Tally
@@ -162,7 +163,14 @@ class _Robot(Closing):
             self.streams += ("tf",)
         self._order = joint_order(model)
         self._publisher = StatePublisher(
-            session, model, robot, wires, streams=self.streams, takeover=takeover
+            session,
+            model,
+            robot,
+            wires,
+            streams=self.streams,
+            # Every sample has its own stamp; the clock is there to say that these are of another time.
+            clock=ManualClock(domain=SIMULATED),
+            takeover=takeover,
         )
 
     def publish(self, state: JointState) -> None:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 
+from zstate.clock import SIMULATED
 from zstate.closing import Closing
 from zstate.net.outlets import LatchedOutlet, Outlets, StreamOutlet
 from zstate.net.presence import writer_here
@@ -60,7 +61,7 @@ class Verbatim(Closing):
         """What the robot is, for late joiners too."""
         said = description
         again = RobotDescription(
-            self._session_id, said.urdf, said.digest, said.joint_names, said.moving_edges, said.clock
+            self._session_id, said.urdf, said.digest, said.joint_names, said.moving_edges, SIMULATED
         )
         for outlet in self._latch("robot_description", writer):
             outlet.set(again)

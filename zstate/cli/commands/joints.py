@@ -7,6 +7,7 @@ import click
 from zstate.cli.console import count_text, say
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
+    clock_option,
     load_robot,
     name_option,
     rate_option,
@@ -23,9 +24,17 @@ from zstate.cli.words import words_of
 @seconds_option
 @name_option
 @wire_option
+@clock_option
 @session_options
 def joints_command(
-    *, robot: str, rate: float, seconds: float | None, name: str | None, wire: str, network: Network
+    *,
+    robot: str,
+    rate: float,
+    seconds: float | None,
+    name: str | None,
+    wire: str,
+    clock: str,
+    network: Network,
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
 
@@ -36,6 +45,7 @@ def joints_command(
     zstate joints arm.urdf --rate 500 --seconds 10
     zstate joints panda --wire ros2                    # /joint_states, for a robot_state_publisher
     """
+    from zstate.cli.clocks import open_clock
     from zstate.cli.publishing import run
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
@@ -43,7 +53,8 @@ def joints_command(
     model, called = load_robot(robot, name)
     with (
         open_session(network, (wire,)) as session,
-        StatePublisher(session, model, called, (wire,), streams=("joint_states",)) as publisher,
+        open_clock(session, clock, wire) as time,
+        StatePublisher(session, model, called, (wire,), streams=("joint_states",), clock=time) as publisher,
     ):
         joints = count_text(len(model.joint_names), "joint")
         place = words_of(wire).place(called, ("joint_states",))

@@ -12,7 +12,7 @@ import click
 
 from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options, wire_option
+from zstate.cli.options import reading_clock_option, session_options, wire_option
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
@@ -20,6 +20,7 @@ from zstate.errors import duration_text
 
 if TYPE_CHECKING:
     from zstate.cli.metered_buffer import Mark, Measure, MeteredBuffer
+    from zstate.clock import Clock
     from zstate.following.tally import Stats
     from zstate.listener import Follow, TransformListener
     from zstate.net.session import Session
@@ -33,13 +34,17 @@ _MEETING_S = 0.3
 @click.argument("robot", default="*", metavar="[ROBOT]")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @wire_option
+@reading_clock_option
 @session_options
-def listen_command(network: Network, robot: str, as_json: bool, wire: str) -> None:
+def listen_command(
+    *, network: Network, robot: str, as_json: bool, wire: str, clock: str | None
+) -> None:
     """Follow ROBOT, or all robots, and say once a second how their samples come in.
 
     Rate and age are measured here, latency is the median time from a sample's stamp until it can be
     looked up. The counts are those since the start: received, dropped here, missed on the way, late
-    (older than the history) and refused. On ROS's side it follows /tf, all nodes together; joint states
+    (older than the history) and refused; and those off the clock, whose stamps are more than a minute away
+    from the time here. On ROS's side it follows /tf, all nodes together; joint states
     of a robot that is named and described.
 
     \b
@@ -47,13 +52,15 @@ def listen_command(network: Network, robot: str, as_json: bool, wire: str) -> No
     zstate listen panda --json
     zstate listen --wire ros2:domain=5
     """
+    from zstate.cli.clocks import open_clock
     from zstate.clock import SystemClock
     from zstate.rate import Rate
 
     with (
         open_session(network, (wire,)) as session,
         Roster(session, robot, wire) as roster,
-        Ears(session, roster, robot, wire) as ears,
+        open_clock(session, clock, wire) as time,
+        Ears(session, roster, robot, wire, time) as ears,
     ):
         forever = Event()
         forever.wait(_MEETING_S)
@@ -66,13 +73,16 @@ def listen_command(network: Network, robot: str, as_json: bool, wire: str) -> No
 class Ears(Closing):
     """A listener for each robot that is wanted and announced, opened when it appears."""
 
-    def __init__(self, session: Session, roster: Roster, robot: str, wire: str) -> None:
+    def __init__(  # noqa: PLR0917 - one use
+        self, session: Session, roster: Roster, robot: str, wire: str, clock: Clock | None
+    ) -> None:
         from zstate.wire.keys import ANY, check_robot
 
         self._robot = None if robot == ANY else check_robot(robot)
         self._session = session
         self._wire = wire
         self._roster = roster
+        self._clock = clock
         self._said = ""
         self._ears: dict[str, tuple[TransformListener, MeteredBuffer, Mark]] = {}
         self._opened = ExitStack()
@@ -96,7 +106,7 @@ class Ears(Closing):
 
         follow = self._followed(streams)
         if follow in streams:
-            buffer = MeteredBuffer()
+            buffer = MeteredBuffer(self._clock)
             listener = TransformListener(
                 self._session, robot, buffer, self._wire, follow, history_on_join=False
             )
@@ -121,7 +131,7 @@ class Ears(Closing):
         for robot, (listener, buffer, since) in sorted(self._ears.items()):
             now = buffer.meter.mark()
             self._ears[robot] = listener, buffer, now
-            yield robot, buffer.meter.measure(since, now), listener.stats
+            yield robot, buffer.measure(since, now), listener.stats
 
 
 def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:
@@ -132,6 +142,7 @@ def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:
         f"{robot}  {measure.rate_hz:.1f} Hz  age {_time_text(measure.age_s)}  "
         f"latency {_time_text(measure.latency_s)}  received {stats.received}  dropped {stats.dropped}  "
         f"missed {stats.missed}  late {stats.late}  refused {_refused_text(stats.refused)}"
+        f"{f'  off the clock {stats.off_clock}' if stats.off_clock else ''}"
     )
 
 

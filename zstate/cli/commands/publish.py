@@ -12,6 +12,7 @@ from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
+    clock_option,
     load_robot,
     name_option,
     seconds_option,
@@ -57,6 +58,7 @@ def _source(_: click.Context, __: click.Parameter, source: str) -> str:
     help="Samples a second, exactly; default: every sample that comes in, and 100 for another source.",
 )
 @wires_option
+@clock_option
 @seconds_option
 @name_option
 @session_options
@@ -66,6 +68,7 @@ def publish_command(
     source: str,
     rate: float | None,
     wires: tuple[str, ...],
+    clock: str,
     seconds: float | None,
     name: str | None,
     network: Network,
@@ -87,9 +90,11 @@ def publish_command(
     zstate publish panda --source sine
     zstate publish arm.urdf --rate 250
     zstate publish panda --source run.mcap
+    zstate publish panda --source sine --clock sim     # as time goes on in a simulation or a replay
     zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
+    from zstate.cli.clocks import open_clock
     from zstate.cli.publishing import answering_lookups, run
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
@@ -98,8 +103,9 @@ def publish_command(
     followed = wires[:1] if source == "joints" else ()
     with (
         open_session(network, wires) as session,
-        StatePublisher(session, model, called, followed, streams=_DERIVED) as derived,
-        StatePublisher(session, model, called, wires[len(followed) :]) as whole,
+        open_clock(session, clock, wires[0]) as time,
+        StatePublisher(session, model, called, followed, streams=_DERIVED, clock=time) as derived,
+        StatePublisher(session, model, called, wires[len(followed) :], clock=time) as whole,
         answering_lookups(session, derived, whole),
     ):
         places = [words_of(wire).place(called, _DERIVED) for wire in followed]

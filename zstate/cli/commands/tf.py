@@ -11,7 +11,13 @@ import click
 
 from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_rate, checked_seconds, session_options, wire_option
+from zstate.cli.options import (
+    checked_rate,
+    checked_seconds,
+    reading_clock_option,
+    session_options,
+    wire_option,
+)
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed
 
@@ -64,6 +70,7 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
 @click.option("--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @wire_option
+@reading_clock_option
 @session_options
 def tf_command(
     *,
@@ -76,6 +83,7 @@ def tf_command(
     rate: float,
     robot: str,
     wire: str,
+    clock: str | None,
     as_json: bool,
 ) -> None:
     """The pose of frame B in frame A, until Ctrl-C.
@@ -89,18 +97,27 @@ def tf_command(
     zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
     from zstate.cli.awaited_pose import AwaitedPose
+    from zstate.cli.clocks import open_clock
     from zstate.listener import TransformListener
 
-    show = _show_json if as_json else _show_text
+    ends = once or at is not None
     with (
         open_session(network, (wire,)) as session,
         Roster(session, robot, wire) as roster,
-        TransformListener(session, robot, wire=wire, follow=followed(wire)) as listener,
+        open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
+        TransformListener(session, robot, wire=wire, follow=followed(wire), clock=time_kept) as listener,
     ):
         awaited = AwaitedPose(listener, roster, target, source)
+
+        def show(transform: Transform) -> None:
+            if as_json:
+                _show_json(transform, awaited.age_s(transform))
+            else:
+                say(transform_text(transform))
+
         if not as_json:
             say(f"pose of {source} in {target}")
-        if once or at is not None:
+        if ends:
             show(awaited.answer(at, timeout_s=timeout))
         else:
             _follow(awaited, rate, show)
@@ -123,13 +140,8 @@ def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
             note(awaited.silence())
 
 
-def _show_json(transform: Transform) -> None:
-    age_s = None if transform.stamp is None else (time.time_ns() - transform.stamp) * 1e-9
+def _show_json(transform: Transform, age_s: float | None) -> None:
     say_json({**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s})
-
-
-def _show_text(transform: Transform) -> None:
-    say(transform_text(transform))
 
 
 def transform_text(transform: Transform) -> str:

@@ -1,0 +1,135 @@
+"""``--clock``: which time a command keeps."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from looking import RRBOT, Spawn, failure, interrupted, standing, started, zstate
+from support import until
+
+from zstate import StatePublisher, TransformListener, connect, load_model
+from zstate.clock import ManualClock
+from zstate.clock_publisher import ClockPublisher
+
+pytestmark = pytest.mark.processes
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+@contextmanager
+def simulation(start: int = 5 * SECOND, speed: float = 10.0) -> Iterator[None]:
+    """A time that goes ``speed`` times as fast as the system's, and is told a hundred times a second."""
+    stop = threading.Event()
+
+    def tell() -> None:
+        began = time.monotonic_ns()
+        while not stop.wait(0.01):
+            publisher.publish(start + round(speed * (time.monotonic_ns() - began)))
+
+    with connect() as session, ClockPublisher(session) as publisher:
+        thread = threading.Thread(target=tell)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_publish_stamps_and_paces_by_the_simulated_time():
+    with simulation(), connect() as session, TransformListener(session, "rrbot") as listener:
+        done = zstate(
+            "publish", RRBOT, "--source", "sine", "--clock", "sim", "--rate", "50", "--seconds", "5"
+        )
+        # Five simulated seconds: 250 ticks of 20 ms, exact by that time however fast it goes.
+        assert "commanded 50 Hz, achieved 50.00 Hz" in done.stdout.decode()
+        until(lambda: listener.stats.received == 250)
+        frame = next(frame for frame in listener.buffer.frames() if frame.kind == "joint")
+        assert frame.newest - frame.oldest == 249 * 20 * MS
+        assert listener.buffer.domain.name == "sim"
+        assert listener.stats.off_clock == 0
+
+
+def test_who_tells_no_time_is_waited_for_with_a_word(spawn: Spawn):
+    child = started(spawn, "joints", RRBOT, "--clock", "sim")
+    until(lambda: "waiting for the simulated time on zstate/clock" in child.stderr)
+    with simulation():
+        assert child.line().startswith("rrbot: a sine on 2 joints")
+        until(lambda: "heard zstate/clock: it is " in child.stderr)
+        interrupted(child)
+
+
+def test_a_wait_for_the_time_ends_with_ctrl_c(spawn: Spawn):
+    child = started(spawn, "publish", RRBOT, "--clock", "sim")
+    until(lambda: "waiting for the simulated time" in child.stderr)
+    interrupted(child)
+
+
+def test_tf_gives_up_when_nobody_tells_the_time():
+    message = failure("tf", "world", "tool", "--once", "--timeout", "0.7", "--clock", "sim")
+    assert "nobody has told the time on 'zstate/clock' for 0.7 s" in message
+
+
+def test_tf_tells_ages_by_the_time_of_the_robot():
+    with (
+        simulation(5 * SECOND, speed=0.0),
+        connect() as session,
+        StatePublisher(session, load_model(RRBOT), "rrbot", clock=ManualClock(3 * SECOND, "sim")) as robot,
+    ):
+        stop = threading.Event()
+
+        def publish() -> None:
+            while not stop.wait(0.01):
+                robot.publish([0.5, 0.5])
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            asked = ("tf", "world", "tool", "--once", "--json")
+            unknown = json.loads(zstate(*asked).stdout)
+            known = json.loads(zstate(*asked, "--clock", "sim").stdout)
+        finally:
+            stop.set()
+            thread.join()
+    assert (unknown["stamp"], unknown["age_s"]) == (3 * SECOND, None)
+    assert known["age_s"] == pytest.approx(2.0)
+
+
+def test_a_reader_of_one_time_refuses_robots_of_the_other(spawn: Spawn):
+    with simulation(), standing():
+        listening = started(spawn, "listen", "--clock", "sim", "--json")
+        until(lambda: "'rrbot' keeps 'system' time, but the clock here tells 'sim' time" in listening.stderr)
+
+        def refused() -> bool:
+            return json.loads(listening.line())["refused"].get("clock domain", 0) > 1
+
+        until(refused)
+
+
+def test_listen_counts_stamps_that_are_off_the_clock(spawn: Spawn):
+    stop = threading.Event()
+    with connect() as session, StatePublisher(session, load_model(RRBOT), "rrbot") as robot:
+
+        def publish() -> None:
+            while not stop.wait(0.01):
+                robot.publish([0.5, 0.5], stamp=time.time_ns() // SECOND)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            listening = started(spawn, "listen")
+            until(lambda: "  off the clock " in listening.line())
+            assert "the writer gives seconds where nanoseconds are meant" in listening.stderr
+        finally:
+            stop.set()
+            thread.join()
+
+
+def test_another_time_is_wrong_usage():
+    assert "'noon' is not one of 'system', 'sim'" in failure("joints", RRBOT, "--clock", "noon", code=2)
