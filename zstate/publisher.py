@@ -18,6 +18,7 @@ from zstate.model.robot import RobotModel
 from zstate.moving_edges import MovingEdges
 from zstate.net.claims import Claim
 from zstate.net.clock_offset import ClockService
+from zstate.net.forked import new_lock
 from zstate.net.history import Memory, answer_past
 from zstate.net.outlets import Outlets, StreamOutlet
 from zstate.net.presence import writer_here
@@ -79,7 +80,7 @@ class StatePublisher(Closing):
         self.model = model
         self.robot = check_robot(robot or model.name)
         self._clock: Clock = clock or SystemClock()
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._stop = threading.Event()
         self._opened = ExitStack()
         self._edges = MovingEdges(model, self.robot)

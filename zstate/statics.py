@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import threading
 from contextlib import ExitStack
 from urllib.parse import quote
 
@@ -11,6 +10,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
 from zstate.net.claims import Claim, check_edge
+from zstate.net.forked import new_lock
 from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
@@ -54,7 +54,7 @@ class StaticPublisher(Closing):
         self._edges: dict[str, Transform] = {}
         # Refuses here, where the mistake is made, what every reader would refuse.
         self._check = TransformBuffer()
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._closed = False
         self._session = session
         self._announced = Announced(self.robot, "tf_static", identity, self.writer)

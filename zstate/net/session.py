@@ -30,6 +30,7 @@ from zstate.net.config import (
     given_config,
     our_config,
 )
+from zstate.net.forked import keep_for_ever, new_lock
 from zstate.net.modes import (
     check_credentials,
     check_mode,
@@ -42,6 +43,7 @@ from zstate.net.security import Credentials
 from zstate.net.twin import Twin
 
 CLOSE_WITHIN_S = 0.8
+AGAIN_S = 0.1
 
 
 def connect(
@@ -129,11 +131,19 @@ def _connect(
     where = listening(mode, listen, credentials)
     check_credentials(mode, credentials, where)
     within = timeout_s if mode == "client" else None
-    return _session(our_config(mode, endpoints, where, within, credentials), endpoints, credentials)
+    config = our_config(mode, endpoints, where, within, credentials)
+    if mode != "client" or len(endpoints) == 1:
+        return _session(config, endpoints, credentials)
+    # With time to wait, Zenoh spends all of it on the first of them; without, it asks each once.
+    config.insert_json5("connect/timeout_ms", "0")
+    return _session(config, endpoints, credentials, timeout_s)
 
 
-def _session(config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None) -> Session:
-    return Session(_open(config, endpoints, credentials), twin=Twin.of(config, credentials))
+def _session(
+    config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None, again_for_s: float = 0.0
+) -> Session:
+    raw = _open(config, endpoints, credentials, again_for_s)
+    return Session(raw, twin=Twin.of(config, credentials))
 
 
 def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
@@ -161,12 +171,19 @@ def _open_lobby(endpoint: str) -> zenoh.Session:
 
 
 def _open(
-    config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None = None
+    config: zenoh.Config,
+    endpoints: Sequence[str],
+    credentials: Credentials | None = None,
+    again_for_s: float = 0.0,
 ) -> zenoh.Session:
-    try:
-        return open_zenoh(config)
-    except zenoh.ZError as error:
-        raise _explained(str(error), endpoints, credentials) from None
+    deadline = time.monotonic() + again_for_s
+    while True:
+        try:
+            return open_zenoh(config)
+        except zenoh.ZError as error:
+            if time.monotonic() >= deadline:
+                raise _explained(str(error), endpoints, credentials) from None
+        time.sleep(AGAIN_S)
 
 
 def _explained(text: str, endpoints: Sequence[str], credentials: Credentials | None) -> NetworkError:
@@ -207,7 +224,7 @@ class Session(Closing):
         self._rendezvous = rendezvous
         self._pid = os.getpid()
         self._closed = False
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._numbers = itertools.count()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
@@ -238,15 +255,19 @@ class Session(Closing):
 
     def release(self, entity: Undeclarable) -> None:
         """Undeclare something of this session. Nothing happens if that, or the session, is gone."""
-        if self._closed or os.getpid() != self._pid:
-            return
-        with suppress(zenoh.ZError):
-            entity.undeclare()
+        if os.getpid() != self._pid:
+            keep_for_ever(entity)
+        elif not self._closed:
+            with suppress(zenoh.ZError):
+                entity.undeclare()
 
     def close(self) -> None:
         """Leave the network within a second. A second call does nothing."""
         with self._lock:
-            if self._closed or os.getpid() != self._pid:
+            if os.getpid() != self._pid:
+                keep_for_ever(self._raw)
+                return
+            if self._closed:
                 return
             self._closed = True
         _run_bounded(self._leave)
