@@ -44,7 +44,6 @@ from zstate.net.twin import Twin
 
 CLOSE_WITHIN_S = 0.8
 AGAIN_S = 0.1
-AGAIN_S = 0.1
 
 
 def connect(
