@@ -149,9 +149,9 @@ class Watch(Closing):
 
     def close(self) -> None:
         """Stop within a second. A second call does nothing."""
+        self._receiver.close()  # its thread asks the other
         if self._routers is not None:
             self._routers.close()
-        self._receiver.close()
 
 
 def watch(
