@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Literal
 
 from zstate.closing import Closing
 from zstate.errors import duration_text
+from zstate.following.bounded import remember
 from zstate.following.placements import Placements
 from zstate.following.teller import Teller
 from zstate.following.vigil import Vigil
 from zstate.wire.keys import Stream
 from zstate.wire.writer import Announced, Writer
 
-K = TypeVar("K")
-V = TypeVar("V")
-
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back"]
 
 KEPT = 1024
-_FORMER = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +72,9 @@ class Events(Closing):
         self._alone = self._heard - (frozenset(shared) - {"joint_states"})
         self._kept: deque[Event] = deque(maxlen=KEPT)
         self._alive: dict[_Place, dict[int, Announced]] = {}
-        self._former: OrderedDict[tuple[_Place, str, str], Writer] = OrderedDict()
-        self._fought: OrderedDict[tuple[str, str, int, str], None] = OrderedDict()
+        self._former: dict[tuple[_Place, str, str], Writer] = {}
+        self._gone: dict[tuple[_Place, int], None] = {}
+        self._fought: dict[tuple[str, str, int, str], None] = {}
         self._placements = Placements()
         self._lock = threading.Lock()
         self._vigil = Vigil()
@@ -139,7 +137,7 @@ class Events(Closing):
         if key not in self._fought:
             writer = None if announced is None else announced.writer
             self._add("conflict", robot, "tf_static", writer, text)
-        _remember(self._fought, key, None)
+        remember(self._fought, key, None)
 
     def _look(self, now_s: float) -> float:
         stale, next_s = self._vigil.look(now_s)
@@ -156,22 +154,19 @@ class Events(Closing):
             return
         rivals = [other.writer for other in others.values() if other.excludes(announced)]
         others[writer.session] = announced
-        key = (place, writer.program, writer.host)
-        before = self._former.get(key)
-        _remember(self._former, key, writer)
-        self._tell_of_coming(announced, before)
+        self._tell_of_coming(announced, is_alone=not rivals)
         if rivals and announced.stream in self._alone:
             text = f"{_who(announced)}, and so does {rivals[-1]}; readers follow whoever came last"
             self._add("conflict", announced.robot, announced.stream, writer, text)
-        if announced.stream == self._followed:
-            self._vigil.begin((announced.robot, writer.session))
+        self._vigil.begin((announced.robot, writer.session))
 
-    def _tell_of_coming(self, announced: Announced, before: Writer | None) -> None:
-        writer = announced.writer
-        if before is None:
-            self._add("joined", announced.robot, announced.stream, writer, _who(announced))
-        elif before.session == writer.session:
+    def _tell_of_coming(self, announced: Announced, *, is_alone: bool) -> None:
+        place, writer = _place(announced), announced.writer
+        before = self._former.get((place, writer.program, writer.host))
+        if (place, writer.session) in self._gone:
             self._add("back", announced.robot, announced.stream, writer, f"{_who(announced)}: it is back")
+        elif before is None or not is_alone:
+            self._add("joined", announced.robot, announced.stream, writer, _who(announced))
         else:
             was = f", pid {before.pid} before" if before.pid else ""
             text = f"{_who(announced)} anew: it was restarted{was}"
@@ -182,11 +177,12 @@ class Events(Closing):
         others = self._alive.get(place, {})
         if others.pop(writer.session, None) is None:
             return
+        remember(self._gone, (place, writer.session), None)
+        remember(self._former, (place, writer.program, writer.host), writer)
         if not others:
             del self._alive[place]
             self._placements.replace((announced.robot, announced.name), frozenset())
-        is_followed = announced.stream == self._followed
-        was_stale = is_followed and self._vigil.end((announced.robot, writer.session))
+        was_stale = self._vigil.end((announced.robot, writer.session))
         who = f"{announced.robot!r}: {writer} "
         what = _what(announced)
         if kind == "cut off":
@@ -216,13 +212,6 @@ class Events(Closing):
         self._kept.append(event)
         if self._teller is not None:
             self._teller.tell(event)
-
-
-def _remember(known: OrderedDict[K, V], key: K, value: V) -> None:
-    known[key] = value
-    known.move_to_end(key)
-    while len(known) > _FORMER:
-        known.popitem(last=False)
 
 
 def _place(announced: Announced) -> _Place:

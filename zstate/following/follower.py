@@ -11,6 +11,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM
 from zstate.errors import InsertRefused, InvalidInput, MessageError
 from zstate.following.absent import Absent
+from zstate.following.bounded import remember
 from zstate.following.tally import Tally
 from zstate.wire.messages import RobotDescription, Sample
 
@@ -32,7 +33,7 @@ class Follower(ABC):
         self._tally = tally
         self._writers: dict[int, str] = {}
         self._session: int | None = None
-        self._ended_sessions: set[int] = set()
+        self._ended_sessions: dict[int, None] = {}
         self._next_seq: int | None = None
         self._last_late: Sample | None = None
         self._early: deque[Sample] = deque(maxlen=_EARLY)
@@ -56,7 +57,7 @@ class Follower(ABC):
     def name_writer(self, session: int, writer: str) -> None:
         """The writer behind a session, as announced."""
         with self._lock:
-            self._writers[session] = writer
+            remember(self._writers, session, writer)
             self._writer_changed()
 
     def writer_left(self, session: int) -> None:
@@ -197,7 +198,7 @@ class Follower(ABC):
             return False
         if session != self._session:
             if self._session is not None:
-                self._ended_sessions.add(self._session)
+                remember(self._ended_sessions, self._session, None)
                 self._early.clear()
                 self._succeed(sample)
             self._session = session

@@ -16,6 +16,7 @@ _SMOOTHING = 0.1
 
 @dataclass(slots=True)
 class _Pulse:
+    streams: int = 0
     last_s: float = 0.0
     period_s: float = 0.0
     samples: int = 0
@@ -41,15 +42,20 @@ class Vigil:
         self._lock = threading.Lock()
 
     def begin(self, writer: Source) -> None:
-        """It is announced."""
+        """It is announced, with one more stream."""
         with self._lock:
-            self._pulses.setdefault(writer, _Pulse())
+            self._pulses.setdefault(writer, _Pulse()).streams += 1
 
     def end(self, writer: Source) -> bool:
-        """It is not announced any more; whether it was stale by then."""
+        """One of its streams is not announced any more; whether it was stale by then."""
         with self._lock:
-            pulse = self._pulses.pop(writer, None)
-        return pulse is not None and pulse.is_stale
+            pulse = self._pulses.get(writer)
+            if pulse is None:
+                return False
+            pulse.streams -= 1
+            if not pulse.streams:
+                del self._pulses[writer]
+            return pulse.is_stale
 
     def hear(self, writer: Source, now_s: float) -> float | None:
         """A sample has come; how long [s] none did, if that was called stale."""
