@@ -15,25 +15,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from answers import Answers
 
 from zstate import (
     SineSource,
     StatePublisher,
     StaticPublisher,
     TransformListener,
-    ZStateError,
     connect,
     load_model,
 )
 from zstate.clock import SystemClock
-from zstate.errors import Stale
-from zstate.model.kinematics import Kinematics
 from zstate.recorder import Recorder
 from zstate.sources.source import JointReading
 from zstate.transform import Transform
 
-MAX_AGE_S = 0.5
 CLONE_NEWNET = 0x40000000
 
 Session = dict[str, Any]
@@ -156,7 +152,7 @@ def router(listen: str, connect_to: list[str] | None = None) -> None:
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
     """One that follows robots; with ``busy_ms`` each sample costs it so long, and nobody else runs."""
     with connect(**session) as opened, TransformListener(opened, robot, follow=follow) as listener:
-        answers = _Answers(listener)
+        answers = Answers(listener)
         if busy_ms:
             _burden(listener, busy_ms)
         _serve(
@@ -181,126 +177,3 @@ def _burden(listener: TransformListener, busy_ms: float) -> None:
         return insert(*arguments)
 
     listener.buffer.insert_joints = slowly  # type: ignore[method-assign]
-
-
-class _Answers:
-    """What a reader can say of the robots it follows. An answer that is not the sine's is an error."""
-
-    def __init__(self, listener: TransformListener) -> None:
-        self._listener = listener
-        self._buffer = listener.buffer
-        self._model = load_model("rrbot")
-        self._kinematics = Kinematics(self._model)
-        self._source = SineSource(self._model)
-        self._watching: dict[str, _Watching] = {}
-
-    def near(self, robot: str, stamp: int, timeout_s: float = 10.0) -> bool:
-        """Whether the newest sample comes to be within half a minute of a stamp."""
-        deadline = time.monotonic() + timeout_s
-        while abs(self.newest(robot) - stamp) > 30_000_000_000:
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.001)
-        self._check(robot)
-        return True
-
-    def newest(self, robot: str) -> int:
-        """The stamp of the newest sample, or 0."""
-        try:
-            return self._buffer.latest(f"{robot}/world", f"{robot}/tool")
-        except ZStateError:
-            return 0
-
-    def after(self, robot: str, stamp: int, timeout_s: float = 15.0) -> int | None:
-        """When [ns] there was an answer with a later stamp; it is checked."""
-        deadline = time.monotonic() + timeout_s
-        while self.newest(robot) <= stamp:
-            if time.monotonic() > deadline:
-                return None
-            time.sleep(0.001)
-        heard_at = time.time_ns()
-        self._check(robot)
-        return heard_at
-
-    def _check(self, robot: str) -> None:
-        answer = self._buffer.lookup(f"{robot}/world", f"{robot}/tool")
-        assert answer.stamp is not None
-        positions = self._source.read(answer.stamp).positions
-        pose = self._kinematics.link_poses(positions)[self._model.links.index("tool")]
-        expected = Transform.from_pose7("world", "tool", pose)
-        assert np.allclose(answer.matrix, expected.matrix, rtol=0.0, atol=1e-9), (answer, expected)
-
-    def mark(self, robot: str, value: float, timeout_s: float = 10.0) -> int | None:
-        """When [ns] the robot's static edge had this length."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            try:
-                edge = self._buffer.lookup(f"{robot}/world", f"{robot}/mark")
-            except ZStateError:
-                edge = None
-            if edge is not None and edge.translation[0] == value:
-                return time.time_ns()
-            time.sleep(0.001)
-        return None
-
-    def stats(self) -> dict[str, Any]:
-        stats = self._listener.stats
-        names = ("received", "dropped", "missed", "late", "refused")
-        return {name: getattr(stats, name) for name in names}
-
-    def watch(self, robot: str) -> None:
-        self._watching[robot] = _Watching(self, robot)
-
-    def watched(self, robot: str) -> dict[str, Any]:
-        return self._watching.pop(robot).report()
-
-    def latencies(self, robot: str, count: int) -> list[int]:
-        """How old [ns] each of the next samples is when it can be looked up."""
-        ages: list[int] = []
-        newest = self.newest(robot)
-        while len(ages) < count:
-            answer = self._buffer.wait(f"{robot}/world", f"{robot}/tool", newest + 1, timeout_s=10.0)
-            ages.append(time.time_ns() - self.newest(robot))
-            assert answer.stamp is not None
-            newest = self.newest(robot)
-        return ages
-
-
-class _Watching:
-    """Looks at one robot every few milliseconds: newest must never go back, nor old be called fresh."""
-
-    def __init__(self, answers: _Answers, robot: str) -> None:
-        self._answers = answers
-        self._robot = robot
-        self._stop = threading.Event()
-        self._seen: dict[str, int] = {"looks": 0, "went_back": 0, "old_as_fresh": 0, "stale": 0, "gap_ns": 0}
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        seen, newest, changed = self._seen, self._answers.newest(self._robot), time.monotonic_ns()
-        ends = f"{self._robot}/world", f"{self._robot}/tool"
-        while not self._stop.wait(0.003):
-            seen["looks"] += 1
-            before, newest = newest, self._answers.newest(self._robot)
-            seen["went_back"] += newest < before
-            if newest != before:
-                seen["gap_ns"] = max(seen["gap_ns"], time.monotonic_ns() - changed)
-                changed = time.monotonic_ns()
-            asked_at = time.time_ns()
-            try:
-                answer = self._answers._buffer.lookup(*ends, max_age_s=MAX_AGE_S)
-                seen["old_as_fresh"] += asked_at - (answer.stamp or 0) > MAX_AGE_S * 1e9
-            except Stale:
-                seen["stale"] += 1
-            except ZStateError:
-                pass
-
-    def report(self) -> dict[str, int]:
-        self._stop.set()
-        self._thread.join()
-        return self._seen
-
-
-if __name__ == "__main__":
-    main()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import pytest
+from answers import MAX_AGE_S
 from namespaces import REASON, Hosts, possible
 from parties import SLACK, Party, Start, assert_no_growth, client
 from support import until
@@ -15,7 +16,6 @@ pytestmark = [pytest.mark.processes, pytest.mark.netns, pytest.mark.skipif(not p
 
 RATE_HZ = 100.0
 BOUND_S = 1.0
-MAX_AGE_S = 0.5  # what the watching readers call fresh
 CUT_READERS = ("swallowed5", "swallowed15", "unplugged5", "unplugged15")
 """How a host is cut off, and for how many seconds."""
 
