@@ -8,15 +8,18 @@ import time
 import pytest
 from live import RRBOT, await_reader, settle
 from support import until
+from tales import START, Tale
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import ManualClock
+from zstate.buffer.domain import Domain
+from zstate.clock import ManualClock, SystemClock
 from zstate.clock_publisher import ClockPublisher
 from zstate.errors import ClockMismatch
 from zstate.following.off_clock import likely_cause
 from zstate.listener import TransformListener
 from zstate.net.streams import StreamPublisher
 from zstate.publisher import StatePublisher
+from zstate.replayer import Replayer
 from zstate.simulated_clock import SimulatedClock
 from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
@@ -281,6 +284,38 @@ def test_simulated_time_is_never_far_off(sessions):
         publisher.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 1)
         assert listener.stats.off_clock == 0
+
+
+def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
+    writer, reader = sessions
+    with Tale(tmp_path / "run.mcap", "arm") as tale:
+        tale.describe("arm")
+        for number in range(10):
+            tale.joints("arm", START + number * 10 * MS, [0.1 * number, 0.0])
+        tale.edges("cart", START + 20 * MS, {("floor", "cart"): [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]})
+    with (
+        StatePublisher(writer, RRBOT, "r1"),
+        TransformListener(reader, "*", clock=SystemClock()) as real,
+        TransformListener(reader, "arm") as replayed,
+        Replayer(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
+    ):
+        until(lambda: real.buffer.domain.of("r1") == "system")
+        replayer.run()
+        until(lambda: "clock domain" in real.stats.refused)
+        until(lambda: replayed.buffer.domain.name == "sim")
+        assert not real.buffer.can_lookup("arm/world", "arm/tool")
+
+
+def test_whose_time_it_is_may_stay_open():
+    domain = Domain()
+    assert domain.objection("ros", "") == ""
+    assert (domain.name, domain.of("ros"), domain.of("nobody")) == (None, "", None)
+    assert domain.objection("r1", "sim") == ""
+    assert domain.objection("ros", "") == ""
+    assert domain.objection("r2", "system").startswith(
+        "'r2' keeps 'system' time, but 'r1', which is in the same buffer, keeps 'sim' time"
+    )
+    assert (domain.name, domain.of("r2")) == ("sim", None)
 
 
 @pytest.mark.parametrize(

@@ -149,3 +149,25 @@ def test_every_error_crosses_processes_whole(error: errors.ZStateError) -> None:
     assert type(copy) is type(error)
     assert str(copy) == str(error)
     assert vars(copy) == vars(error)
+
+
+@pytest.mark.parametrize(
+    ("offset_ns", "uncertainty_ns", "text"),
+    [
+        (1_200_000_000, 300_000, "; the clock of 'driver@jetson' is 1.2 s ahead of this one (± 300.0 us)"),
+        (-2_000_000, 1_000_000, "; the clock of 'driver@jetson' is 2.0 ms behind this one (± 1.0 ms)"),
+        (999_999, 100, ""),
+        (2_000_000, 2_000_001, ""),
+    ],
+)
+def test_the_writers_clock_is_named_where_it_may_be_the_cause(
+    offset_ns: int, uncertainty_ns: int, text: str
+) -> None:
+    error = InFuture(
+        "map", "hand", edge=("map", "base"), requested=5 * S, newest=4 * S, writer="driver@jetson"
+    )
+    without = error.explanation()
+    error.clock_offset_ns, error.clock_uncertainty_ns = offset_ns, uncertainty_ns
+    assert error.explanation() == without + text
+    again = pickle.loads(pickle.dumps(timed_out(error, 1.0)))
+    assert (again.clock_offset_ns, again.clock_uncertainty_ns) == (offset_ns, uncertainty_ns)

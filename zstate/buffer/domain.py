@@ -20,10 +20,15 @@ class Domain:
     @property
     def name(self) -> str | None:
         """Its name: "system", or that of a simulated time; None while it is open."""
-        return self._given or next(iter(list(self._kept.values())), None)
+        return self._given or self._first()[1] or None
+
+    def _first(self) -> tuple[str, str]:
+        """A robot that decides, and the time it keeps; both empty without one."""
+        told = ((robot, kept) for robot, kept in list(self._kept.items()) if kept)
+        return next(told, ("", ""))
 
     def of(self, robot: str) -> str | None:
-        """The time that ``robot`` keeps; None while it has not said so."""
+        """The time that ``robot`` keeps: empty where its wire does not tell, None before its description."""
         return self._kept.get(robot)
 
     def decide(self, domain: str) -> None:
@@ -37,16 +42,15 @@ class Domain:
         """
         with self._lock:
             self._kept.pop(robot, None)
-            held = self.name
-            if not domain or held is None or held == domain:
-                if domain:
-                    self._kept[robot] = domain
+            held, holder = self.name, self._first()[0]
+            if not domain or held in (None, domain):
+                self._kept[robot] = domain
                 return ""
-            if self._given is not None:
-                holder = f"the clock here tells {held!r} time"
-            else:
-                holder = f"{next(iter(self._kept))!r}, which is in the same buffer, keeps {held!r} time"
+        if self._given is None:
+            other = f"{holder!r}, which is in the same buffer, keeps {held!r} time"
+        else:
+            other = f"the clock here tells {held!r} time"
         return (
-            f"{robot!r} keeps {domain!r} time, but {holder}; stamps of the two cannot be compared: "
+            f"{robot!r} keeps {domain!r} time, but {other}; stamps of the two cannot be compared: "
             "give them buffers of their own, or all of them one clock"
         )

@@ -51,7 +51,7 @@ class OffClock:
         if kept is None and self._is_described:
             # Whose time it is stands in the description, which is on its way, or will never come.
             return isinstance(sample, TransformSample) and sample.edges is not None
-        return kept is None or kept == SYSTEM
+        return kept in (None, "", SYSTEM)
 
     def _text(self, robot: str, writer: str | None, stamp: int) -> str:
         now = self._buffer.clock.now()
