@@ -34,8 +34,9 @@ FLOORS = (
         "lookup_service",
     },
     {"ros1", "bridge", "replaying"},
-    {"replayer", "metrics"},
+    {"replayer"},
     {"zstate"},
+    {"metrics"},
     {"view", "cli"},
     {"__main__"},
 )
@@ -67,6 +68,7 @@ HOMES = {
     "sensor_msgs": "ros1",
     "std_msgs": "ros1",
     "tf2_msgs": "ros1",
+    "prometheus_client": "metrics",
     "viser": "view",
     "click": "cli",
     "rich": "cli",

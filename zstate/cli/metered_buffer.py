@@ -5,16 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from statistics import median
 
-from numpy.typing import ArrayLike
-
-from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock, SystemClock
+from zstate.metrics.measured_buffer import MeasuredBuffer
 
 # Enough for a median, bounded for a demo that runs for days.
 _KEPT = 100_000
@@ -78,12 +74,16 @@ class Meter:
         )
 
 
-class MeteredBuffer(TransformBuffer):
-    """A TransformBuffer whose ``meter`` notes when each sample of a robot can be looked up."""
+class MeteredBuffer(MeasuredBuffer):
+    """A MeasuredBuffer whose ``meter`` notes when each sample of a robot can be looked up."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
         self.meter = Meter(clock)
+
+    def _note_sample(self, stamp: int) -> None:
+        super()._note_sample(stamp)
+        self.meter.note(stamp)
 
     def measure(self, since: Mark, until: Mark) -> Measure:
         """How samples came in between two marks of ``meter``."""
@@ -91,17 +91,3 @@ class MeteredBuffer(TransformBuffer):
         if self.domain.name in (None, self.clock.domain):
             return measure
         return replace(measure, latency_s=None, age_s=None)
-
-    def insert_joints(
-        self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
-    ) -> bool:
-        taken = super().insert_joints(track, stamp, positions, velocities)
-        self.meter.note(stamp)
-        return taken
-
-    def insert_many(
-        self, edges: Sequence[tuple[str, str]], stamp: int, poses: ArrayLike, *, writer: str | None = None
-    ) -> bool:
-        taken = super().insert_many(edges, stamp, poses, writer=writer)
-        self.meter.note(stamp)
-        return taken

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -14,6 +15,7 @@ from zstate.cli.network import Network
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
+    from zstate.metrics.address import Address
     from zstate.model.robot import RobotModel
     from zstate.net.security import Credentials
 
@@ -108,6 +110,28 @@ wires_option = click.option(
     envvar="ZSTATE_WIRE",
     help="What is spoken, as in `--wire native --wire ros2:domain=5,namespace=r1`; the first one is also "
     "where joint_states are heard.",
+)
+
+
+def _checked_address(_: click.Context, __: click.Parameter, text: str | None) -> Address | None:
+    if text is None:
+        return None
+    from zstate.metrics.address import Address
+
+    import_module("zstate.metrics.library")  # told before anything runs when it is missing
+
+    try:
+        return Address.parse(text)
+    except InvalidInput as error:
+        raise click.BadParameter(str(error)) from None
+
+
+metrics_option = click.option(
+    "--metrics",
+    callback=_checked_address,
+    metavar="[HOST:]PORT",
+    help="Serve metrics for Prometheus over HTTP, on this host alone unless HOST says otherwise; 0 is a "
+    "free port.",
 )
 
 

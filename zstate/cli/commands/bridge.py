@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import fail, note, say
+from zstate.cli.metrics import of_bridge, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options
+from zstate.cli.options import metrics_option, session_options
 from zstate.errors import Unreachable
 
 if TYPE_CHECKING:
     from zstate.bridge import Way
+    from zstate.metrics.address import Address
     from zstate.net.session import Session
 
 # The router of rmw_zenoh, on this host.
@@ -37,8 +39,11 @@ _ROS_ROUTER = "tcp/127.0.0.1:7447"
     metavar="ENDPOINT",
     help="The router of the ROS nodes. The session options below are those of the other side.",
 )
+@metrics_option
 @session_options
-def bridge_command(*, network: Network, robot: str | None, wire: str, ros: str) -> None:
+def bridge_command(
+    *, network: Network, robot: str | None, wire: str, ros: str, metrics: Address | None
+) -> None:
     """Carry ROBOT between zstate's native wire and ROS 2 nodes that run rmw_zenoh, both ways.
 
     Whoever writes it, on either side, is heard on the other: model, joint states with their stamps,
@@ -55,7 +60,10 @@ def bridge_command(*, network: Network, robot: str | None, wire: str, ros: str) 
     has_room = _has_room_for_all(wire)
     with open_session(network) as native, _ros_session(ros) as session:
         robots = [robot] if robot else None if has_room else _announced(native)
-        with Bridge(native, session, wire, robots, on_change=_tell):
+        with (
+            Bridge(native, session, wire, robots, on_change=_tell) as bridge,
+            served(metrics, of_bridge(bridge)),
+        ):
             named = " and ".join(map(repr, robots)) if robots else "every robot"
             say(f"bridging {named} between native and {wire} at {ros}")
             note("a robot is carried as soon as its robot_description is heard")

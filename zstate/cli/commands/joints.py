@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import click
 
 from zstate.cli.console import count_text, say
+from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     clock_option,
     load_robot,
+    metrics_option,
     name_option,
     rate_option,
     seconds_option,
@@ -16,6 +20,9 @@ from zstate.cli.options import (
     wire_option,
 )
 from zstate.cli.words import words_of
+
+if TYPE_CHECKING:
+    from zstate.metrics.address import Address
 
 
 @click.command("joints")
@@ -25,6 +32,7 @@ from zstate.cli.words import words_of
 @name_option
 @wire_option
 @clock_option
+@metrics_option
 @session_options
 def joints_command(
     *,
@@ -34,6 +42,7 @@ def joints_command(
     name: str | None,
     wire: str,
     clock: str,
+    metrics: Address | None,
     network: Network,
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
@@ -55,6 +64,7 @@ def joints_command(
         open_session(network, (wire,)) as session,
         open_clock(session, clock, wire) as time,
         StatePublisher(session, model, called, (wire,), streams=("joint_states",), clock=time) as publisher,
+        served(metrics, of_publishers(publisher)),
     ):
         joints = count_text(len(model.joint_names), "joint")
         place = words_of(wire).place(called, ("joint_states",))

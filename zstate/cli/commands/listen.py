@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import note, say, say_json
+from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import reading_clock_option, session_options, wire_option
+from zstate.cli.options import metrics_option, reading_clock_option, session_options, wire_option
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from zstate.clock import Clock
     from zstate.following.tally import Stats
     from zstate.listener import Follow, TransformListener
+    from zstate.metrics.address import Address
     from zstate.net.session import Session
     from zstate.wire.keys import Stream
 
@@ -35,9 +37,16 @@ _MEETING_S = 0.3
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @wire_option
 @reading_clock_option
+@metrics_option
 @session_options
 def listen_command(
-    *, network: Network, robot: str, as_json: bool, wire: str, clock: str | None
+    *,
+    network: Network,
+    robot: str,
+    as_json: bool,
+    wire: str,
+    clock: str | None,
+    metrics: Address | None,
 ) -> None:
     """Follow ROBOT, or all robots, and say once a second how their samples come in.
 
@@ -61,6 +70,7 @@ def listen_command(
         Roster(session, robot, wire) as roster,
         open_clock(session, clock, wire) as time,
         Ears(session, roster, robot, wire, time) as ears,
+        served(metrics, of_listeners(ears.listeners), of_writers(roster)),
     ):
         forever = Event()
         forever.wait(_MEETING_S)
@@ -73,9 +83,7 @@ def listen_command(
 class Ears(Closing):
     """A listener for each robot that is wanted and announced, opened when it appears."""
 
-    def __init__(  # noqa: PLR0917 - one use
-        self, session: Session, roster: Roster, robot: str, wire: str, clock: Clock | None
-    ) -> None:
+    def __init__(self, session: Session, roster: Roster, robot: str, wire: str, clock: Clock | None) -> None:
         from zstate.wire.keys import ANY, check_robot
 
         self._robot = None if robot == ANY else check_robot(robot)
@@ -89,6 +97,10 @@ class Ears(Closing):
 
     def close(self) -> None:
         self._opened.close()
+
+    def listeners(self) -> list[TransformListener]:
+        """Those that are open."""
+        return [listener for listener, _, _ in self._ears.copy().values()]
 
     def open_new(self) -> None:
         """Listen to robots that have appeared; says what is waited for while there is none."""

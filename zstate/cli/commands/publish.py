@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import count_text, fail, note, say
+from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
     clock_option,
     load_robot,
+    metrics_option,
     name_option,
     seconds_option,
     session_options,
@@ -23,6 +25,7 @@ from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.cli.heard_source import HeardSource
+    from zstate.metrics.address import Address
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.publisher import StatePublisher
@@ -61,6 +64,7 @@ def _source(_: click.Context, __: click.Parameter, source: str) -> str:
 @clock_option
 @seconds_option
 @name_option
+@metrics_option
 @session_options
 def publish_command(
     *,
@@ -71,6 +75,7 @@ def publish_command(
     clock: str,
     seconds: float | None,
     name: str | None,
+    metrics: Address | None,
     network: Network,
 ) -> None:
     """Publish the state of ROBOT: its model, its fixed edges, and transforms.
@@ -107,6 +112,7 @@ def publish_command(
         StatePublisher(session, model, called, followed, streams=_DERIVED, clock=time) as derived,
         StatePublisher(session, model, called, wires[len(followed) :], clock=time) as whole,
         answering_lookups(session, derived, whole),
+        served(metrics, of_publishers(derived, whole)),
     ):
         places = [words_of(wire).place(called, _DERIVED) for wire in followed]
         places += [words_of(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]

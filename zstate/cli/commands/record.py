@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import fail, is_terminal, note, say
+from zstate.cli.metrics import of_recorder, of_writers, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_seconds, session_options, wire_option
+from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
 from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
     from zstate.cli.recording import Progress
+    from zstate.metrics.address import Address
     from zstate.recorder import Recorder
 
 _LINE_S = 1.0
@@ -47,6 +49,7 @@ def _checked_megabytes(_: click.Context, __: click.Parameter, size: float | None
     help="Begin another file after so long.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace a FILE that exists.")
+@metrics_option
 @session_options
 def record_command(
     *,
@@ -57,6 +60,7 @@ def record_command(
     split_size: float | None,
     split_seconds: float | None,
     overwrite: bool,
+    metrics: Address | None,
     network: Network,
 ) -> None:
     """Record ROBOTs, or all there are, into the MCAP file FILE, until Ctrl-C.
@@ -89,7 +93,11 @@ def record_command(
             )
         except RecordingError as error:
             fail(str(error).replace("overwrite=True", "--overwrite"))
-        with recorder, Roster(session, robots[0] if len(robots) == 1 else "*", wire) as roster:
+        with (
+            recorder,
+            Roster(session, robots[0] if len(robots) == 1 else "*", wire) as roster,
+            served(metrics, of_recorder(recorder), of_writers(roster)),
+        ):
             _run(recorder, roster, robots, duration)
 
 

@@ -10,10 +10,13 @@ import click
 
 from zstate.cli.console import note, say
 from zstate.cli.identity import router_identity_options
+from zstate.cli.metrics import of_connections, of_writers, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import config_option
+from zstate.cli.options import config_option, metrics_option
+from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
+    from zstate.metrics.address import Address
     from zstate.net.router_config import RouterConfig
     from zstate.net.security import Credentials
     from zstate.net.thinning import Thinning
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
 @click.option("--ros2", is_flag=True, help="With the settings of rmw_zenohd, in its place.")
 @router_identity_options
 @config_option
+@metrics_option
 @click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5), and run nothing.")
 def router_command(
     *,
@@ -59,6 +63,7 @@ def router_command(
     namespace: str,
     ros2: bool,
     config: str | None,
+    metrics: Address | None,
     only_print: bool,
     credentials: Credentials | None,
 ) -> None:
@@ -78,7 +83,7 @@ def router_command(
     if file:
         made = {"--ros2": ros2, "--acl": acl, "--downsample": downsample, "--print": only_print}
         _refuse_beside(file, [option for option, is_given in made.items() if is_given])
-        _run(Network("router", connect, listen, config, credentials), listen, file)
+        _run(Network("router", connect, listen, config, credentials), listen, metrics, file)
         return
     thinning = _thinning(downsample, robot, wan, namespace)
     router = _router(listen, connect, credentials, acl, thinning, ros2=ros2)
@@ -86,7 +91,7 @@ def router_command(
         say(router.text().rstrip("\n"))
     else:
         network = Network("router", config=router.settings(), credentials=credentials)
-        _run(network, router.listen)
+        _run(network, router.listen, metrics)
 
 
 def _refuse_beside(file: str, options: list[str]) -> None:
@@ -136,11 +141,15 @@ def _stream_rate(text: str) -> tuple[str, float]:
         raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
 
 
-def _run(network: Network, listen: tuple[str, ...], file: str = "") -> None:
+def _run(network: Network, listen: tuple[str, ...], metrics: Address | None, file: str = "") -> None:
     from zstate.clock import wait_in_slices
     from zstate.net.modes import listening
 
-    with open_session(network) as session:
+    with (
+        open_session(network) as session,
+        Roster(session) as roster,
+        served(metrics, of_connections(session), of_writers(roster)),
+    ):
         say(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
         if listen == (default := listening("router", (), network.credentials)):
             opened = default[0].replace("127.0.0.1", "0.0.0.0")

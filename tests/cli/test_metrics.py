@@ -1,0 +1,118 @@
+"""--metrics PORT: scraped from real processes."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from looking import RRBOT, Spawn, failure, interrupted, standing, started
+from metrics.scrape import Row, row, scraped
+from support import Child, until
+
+pytestmark = pytest.mark.processes
+
+
+def url_of(command: Child) -> str:
+    until(lambda: "metrics at " in command.stderr)
+    match = re.search(r"metrics at (http://127\.0\.0\.1:\d+/metrics)", command.stderr)
+    assert match
+    return match[1]
+
+
+def grown(url: str, grows: Row) -> dict[Row, float]:
+    """A scrape that finds ``grows`` larger than one before."""
+    first = scraped(url)[grows]
+    until(lambda: scraped(url)[grows] > first)
+    return scraped(url)
+
+
+def test_a_publisher_serves_what_it_does_and_what_it_costs(spawn: Spawn):
+    command = started(spawn, "publish", RRBOT, "--source", "sine", "--metrics", "0")
+    labels = {"robot": "rrbot", "wire": "native"}
+    rows = grown(url_of(command), row("zstate_publisher_samples_total", stream="joint_states", **labels))
+    assert rows[row("zstate_publisher_suppressed_total", stream="tf", **labels)] > 0
+    assert rows[row("zstate_publisher_commanded_hertz", robot="rrbot")] == 100.0
+    assert rows[row("process_resident_memory_bytes")] > 0
+    interrupted(command)
+
+
+def test_a_listener_serves_the_counts_that_it_shows(spawn: Spawn):
+    command = started(spawn, "listen", "rrbot", "--json", "--metrics", "0")
+    url = url_of(command)
+    with standing():
+        until(lambda: row("zstate_listener_received_total", robot="rrbot") in scraped(url))
+        rows = grown(url, row("zstate_listener_received_total", robot="rrbot"))
+        received = rows[row("zstate_listener_received_total", robot="rrbot")]
+        in_buckets = rows[row("zstate_listener_latency_seconds_count", robot="rrbot")]
+        # It goes on while it is read.
+        assert received <= in_buckets <= received + 100
+        assert rows[row("zstate_writers", robot="rrbot", stream="joint_states")] == 1
+        assert rows[row("zstate_listener_missed_total", robot="rrbot")] == 0
+        until(lambda: scraped(url)[row("zstate_listener_rate_hertz", robot="rrbot")] > 10.0)
+    until(lambda: scraped(url)[row("zstate_robots")] == 0)
+    interrupted(command)
+
+
+def test_a_router_serves_who_is_there(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    command = started(spawn, "router", "--listen", endpoint, "--metrics", "0")
+    url = url_of(command)
+    assert scraped(url)[row("zstate_router_sessions", mode="client")] == 0
+    with standing(router=endpoint):
+        until(lambda: scraped(url).get(row("zstate_writers", robot="rrbot", stream="joint_states")) == 1)
+        rows = scraped(url)
+    assert rows[row("zstate_router_sessions", mode="client")] == 1
+    assert rows[row("zstate_router_links", protocol="tcp")] == 1
+    interrupted(command)
+
+
+def test_a_recorder_serves_what_it_writes(spawn: Spawn, tmp_path: Path):
+    with standing():
+        command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
+        url = url_of(command)
+        messages = row("zstate_recorder_messages_total", robot="rrbot", stream="joint_states")
+        until(lambda: messages in scraped(url))
+        rows = grown(url, messages)
+    assert rows[row("zstate_recorder_files")] == 1
+    assert rows[row("zstate_recorder_size_bytes")] > 0
+    interrupted(command)
+
+
+def test_a_bridge_serves_whom_it_carries(spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("ZSTATE_CONNECT")
+    monkeypatch.delenv("ZSTATE_WIRE")
+    command = started(spawn, "bridge", "rrbot", "--ros", ros_router, "--metrics", "0")
+    url = url_of(command)
+    with standing():
+        carried = row("zstate_bridge_carried", robot="rrbot", way="native to ROS")
+        until(lambda: scraped(url).get(carried) == 1)
+    interrupted(command)
+
+
+def test_a_busy_port_and_a_place_that_is_none_are_told(spawn: Spawn):
+    command = started(spawn, "joints", RRBOT, "--metrics", "0")
+    port = url_of(command).split(":")[2].split("/")[0]
+    assert "or 0 for a free one" in failure("joints", RRBOT, "--name", "other", "--metrics", port)
+    assert "for instance 9100" in failure("joints", RRBOT, "--metrics", "here", code=2)
+
+
+def test_without_the_library_a_command_says_what_to_install(spawn: Spawn):
+    child = spawn(
+        "import sys; sys.modules['prometheus_client'] = None\nfrom zstate.cli.main import main; main()",
+        *("joints", RRBOT, "--metrics", "0"),
+    )
+    assert child.wait() == 1
+    assert "pip install 'zstate[metrics]'" in child.stderr
+    assert "Traceback" not in child.stderr
+
+
+def test_commands_without_it_load_no_library():
+    code = (
+        "import sys\n"
+        "import zstate.cli.commands.listen, zstate.cli.commands.publish, zstate.cli.metered_buffer\n"
+        "print('prometheus_client' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"False\n"

@@ -1,0 +1,160 @@
+"""What collectors find: the values are those of the stats, and there is no end of labels."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import pytest
+from live import RRBOT, settle
+from metrics.scrape import collected, row
+from prometheus_client.core import CounterMetricFamily
+from support import until
+
+from zstate.errors import InFuture, InvalidInput
+from zstate.listener import TransformListener
+from zstate.metrics.families import MOST_ROBOTS, Families
+from zstate.metrics.listening import ListenerMetrics
+from zstate.metrics.measured_buffer import MeasuredBuffer
+from zstate.metrics.presence import ConnectionMetrics, WriterMetrics
+from zstate.metrics.publishing import PublisherMetrics
+from zstate.net.connections import connections
+from zstate.net.presence import RobotInfo, discover, writer_here
+from zstate.net.session import connect
+from zstate.net.streams import StreamPublisher
+from zstate.publisher import StatePublisher
+from zstate.sources import SineSource
+from zstate.wire.messages import JointState
+from zstate.wire.native import ENCODINGS
+
+JOINTS = {"robot": "r1", "wire": "native", "stream": "joint_states"}
+TF = {**JOINTS, "stream": "tf"}
+
+
+def test_a_publisher_tells_what_it_put_suppressed_and_refused(sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        for _ in range(3):
+            publisher.publish([0.0, 0.0])
+        with pytest.raises(InvalidInput):
+            publisher.publish([0.0])
+        rows = collected(PublisherMetrics([publisher]))
+        size = publisher.stats.streams["native", "joint_states"].bytes
+    assert rows[row("zstate_publisher_samples_total", **JOINTS)] == 3
+    assert rows[row("zstate_publisher_bytes_total", **JOINTS)] == size > 3 * 2 * 8
+    assert rows[row("zstate_publisher_suppressed_total", **JOINTS)] == 0
+    assert rows[row("zstate_publisher_samples_total", **TF)] == 0
+    assert rows[row("zstate_publisher_suppressed_total", **TF)] == 3
+    assert rows[row("zstate_publisher_refused_total", robot="r1")] == 1
+    assert row("zstate_publisher_ticks_total", robot="r1") not in rows
+
+
+def test_a_publisher_at_a_rate_tells_how_it_keeps_it(sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
+        report = publisher.run(SineSource(RRBOT), 200.0, seconds=0.05)
+        rows = collected(PublisherMetrics([publisher]))
+    assert rows[row("zstate_publisher_commanded_hertz", robot="r1")] == 200.0
+    assert rows[row("zstate_publisher_ticks_total", robot="r1")] == report.ticks
+    assert rows[row("zstate_publisher_late_ticks_total", robot="r1")] == report.late
+    assert rows[row("zstate_publisher_skipped_ticks_total", robot="r1")] == report.skipped
+
+
+def test_a_listener_tells_its_stats_ages_latency_and_lookups(sessions):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "r1", MeasuredBuffer(), history_on_join=False) as listener,
+        StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as noise,
+    ):
+        settle(writer, "r1")
+        noise.put(b"noise")
+        for _ in range(4):
+            publisher.publish([0.0, 0.0])
+        until(lambda: listener.stats.received == 4 and listener.stats.refused)
+        listener.buffer.lookup("base", "lower")
+        with pytest.raises(InFuture):
+            listener.buffer.lookup("base", "lower", time.time_ns() + 10**9)
+        rows = collected(ListenerMetrics(lambda: [listener]))
+    assert rows[row("zstate_listener_received_total", robot="r1")] == 4
+    for lost in ("dropped", "missed", "late"):
+        assert rows[row(f"zstate_listener_{lost}_total", robot="r1")] == 0
+    assert rows[row("zstate_listener_refused_total", robot="r1", reason="malformed")] == 1
+    assert 0.0 < rows[row("zstate_listener_age_seconds", robot="r1")] < 60.0
+    assert rows[row("zstate_listener_latency_seconds_count", robot="r1")] == 4
+    assert rows[row("zstate_listener_lookups_total", robot="r1")] == 2
+    assert rows[row("zstate_listener_lookup_errors_total", robot="r1", kind="InFuture")] == 1
+
+
+def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
+    writer, reader = sessions
+    with (
+        TransformListener(reader, history_on_join=False) as listener,
+        StatePublisher(writer, RRBOT, "r1") as one,
+        StatePublisher(writer, RRBOT, "r2") as two,
+    ):
+        settle(writer, "r1")
+
+        def all_heard() -> bool:
+            for publisher in (one, two):
+                publisher.publish([0.0, 0.0])
+            return listener.robots() == ("r1", "r2") and listener.buffer.can_lookup("r2/base", "r2/lower")
+
+        until(all_heard)
+        rows = collected(ListenerMetrics(lambda: [listener]))
+    assert {labels for name, labels in rows if name == "zstate_listener_age_seconds"} == {
+        frozenset({("robot", "r1")}),
+        frozenset({("robot", "r2")}),
+    }
+    assert row("zstate_listener_received_total", robot="*") in rows
+
+
+def test_a_writer_that_starts_again_and_again_adds_no_row(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", MeasuredBuffer(), history_on_join=False) as listener:
+        settle(writer, "r1")
+        metrics = ListenerMetrics(lambda: [listener])
+        writers = WriterMetrics(lambda: discover(reader))
+        seen: list[set[object]] = []
+        for number in range(1, 6):
+            with StatePublisher(writer, RRBOT, "r1") as publisher:
+                until(lambda: discover(reader))
+                publisher.publish([0.0, 0.0])
+                until(lambda: listener.stats.received == number)  # noqa: B023 - called in this round
+                seen.append(set(collected(metrics)) | set(collected(writers)))
+    assert all(rows == seen[0] for rows in seen)
+
+
+def test_robots_beyond_a_limit_are_counted_and_have_no_rows():
+    writer = writer_here(1)
+    robots = [
+        RobotInfo(f"r{number:04}", (("joint_states", replace(writer, session=number)),))
+        for number in range(MOST_ROBOTS + 3)
+    ]
+    rows = collected(WriterMetrics(lambda: robots))
+    assert rows[row("zstate_robots")] == MOST_ROBOTS + 3
+    assert len([name for name, _ in rows if name == "zstate_writers"]) == MOST_ROBOTS
+
+
+def test_two_writers_of_a_stream_are_two():
+    writers = (("tf_static", writer_here(1)), ("tf_static", writer_here(2)))
+    rows = collected(WriterMetrics(lambda: [RobotInfo("r1", writers)]))
+    assert rows[row("zstate_writers", robot="r1", stream="tf_static")] == 2
+
+
+def test_rows_of_the_same_labels_add_up_and_counters_end_in_total():
+    families = Families()
+    for value in (2, 3):
+        families.count("zstate_things", "Things.", value, robot="r1")
+    (family,) = families
+    assert isinstance(family, CounterMetricFamily)
+    assert [(sample.name, sample.value) for sample in family.samples] == [("zstate_things_total", 5)]
+
+
+def test_a_router_tells_whom_it_has_links_to(free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    with connect(mode="router", listen=endpoint) as router:
+        with connect(mode="client", endpoints=endpoint), connect(mode="peer", endpoints=endpoint):
+            until(lambda: connections(router).sessions == {"client": 1, "peer": 1, "router": 0})
+            rows = collected(ConnectionMetrics(router))
+            assert rows[row("zstate_router_sessions", mode="client")] == 1
+            assert rows[row("zstate_router_links", protocol="tcp")] == 2
+        until(lambda: not any(connections(router).sessions.values()))
