@@ -115,7 +115,8 @@ class StatePublisher(Closing):
     ) -> Memory | None:
         if cache_s == 0.0 or "native" not in self._wires:
             return None
-        memory = Memory(cache_s, self.model.position_count + 2 * self.model.velocity_count)
+        numbers = self.model.position_count + 2 * self.model.velocity_count
+        memory = Memory(cache_s, numbers, self._session_id)
         output = self._outputs[self._wires.index("native")]
         for stream, say in output.sayings.items():
             if stream in streams:

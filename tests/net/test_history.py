@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 from live import SECOND, STAMP
 from support import until
@@ -24,7 +26,7 @@ def state(seq: int, stamp: int | None = None, session: int = 7, numbers: int = 2
 
 
 def remembering(count: int, span_s: float = 1e6, numbers: int = 2, session: int = 7) -> Memory:
-    memory = Memory(span_s, numbers)
+    memory = Memory(span_s, numbers, session)
     for seq in range(count):
         memory.keep(state(seq, session=session, numbers=numbers))
     return memory
@@ -52,7 +54,7 @@ def test_pages_go_back_from_the_newest():
         ([], False),
     ]
     assert seqs(memory.before(10**15, 4)[0]) == [6, 7, 8, 9]
-    assert Memory(1.0, 2).before(None, 4) == ([], False)
+    assert Memory(1.0, 2, 7).before(None, 4) == ([], False)
 
 
 def test_after_a_clock_was_set_back_only_what_came_then_is_remembered():
@@ -75,7 +77,7 @@ def test_a_stamp_slightly_back_forgets_nothing():
 
 
 def test_memory_is_bounded_whatever_the_stamps_say():
-    memory = Memory(1e6, 100_000)
+    memory = Memory(1e6, 100_000, 7)
     for seq in range(100):
         memory.keep(state(seq, STAMP, numbers=1))
     kept = seqs(memory.since(0))
@@ -86,7 +88,7 @@ def test_memory_is_bounded_whatever_the_stamps_say():
 @pytest.mark.parametrize("span_s", [-1.0, 0.0, float("nan"), float("inf")])
 def test_a_span_that_is_none_is_refused(span_s: float):
     with pytest.raises(InvalidInput, match="cache_s"):
-        Memory(span_s, 2)
+        Memory(span_s, 2, 7)
 
 
 class Heard:
@@ -138,6 +140,18 @@ def test_a_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Se
         assert len(heard.pages[0]) == (PAGE_BYTES // len(heard.pages[0][0].payload) or 1)
         newest_first = [seq for page in heard.seqs() for seq in reversed(page)]
         assert newest_first == list(range(99, 99 - len(newest_first), -1))
+
+
+def test_a_writer_that_has_said_nothing_says_so_and_is_not_asked_again(sessions):
+    writer, reader = sessions
+    with answer_past(writer, "r1", "joint_states", Memory(1.0, 2, 7), encode) as service:
+        await_answers(reader)
+        before = service.answered
+        heard = Heard(reader)
+        with heard.reader:
+            heard.reader.ask(KEY, 7)
+            until(lambda: service.answered == before + 1)
+    assert (heard.pages, heard.errors) == ([], [])
 
 
 def test_each_writer_of_a_key_is_asked_for_itself(sessions: tuple[Session, Session]):
@@ -202,6 +216,23 @@ def test_a_writer_that_always_names_the_same_older_page_is_not_asked_for_ever(se
         heard.reader.ask(KEY, 8)
         until(lambda: len(heard.pages) == 4)
     assert asked == ["", "5", "", "5"]
+
+
+def test_who_answers_only_later_is_heard_all_the_same(sessions: tuple[Session, Session]):
+    writer, reader = sessions
+    heard = Heard(reader)
+    with heard.reader:
+        heard.reader.ask(KEY, 7)
+        asked = threading.Event()
+
+        def answer(parameters):
+            first = not asked.is_set()
+            asked.set()
+            return None if first else Answer(encode(Past(ENCODINGS[JointState], (b"x",))), ENCODINGS[Past])
+
+        with Service(writer, KEY, answer):
+            until(lambda: heard.pages)
+    assert [[one.payload for one in page] for page in heard.pages] == [[b"x"]]
 
 
 def test_who_does_not_answer_costs_no_thread_and_closing_does_not_wait_for_it(sessions):

@@ -18,8 +18,10 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -42,6 +44,10 @@ PAGE_SAMPLES = 256
 
 MOST_BYTES = 8_000_000
 TIMEOUT_S = 1.0
+FIRST_REST_S = 0.05
+TRIES = 5
+"""So often a writer is asked that does not answer, with longer and longer rests: 1.5 s in all."""
+
 _OVERHEAD = 300
 """What a remembered sample takes besides its numbers [bytes]."""
 
@@ -50,16 +56,17 @@ _MOST_PAGES = 4096
 
 
 class Memory:
-    """The samples of one writer of the last ``span_s`` seconds before the newest, by their stamps.
+    """The samples of the session ``writer``: the last ``span_s`` seconds before the newest, by their stamps.
 
     At most as many as fit into 8 MB, ``numbers`` numbers in each. One thread at a time remembers; any
     thread may ask meanwhile.
     """
 
-    def __init__(self, span_s: float, numbers: int) -> None:
+    def __init__(self, span_s: float, numbers: int, writer: int) -> None:
         if not 0.0 < span_s < 1e9:
             raise InvalidInput(f"cache_s is a number of seconds, 0 for no cache; not {span_s!r}")
         self.span_s = span_s
+        self.writer = writer
         self._span_ns = round(span_s * 1e9)
         self._states: deque[JointState] = deque(maxlen=MOST_BYTES // (8 * numbers + _OVERHEAD))
 
@@ -96,21 +103,20 @@ def answer_past(
     encoding = ENCODINGS[STREAM_TYPES[stream]]
 
     def answer(parameters: Mapping[str, str]) -> Answer | None:
+        if parameters.get("session", str(memory.writer)) != str(memory.writer):
+            return None  # another writer of this key is asked
         before = parameters.get("before", "")
         states, more = memory.before(int(before) if _is_count(before) else None, PAGE_SAMPLES)
-        if not states or parameters.get("session", str(states[0].session)) != str(states[0].session):
-            return None  # another writer of this key is asked
         samples = _page(states, say)
-        first = states[-len(samples)].seq
-        older = more or len(samples) < len(states)
-        past = Past(encoding, samples, first if older else None)
+        is_all = not more and len(samples) == len(states)
+        past = Past(encoding, samples, None if is_all else states[-len(samples)].seq)
         return Answer(encode(past), ENCODINGS[Past])
 
     return Service(session, stream_key(robot, stream), answer)
 
 
 def _page(states: Sequence[JointState], say: Callable[[JointState], bytes]) -> tuple[bytes, ...]:
-    """The newest of ``states`` as they are said, as many as fit into a page, at least one."""
+    """The newest of ``states`` as they are said, as many as fit into a page, at least one if there is any."""
     samples: list[bytes] = []
     room = PAGE_BYTES
     for state in reversed(states):
@@ -133,6 +139,8 @@ class _Asked:
     writer: int
     before: int | None = None
     pages: int = 0
+    tries: int = 0
+    due: float = 0.0
     replies: list[zenoh.Sample] = field(default_factory=list[zenoh.Sample])
 
 
@@ -141,7 +149,7 @@ class PastReader(Closing):
 
     ``on_page(arrivals)`` is called from that thread, page by page from the newest to the oldest; the
     arrivals of a page are oldest first. It says whether older ones are wanted. Who does not answer is
-    not asked again; a page that cannot be read goes to ``on_error``.
+    asked a few times more; a page that cannot be read goes to ``on_error``.
     """
 
     def __init__(
@@ -154,7 +162,7 @@ class PastReader(Closing):
         self._on_page = on_page
         self._on_error = on_error
         self._events: queue.SimpleQueue[tuple[_Asked, bool] | None] = queue.SimpleQueue()
-        self._waiting: deque[_Asked] = deque()
+        self._waiting: list[_Asked] = []
         self._in_flight = 0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="zstate past", daemon=True)
@@ -165,14 +173,31 @@ class PastReader(Closing):
         self._events.put((_Asked(key, writer), False))
 
     def _run(self) -> None:
-        while (event := self._events.get()) is not None and not self._closed:
-            asked, has_answered = event
-            if has_answered:
-                self._in_flight -= 1
-            if not has_answered or self._hand_over(asked):
-                self._waiting.append(asked)
-            while self._waiting and self._in_flight < _IN_FLIGHT:
-                self._send(self._waiting.popleft())
+        while not self._closed:
+            with suppress(queue.Empty):
+                event = self._events.get(timeout=self._pause())
+                if event is not None:
+                    self._take(*event)
+            self._send_due()
+
+    def _pause(self) -> float | None:
+        """How long [s] nothing is to be done but to wait for events; None is for ever."""
+        if not self._waiting or self._in_flight >= _IN_FLIGHT:
+            return None
+        return max(0.0, min(asked.due for asked in self._waiting) - time.monotonic())
+
+    def _take(self, asked: _Asked, is_over: bool) -> None:
+        if is_over:
+            self._in_flight -= 1
+        if not is_over or self._hand_over(asked):
+            self._waiting.append(asked)
+
+    def _send_due(self) -> None:
+        now = time.monotonic()
+        due = [asked for asked in self._waiting if asked.due <= now]
+        for asked in due[: _IN_FLIGHT - self._in_flight]:
+            self._waiting.remove(asked)
+            self._send(asked)
 
     def _send(self, asked: _Asked) -> None:
         selector = f"{asked.key}?session={asked.writer}"
@@ -203,9 +228,13 @@ class PastReader(Closing):
         )
 
     def _hand_over(self, asked: _Asked) -> bool:
-        """Whether there is another page to ask for."""
+        """Whether there is something to ask for, now or later."""
         if not asked.replies:
-            return False
+            # The token of a writer just met may be known before what answers there; or a page was lost.
+            asked.tries += 1
+            asked.due = time.monotonic() + FIRST_REST_S * 2**asked.tries
+            return asked.tries < TRIES
+        asked.tries, asked.due = 0, 0.0
         page = arrival_of(asked.replies[0])
         try:
             past = decode(page.payload, page.encoding, Past)
@@ -213,7 +242,7 @@ class PastReader(Closing):
             self._on_error(page.key, error)
             return False
         arrivals = [Arrival(page.key, sample, past.encoding) for sample in past.samples]
-        is_wanted = self._on_page(arrivals)
+        is_wanted = bool(arrivals) and self._on_page(arrivals)
         asked.pages += 1
         goes_back = past.before is not None and (asked.before is None or past.before < asked.before)
         asked.before = past.before
