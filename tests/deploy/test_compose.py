@@ -37,12 +37,13 @@ def test_its_router_lets_nobody_else_write(deployment: Deployment, spawn: Any):
         return connect(mode="client", endpoints=endpoint, credentials=credentials)
 
     model = load_model("rrbot")
-    with join("r1") as robot, join("r2") as other, join("desk") as viewer, StatePublisher(robot, model, "r1"):
-        until(lambda: [info.name for info in discover(viewer)] == ["r1"])
+    with join("r1") as robot, join("r2") as other, join("desk") as viewer:
         for session in (other, viewer):
             with pytest.raises(AccessDenied, match="'r1 writes'"):
                 StatePublisher(session, model, "r1")
-        assert discover(other, 0.3) == ()  # r2 is nobody here
+        with StatePublisher(robot, model, "r1"):
+            until(lambda: [info.name for info in discover(viewer)] == ["r1"])
+            assert discover(other, 0.3) == ()  # r2 is nobody here
 
 
 def test_nobody_comes_in_without_a_certificate(deployment: Deployment, spawn: Any):
