@@ -26,7 +26,7 @@ class MeasuredBuffer(TransformBuffer):
 
     ``latency`` [s] is from a sample's stamp until it can be looked up, by the clocks of both machines.
     The kernel's own lookups cannot be counted for nothing, so this is a buffer to be chosen: each
-    ``lookup`` takes some hundred nanoseconds more. What a plan or ``lookup_many`` answers is not counted.
+    ``lookup`` takes two to three times as long. What a plan or ``lookup_many`` answers is not counted.
     """
 
     def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:

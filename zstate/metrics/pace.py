@@ -24,7 +24,3 @@ class Paces:
             rate_hz = max(0.0, count - before) / (now - time_s)
             self._marks[key] = now, count, rate_hz
         return rate_hz
-
-    def forget_others(self, keys: set[Hashable]) -> None:
-        """Only ``keys`` are counted on."""
-        self._marks = {key: mark for key, mark in self._marks.items() if key in keys}
