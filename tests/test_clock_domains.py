@@ -152,6 +152,7 @@ def test_85_us_back_are_a_sorted_sample_and_nothing_else(sessions, caplog, follo
             clock.set(stamp)
             publisher.publish([0.1 * number, 0.0])
         until(lambda: listener.stats.received == 4)
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
         for stamp in stamps:
             assert listener.buffer.lookup("world", "tool", stamp).kind == "exact"
         stats = listener.stats
@@ -183,6 +184,7 @@ def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot
         buffer.wait("r2/world", "r2/tool", timeout_s=5.0)
         publish(NOW)
         until(lambda: buffer.domain.of("r1") == "system")
+        buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
         publish(NOW + HOUR)
         publish(NOW + HOUR + MS)
         assert buffer.latest("r1/world", "r1/tool") == NOW + HOUR + MS
@@ -216,6 +218,7 @@ def test_a_simulation_that_begins_again_soon_is_a_new_epoch_at_its_second_sample
             clock.set(stamp)
             publisher.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 5)
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
         assert listener.buffer.latest("world", "tool") == 10 * MS
         assert not listener.buffer.can_lookup("world", "tool", 4 * SECOND)
 

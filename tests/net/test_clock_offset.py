@@ -143,10 +143,14 @@ def test_a_clock_that_agrees_is_known_and_not_worth_a_word(sessions, follow):
     ):
         settle(writer, "r1", follow)
         publisher.publish([0.0, 0.0])
-        stamp = listener.buffer.wait("world", "tool", timeout_s=5.0).stamp
-        explain = listener.buffer.explain
-        until(lambda: explain("world", "tool", stamp + 1).clock_offset_ns is not None)
-        reason = explain("world", "tool", stamp + 1)
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+
+        def refusal():
+            publisher.publish([0.0, 0.0])  # until one of them comes after its writer was announced
+            return listener.buffer.explain("world", "tool", time.time_ns() + SECOND)
+
+        until(lambda: refusal().clock_offset_ns is not None)
+        reason = refusal()
         assert abs(reason.clock_offset_ns) <= reason.clock_uncertainty_ns
         assert "the clock of" not in str(reason)
 

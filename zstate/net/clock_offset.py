@@ -31,7 +31,9 @@ from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.writer import Writer
 
 AGAIN_S = 30.0
-"""So old a measurement is repeated when it is asked for."""
+"""So old a measurement is repeated when it is asked for; sooner while there was no answer."""
+
+_UNANSWERED_AGAIN_S = 5.0
 
 _MEETING_S = 0.05
 
@@ -188,7 +190,7 @@ class _Measured:
 
     def __call__(self) -> Offset | None:
         now_s = time.monotonic()
-        if now_s - self._wanted_s >= AGAIN_S:
+        if now_s - self._wanted_s >= (_UNANSWERED_AGAIN_S if self.offset is None else AGAIN_S):
             self._wanted_s = now_s
             self._meter.want(self)
         return self.offset
