@@ -181,7 +181,8 @@ class _Watching:
         behind = missing(self._buffer, self._ends)
         if _epoch() != self._epoch:
             # The half minute in which the soak begins is not counted: not everybody is there yet.
-            if not self._is_complete and self._epoch and self._latched_after_s:
+            # Nor is the end, when the publishers have gone and taken their edges back.
+            if not self._is_complete and self._latched_after_s and behind < len(self._ends):
                 self._lost_latched += behind
             self._epoch, self._is_complete = _epoch(), False
             behind = missing(self._buffer, self._ends)
@@ -205,8 +206,14 @@ class _Watching:
 def missing(buffer: TransformBuffer, ends: list[tuple[str, str, str]]) -> int:
     """How many robots have not got the static edge of this half minute."""
     epoch = float(_epoch())
-    known = [(root, mark) for root, _, mark in ends if buffer.can_lookup(root, mark)]
-    return len(ends) - sum(buffer.lookup(*edge).translation[0] == epoch for edge in known)
+    return sum(_marked(buffer, root, mark) != epoch for root, _, mark in ends)
+
+
+def _marked(buffer: TransformBuffer, root: str, mark: str) -> float | None:
+    try:
+        return float(buffer.lookup(root, mark).translation[0])
+    except ZStateError:  # not there yet, or withdrawn at the end
+        return None
 
 
 # ---- the whole
