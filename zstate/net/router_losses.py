@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from contextlib import suppress
 
 import zenoh
 
@@ -46,7 +47,8 @@ class RouterLosses(Closing):
             time.sleep(_ROUND_S)
 
     def _follow(self) -> None:
-        with self._lock:
+        # Closing may come between: a listener that is undeclared has nothing more to tell.
+        with self._lock, suppress(zenoh.ZError):
             while (event := self._events.try_recv()) is not None:
                 zid, is_router = str(event.transport.zid), event.transport.whatami == zenoh.WhatAmI.ROUTER
                 if event.kind == zenoh.SampleKind.PUT and is_router:
