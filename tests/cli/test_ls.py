@@ -7,6 +7,8 @@ import socket
 import pytest
 from looking import EVERYTHING, failure, standing, zstate
 
+from zstate import StaticPublisher, connect
+
 pytestmark = pytest.mark.processes
 
 
@@ -26,6 +28,15 @@ def test_json_names_robots_and_writers():
     assert [robot["robot"] for robot in robots] == ["left", "right"]
     (writer,) = robots[0]["writers"]
     assert (writer["stream"], writer["pid"]) == ("joint_states", os.getpid())
+
+
+def test_static_edges_stand_with_the_name_under_which_they_are_written():
+    with connect() as session, StaticPublisher(session, "arm", "mount"):
+        lines = zstate("ls").stdout.decode().splitlines()
+        (robot,) = json.loads(zstate("ls", "--json").stdout)
+    assert lines[0] == "arm"
+    assert lines[1].split()[0] == "tf_static/mount"
+    assert [writer["names"] for writer in robot["writers"]] == [["mount"]]
 
 
 def test_nobody_is_no_error():

@@ -49,6 +49,18 @@ def test_an_identity_that_is_not_ours_is_refused(identity: str):
         Writer.parse(identity)
 
 
+@given(st.text(max_size=20))
+def test_the_name_of_static_edges_stands_in_the_token_and_without_one_it_is_as_before(name: str):
+    announced = Announced("r1", "tf_static", DRIVER, name)
+    assert Announced.parse("r1", "tf_static", check_writer(announced.identity)) == announced
+    assert Announced.parse("r1", "tf_static", DRIVER.identity).name == ""
+
+
+def test_a_name_stands_nowhere_else():
+    with pytest.raises(InvalidInput):
+        Announced.parse("r1", "joint_states", f"{DRIVER.identity},mount")
+
+
 def test_a_writer_here_tells_this_process():
     before = time.time_ns()
     writer = writer_here(7)

@@ -126,6 +126,11 @@ def _checked_address(_: click.Context, __: click.Parameter, text: str | None) ->
         raise click.BadParameter(str(error)) from None
 
 
+takeover_option = click.option(
+    "--takeover",
+    is_flag=True,
+    help="Write also what somebody else writes already; readers follow whoever came last.",
+)
 metrics_option = click.option(
     "--metrics",
     callback=_checked_address,

@@ -34,10 +34,18 @@ def writer_here(session: int, program: str = "") -> Writer:
 
 @dataclass(frozen=True, order=True, slots=True)
 class RobotInfo:
-    """A robot that somebody writes for: its writers as (stream, writer), sorted."""
+    """A robot that somebody writes for: its writers as (stream, writer), sorted.
+
+    ``static_names`` are (name, writer) for the names under which static edges are written.
+    """
 
     name: str
     writers: tuple[tuple[Stream, Writer], ...]
+    static_names: tuple[tuple[str, Writer], ...] = ()
+
+    def names_of(self, writer: Writer) -> tuple[str, ...]:
+        """The names under which ``writer`` writes static edges, sorted."""
+        return tuple(name for name, said_by in self.static_names if said_by == writer)
 
 
 class Announcement(Closing):
@@ -102,10 +110,16 @@ def tokens_now(session: Session, expression: str, timeout_s: float) -> frozenset
 
 def by_robot(found: Iterable[Announced]) -> tuple[RobotInfo, ...]:
     """What was announced, robot by robot, sorted."""
-    writers: dict[str, list[tuple[Stream, Writer]]] = {}
+    robots: dict[str, list[Announced]] = {}
     for token in found:
-        writers.setdefault(token.robot, []).append((token.stream, token.writer))
-    return tuple(RobotInfo(name, tuple(sorted(said))) for name, said in sorted(writers.items()))
+        robots.setdefault(token.robot, []).append(token)
+    return tuple(_info(name, tokens) for name, tokens in sorted(robots.items()))
+
+
+def _info(robot: str, tokens: Iterable[Announced]) -> RobotInfo:
+    writers: set[tuple[Stream, Writer]] = {(token.stream, token.writer) for token in tokens}
+    names = {(token.name, token.writer) for token in tokens if token.name}
+    return RobotInfo(robot, tuple(sorted(writers)), tuple(sorted(names)))
 
 
 class Watch(Closing):

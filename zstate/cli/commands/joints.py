@@ -17,6 +17,7 @@ from zstate.cli.options import (
     rate_option,
     seconds_option,
     session_options,
+    takeover_option,
     wire_option,
 )
 from zstate.cli.words import words_of
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 @name_option
 @wire_option
 @clock_option
+@takeover_option
 @metrics_option
 @session_options
 def joints_command(
@@ -42,6 +44,7 @@ def joints_command(
     name: str | None,
     wire: str,
     clock: str,
+    takeover: bool,
     metrics: Address | None,
     network: Network,
 ) -> None:
@@ -63,7 +66,9 @@ def joints_command(
     with (
         open_session(network, (wire,)) as session,
         open_clock(session, clock, wire) as time,
-        StatePublisher(session, model, called, (wire,), streams=("joint_states",), clock=time) as publisher,
+        StatePublisher(
+            session, model, called, (wire,), streams=("joint_states",), clock=time, takeover=takeover
+        ) as publisher,
         served(metrics, of_publishers(publisher)),
     ):
         joints = count_text(len(model.joint_names), "joint")

@@ -19,6 +19,7 @@ from zstate.errors import duration_text
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.wire.keys import Stream
     from zstate.wire.writer import Writer
 
 
@@ -77,7 +78,11 @@ def _list_robots(session: Session, *, as_json: bool) -> None:
 
 def _lines(robots: tuple[RobotInfo, ...]) -> list[str]:
     rows = in_columns(
-        [(f"  {stream}", str(writer), _since(writer)) for robot in robots for stream, writer in robot.writers]
+        [
+            (f"  {_said(robot, stream, writer)}", str(writer), _since(writer))
+            for robot in robots
+            for stream, writer in robot.writers
+        ]
     )
     lines: list[str] = []
     for robot in robots:
@@ -85,6 +90,13 @@ def _lines(robots: tuple[RobotInfo, ...]) -> list[str]:
         lines += [robot.name, *rows[:count]]
         rows = rows[count:]
     return lines
+
+
+def _said(robot: RobotInfo, stream: Stream, writer: Writer) -> str:
+    from zstate.wire.keys import MODEL_WRITER
+
+    names = [name for name in robot.names_of(writer) if stream == "tf_static" and name != MODEL_WRITER]
+    return f"{stream}/{','.join(names)}" if names else stream
 
 
 def _since(writer: Writer) -> str:
@@ -101,5 +113,8 @@ def _lasting(nanoseconds: int) -> str:
 
 
 def _facts(robot: RobotInfo) -> dict[str, Any]:
-    writers = [{"stream": stream, **asdict(writer)} for stream, writer in robot.writers]
+    writers = [
+        {"stream": stream, **asdict(writer), "names": robot.names_of(writer) if stream == "tf_static" else ()}
+        for stream, writer in robot.writers
+    ]
     return {"robot": robot.name, "writers": writers}

@@ -19,6 +19,7 @@ from zstate.cli.options import (
     name_option,
     seconds_option,
     session_options,
+    takeover_option,
     wires_option,
 )
 from zstate.cli.words import is_ros, words_of
@@ -64,6 +65,7 @@ def _source(_: click.Context, __: click.Parameter, source: str) -> str:
 @clock_option
 @seconds_option
 @name_option
+@takeover_option
 @metrics_option
 @session_options
 def publish_command(
@@ -75,6 +77,7 @@ def publish_command(
     clock: str,
     seconds: float | None,
     name: str | None,
+    takeover: bool,
     metrics: Address | None,
     network: Network,
 ) -> None:
@@ -109,8 +112,12 @@ def publish_command(
     with (
         open_session(network, wires) as session,
         open_clock(session, clock, wires[0]) as time,
-        StatePublisher(session, model, called, followed, streams=_DERIVED, clock=time) as derived,
-        StatePublisher(session, model, called, wires[len(followed) :], clock=time) as whole,
+        StatePublisher(
+            session, model, called, followed, streams=_DERIVED, clock=time, takeover=takeover
+        ) as derived,
+        StatePublisher(
+            session, model, called, wires[len(followed) :], clock=time, takeover=takeover
+        ) as whole,
         answering_lookups(session, derived, whole),
         served(metrics, of_publishers(derived, whole)),
     ):

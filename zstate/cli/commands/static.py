@@ -11,7 +11,7 @@ import click
 
 from zstate.cli.console import fail, note, say
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options, wire_option
+from zstate.cli.options import session_options, takeover_option, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 @click.option("--file", type=click.Path(exists=True, dir_okay=False), help="All [[static]] of a TOML file.")
 @click.option("--robot", metavar="NAME", help="Whose edge it is; default: the only robot announced.")
 @click.option("--writer", metavar="NAME", help="Under which name; default: this program and its process id.")
+@takeover_option
 @wire_option
 @session_options
 def static_command(
@@ -50,6 +51,7 @@ def static_command(
     file: str | None,
     robot: str | None,
     writer: str | None,
+    takeover: bool,
     wire: str,
     network: Network,
 ) -> None:
@@ -84,7 +86,9 @@ def static_command(
     with open_session(network, (wire,)) as session, ExitStack() as publishers:
         owned = _by_ros_owner(statics, robot, wire) if is_ros(wire) else _by_owner(session, statics, robot)
         for owner, edges in owned.items():
-            publisher = publishers.enter_context(StaticPublisher(session, owner, writer, wire))
+            publisher = publishers.enter_context(
+                StaticPublisher(session, owner, writer, wire, takeover=takeover)
+            )
             for edge in edges:
                 publisher.set(edge)
                 say(_sentence(edge, publisher, wire))
