@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -126,11 +125,10 @@ def test_secrets_that_everybody_can_read_are_refused(fleet: Path, tmp_path: Path
     assert f"chmod 600 {users}" in refusal(Credentials(users=users), endpoints="tcp/127.0.0.1:1")
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root reads every file")
-def test_a_file_that_is_not_ours_to_read_is_named(fleet: Path, tmp_path: Path):
+def test_what_cannot_be_read_is_named(fleet: Path, tmp_path: Path):
     hidden = tmp_path / "ca.pem"
-    hidden.touch(0o000)
-    assert "another user or group" in refusal(Credentials(ca=hidden))
+    hidden.mkdir()  # root reads every file
+    assert str(hidden) in refusal(Credentials(ca=hidden))
 
 
 @pytest.mark.parametrize(

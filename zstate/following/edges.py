@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frames import FrameInfo
 from zstate.errors import InvalidInput
@@ -23,7 +21,7 @@ from zstate.wire.messages import (
 class EdgeFollower(Follower):
     """Follows ready transforms, without a model. ``live`` names the writers there are, by session."""
 
-    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally, live: Mapping[int, str]) -> None:
+    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally, live: dict[int, str]) -> None:
         super().__init__(robot, buffer, tally)
         self._live = live
         self._edges: Edges = ()
@@ -89,7 +87,7 @@ class EdgeFollower(Follower):
 
     def _others(self) -> set[str]:
         """The names of the other writers there are."""
-        return set(self._live.values()) - {self.writer or ""}
+        return {name for session, name in self._live.copy().items() if session != self._session}
 
     def _children(self) -> set[str]:
         """The frames that we place."""

@@ -9,7 +9,8 @@ from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import zenoh
 
-from zstate.net.session import Session, Undeclarable
+from zstate.net.session import Session
+from zstate.net.undeclaring import Undeclarable
 
 JOIN_WITHIN_S = 0.8
 

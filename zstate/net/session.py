@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, Protocol
 
 import zenoh
 
@@ -41,6 +40,7 @@ from zstate.net.rendezvous import Rendezvous, rendezvous_address
 from zstate.net.runtime import open_zenoh
 from zstate.net.security import Credentials
 from zstate.net.twin import Twin
+from zstate.net.undeclaring import Undeclarable, undeclare
 
 CLOSE_WITHIN_S = 0.8
 AGAIN_S = 0.1
@@ -205,12 +205,6 @@ def _without_places(text: str) -> str:
     return re.sub(r" at /[^\s\]]*", "", text)
 
 
-class Undeclarable(Protocol):
-    """Whatever was declared on a Zenoh session."""
-
-    def undeclare(self) -> Any: ...
-
-
 class Session(Closing):
     """A place on the network. Made by ``connect``; a context manager.
 
@@ -259,7 +253,7 @@ class Session(Closing):
             keep_for_ever(entity)
         elif not self._closed:
             with suppress(zenoh.ZError):
-                entity.undeclare()
+                undeclare(entity)
 
     def close(self) -> None:
         """Leave the network within a second. A second call does nothing."""

@@ -48,6 +48,8 @@ class FromRos(Closing):
         self._model = model
         self._names = names
         self._tally = tally
+        # Whoever carries both ways has been told that the robot is written on both sides.
+        self._beside_others = not at_once
         self._links = frozenset(model.links)
         self._placed_by_model = frozenset(joint.child for joint in model.joints)
         self._reader = JointStateReader(model)
@@ -79,7 +81,9 @@ class FromRos(Closing):
                 raise Closed("the bridge is closed")
             if self._states is None:
                 self._states = self._opened.enter_context(
-                    StatePublisher(self._session, self._model, self._names.robot)
+                    StatePublisher(
+                        self._session, self._model, self._names.robot, takeover=self._beside_others
+                    )
                 )
             return self._states
 
