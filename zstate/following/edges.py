@@ -87,7 +87,9 @@ class EdgeFollower(Follower):
 
     def _others(self) -> set[str]:
         """The names of the other writers there are."""
-        return {name for session, name in self._live.copy().items() if session != self._session}
+        # Ours may not be known yet; and what else our program writes goes by the same name.
+        others = {name for session, name in self._live.copy().items() if session != self._session}
+        return others - {self.writer or ""}
 
     def _children(self) -> set[str]:
         """The frames that we place."""
