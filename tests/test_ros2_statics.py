@@ -32,7 +32,7 @@ def test_static_edges_of_several_writers_add_up_and_nothing_is_withdrawn(session
         mount.edge(0, "tool", "laser", 2.0)
         room.edge(0, "map", "tool", 4.0)
         assert listener.buffer.wait("map", "laser", timeout_s=5.0).translation[0] == 6.0
-        assert x_of(listener, "map", "camera") == 5.0
+        until(lambda: x_of(listener, "map", "camera") == 5.0)
         until(lambda: writers(listener) == {"camera": "/mount", "laser": "/mount", "tool": "/room"})
         mount.edge(0, "base", "camera", 8.0)
         assert listener.buffer.wait("base", "camera", timeout_s=5.0).translation[0] == 8.0
