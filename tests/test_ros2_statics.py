@@ -27,7 +27,9 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_static_edges_of_several_writers_add_up_and_nothing_is_withdrawn(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
-        mount, room = (RosNode(writer, name).publisher(TF_STATIC).announce() for name in ("mount", "room"))
+        mount, room = (
+            RosNode(writer, name).publisher(TF_STATIC).announce().await_reader() for name in ("mount", "room")
+        )
         mount.edge(0, "tool", "camera", 1.0)
         mount.edge(0, "tool", "laser", 2.0)
         room.edge(0, "map", "tool", 4.0)
