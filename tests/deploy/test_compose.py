@@ -17,8 +17,8 @@ pytestmark = pytest.mark.processes
 def test_its_robot_moves_through_its_router_and_the_reader_sees_it(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     deployment.start(spawn, "robot").line()
-    assert deployment.is_healthy("robot")
-    assert deployment.is_healthy("reader")
+    until(lambda: deployment.is_healthy("robot"))
+    until(lambda: deployment.is_healthy("reader"))
     assert "r1" in deployment.start(spawn, "reader").line()
 
 

@@ -10,8 +10,11 @@ from typing import Any
 
 from support import DEADLINE_S, Child
 
-SLACK = 3.0
-"""The factor by which a machine of CI, busy with other things, may exceed a stated bound."""
+SLACK = 12.0
+"""A machine of CI is busy with other tests: what exceeds a stated bound by so much does not come back at all.
+
+The figures are printed (``-rP``); hold them against the bounds where nothing else runs (``-n 0``).
+"""
 
 HERE = str(Path(__file__).parent)
 _CODE = f"import sys; sys.path.insert(0, {HERE!r}); import roles; roles.main()"

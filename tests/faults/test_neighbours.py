@@ -85,7 +85,7 @@ def test_a_slow_reader_loses_samples_and_the_fast_one_beside_it_none_nor_time(st
     print(f"a slow reader: the fast one's median latency {alone / 1e3:.0f} us before, {beside / 1e3:.0f} us")
     print(f"beside it; the slow one dropped {slowly['dropped']} samples, the fast one {quickly['dropped']}")
     assert (quickly["dropped"], quickly["missed"], slowly["missed"]) == (0, 0, 0)
-    assert beside / alone < 1.5 * SLACK
+    assert beside / alone < 4.5  # 1.5, and as much again for a busy machine
 
 
 def test_twenty_readers_of_one_robot_get_every_sample_and_every_latched_value(start: Start, endpoint: str):
