@@ -52,7 +52,7 @@ SIGNATURES = {
     "StatePublisher.publish": "(positions, velocities=None, efforts=None, stamp=None)",
     "StatePublisher.run": "(source, rate_hz=100.0, *, seconds=None)",
     "StatePublisher.close": "()",
-    "StaticPublisher": "(session, robot, writer=None, wire='native', *, program='', takeover=False)",
+    "StaticPublisher": "(session, robot, writer=None, wires=('native',), *, program='', takeover=False)",
     "StaticPublisher.set": "(transform)",
     "StaticPublisher.withdraw": "(child)",
     "StaticPublisher.close": "()",

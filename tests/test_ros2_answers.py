@@ -171,7 +171,7 @@ def test_behind_a_bridge_robots_are_followed_and_their_writers_named(sessions):
     with (
         TransformListener(reader, "r1", wire="ros2dds", follow="tf") as listener,
         StatePublisher(writer, RRBOT, "r1", ("ros2dds",)) as publisher,
-        StaticPublisher(writer, "r1", "mount", wire="ros2dds") as statics,
+        StaticPublisher(writer, "r1", "mount", wires="ros2dds") as statics,
     ):
         statics.set(Transform("tool", "camera", (0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
         await_reader(writer, "tf")

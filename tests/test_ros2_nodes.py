@@ -152,7 +152,7 @@ def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
         publisher.publish(POSITIONS, stamp=STAMP)
         for ear in ears:
             ear.heard(1)
-    with StaticPublisher(writer, "rrbot", "mount", wire="ros2") as statics:
+    with StaticPublisher(writer, "rrbot", "mount", wires="ros2") as statics:
         statics.set(Transform("tool", "camera", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
         statics.withdraw("camera")
     await_reader(writer, "last")

@@ -41,6 +41,18 @@ def test_who_joins_late_is_given_all_edges_of_all_writers(sessions):
     assert writers == {"r1/camera": "mount", "r1/lens": "mount", "r1/tool": "room"}
 
 
+def test_edges_are_said_on_several_wires_at_once(sessions):
+    writer, reader = sessions
+    with (
+        StaticPublisher(writer, "r1", "mount", ("native", "ros2")) as statics,
+        TransformListener(reader, "r1") as here,
+        TransformListener(reader, "r1", wire="ros2") as there,
+    ):
+        statics.set(edge("tool", "camera", 1.0))
+        for listener in (here, there):
+            assert listener.buffer.wait("tool", "camera", timeout_s=5.0).translation[0] == 1.0
+
+
 def test_an_update_reaches_everybody_and_leaves_the_other_edges(sessions):
     writer, reader = sessions
     with (
@@ -146,7 +158,7 @@ def test_the_models_own_writer_name_is_reserved_and_a_bad_one_refused(sessions):
     with pytest.raises(InvalidInput, match="robot name"):
         StaticPublisher(sessions[0], "r/1")
     with pytest.raises(InvalidInput, match="no wire 'dds'"):
-        StaticPublisher(sessions[0], "r1", wire="dds")
+        StaticPublisher(sessions[0], "r1", wires="dds")
     assert discover(sessions[1], timeout_s=0.3) == ()
 
 

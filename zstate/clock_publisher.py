@@ -13,7 +13,7 @@ from zstate.errors import Closed
 from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
-from zstate.net.wires import wire_named
+from zstate.net.wires import wire_named, wire_names
 from zstate.wire.messages import Clock
 from zstate.wire.ros2.topics import SHARED
 
@@ -25,7 +25,7 @@ class ClockPublisher(Closing):
     safe from any thread.
     """
 
-    def __init__(self, session: Session, wires: Sequence[str] = ("native",)) -> None:
+    def __init__(self, session: Session, wires: str | Sequence[str] = ("native",)) -> None:
         self._session_id = secrets.randbits(32)
         self._seq = 0
         self._lock = threading.Lock()
@@ -33,7 +33,8 @@ class ClockPublisher(Closing):
         with ExitStack() as opening:
             # The time is no robot's; on a ROS wire it stands where nobody in particular does.
             outlets = [
-                opening.enter_context(Outlets(session, wire_named(wire), SHARED, writer)) for wire in wires
+                opening.enter_context(Outlets(session, wire_named(wire), SHARED, writer))
+                for wire in wire_names(wires)
             ]
             self._outlets = [out.stream("clock") for out in outlets]
             self._opened = opening.pop_all()

@@ -24,7 +24,7 @@ from zstate.net.outlets import Outlets, StreamOutlet
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
-from zstate.net.wires import wire_named
+from zstate.net.wires import wire_named, wire_names
 from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
 from zstate.status import Beat, PublisherStats, StreamStats
@@ -69,7 +69,7 @@ class StatePublisher(Closing):
         session: Session,
         model: RobotModel,
         robot: str | None = None,
-        wires: Sequence[str] = ("native",),
+        wires: str | Sequence[str] = ("native",),
         *,
         streams: Sequence[Stream] = STREAMS,
         clock: Clock | None = None,
@@ -89,7 +89,7 @@ class StatePublisher(Closing):
         self._refused = 0
         self._last_refusal = ""
         self._rate: Rate | None = None
-        self._wires = tuple(wires)
+        self._wires = wires = wire_names(wires)
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
         layout = Layout(coordinate_names(model), velocity_slots(model), self._edges.names)

@@ -16,6 +16,7 @@ from zstate.following.recorded import check_recorded
 from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
+from zstate.net.wires import wire_names
 from zstate.record.models import first_descriptions, model_of
 from zstate.record.reader import RecordReader
 from zstate.record.transcript import LATCHED, Said, Transcript
@@ -71,7 +72,7 @@ class Replayer(Closing):
         path: str | Path,
         robots: Sequence[str] = (),
         *,
-        wires: Sequence[str] = ("native",),
+        wires: str | Sequence[str] = ("native",),
         rate: float = 1.0,
         start_s: float = 0.0,
         duration_s: float | None = None,
@@ -81,7 +82,7 @@ class Replayer(Closing):
     ) -> None:
         self.rate = rate
         self._session = session
-        self._wires = tuple(wires)
+        self._wires = wire_names(wires)
         self._loop = loop
         self._takeover = takeover
         self._clock: Clock = clock or SystemClock()

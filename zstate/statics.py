@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from contextlib import ExitStack
 from urllib.parse import quote
 
@@ -14,7 +15,7 @@ from zstate.net.forked import new_lock
 from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
-from zstate.net.wires import wire_named
+from zstate.net.wires import wire_named, wire_names
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
@@ -40,7 +41,7 @@ class StaticPublisher(Closing):
         session: Session,
         robot: str,
         writer: str | None = None,
-        wire: str = "native",
+        wires: str | Sequence[str] = ("native",),
         *,
         program: str = "",
         takeover: bool = False,
@@ -60,10 +61,14 @@ class StaticPublisher(Closing):
         self._announced = Announced(self.robot, "tf_static", identity, self.writer)
         self._claim: Claim | None = None
         with ExitStack() as opening:
-            if wire == "native" and not takeover:  # in ROS static edges are everybody's
+            if "native" in wire_names(wires) and not takeover:  # in ROS static edges are everybody's
                 self._claim = opening.enter_context(Claim(session, [self._announced]))
-            outlets = opening.enter_context(Outlets(session, wire_named(wire), robot, identity))
-            self._latched = outlets.latched("tf_static", self.writer)
+            self._latched = [
+                opening.enter_context(Outlets(session, wire_named(wire), robot, identity)).latched(
+                    "tf_static", self.writer
+                )
+                for wire in wire_names(wires)
+            ]
             self._opened = opening.pop_all()
 
     def set(self, transform: Transform) -> None:
@@ -107,7 +112,11 @@ class StaticPublisher(Closing):
     def _send(self) -> None:
         edges = tuple((edge.target, edge.source) for edge in self._edges.values())
         poses = to_block([edge.pose7 for edge in self._edges.values()])
-        self._latched.set(StaticTransforms(self._session_id, edges, poses))
+        message = StaticTransforms(self._session_id, edges, poses)
+        # All of them first: what one wire cannot say is said on none.
+        said = [(latched, latched.encode(message)) for latched in self._latched]
+        for latched, payload in said:
+            latched.put(payload)
 
     def close(self) -> None:
         """Withdraw the edges. A second call does nothing."""
@@ -115,7 +124,8 @@ class StaticPublisher(Closing):
             if self._closed:
                 return
             self._closed = True
-            self._latched.withdraw()
+            for latched in self._latched:
+                latched.withdraw()
             self._opened.close()
 
 

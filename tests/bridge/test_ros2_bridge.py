@@ -174,8 +174,8 @@ def test_static_edges_of_others_are_carried_and_those_of_the_model_are_not_repea
     ):
         statics.set(hook)
         camera_from_hook = listener.buffer.wait("camera_link", "hook", timeout_s=10.0)
-        model = TransformListener(session, "r1", wire=here)
-        expected = model.buffer.wait("camera_link", "hook", timeout_s=10.0)
+        with TransformListener(session, "r1", wire=here) as near:
+            expected = near.buffer.wait("camera_link", "hook", timeout_s=10.0)
         assert np.allclose(camera_from_hook.matrix, expected.matrix, rtol=0, atol=1e-15)
         moved = Transform("tool", "hook", (0.5, 0.0, 0.0), UPRIGHT)
         statics.set(moved)
@@ -310,8 +310,8 @@ def test_static_edges_of_another_robot_are_not_taken_for_ones_own(world):
     ros = world.join("ros2")
     with (
         StatePublisher(ros, RRBOT, "r1", (EACH,)),
-        StaticPublisher(ros, "r1", wire=EACH) as own,
-        StaticPublisher(ros, "r2", wire=EACH) as foreign,
+        StaticPublisher(ros, "r1", wires=EACH) as own,
+        StaticPublisher(ros, "r2", wires=EACH) as foreign,
         TransformListener(world.join("native")) as listener,
     ):
         foreign.set(Transform("base", "plate", (0.0, 0.0, 1.0), UPRIGHT))

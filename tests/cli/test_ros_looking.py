@@ -36,7 +36,7 @@ def test_tf_says_what_it_waits_for_in_the_words_of_ros(spawn: Spawn, ros_router:
     with standing(wire="ros2", router=ros_router):
         assert command.line() == "pose of lower in base"
         assert command.line().startswith("At time ")
-        assert "heard /tf: " in command.stderr
+        until(lambda: "heard /tf: " in command.stderr)
     until(lambda: "no new sample of 'base' -> 'upper'" in command.stderr)
     interrupted(command)
     for unknown_to_ros in ("zstate joints", "zstate publish", "ros/"):
@@ -47,7 +47,7 @@ def test_tf_tells_two_trees_apart_with_the_command_that_joins_them(ros_router: s
     with (
         standing(wire="ros2", router=ros_router),
         connect(mode="client", endpoints=ros_router) as session,
-        StaticPublisher(session, "ros", wire="ros2") as statics,
+        StaticPublisher(session, "ros", wires="ros2") as statics,
     ):
         statics.set(Transform("map", "shelf", (0.0, 0.0, 1.0), UPRIGHT))
         message = failure("tf", "shelf", "lower", "--once", "--timeout", "1")

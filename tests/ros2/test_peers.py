@@ -83,7 +83,7 @@ def test_a_peer_that_joins_late_still_hears_the_model_and_the_fixed_edges(peer: 
 
 @every_peer_that_latches
 def test_a_peer_that_joins_late_still_hears_a_static_edge(peer: Peer, session: Session):
-    with StaticPublisher(session, "r1", "camera_mount", wire=WIRE) as statics:
+    with StaticPublisher(session, "r1", "camera_mount", wires=WIRE) as statics:
         statics.set(Transform.from_pose7("tool", "camera", TURN))
         peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
         assert peer.hears("/tf_static") == tf_message(transform_stamped(0, "tool", "camera", TURN))

@@ -79,7 +79,7 @@ class Carrier(Closing):
                 StatePublisher(target.session, model, robot, (target.wire,), program=PROGRAM, takeover=True)
             )
             statics = opening.enter_context(
-                StaticPublisher(target.session, robot, wire=target.wire, program=PROGRAM, takeover=True)
+                StaticPublisher(target.session, robot, wires=(target.wire,), program=PROGRAM, takeover=True)
             )
             opening.enter_context(StaticCarrier(source.session, model, statics, self._tally, source.wire))
             readings = opening.enter_context(SubscribedSource(source.session, model, robot, wire=source.wire))

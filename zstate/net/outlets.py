@@ -93,10 +93,15 @@ class LatchedOutlet:
     def __init__(self, outlet: Outlet, publisher: LatchedPublisher) -> None:
         self._outlet = outlet
         self._publisher = publisher
+        self.encode = outlet.encode
+
+    def put(self, payload: bytes) -> None:
+        """Replace the value, for everybody, by what ``encode`` made of a message. Raises Closed."""
+        self._publisher.set(payload, self._outlet.attachment(time.time_ns()))
 
     def set(self, message: Message) -> None:
         """Replace the value, for everybody. Raises Closed."""
-        self._publisher.set(self._outlet.encode(message), self._outlet.attachment(time.time_ns()))
+        self.put(self.encode(message))
 
     def withdraw(self) -> None:
         """Take the value back, from everybody, where the wire can say that."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 
 NAMES = ("native", "ros2", "ros2dds")
+
+
+def wire_names(wires: str | Sequence[str]) -> tuple[str, ...]:
+    """The names of one wire or several."""
+    return (wires,) if isinstance(wires, str) else tuple(wires)
 
 
 def wire_named(name: str) -> Wire:

@@ -87,7 +87,7 @@ def static_command(
         owned = _by_ros_owner(statics, robot, wire) if is_ros(wire) else _by_owner(session, statics, robot)
         for owner, edges in owned.items():
             publisher = publishers.enter_context(
-                StaticPublisher(session, owner, writer, wire, takeover=takeover)
+                StaticPublisher(session, owner, writer, (wire,), takeover=takeover)
             )
             for edge in edges:
                 publisher.set(edge)
