@@ -29,7 +29,6 @@ from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
 from zstate.status import Beat, PublisherStats, StreamStats
 from zstate.wire.keys import MODEL_WRITER, Stream, check_robot
-from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
@@ -38,6 +37,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.writer import Announced, Writer
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
@@ -92,7 +92,7 @@ class StatePublisher(Closing):
         self._wires = wires = wire_names(wires)
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
-        layout = Layout(coordinate_names(model), velocity_slots(model), self._edges.names)
+        sample_names = SampleNames(coordinate_names(model), velocity_slots(model), self._edges.names)
         writer = writer_here(self._session_id, program)
         with ExitStack() as opening:
             self._claim = self._claimed(session, writer, streams, opening) if not takeover else None
@@ -100,7 +100,7 @@ class StatePublisher(Closing):
                 # Before anybody is told of this writer: who is told asks what time it is here.
                 opening.enter_context(ClockService(session, self.robot, writer, self._clock))
             outlets = [
-                opening.enter_context(Outlets(session, wire_named(wire), self.robot, writer, layout))
+                opening.enter_context(Outlets(session, wire_named(wire), self.robot, writer, sample_names))
                 for wire in wires
             ]
             self._outputs = [self._output(out, streams) for out in outlets]

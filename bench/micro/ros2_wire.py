@@ -26,8 +26,8 @@ from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
-from zstate.wire.layout import Layout
 from zstate.wire.messages import JointState, RobotDescription, Sample, order_digest, to_block
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Arrival, Place
 
 JOINTS = 30
@@ -70,7 +70,9 @@ def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
     """The ways to write one sample of positions and velocities; what they open, the session closes."""
     numbers, state = np.linspace(-1.0, 1.0, JOINTS), sample(model, STAMP)
     publisher = StatePublisher(session, model, "whole", (wire,), streams=["joint_states"])
-    stream = Outlets(session, wire_named(wire), "alone", writer_here(1), layout(model)).stream("joint_states")
+    stream = Outlets(session, wire_named(wire), "alone", writer_here(1), sample_names(model)).stream(
+        "joint_states"
+    )
     payload, beside = stream.encode(state), bytes(33)
     bare = session.zenoh.declare_publisher(f"bench/{wire}")
     return {
@@ -84,7 +86,7 @@ def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
 def reading(wire: str, model: RobotModel) -> dict[str, Call]:
     """The ways into a message, and into a buffer, of samples that follow each other."""
     spoken = wire_named(wire)
-    outlet = spoken.voice("r1", writer_here(1), Place("1", 0), layout(model)).outlet("joint_states", 1)
+    outlet = spoken.voice("r1", writer_here(1), Place("1", 0), sample_names(model)).outlet("joint_states", 1)
     stamps = count(STAMP, 10_000_000)
 
     def arrivals() -> list[Arrival]:
@@ -106,9 +108,9 @@ def reading(wire: str, model: RobotModel) -> dict[str, Call]:
     }
 
 
-def layout(model: RobotModel) -> Layout:
+def sample_names(model: RobotModel) -> SampleNames:
     """What the numbers are called."""
-    return Layout(coordinate_names(model), velocity_slots(model))
+    return SampleNames(coordinate_names(model), velocity_slots(model))
 
 
 def sample(model: RobotModel, stamp: int) -> JointState:

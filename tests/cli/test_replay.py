@@ -70,8 +70,8 @@ def test_a_robot_that_is_live_is_left_alone_unless_one_insists(file: str):
     with standing("arm"):
         message = failure("replay", file)
         assert "there is 'arm' by " in message
-        assert "--force" in message
-        assert zstate("replay", file, "--force").returncode == 0
+        assert "--takeover" in message
+        assert zstate("replay", file, "--takeover").returncode == 0
 
 
 def test_a_part_can_be_replayed(file: str):

@@ -9,9 +9,9 @@ from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, star
 from support import until
 
 from zstate import StaticPublisher, Transform, connect
-from zstate.wire.layout import Layout
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.ros2.wire import Ros2Wire
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Place
 from zstate.wire.writer import Writer
 
@@ -96,7 +96,7 @@ def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router
     )
     wire = Ros2Wire()
     with connect(mode="client", endpoints=ros_router) as session:
-        voice = wire.voice("r", Writer("driver", "", 0, 0, 1), Place(session.zid, 0), Layout())
+        voice = wire.voice("r", Writer("driver", "", 0, 0, 1), Place(session.zid, 0), SampleNames())
         outlet = voice.outlet("joint_states", 1)
         await_reader(session, outlet.key)
         session.zenoh.put(outlet.key, outlet.encode(unmeasured), attachment=outlet.attachment(5))

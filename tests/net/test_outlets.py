@@ -10,11 +10,11 @@ from zstate.net.outlets import Outlets
 from zstate.net.presence import discover, writer_here
 from zstate.net.session import connect
 from zstate.net.wires import wire_named
-from zstate.wire.layout import Layout
 from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
+from zstate.wire.sample_names import SampleNames
 
 WIRES = ("native", "ros2", "ros2dds")
-LAYOUT = Layout(("a", "b"), (0, 1))
+LAYOUT = SampleNames(("a", "b"), (0, 1))
 STATE = JointState(STAMP, 0, 1, order_digest(("a", "b")), to_block([1.0, 2.0]))
 DESCRIBED = RobotDescription(1, "<robot/>", "digest", (), ())
 KEYS = {

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
-from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     Clock,
     JointCommand,
@@ -22,6 +21,7 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Arrival, Place, Wire
 from zstate.wire.writer import Announced, Writer
 
@@ -238,7 +238,7 @@ def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, a
 
 def test_the_native_wire_says_every_stream_through_the_seam():
     wire: Wire = NativeWire()
-    voice = wire.voice("r1", Writer("arm", "jetson", 412, 5, 7), Place("z1", 0), Layout())
+    voice = wire.voice("r1", Writer("arm", "jetson", 412, 5, 7), Place("z1", 0), SampleNames())
     by_type = {type(message): message for message in MESSAGES}
     for stream, kind in STREAM_TYPES.items():
         message, outlet = by_type[kind], voice.outlet(stream, 0, "w")
@@ -250,7 +250,7 @@ def test_the_native_wire_says_every_stream_through_the_seam():
 
 def test_a_token_of_the_native_wire_says_who_writes_what():
     wire, writer = NativeWire(), Writer("arm", "jetson", 412, 5, 7)
-    outlet = wire.voice("r1", writer, Place("z1", 0), Layout()).outlet("tf", 0)
+    outlet = wire.voice("r1", writer, Place("z1", 0), SampleNames()).outlet("tf", 0)
     assert outlet.token is not None
     assert wire.announced(outlet.token, "r1") == Announced("r1", "tf", writer)
     assert wire.announced("zstate/r1/@writer/tf/nonsense", "r1") is None

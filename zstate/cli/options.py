@@ -108,8 +108,7 @@ wires_option = click.option(
     callback=_checked_wire,
     metavar="WIRE",
     envvar="ZSTATE_WIRE",
-    help="What is spoken, as in `--wire native --wire ros2:domain=5,namespace=r1`; the first one is also "
-    "where joint_states are heard.",
+    help="What is spoken, as in `--wire native --wire ros2:domain=5,namespace=r1`; may be repeated.",
 )
 
 

@@ -13,8 +13,8 @@ from zstate.net.presence import announce
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.wire.keys import Stream
-from zstate.wire.layout import Layout
 from zstate.wire.messages import Message
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Outlet, Place, Wire
 from zstate.wire.writer import Writer
 
@@ -23,11 +23,16 @@ class Outlets(Closing):
     """One writer of ``robot`` on ``wire``: opens its streams and latched values, closes them together."""
 
     def __init__(
-        self, session: Session, wire: Wire, robot: str, writer: Writer, layout: Layout | None = None
+        self,
+        session: Session,
+        wire: Wire,
+        robot: str,
+        writer: Writer,
+        sample_names: SampleNames | None = None,
     ) -> None:
         self._session = session
         place = Place(session.zid, session.next_number())
-        self._voice = wire.voice(robot, writer, place, layout or Layout())
+        self._voice = wire.voice(robot, writer, place, sample_names or SampleNames())
         self._robot = robot
         self._is_permitted = wire.name != "native"  # what others are permitted, theirs have to say
         self._opened = ExitStack()

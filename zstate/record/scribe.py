@@ -104,12 +104,12 @@ class Scribe:
             self._counts[robot, "tf_static"] += 1
 
     def _take_sample(self, robot: str, message: Sample | Clock, log_time: int) -> None:
-        layout = self._orders_of(robot).layout(message)
-        if layout is None:
+        sample_names = self._orders_of(robot).sample_names(message)
+        if sample_names is None:
             self._keep_early(robot, message, log_time)
             return
         stream = _STREAMS[type(message)]
-        self._pen(robot, stream, message.session).write(message, layout, log_time)
+        self._pen(robot, stream, message.session).write(message, sample_names, log_time)
         self._counts[robot, stream] += 1
 
     def _take_description(self, robot: str, description: RobotDescription, log_time: int) -> None:

@@ -18,7 +18,6 @@ from zstate.wire.keys import (
     writer_expression,
     writer_key,
 )
-from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     Clock,
     JointCommand,
@@ -30,6 +29,7 @@ from zstate.wire.messages import (
     Status,
     TransformSample,
 )
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Announced, Writer
 
@@ -118,7 +118,7 @@ class NativeWire:
     name = "native"
     shared: frozenset[Stream] = frozenset()
 
-    def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> NativeVoice:
+    def voice(self, robot: str, writer: Writer, place: Place, sample_names: SampleNames) -> NativeVoice:
         return NativeVoice(robot, writer)
 
     def reader_tokens(

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 from zstate.wire.keys import Stream
-from zstate.wire.layout import Layout
 from zstate.wire.messages import Message
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.writer import Announced, Writer
 
 
@@ -90,7 +90,7 @@ class Wire(Protocol):
         """The streams of a robot that many writers say together, each a part."""
         ...
 
-    def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> Voice:
+    def voice(self, robot: str, writer: Writer, place: Place, sample_names: SampleNames) -> Voice:
         """How ``writer`` says the streams of ``robot``. InvalidInput for names that cannot be in a key."""
         ...
 

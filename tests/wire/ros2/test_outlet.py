@@ -14,7 +14,6 @@ from wire.ros2.by_hand import (
 )
 
 from zstate.errors import InvalidInput
-from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     Clock,
     JointCommand,
@@ -28,6 +27,7 @@ from zstate.wire.messages import (
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.outlet import Address, RosOutlet
+from zstate.wire.sample_names import SampleNames
 
 STAMP = 1_700_000_000_123_456_789
 DIGEST = b"8 bytes."
@@ -35,14 +35,14 @@ EDGES = (("base", "arm"), ("arm", "fleet/tool"))
 POSES = np.random.default_rng(3).normal(size=(2, 7))
 # A floating joint "body" before a hinge: seven and one positions, six and one velocities.
 BODY = tuple(f"body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw"))
-DRONE = Layout((*BODY, "hinge"), (0, 1, 2, 3, 4, 5, 7), EDGES)
-ARM = Layout(("a", "b"), (0, 1), EDGES)
+DRONE = SampleNames((*BODY, "hinge"), (0, 1, 2, 3, 4, 5, 7), EDGES)
+ARM = SampleNames(("a", "b"), (0, 1), EDGES)
 GID = bytes(range(16))
 
 
-def outlet(layout: Layout = ARM, gid: bytes | None = GID, prefix: str = "") -> RosOutlet:
+def outlet(sample_names: SampleNames = ARM, gid: bytes | None = GID, prefix: str = "") -> RosOutlet:
     names = FrameNames(Ros2Options(frame_prefix=prefix), "r1")
-    return RosOutlet("joint_states", Address("key", "token", gid), names, layout)
+    return RosOutlet("joint_states", Address("key", "token", gid), names, sample_names)
 
 
 def state(*blocks, names=None, stamp: int = STAMP) -> JointState:

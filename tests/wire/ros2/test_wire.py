@@ -19,9 +19,9 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import MessageError
-from zstate.wire.layout import Layout
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Writer
 
@@ -53,7 +53,7 @@ def arrival(payload: bytes = GOOD, beside: bytes | None = attachment(7, GID), ke
 
 
 def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
-    voice = wire(namespace="fleet/r1", domain=5).voice("r1", WRITER, Place(ZID, 3), Layout())
+    voice = wire(namespace="fleet/r1", domain=5).voice("r1", WRITER, Place(ZID, 3), SampleNames())
     assert voice.token == f"@ros2_lv/5/{ZID}/3/3/NN/%/%fleet%r1/arm_driver"
     outlet = voice.outlet("joint_states", 9)
     assert outlet.key == key_of(JOINT_STATES, "fleet/r1", 5)
@@ -66,7 +66,7 @@ def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
 
 
 def test_the_bridges_wire_has_plain_keys_its_own_tokens_and_nothing_beside():
-    voice = Ros2DdsWire(Ros2Options(namespace="r1")).voice("r1", WRITER, Place(ZID, 3), Layout())
+    voice = Ros2DdsWire(Ros2Options(namespace="r1")).voice("r1", WRITER, Place(ZID, 3), SampleNames())
     assert voice.token is None
     outlet = voice.outlet("tf_static", 9)
     assert (outlet.key, outlet.attachment(8)) == ("r1/tf_static", None)

@@ -90,9 +90,9 @@ def publish_command(
     On the native wire it remembers the last seconds for whoever joins, and answers lookups on
     zstate/ROBOT/lookup, for devices without a buffer.
 
-    With several wires the first is followed, and the others get everything. ROS 2 nodes are met at
-    their router: where ROS 2 is spoken alone, that of this host is found; otherwise say --connect, or
-    let `zstate bridge` carry the robot over.
+    With several wires joint_states are heard on the first, and the others get everything. ROS 2 nodes
+    are met at their router: where ROS 2 is spoken alone, that of this host is found; otherwise say
+    --connect, or let `zstate bridge` carry the robot over.
 
     \b
     zstate publish panda --source sine

@@ -9,7 +9,7 @@ import click
 
 from zstate.cli.console import fail, is_terminal, note, say
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_seconds, session_options
+from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -27,17 +27,6 @@ def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
         return check_speed(rate)
     except InvalidInput as error:
         raise click.BadParameter(str(error)) from None
-
-
-def _checked_wires(_: click.Context, __: click.Parameter, wires: tuple[str, ...]) -> tuple[str, ...]:
-    from zstate.net.wires import wire_named
-
-    try:
-        for wire in wires:
-            wire_named(wire)
-    except InvalidInput as error:
-        raise click.BadParameter(str(error)) from None
-    return wires
 
 
 @click.command("replay")
@@ -63,18 +52,8 @@ def _checked_wires(_: click.Context, __: click.Parameter, wires: tuple[str, ...]
     "--duration", type=float, callback=checked_seconds, metavar="S", help="Replay so much of it [s]."
 )
 @click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
-@click.option(
-    "--wire",
-    "wires",
-    multiple=True,
-    default=("native",),
-    show_default=True,
-    callback=_checked_wires,
-    metavar="WIRE",
-    envvar="ZSTATE_WIRE",
-    help="What is spoken, as in `--wire native --wire ros2:domain=5`; may be repeated.",
-)
-@click.option("--force", is_flag=True, help="Also where somebody else writes these robots now.")
+@wires_option
+@takeover_option
 @session_options
 def replay_command(
     *,
@@ -85,14 +64,13 @@ def replay_command(
     duration: float | None,
     loop: bool,
     wires: tuple[str, ...],
-    force: bool,
+    takeover: bool,
     network: Network,
 ) -> None:
     """Publish what FILE holds of ROBOTs, or of all there are, with the stamps it was recorded with.
 
     FILE is an MCAP file of `zstate record`, or a bag of ROS 2. The time of the recording is said on
-    zstate/clock, and on /clock. Not where somebody else writes the same robots now: readers could not
-    tell the two apart.
+    zstate/clock, and on /clock. Not where somebody else writes the same robots now.
 
     \b
     zstate replay run.mcap
@@ -113,12 +91,12 @@ def replay_command(
             start_s=start,
             duration_s=duration,
             loop=loop,
-            takeover=force,
+            takeover=takeover,
         ) as replayer,
     ):
         live = live_writers(session, replayer.robots, wires)
-        if live and not force:
-            fail(f"there is {'; '.join(live)} on the network already; end that first, or use --force")
+        if live and not takeover:
+            fail(f"there is {'; '.join(live)} on the network already; end that first, or use --takeover")
         say(introduction(replayer, file))
         _run(replayer)
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from zstate.errors import InvalidInput
 from zstate.wire.keys import Stream
-from zstate.wire.layout import Layout
 from zstate.wire.messages import (
     Clock,
     Edges,
@@ -25,6 +24,7 @@ from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.joint_state import JointStateEncoder
 from zstate.wire.ros2.plain import encode_clock, encode_string
 from zstate.wire.ros2.tf_message import TfMessageEncoder
+from zstate.wire.sample_names import SampleNames
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,16 @@ class RosOutlet:
     encoding = ""
     can_withdraw = False  # a ROS node takes a Zenoh delete for a broken message
 
-    def __init__(self, stream: Stream, address: Address, names: FrameNames, layout: Layout) -> None:
+    def __init__(
+        self, stream: Stream, address: Address, names: FrameNames, sample_names: SampleNames
+    ) -> None:
         self.key = address.key
         self.token = address.token
         self._gid = address.gid
         self._seq = 0
         self._stream = stream
         self._names = names
-        self._layout = layout
+        self._sample_names = sample_names
         self._joints: tuple[tuple[str, ...], JointStateEncoder] | None = None
         self._edges: tuple[Edges, TfMessageEncoder] | None = None
 
@@ -68,7 +70,7 @@ class RosOutlet:
         if isinstance(message, JointState):
             return self._encode_joints(message)
         if isinstance(message, TransformSample):
-            edges = self._layout.moving_edges if message.edges is None else message.edges
+            edges = self._sample_names.moving_edges if message.edges is None else message.edges
             return self._encode_edges(edges, _dated(message.stamp), message.poses)
         if isinstance(message, StaticTransforms):
             return self._encode_edges(message.edges, 0, message.poses)
@@ -79,17 +81,17 @@ class RosOutlet:
         raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
 
     def _encode_joints(self, state: JointState) -> bytes:
-        names = self._layout.coordinates if state.names is None else state.names
+        names = self._sample_names.coordinates if state.names is None else state.names
         if self._joints is None or self._joints[0] is not names:
             self._joints = names, JointStateEncoder(names)
         rates, forces = state.velocities, state.efforts
-        if len(self._layout.velocity_slots) != len(names):
+        if len(self._sample_names.velocity_slots) != len(names):
             rates, forces = self._spread(rates, len(names)), self._spread(forces, len(names))
         return self._joints[1].encode(_dated(state.stamp), state.positions, rates, forces)
 
     def _spread(self, block: bytes | None, count: int) -> bytes | None:
         """Each number in the place of its coordinate: ROS knows as many velocities as positions."""
-        slots = self._layout.velocity_slots
+        slots = self._sample_names.velocity_slots
         if block is None or len(block) != 8 * len(slots):
             return block
         numbers = np.full(count, np.nan)

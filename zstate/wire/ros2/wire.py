@@ -10,7 +10,6 @@ from typing import Literal
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import ANY, Stream
-from zstate.wire.layout import Layout
 from zstate.wire.messages import Message
 from zstate.wire.ros2.attachment import session_of, unpack
 from zstate.wire.ros2.frame_names import FrameNames
@@ -29,6 +28,7 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.outlet import Address, RosOutlet
 from zstate.wire.ros2.qos import STREAM_QOS
 from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_of_topic, type_of
+from zstate.wire.sample_names import SampleNames
 from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Announced, Writer
 
@@ -38,10 +38,10 @@ STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_descrip
 class RosVoice:
     """One ROS node: a writer of one robot."""
 
-    def __init__(self, wire: Ros2Wire, robot: str, node: NodeToken, layout: Layout) -> None:
+    def __init__(self, wire: Ros2Wire, robot: str, node: NodeToken, sample_names: SampleNames) -> None:
         self._wire = wire
         self._robot = robot
-        self._layout = layout
+        self._sample_names = sample_names
         self._names = FrameNames(wire.options, robot)
         self._node = node
         self.token = wire.node_token(node)
@@ -49,7 +49,9 @@ class RosVoice:
     def outlet(self, stream: Stream, number: int, name: str = "") -> RosOutlet:
         key = self._wire.key(self._robot, stream)
         token = self._wire.endpoint_token(self._node, self._robot, stream, "MP", number)
-        return RosOutlet(stream, Address(key, token, self._wire.gid_of(token)), self._names, self._layout)
+        return RosOutlet(
+            stream, Address(key, token, self._wire.gid_of(token)), self._names, self._sample_names
+        )
 
 
 class Ros2Wire:
@@ -71,8 +73,8 @@ class Ros2Wire:
     def _key_layout(self, options: Ros2Options) -> TopicKeys:
         return RmwKeys(options)
 
-    def voice(self, robot: str, writer: Writer, place: Place, layout: Layout) -> RosVoice:
-        return RosVoice(self, robot, self._node(robot, writer.program, place), layout)
+    def voice(self, robot: str, writer: Writer, place: Place, sample_names: SampleNames) -> RosVoice:
+        return RosVoice(self, robot, self._node(robot, writer.program, place), sample_names)
 
     def _node(self, robot: str, program: str, place: Place) -> NodeToken:
         namespace = f"/{self.options.namespace_of(robot)}"

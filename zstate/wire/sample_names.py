@@ -1,4 +1,4 @@
-"""Layout: what the numbers in the samples of one robot are called."""
+"""SampleNames: what the numbers in the samples of one robot are called."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from zstate.wire.messages import Edges
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class SampleNames:
     """The names behind the numbers of a writer's samples, for wires that name each of them.
 
     ``coordinates`` names each number of a position vector; ``velocity_slots`` says under which of them
