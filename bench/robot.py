@@ -1,0 +1,64 @@
+"""What the processes of a run are told of a robot, and what they should answer; worked out by zstate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate import RobotModel, SineSource, load_model
+from zstate.model.kinematics import Kinematics
+
+ROWS = 600
+ROW_NS = 10_000_000
+
+MODELS = {"panda": "panda", "g1": "g1", "talos": "talos_full_v2", "tiago_dual": "tiago_dual"}
+"""The robots of the scenarios, and their names in zstate's catalog."""
+
+
+@dataclass(frozen=True)
+class BenchRobot:
+    """A robot, six seconds of a smooth motion, and where that puts the tip.
+
+    ``rows`` (N, n_joints) [rad] or [m]; ``poses`` (N, 7) are ``base_from_tip``. The tip is the link with the
+    most moving joints between it and the root, the last of them in the order of the URDF.
+    """
+
+    name: str
+    model: RobotModel
+    tip: str
+    rows: NDArray[np.float64]
+    poses: NDArray[np.float64]
+
+    @property
+    def moving_edges(self) -> int:
+        """How many transforms /tf has of it: its joints that move, mimics included."""
+        return sum(joint.type != "fixed" for joint in self.model.joints)
+
+
+@lru_cache
+def bench_robot(name: str) -> BenchRobot:
+    """One of ``MODELS``. Only joints of one number each, for ROS's joint states hold no others."""
+    model = load_model(MODELS[name])
+    source, kinematics = SineSource(model), Kinematics(model)
+    rows = np.array([source.read(n * ROW_NS).positions for n in range(ROWS)])
+    tip = deepest_link(model)
+    place = model.links.index(tip)
+    poses = np.array([kinematics.link_poses(row)[place] for row in rows])
+    return BenchRobot(name, model, tip, rows, poses)
+
+
+def deepest_link(model: RobotModel) -> str:
+    """The link with the most moving joints above it; of several, the last."""
+    above = {joint.child: joint for joint in model.joints}
+
+    def depth(link: str) -> int:
+        count = 0
+        while link in above:
+            count += above[link].type != "fixed"
+            link = above[link].parent
+        return count
+
+    return max(reversed(model.links), key=depth)
