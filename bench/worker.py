@@ -3,9 +3,10 @@
     PYTHON -m bench.worker SUBJECT writer|reader|joiner LABEL
 
 On standard input: the job as a line of JSON, then ``{"do": "go"}``, ``{"do": "stop", ...}`` and
-``{"do": "close"}``. On standard output, as lines of JSON: ``ready`` when it is connected; ``first`` when a reader has an answer from every
-robot; ``result`` at the end; ``failed`` with the error instead of any of them. What was recorded is left in
-the job's folder as int64: ``LABEL.stamps`` (sent, or answered), ``LABEL.times`` (when) and ``LABEL.robots``.
+``{"do": "close"}``. On standard output, as lines of JSON: ``ready`` when it is connected; ``first`` when a
+reader has an answer from every robot; ``result`` at the end; ``failed`` with the error instead of any of
+them. What was recorded is left in the job's folder as int64: ``LABEL.stamps`` (sent, or answered),
+``LABEL.times`` (when) and ``LABEL.robots``.
 """
 
 from __future__ import annotations
