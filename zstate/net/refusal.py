@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import socket
 import ssl
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from zstate.errors import AccessDenied, NetworkError, Unreachable
@@ -26,22 +27,44 @@ class Refusal:
     text: str
 
 
-def why_refused(endpoints: Sequence[str], credentials: Credentials | None) -> NetworkError:
-    """The error for whoever reached none of ``endpoints``: AccessDenied, or Unreachable if nobody is there.
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """What those behind some endpoints object to: None where nobody is, or where it cannot be asked."""
 
-    Knocks at each of them once more, by plain sockets, which takes seconds at most.
+    refusals: Mapping[str, Refusal | None]
+
+    @property
+    def are_refusals(self) -> bool:
+        """Whether there are any, and nobody is left who might let us in."""
+        return bool(self.refusals) and None not in self.refusals.values()
+
+    @property
+    def error(self) -> NetworkError:
+        """The error for whoever reached none of them: AccessDenied, or Unreachable if nobody is there."""
+        for endpoint, refusal in self.refusals.items():
+            if refusal is not None:
+                return AccessDenied(self._text(endpoint, refusal), reason=refusal.reason, endpoint=endpoint)
+        where = " or ".join(map(repr, self.refusals)) or "the configured endpoints"
+        text = f"nothing answers at {where}; is the router running? `zstate router`"
+        return Unreachable(text, endpoints=tuple(self.refusals))
+
+    def _text(self, endpoint: str, refusal: Refusal) -> str:
+        silent = [repr(other) for other, answer in self.refusals.items() if answer is None]
+        rest = f" (nothing answers at {' or '.join(silent)})" if silent else ""
+        return f"{endpoint!r} answers and does not let this session in: {refusal.text}{rest}"
+
+
+def knock(endpoints: Sequence[str], credentials: Credentials | None) -> Answers:
+    """Ask at each of ``endpoints``, by plain sockets, at once; takes seconds at most.
+
+    Who answers and does not object to a certificate is said to object to the user: whoever is let in
+    by Zenoh has no reason to ask.
     """
-    refusals = {endpoint: _knock(endpoint, credentials) for endpoint in endpoints}
-    for endpoint, refusal in refusals.items():
-        if refusal is not None:
-            silent = [repr(other) for other, answer in refusals.items() if answer is None]
-            rest = f" (nothing answers at {' or '.join(silent)})" if silent else ""
-            text = f"{endpoint!r} answers and does not let this session in: {refusal.text}{rest}"
-            return AccessDenied(text, reason=refusal.reason, endpoint=endpoint)
-    where = " or ".join(map(repr, endpoints)) or "the configured endpoints"
-    return Unreachable(
-        f"nothing answers at {where}; is the router running? `zstate router`", endpoints=endpoints
-    )
+    if len(endpoints) == 1:
+        return Answers({endpoint: _knock(endpoint, credentials) for endpoint in endpoints})
+    with ThreadPoolExecutor(len(endpoints) or 1) as pool:
+        asked = {endpoint: pool.submit(_knock, endpoint, credentials) for endpoint in endpoints}
+        return Answers({endpoint: answer.result() for endpoint, answer in asked.items()})
 
 
 def _knock(endpoint: str, credentials: Credentials | None) -> Refusal | None:

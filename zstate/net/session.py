@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from contextlib import suppress
 import zenoh
 
 from zstate.closing import Closing
-from zstate.errors import Closed, ConfigError, InvalidInput, NetworkError, PortBusy
+from zstate.errors import Closed, ConfigError, InvalidInput
 from zstate.net.config import (
     ANY_LOOPBACK_PORT,
     CONFIG_VARIABLE,
@@ -36,6 +35,7 @@ from zstate.net.modes import (
     check_stays_here,
     listening,
 )
+from zstate.net.opening import open_within, patience_in
 from zstate.net.rendezvous import Rendezvous, rendezvous_address
 from zstate.net.runtime import open_zenoh
 from zstate.net.security import Credentials
@@ -43,7 +43,6 @@ from zstate.net.twin import Twin
 from zstate.net.undeclaring import Undeclarable, undeclare
 
 CLOSE_WITHIN_S = 0.8
-AGAIN_S = 0.1
 
 
 def connect(
@@ -96,7 +95,8 @@ def connect(
             path="mode",
         )
     given = given_config(source, *checked, credentials)
-    return _session(given, checked[1] or endpoints_in(given), credentials or credentials_in(given))
+    where = checked[1] or endpoints_in(given)
+    return _session(given, where, credentials or credentials_in(given), patience_in(given))
 
 
 def _check(
@@ -130,19 +130,15 @@ def _connect(
         return _connect_on_this_host(mode, credentials)
     where = listening(mode, listen, credentials)
     check_credentials(mode, credentials, where)
-    within = timeout_s if mode == "client" else None
-    config = our_config(mode, endpoints, where, within, credentials)
-    if mode != "client" or len(endpoints) == 1:
-        return _session(config, endpoints, credentials)
-    # With time to wait, Zenoh spends all of it on the first of them; without, it asks each once.
-    config.insert_json5("connect/timeout_ms", "0")
-    return _session(config, endpoints, credentials, timeout_s)
+    # With time to wait, Zenoh spends all of it on the first endpoint; without, it asks each once.
+    config = our_config(mode, endpoints, where, 0.0 if mode == "client" else None, credentials)
+    return _session(config, endpoints, credentials, timeout_s if mode == "client" else 0.0)
 
 
 def _session(
-    config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None, again_for_s: float = 0.0
+    config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None, timeout_s: float
 ) -> Session:
-    raw = _open(config, endpoints, credentials, again_for_s)
+    raw = open_within(config, endpoints, credentials, timeout_s)
     return Session(raw, twin=Twin.of(config, credentials))
 
 
@@ -159,7 +155,7 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
     # The lobby first: while the rendezvous is silent, opening a session takes half a second longer.
     rendezvous = Rendezvous((host, port), _open_lobby)
     try:
-        raw = _open(our_config("peer", [rendezvous.endpoint], [ANY_LOOPBACK_PORT]), ())
+        raw = open_within(our_config("peer", [rendezvous.endpoint], [ANY_LOOPBACK_PORT]), ())
     except BaseException:
         rendezvous.close()
         raise
@@ -168,41 +164,6 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
 
 def _open_lobby(endpoint: str) -> zenoh.Session:
     return open_zenoh(our_config("peer", (), [endpoint]))
-
-
-def _open(
-    config: zenoh.Config,
-    endpoints: Sequence[str],
-    credentials: Credentials | None = None,
-    again_for_s: float = 0.0,
-) -> zenoh.Session:
-    deadline = time.monotonic() + again_for_s
-    while True:
-        try:
-            return open_zenoh(config)
-        except zenoh.ZError as error:
-            if time.monotonic() >= deadline:
-                raise _explained(str(error), endpoints, credentials) from None
-        time.sleep(AGAIN_S)
-
-
-def _explained(text: str, endpoints: Sequence[str], credentials: Credentials | None) -> NetworkError:
-    """Zenoh has one error for everything; its text tells them apart."""
-    busy = re.search(r"bound to (\S+?):? .*Address already in use", text)
-    if busy:
-        return PortBusy(
-            f"somebody listens at {busy[1]!r} already; choose another port, or stop that program",
-            endpoint=busy[1],
-        )
-    if "Unable to connect" in text:
-        from zstate.net.refusal import why_refused  # noqa: PLC0415  # loads ssl, which few need
-
-        return why_refused(endpoints, credentials)
-    return NetworkError(f"Zenoh cannot open a session: {_without_places(text)}")
-
-
-def _without_places(text: str) -> str:
-    return re.sub(r" at /[^\s\]]*", "", text)
 
 
 class Session(Closing):
