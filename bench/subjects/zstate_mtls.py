@@ -1,0 +1,54 @@
+"""zstate through a router, everything encrypted and everybody checked by certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from bench.job import Job
+from bench.subjects.ours import HOW_READ, here, our_versions, router
+from bench.subjects.subject import Roles, Service, Subject
+
+if TYPE_CHECKING:
+    from zstate.net.session import Session
+
+LIBRARY = "cryptography"
+
+
+def _load() -> Roles:
+    from bench.subjects.zstate_roles import roles  # noqa: PLC0415 - as late as the protocol asks
+
+    return roles(_connect)
+
+
+def _connect(job: Job, role: str) -> Session:
+    from zstate import connect  # noqa: PLC0415 - as above
+    from zstate.net.security import Credentials  # noqa: PLC0415
+
+    credentials = Credentials.from_folder(job.folder, role)
+    return connect(mode="client", endpoints=f"tls/127.0.0.1:{job.ports[0]}", credentials=credentials)
+
+
+def _services(job: Job) -> Sequence[Service]:
+    from zstate.net.certificates import issue_identities  # noqa: PLC0415 - as above
+
+    issue_identities(job.folder, ("router", "writer", "reader"))
+    return (router(job, "--certs", job.folder, "--identity", "router", protocol="tls"),)
+
+
+SUBJECT = Subject(
+    name="zstate_mtls",
+    title="zstate, mutual TLS",
+    settings=(
+        "writer and reader are clients of one `zstate router` on loopback over TLS 1.3; each shows a "
+        "certificate of `zstate certs`, and checks the other's; native wire",
+        *HOW_READ,
+    ),
+    install=("pip install -e '.[bench,certs]'",),
+    python=lambda: here() if find_spec(LIBRARY) else None,
+    versions=lambda: {**our_versions(), LIBRARY: version(LIBRARY)},
+    load=_load,
+    services=_services,
+)

@@ -1,0 +1,101 @@
+"""A writer and a reader of zstate, whatever they are connected by and whichever wire they speak."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from bench.job import Job
+from bench.subjects.subject import Answered, Roles
+from zstate import StatePublisher, Transform, TransformListener, load_model
+from zstate.closing import Closing
+from zstate.errors import LookupFailed
+from zstate.net.session import Session
+
+Connect = Callable[[Job, str], Session]
+"""``connect(job, role)``: the session of a "writer" or a "reader"."""
+
+
+def roles(connect: Connect, wire: str = "native") -> Roles:
+    """Both roles, connected like this."""
+    return partial(Writer, connect, wire), partial(Reader, connect, wire)
+
+
+class Writer(Closing):
+    """A ``StatePublisher`` that is given positions and a stamp."""
+
+    def __init__(self, connect: Connect, wire: str, job: Job) -> None:
+        model = load_model(Path(job.urdf))
+        columns = [job.joints.index(name) for name in model.joint_names]
+        self._rows = list(np.array(job.rows)[:, columns])
+        self._session = connect(job, "writer")
+        self._publisher = StatePublisher(self._session, model, job.robot, wires=(wire,))
+
+    def send(self, row: int, stamp: int) -> None:
+        self._publisher.publish(self._rows[row], stamp=stamp)
+
+    def close(self) -> None:
+        self._publisher.close()
+        self._session.close()
+
+
+class Reader(Closing):
+    """A ``TransformListener``; its buffer's ``watch`` wakes it, and it asks for that stamp.
+
+    The watch already hands over the answer; the lookup is made nevertheless, as by everybody else.
+    """
+
+    def __init__(self, connect: Connect, wire: str, job: Job, answered: Answered) -> None:
+        self._job = job
+        self._answered = answered
+        self._session = connect(job, "reader")
+        robot = job.robots[0] if len(job.robots) == 1 else "*"
+        self._listener = TransformListener(self._session, robot, wire=wire)
+        self._buffer = self._listener.buffer
+        self._ends = [(f"{robot}/{job.base}", f"{robot}/{job.tip}") for robot in job.robots]
+        self._closed = threading.Event()
+        if job.load == "slow":
+            threading.Thread(target=self._loop, daemon=True).start()
+        else:
+            self._watches = [
+                self._buffer.watch(*ends, partial(self._answer, ends, number))
+                for number, ends in enumerate(self._ends)
+            ]
+
+    def _answer(self, ends: tuple[str, str], robot: int, news: Transform) -> None:
+        assert news.stamp is not None
+        self._buffer.lookup(*ends, news.stamp)
+        self._answered(news.stamp, robot)
+
+    def _loop(self) -> None:
+        """A loop that takes its time with each answer: it waits for a newer sample, and takes the newest."""
+        ends, newest = self._ends[0], None
+        while not self._closed.is_set():
+            try:
+                self._buffer.wait(*ends, newest, timeout_s=0.5)
+            except LookupFailed:
+                continue
+            stamp = self._buffer.latest(*ends)
+            self._buffer.lookup(*ends, stamp)
+            self._answered(stamp)
+            newest = stamp + 1
+
+    def pose(self, stamp: int, robot: int = 0) -> list[float]:
+        return self._buffer.lookup(*self._ends[robot], stamp).pose7.tolist()
+
+    def has_tree(self) -> bool:
+        can_lookup, job = self._buffer.can_lookup, self._job
+        return all(
+            can_lookup(f"{robot}/{job.base}", f"{robot}/{link}")
+            for robot in reversed(job.robots)
+            for link in reversed(job.links)
+        )
+
+    def close(self) -> None:
+        self._closed.set()
+        self._listener.close()
+        self._session.close()
