@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,14 @@ from zstate.transform import Transform
 
 MAX_AGE_S = 0.5
 """What is called fresh."""
+
+
+def comes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Whether ``condition()`` becomes true in time. It is looked at each millisecond."""
+    deadline = time.monotonic() + timeout_s
+    while not (is_true := condition()) and time.monotonic() < deadline:
+        time.sleep(0.001)
+    return is_true
 
 
 class Answers:
@@ -30,13 +39,10 @@ class Answers:
 
     def near(self, robot: str, stamp: int, timeout_s: float = 10.0) -> bool:
         """Whether the newest sample comes to be within half a minute of a stamp."""
-        deadline = time.monotonic() + timeout_s
-        while abs(self.newest(robot) - stamp) > 30_000_000_000:
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.001)
-        self._check(robot)
-        return True
+        is_near = comes_true(lambda: abs(self.newest(robot) - stamp) <= 30_000_000_000, timeout_s)
+        if is_near:
+            self._check(robot)
+        return is_near
 
     def newest(self, robot: str) -> int:
         """The stamp of the newest sample, or 0."""
@@ -47,11 +53,8 @@ class Answers:
 
     def after(self, robot: str, stamp: int, timeout_s: float = 15.0) -> int | None:
         """When [ns] there was an answer with a later stamp; it is checked."""
-        deadline = time.monotonic() + timeout_s
-        while self.newest(robot) <= stamp:
-            if time.monotonic() > deadline:
-                return None
-            time.sleep(0.001)
+        if not comes_true(lambda: self.newest(robot) > stamp, timeout_s):
+            return None
         heard_at = time.time_ns()
         self._check(robot)
         return heard_at
@@ -66,16 +69,13 @@ class Answers:
 
     def mark(self, robot: str, value: float, timeout_s: float = 10.0) -> int | None:
         """When [ns] the robot's static edge had this length."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            try:
-                edge = self._buffer.lookup(f"{robot}/world", f"{robot}/mark")
-            except ZStateError:
-                edge = None
-            if edge is not None and edge.translation[0] == value:
-                return time.time_ns()
-            time.sleep(0.001)
-        return None
+        return time.time_ns() if comes_true(lambda: self._mark(robot) == value, timeout_s) else None
+
+    def _mark(self, robot: str) -> float | None:
+        try:
+            return float(self._buffer.lookup(f"{robot}/world", f"{robot}/mark").translation[0])
+        except ZStateError:
+            return None
 
     def fresh(self, robot: str) -> Transform:
         """The newest answer, if that is not too old."""
