@@ -19,7 +19,6 @@ import argparse
 import json
 import os
 import resource
-import socket
 import subprocess
 import sys
 import time
@@ -27,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.micro.others import free_port
 from zstate import SineSource, StatePublisher, TransformListener, connect, load_model
 
 SETTLE_S = 1.0
@@ -58,7 +58,7 @@ def _table(options: argparse.Namespace) -> None:
 
 
 def _run(options: argparse.Namespace, rate: float, role: str) -> list[str]:
-    environment = {**os.environ, "ZSTATE_RENDEZVOUS": f"127.0.0.1:{_free_port()}"}
+    environment = {**os.environ, "ZSTATE_RENDEZVOUS": f"127.0.0.1:{free_port()}"}
     command = [sys.executable, "-m", "bench.micro.chain", "--robot", options.robot]
     command += ["--rates", str(rate), "--seconds", str(options.seconds), "--role"]
     reader = subprocess.Popen([*command, role], env=environment, stdout=subprocess.PIPE, text=True)
@@ -115,12 +115,6 @@ def _read(options: argparse.Namespace) -> dict[str, Any]:
 def _cpu_s() -> float:
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 if __name__ == "__main__":
