@@ -1,0 +1,63 @@
+"""The run: every subject in every scenario, in turns."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bench import results
+from bench.scenario import Scenario
+from bench.subjects.subject import Subject
+from bench.trial import Facts, try_subject
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One subject's turn in one round of a scenario."""
+
+    subject: Subject
+    scenario: Scenario
+    round: int
+
+
+def turns(subjects: Sequence[Subject], scenarios: Sequence[Scenario], repeat: int, seed: int) -> list[Turn]:
+    """Every turn, in its order.
+
+    Within a round of a scenario the subjects come one after the other, so that whoever is compared was
+    measured within the same minutes, in an order that is shuffled anew each time. A fleet is for those
+    subjects that can carry one.
+    """
+    order = random.Random(seed)
+    return [turn for turn_set in _rounds(subjects, scenarios, repeat, order) for turn in turn_set]
+
+
+def _rounds(
+    subjects: Sequence[Subject], scenarios: Sequence[Scenario], repeat: int, order: random.Random
+) -> Iterator[list[Turn]]:
+    most = max((one.repeats for one in scenarios), default=0) * repeat
+    for number in range(most):
+        for scenario in scenarios:
+            if number < scenario.repeats * repeat:
+                able = [one for one in subjects if one.fleet or scenario.fleet == 1]
+                yield [Turn(one, scenario, number) for one in order.sample(able, len(able))]
+
+
+def run(folder: Path, planned: Sequence[Turn], on_turn: Callable[[int, Turn, Facts | None], None]) -> None:
+    """Take every turn and write down what came of it; ``on_turn`` is called before each and after it."""
+    for number, turn in enumerate(planned):
+        on_turn(number, turn, None)
+        load = os.getloadavg()[0]
+        facts = try_subject(turn.subject, turn.scenario)
+        head = {"subject": turn.subject.name, "scenario": turn.scenario.name, "round": turn.round}
+        results.add(folder, {**head, "turn": number, "load_before": round(load, 2), **facts})
+        on_turn(number, turn, facts)
+
+
+def seconds(planned: Sequence[Turn]) -> float:
+    """About how long all of it takes [s]; starting a router, ROS or twenty readers takes most of it."""
+    return sum(
+        3.5 + one.scenario.seconds + 0.4 * one.scenario.readers + 1.2 * one.scenario.joins for one in planned
+    )

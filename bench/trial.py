@@ -1,0 +1,199 @@
+"""Trial: one subject in one scenario, once, in fresh processes."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from bench.job import Job
+from bench.measure import Costs
+from bench.poses import pose_errors
+from bench.process import Process, RunFailed
+from bench.recording import Recording, Window, reader_figures
+from bench.robot import BenchRobot, bench_robot
+from bench.scenario import Scenario
+from bench.subjects.subject import Service, Subject
+
+PORTS = 6
+START_WITHIN_S = 60.0
+WARM_UP_S = 0.7
+# The writers go on for a while after the window, so that its last samples are samples like the others.
+AFTER_S = 0.3
+DRAIN_S = 0.5
+PROBE_EVERY_S = 0.2
+
+Facts: TypeAlias = "dict[str, Any]"
+
+
+def try_subject(subject: Subject, scenario: Scenario) -> Facts:
+    """What came of it: figures, or ``failed`` with the reason."""
+    with tempfile.TemporaryDirectory(prefix="zstate-bench-") as folder, ExitStack() as opened:
+        try:
+            trial = Trial(subject, scenario, folder, opened)
+            return trial.joins() if scenario.joins else trial.run()
+        except (RunFailed, OSError) as reason:  # OSError: a process was gone when its cost was asked for
+            return {"failed": str(reason)}
+
+
+class Trial:
+    """The processes of one run. ``opened`` ends them, the last one first."""
+
+    def __init__(self, subject: Subject, scenario: Scenario, folder: str, opened: ExitStack) -> None:
+        self._subject = subject
+        self._scenario = scenario
+        self._robot = bench_robot(scenario.robot)
+        self._opened = opened
+        self._job = job_of(subject, scenario, self._robot, folder)
+        self._environment = subject.environment(self._job)
+        self._roles: dict[str, list[int]] = {}
+        for service in subject.services(self._job):
+            self._serve(service)
+
+    def run(self) -> Facts:
+        """Writers and readers, a window, and what it cost."""
+        readers = [self._worker("reader", f"reader{n}") for n in range(self._scenario.readers)]
+        shares = self._shares()
+        writers = [self._worker("writer", label, mine) for label, mine in shares.items()]
+        self._begin(writers, readers)
+        time.sleep(WARM_UP_S)
+        window, costs = self._window()
+        ends = {"begin": window.begin, "end": window.end}
+        time.sleep(AFTER_S)
+        for writer in writers:
+            writer.tell(do="stop")
+        for writer in writers:
+            writer.expect("result", START_WITHIN_S)
+        time.sleep(DRAIN_S)
+        for reader in readers:
+            reader.tell(do="stop", **ends)
+        poses = [pose for one in readers for pose in one.expect("result", START_WITHIN_S)["poses"]]
+        folder = self._job.folder
+        sent = Recording.of_writers(folder, shares)
+        heard = [Recording.of_reader(folder, f"reader{n}") for n in range(len(readers))]
+        return {
+            "window_s": round(window.seconds, 4),
+            "sent": int(window.holds(sent.stamps).sum()),
+            "readers": [reader_figures(sent, one, window, self._scenario.rate_hz) for one in heard],
+            **costs.figures(),
+            "poses": pose_errors(sent, self._robot.poses, poses, window.begin),
+        }
+
+    def joins(self) -> Facts:
+        """A writer and a reader that go on, and late joiners one after the other."""
+        reader = self._worker("reader", "reader0")
+        writer = self._worker("writer", "writer0", [0])
+        self._begin([writer], [reader])
+        time.sleep(WARM_UP_S)
+        joined: list[Facts] = []
+        for number in range(self._scenario.joins):
+            with ExitStack() as opened:
+                joiner = self._worker("joiner", f"joiner{number}", opened=opened)
+                joiner.expect("ready", START_WITHIN_S)
+                joiner.tell(do="go")
+                joined.append(joiner.expect("result", START_WITHIN_S))
+        seconds = [one["whole_s"] for one in joined]
+        if None in seconds:
+            return {
+                "failed": f"{seconds.count(None)} of {len(seconds)} late joiners never had the whole tree"
+            }
+        return {
+            "whole_ms": [round(1e3 * one, 1) for one in seconds],
+            "connected_ms": [round(1e3 * one["connected_s"], 1) for one in joined],
+        }
+
+    def _serve(self, service: Service) -> None:
+        environment = {**self._environment, **service.environment}
+        process = Process(service.role, service.command, environment, is_service=True)
+        self._opened.callback(process.end)
+        self._roles.setdefault(service.role, []).append(process.pid)
+        deadline = time.monotonic() + service.within_s
+        if service.says:
+            process.expect_text(service.says, service.within_s)
+        while not _answers(service, environment):
+            if time.monotonic() > deadline:
+                raise process.failed(f"was not ready within {service.within_s:g} s")
+            time.sleep(PROBE_EVERY_S)
+
+    def _worker(
+        self, role: str, label: str, mine: Sequence[int] = (0,), opened: ExitStack | None = None
+    ) -> Process:
+        python = self._subject.python()
+        assert python is not None, f"{self._subject.name} is not installed"
+        command = [python, "-m", "bench.worker", self._subject.name, role, label]
+        process = Process(label, command, self._environment)
+        (opened or self._opened).callback(process.end)
+        if opened is None:
+            self._roles.setdefault(role, []).append(process.pid)
+        process.say(self._job.of(*(self._job.robots[n] for n in mine)).to_json())
+        return process
+
+    def _shares(self) -> dict[str, Sequence[int]]:
+        """The robots of each writer process."""
+        count = self._scenario.writers
+        return {f"writer{n}": range(len(self._job.robots))[n::count] for n in range(count)}
+
+    def _begin(self, writers: Sequence[Process], readers: Sequence[Process]) -> None:
+        """Everybody is connected, the writers write, and every reader has its first answers."""
+        for process in (*readers, *writers):
+            process.expect("ready", START_WITHIN_S)
+        for writer in writers:
+            writer.tell(do="go")
+        for reader in readers:
+            reader.expect("first", START_WITHIN_S)
+
+    def _window(self) -> tuple[Window, Costs]:
+        costs = Costs(self._roles)
+        begin = time.time_ns()
+        costs.begin()
+        time.sleep(self._scenario.seconds)
+        costs.end()
+        return Window(begin, time.time_ns()), costs
+
+
+def job_of(subject: Subject, scenario: Scenario, robot: BenchRobot, folder: str) -> Job:
+    """What every process of the run is told."""
+    urdf = Path(folder) / "robot.urdf"
+    urdf.write_text(robot.model.urdf, encoding="utf-8")
+    robots = ("robot",) if scenario.fleet == 1 else tuple(f"robot{n:03}" for n in range(scenario.fleet))
+    return Job(
+        subject=subject.name,
+        urdf=str(urdf),
+        joints=robot.model.joint_names,
+        base=robot.model.root,
+        tip=robot.tip,
+        links=robot.model.links,
+        rows=tuple(map(tuple, robot.rows.tolist())),
+        rate_hz=scenario.rate_hz,
+        robots=robots,
+        mine=robots[:1],
+        readers=scenario.readers,
+        load=scenario.load,
+        ports=free_ports(PORTS),
+        folder=folder,
+    )
+
+
+def free_ports(count: int) -> tuple[int, ...]:
+    """Ports of loopback that nobody listens at now."""
+    with ExitStack() as opened:
+        probes = [opened.enter_context(socket.socket()) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return tuple(probe.getsockname()[1] for probe in probes)
+
+
+def _answers(service: Service, environment: Mapping[str, str]) -> bool:
+    if service.port:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", service.port)) != 0:
+                return False
+    if service.probe:
+        done = subprocess.run(service.probe, env=environment, capture_output=True, check=False, timeout=10)
+        return done.returncode == 0
+    return True
