@@ -113,6 +113,11 @@ class TransformListener(Closing):
         """What has been received, lost and refused so far."""
         return self._tally.stats()
 
+    @property
+    def refusals(self) -> dict[str, str]:
+        """What could not be used, by reason as in ``stats.refused``: the first of each, in words."""
+        return self._tally.refusals()
+
     def robots(self) -> tuple[str, ...]:
         """The robots that were heard so far, sorted by name."""
         return tuple(sorted({robot.robot for robot in list(self._followers.values()) if robot.heard}))

@@ -50,3 +50,11 @@ def test_threads_lose_no_count():
     for thread in threads:
         thread.join()
     assert (tally.stats().received, tally.stats().refused["loop"]) == (4000, 4000)
+
+
+def test_the_first_refusal_of_each_reason_is_kept_in_words():
+    tally = Tally()
+    tally.refuse("malformed", "one")
+    tally.refuse("malformed", "two")
+    tally.refuse("foreign", "three")
+    assert tally.refusals() == {"malformed": "one", "foreign": "three"}

@@ -36,6 +36,7 @@ class Tally:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
+        self._first: dict[str, str] = {}
         self._noted: set[str] = set()
 
     def count(self, what: str, number: int = 1) -> None:
@@ -48,6 +49,7 @@ class Tally:
         with self._lock:
             self._refused[reason] += 1
             first = self._refused[reason] == 1
+            self._first.setdefault(reason, text)
         if first:
             facts = {"event": "refused", "reason": reason}
             _LOG.warning("refused (%s): %s; further ones are only counted", reason, text, extra=facts)
@@ -59,6 +61,11 @@ class Tally:
             self._noted.add(event)
         if first:
             _LOG.warning("%s; further such events are not logged", text)
+
+    def refusals(self) -> dict[str, str]:
+        """The first refusal of each reason, in words."""
+        with self._lock:
+            return dict(self._first)
 
     def stats(self) -> Stats:
         """All counts now."""
