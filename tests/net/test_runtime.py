@@ -5,42 +5,49 @@ import json
 import pytest
 from support import Child
 
+pytestmark = pytest.mark.processes
+
 OPENING = """
     import json, os, sys
     from pathlib import Path
     from zstate.net.session import connect
 
-    def receiving():
+    def threads():
         names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
-        return sum(name.startswith("rx-") for name in names)
+        return {pool: sum(name.startswith(pool + "-") for name in names) for pool in ("rx", "tx", "net")}
 
     options = json.loads(sys.argv[1])
     with connect(**options) as first, connect(mode="client", endpoints=sys.argv[2]) as second:
-        print(json.dumps([receiving(), os.environ.get("ZENOH_RUNTIME")]))
+        print(json.dumps([threads(), os.environ.get("ZENOH_RUNTIME")]))
 """
 
 
-def opened(spawn, *arguments: str) -> tuple[int, str | None]:
+def opened(spawn, *arguments: str) -> tuple[dict[str, int], str | None]:
     child: Child = spawn(OPENING, *arguments)
     said = json.loads(child.line())
     assert (child.wait(), child.stderr) == (0, "")
     return tuple(said)
 
 
-@pytest.mark.processes
-def test_a_router_receives_with_many_threads_and_the_environment_stays_as_it_was(spawn, free_port: int):
+def test_a_router_has_threads_for_many_who_vanish_and_the_environment_stays_as_it_was(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     threads, left_behind = opened(spawn, json.dumps({"mode": "router", "listen": endpoint}), endpoint)
-    assert threads >= 128
+    assert min(threads.values()) >= 64
     assert left_behind is None
 
 
-@pytest.mark.processes
+def test_whoever_has_few_neighbours_has_few_threads_more(spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    threads, _ = opened(spawn, json.dumps({"mode": "peer", "listen": endpoint}), endpoint)
+    assert 4 <= min(threads.values()) <= max(threads.values()) < 20
+
+
 def test_what_the_environment_says_of_zenohs_threads_is_kept(
     spawn, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):
     endpoint, chosen = f"tcp/127.0.0.1:{free_port}", "(rx: (worker_threads: 3))"
     monkeypatch.setenv("ZENOH_RUNTIME", chosen)
     threads, left_behind = opened(spawn, json.dumps({"mode": "router", "listen": endpoint}), endpoint)
-    assert threads < 20
+    assert threads["rx"] < 20
+    assert threads["net"] < 20
     assert left_behind == chosen

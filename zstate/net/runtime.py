@@ -1,4 +1,4 @@
-"""How many threads Zenoh receives with: enough that those who vanished hold nobody up who comes back."""
+"""How many threads Zenoh has: enough that those who vanished hold nobody up who comes back."""
 
 # pyright: reportUnknownMemberType=false
 # zenoh's stubs leave the return types of some methods out
@@ -11,10 +11,18 @@ import zenoh
 
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 
-# Zenoh sets SO_LINGER to 10 s: when a neighbour was cut off, closing its socket blocks one of these
-# threads for so long (eclipse-zenoh/zenoh#1101). With all of them blocked nobody can connect.
-_RECEIVING = {"router": 128}
-_RECEIVING_OTHERWISE = 8
+# Zenoh sets SO_LINGER to 10 s: closing the socket of a neighbour who was cut off blocks the thread that
+# does it for so long (eclipse-zenoh/zenoh#1101). That is one of those that receive where nothing came for a
+# lease, and one of "net" where nothing could be sent; the last to let go may be one that sends. With all of
+# a kind blocked nobody can connect: Zenoh has 2 that receive, and 1 of the others.
+_THREADS = {"rx": 8, "tx": 4, "net": 4}
+_THREADS_OF_A_ROUTER = {"rx": 128, "tx": 64, "net": 64}
+
+
+def runtime(*, is_router: bool) -> str:
+    """What ``ZENOH_RUNTIME`` is set to."""
+    threads = _THREADS_OF_A_ROUTER if is_router else _THREADS
+    return "({})".format(", ".join(f"{pool}: (worker_threads: {count})" for pool, count in threads.items()))
 
 
 def open_zenoh(config: zenoh.Config) -> zenoh.Session:
@@ -22,8 +30,7 @@ def open_zenoh(config: zenoh.Config) -> zenoh.Session:
     if RUNTIME_VARIABLE in os.environ:
         return zenoh.open(config)
     mode = config.get_json("mode").strip('"')
-    threads = _RECEIVING.get(mode, _RECEIVING_OTHERWISE)
-    os.environ[RUNTIME_VARIABLE] = f"(rx: (worker_threads: {threads}))"
+    os.environ[RUNTIME_VARIABLE] = runtime(is_router=mode == "router")
     try:
         return zenoh.open(config)
     finally:
