@@ -8,11 +8,13 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from support import Child, a_free_port, until
 
 from zstate.errors import ConfigError, InvalidInput
+from zstate.net.certificates import issue_identities
 from zstate.net.session import connect
 
 LAN_PEER = """
@@ -159,3 +161,55 @@ def test_where_multicast_is_blocked_they_meet_through_one_that_all_connect_to(ma
     zids = one.line(), other.line()
     until(lambda: knows(one, zids[1]))
     until(lambda: knows(other, zids[0]))
+
+
+SECURED = """
+    import logging, sys
+    from zstate.net.security import Credentials
+    from zstate.net.session import connect
+    logging.basicConfig(format="%(message)s")
+    folder, name = sys.argv[1:]
+    credentials = Credentials.from_folder(folder, name) if folder else None
+    with connect(mode="lan", credentials=credentials) as session:
+        print(session.zid)
+        for line in sys.stdin:
+            print(*(str(zid) for zid in session.zenoh.info.peers_zid()), "")
+"""
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[str, str]:
+    """The identities r1 and r2 of the machines 0 and 1, and of another authority."""
+    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    ours, theirs = (str(tmp_path / name) for name in ("ours", "theirs"))
+    for folder in (ours, theirs):
+        issue_identities(folder, ["r1", "r2"], hosts=["10.98.0.1", "10.98.0.2"])
+    return ours, theirs
+
+
+@pytest.mark.netns
+def test_machines_of_a_lan_with_certificates_of_one_authority_meet(machines, folders: tuple[str, str]):
+    one, other = (machines(number, SECURED, folders[0], f"r{number + 1}") for number in (0, 1))
+    zids = one.line(), other.line()
+    until(lambda: knows(one, zids[1]))
+    until(lambda: knows(other, zids[0]))
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize(
+    ("has_certificate", "told_us", "told_them"),
+    [
+        (True, "its certificate is not signed by", "its certificate is not signed by"),
+        (False, "it speaks no TLS", "and this session was given no other to trust"),
+    ],
+)
+def test_strangers_in_a_lan_are_not_spoken_to_and_both_are_told_why(
+    machines, folders: tuple[str, str], has_certificate: bool, told_us: str, told_them: str
+):
+    ours = machines(0, SECURED, folders[0], "r1")
+    theirs = machines(1, SECURED, folders[1] if has_certificate else "", "r2")
+    zids = ours.line(), theirs.line()
+    until(lambda: told_us in ours.stderr and "/10.98.0.2:" in ours.stderr)
+    until(lambda: told_them in theirs.stderr and "tls/10.98.0.1:" in theirs.stderr)
+    assert not knows(ours, zids[1])
+    assert not knows(theirs, zids[0])

@@ -2,79 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
-from pathlib import Path
-
 import pytest
-from support import Child, a_free_port
+from refusing import ROUTERS, Fleet
 
 from zstate.errors import AccessDenied, Unreachable
-from zstate.net.certificates import issue_identities
 from zstate.net.security import Credentials
 from zstate.net.session import connect
-
-ROUTERS = """
-    import sys
-    from pathlib import Path
-    from zstate.net.security import Credentials
-    from zstate.net.session import connect
-    folder, *endpoints = sys.argv[1:]
-    users = Path(folder) / "users"
-    kinds = (
-        Credentials.from_folder(folder, "router"),
-        Credentials.from_folder(folder, "router", users=users),
-        Credentials.from_folder(folder, "expired"),
-        Credentials.from_folder(folder, "early"),
-        Credentials(users=users),
-        None,
-    )
-    sessions = [connect(mode="router", listen=e, credentials=c) for e, c in zip(endpoints, kinds)]
-    print("ready")
-    sys.stdin.readline()
-"""
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Routers, by what they are, and the folders of two authorities."""
-
-    folder: Path
-    strangers: Path
-    ports: dict[str, int]
-
-    def tls(self, kind: str, host: str = "127.0.0.1") -> str:
-        return f"tls/{host}:{self.ports[kind]}"
-
-    def tcp(self, kind: str) -> str:
-        return f"tcp/127.0.0.1:{self.ports[kind]}"
-
-    def identity(self, name: str, user: str | None = None, password: str | None = None) -> Credentials:
-        return Credentials.from_folder(self.folder, name, user=user, password=password)
-
-
-@pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
-    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
-    now, two_days = datetime.now(timezone.utc), timedelta(days=2)
-    folder, strangers = tmp_path_factory.mktemp("fleet"), tmp_path_factory.mktemp("strangers")
-    issue_identities(folder, ["router", "r1"])
-    issue_identities(folder, ["expired"], days=1, valid_from=now - two_days)
-    issue_identities(folder, ["early"], days=1, valid_from=now + two_days)
-    issue_identities(strangers, ["r1"])
-    (folder / "users").touch(0o600)
-    (folder / "users").write_text("alice:wonder\nbob:build:it\n")
-    names = ("mtls", "mtls and users", "expired", "early", "users", "open")
-    fleet = Fleet(folder, strangers, {name: a_free_port() for name in names})
-    is_plain = {"users", "open"}
-    endpoints = [fleet.tcp(name) if name in is_plain else fleet.tls(name) for name in names]
-    child = Child(ROUTERS, str(folder), *endpoints)
-    try:
-        assert child.line() == "ready"
-        yield fleet
-    finally:
-        child.kill()
 
 
 def denied(endpoint: str, credentials: Credentials | None) -> tuple[str, str]:

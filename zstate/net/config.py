@@ -108,6 +108,7 @@ def our_config(
             **SETTINGS,
             **_mode(mode),
             **_secured(credentials),
+            **_among_its_own(mode, credentials),
             "connect/endpoints": list(endpoints),
             "listen/endpoints": list(listen),
             "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
@@ -140,6 +141,14 @@ def _mode(mode: Mode) -> dict[str, object]:
 
 def _secured(credentials: Credentials | None) -> dict[str, object]:
     return {} if credentials is None else credentials.settings()
+
+
+def _among_its_own(mode: Mode, credentials: Credentials | None) -> dict[str, object]:
+    # Whoever is found by multicast or gossip and speaks plain TCP would be spoken to, certificates or not.
+    # Routers look for nobody, and may serve the programs of their host without.
+    if mode == "router" or credentials is None or credentials.ca is None:
+        return {}
+    return {"transport/link/protocols": ["tls", "quic"]}
 
 
 def _told(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:

@@ -76,6 +76,8 @@ def _knock(endpoint: str, credentials: Credentials | None) -> Refusal | None:
         with socket.create_connection((match["host"], int(match["port"])), ANSWERS_WITHIN_S) as link:
             if match["protocol"] == "tls":
                 return _greet(link, match["host"], credentials)
+            if credentials is not None and credentials.ca is not None:
+                return _SPEAKS_NO_TLS  # found by multicast; ours would not speak to it
             return _SPEAKS_TLS if _speaks_tls(link) else _of_user(credentials)
     except (OSError, UnicodeError):
         return None

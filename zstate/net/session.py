@@ -36,6 +36,7 @@ from zstate.net.modes import (
     listening,
 )
 from zstate.net.opening import open_within, patience_in
+from zstate.net.refusal_watch import RefusalWatch
 from zstate.net.rendezvous import Rendezvous, rendezvous_address
 from zstate.net.runtime import open_zenoh
 from zstate.net.security import Credentials
@@ -79,8 +80,8 @@ def connect(
     ``credentials`` and a ``mode`` other than "peer" then replace what it says.
 
     Raises InvalidInput or ConfigError for what cannot be used, Unreachable where nobody answers,
-    AccessDenied where somebody does and refuses, PortBusy, NetworkError. Only a client learns that it is
-    refused: the other modes go on trying.
+    AccessDenied where all who do refuse, PortBusy, NetworkError. The other modes go on trying; who refuses
+    them, and why, is logged as a warning.
     """
     checked = _check(mode, endpoints, listen, timeout_s)
     if credentials is not None:
@@ -139,7 +140,8 @@ def _session(
     config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None, timeout_s: float
 ) -> Session:
     raw = open_within(config, endpoints, credentials, timeout_s)
-    return Session(raw, twin=Twin.of(config, credentials))
+    watch = RefusalWatch(raw, config, endpoints, credentials)
+    return Session(raw, watch, twin=Twin.of(config, credentials))
 
 
 def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
@@ -173,10 +175,14 @@ class Session(Closing):
     """
 
     def __init__(
-        self, raw: zenoh.Session, rendezvous: Rendezvous | None = None, *, twin: Twin | None = None
+        self,
+        raw: zenoh.Session,
+        companion: Rendezvous | RefusalWatch | None = None,
+        *,
+        twin: Twin | None = None,
     ) -> None:
         self._raw = raw
-        self._rendezvous = rendezvous
+        self._companion = companion
         self._pid = os.getpid()
         self._closed = False
         self._lock = new_lock()
@@ -228,8 +234,8 @@ class Session(Closing):
         _run_bounded(self._leave)
 
     def _leave(self) -> None:
-        if self._rendezvous is not None:
-            self._rendezvous.close()
+        if self._companion is not None:
+            self._companion.close()
         self._raw.close()
 
 

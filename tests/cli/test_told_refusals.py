@@ -1,0 +1,32 @@
+"""Commands that go on trying where they are refused say why, on one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from looking import RRBOT, Spawn, started
+from support import a_free_port, until
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.mark.parametrize("command", [("router",), ("publish", RRBOT, "--source", "sine")])
+def test_a_wrong_user_is_told_what_to_check(
+    spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+):
+    users = tmp_path / "users.txt"
+    users.touch(0o600)
+    users.write_text("alice:wonder\n")
+    fleet = f"tcp/127.0.0.1:{free_port}"
+    started(spawn, "router", "--listen", fleet, "--users", str(users)).line()
+    monkeypatch.setenv("ZSTATE_PASSWORD", "wander")
+    who = ("--user", "alice", "--users", str(users)) if command == ("router",) else ("--user", "alice")
+    here = f"tcp/127.0.0.1:{a_free_port()}"
+    child = started(spawn, *command, "--connect", fleet, "--listen", here, *who)
+    child.line()
+    until(lambda: "does not let this session in" in child.stderr)
+    (told,) = [line for line in child.stderr.splitlines() if "does not let this session in" in line]
+    assert told.startswith(f"zstate: '{fleet}' answers and ")
+    assert "the user 'alice' or the password" in told
+    assert "--users file" in told

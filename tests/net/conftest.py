@@ -1,0 +1,35 @@
+"""What the tests of the network have: routers that let some in and others not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta, timezone
+
+import pytest
+from refusing import ROUTERS, Fleet
+from support import Child, a_free_port
+
+from zstate.net.certificates import issue_identities
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    now, two_days = datetime.now(timezone.utc), timedelta(days=2)
+    folder, strangers = tmp_path_factory.mktemp("fleet"), tmp_path_factory.mktemp("strangers")
+    issue_identities(folder, ["router", "r1"])
+    issue_identities(folder, ["expired"], days=1, valid_from=now - two_days)
+    issue_identities(folder, ["early"], days=1, valid_from=now + two_days)
+    issue_identities(strangers, ["r1"])
+    (folder / "users").touch(0o600)
+    (folder / "users").write_text("alice:wonder\nbob:build:it\n")
+    names = ("mtls", "mtls and users", "expired", "early", "users", "open")
+    fleet = Fleet(folder, strangers, {name: a_free_port() for name in names})
+    is_plain = {"users", "open"}
+    endpoints = [fleet.tcp(name) if name in is_plain else fleet.tls(name) for name in names]
+    child = Child(ROUTERS, str(folder), *endpoints)
+    try:
+        assert child.line() == "ready"
+        yield fleet
+    finally:
+        child.kill()

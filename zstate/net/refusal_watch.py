@@ -1,0 +1,140 @@
+"""RefusalWatch: tells a session that goes on trying who does not let it in, and why."""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import secrets
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+
+import zenoh
+
+from zstate.closing import Closing
+from zstate.net.security import Credentials
+
+_LOG = logging.getLogger("zstate")
+
+FIRST_LOOK_S = 1.0
+PERIOD_S = 5.0
+
+_FOUND_WITHIN_S = 0.5
+_ADDRESS = re.compile(r"(?P<protocol>tcp|tls)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
+
+Address = tuple[str, str, int]
+"""Protocol, IP address and port."""
+
+
+class RefusalWatch(Closing):
+    """Looks every few seconds whether ``session`` lacks a link to one of ``endpoints``, and asks there why.
+
+    With multicast, and nobody met, also at those who are found by it. A refusal is logged once, until
+    there was a link. A client needs one link only. Nothing is said of endpoints where nobody is: in no
+    order need programs start.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: zenoh.Config,
+        endpoints: Sequence[str],
+        credentials: Credentials | None,
+    ) -> None:
+        self._session = session
+        self._config = config
+        self._endpoints = endpoints
+        self._credentials = credentials
+        self._needs_all = json.loads(config.get_json("mode")) != "client"
+        self._seeks = json.loads(config.get_json("scouting/multicast/enabled")) is True
+        self._settled: set[str] = set()
+        self._stop = threading.Event()
+        if endpoints or self._seeks:
+            threading.Thread(target=self._run, name="zstate refusals", daemon=True).start()
+
+    def close(self) -> None:
+        """Look no more. A second call does nothing."""
+        self._stop.set()
+
+    def _run(self) -> None:
+        period_s = FIRST_LOOK_S
+        with suppress(zenoh.ZError):  # the session was closed meanwhile
+            while not self._stop.wait(period_s):
+                self._look()
+                period_s = PERIOD_S
+
+    def _look(self) -> None:
+        links = {_addresses(str(link.dst)) for link in self._session.info.links()}
+        linked = frozenset[Address]().union(*links)
+        if linked and not self._needs_all:
+            self._settled.clear()
+            return
+        for endpoint in [*self._endpoints, *self._found(alone=not linked)]:
+            if _addresses(endpoint) & linked:
+                self._settled.discard(endpoint)
+            elif endpoint not in self._settled and not self._stop.is_set():
+                self._ask(endpoint)
+
+    def _found(self, *, alone: bool) -> Iterator[str]:
+        """Where those listen who answer by multicast."""
+        if not (alone and self._seeks):
+            return
+        ring: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(64)
+        scout = zenoh.scout(ring, what="peer|router", config=self._config)
+        self._stop.wait(_FOUND_WITHIN_S)
+        hellos: dict[str, list[str]] = {}
+        while (hello := scout.try_recv()) is not None:
+            hellos[str(hello.zid)] = hello.locators
+        scout.stop()
+        for zid, locators in hellos.items():
+            if zid != str(self._session.zid()):
+                yield from locators
+
+    def _ask(self, endpoint: str) -> None:
+        from zstate.net.refusal import knock  # noqa: PLC0415  # loads ssl, which few need
+
+        answers = knock([endpoint], self._credentials)
+        if not answers.are_refusals:
+            return
+        self._settled.add(endpoint)
+        if not self._lets_in(endpoint):
+            error = answers.error
+            facts = {"event": "refused", "reason": getattr(error, "reason", None)}
+            _LOG.warning("%s; still trying", error, extra=facts)
+
+    def _lets_in(self, endpoint: str) -> bool:
+        """Whether a client like this session is let in: then there is a link of theirs, or one soon."""
+        config = zenoh.Config.from_json5(str(self._config))
+        told: dict[str, object] = {
+            "id": f"1{secrets.token_hex(15)}",
+            "mode": "client",
+            "connect": {"endpoints": [endpoint], "timeout_ms": 0, "exit_on_failure": True},
+            "listen/endpoints": [],
+            "scouting/multicast/enabled": False,
+        }
+        for path, value in told.items():
+            config.insert_json5(path, json.dumps(value))
+        try:
+            zenoh.open(config).close()
+        except zenoh.ZError:
+            return False
+        return True
+
+
+def _addresses(endpoint: str) -> frozenset[Address]:
+    """All that the host of ``endpoint`` stands for; none where that is not known, or not by TCP."""
+    match = _ADDRESS.match(endpoint)
+    if match is None:
+        return frozenset()
+    try:
+        found = socket.getaddrinfo(match["host"], int(match["port"]), type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return frozenset()
+    return frozenset(
+        (match["protocol"], str(info[4][0]).removeprefix("::ffff:"), int(match["port"])) for info in found
+    )
