@@ -17,7 +17,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.following.gaps import Gaps
 from zstate.following.tally import Tally
 from zstate.net.inbox import Heard, Inbox
-from zstate.net.presence import watch
+from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
 from zstate.rate import Rate
@@ -105,6 +105,9 @@ class Recorder(Closing):
             robot = self._chosen[0] if len(self._chosen) == 1 else ANY
             opening.enter_context(watch(session, robot, self._on_writer, wire))
             _subscribe(self._inbox, self._wire, self._chosen)
+            for robot in self._chosen or (ANY,):
+                for announcement in announce_reader(session, self._wire, robot, (*_LATCHED, *_SAMPLES)):
+                    opening.enter_context(announcement)
             self._writer = RecordWriter(
                 path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
             )

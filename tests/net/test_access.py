@@ -16,6 +16,7 @@ from support import a_free_port, until
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import InvalidInput
 from zstate.net.access import Fleet, access_control, access_text
+from zstate.net.presence import discover_readers
 from zstate.net.session import Session
 from zstate.publisher import STREAMS
 from zstate.wire import keys
@@ -148,6 +149,22 @@ def test_a_robot_sees_who_the_others_are_and_their_static_edges(site: Site):
         assert listener.buffer.wait("world", "base", timeout_s=5.0).kind == "static"
 
 
+def test_whoever_reads_is_known_to_viewers(site: Site):
+    with (
+        StatePublisher(site.join("r1"), RRBOT, "r1"),
+        TransformListener(site.join("r2"), "r1", follow="tf"),
+        TransformListener(site.join("hand")),
+        TransformListener(site.join("stranger"), "r1"),
+    ):
+        viewer = site.join("desk")
+        until(lambda: {one.robot for one in discover_readers(viewer)} == {"*", "r1"})
+        assert {one.stream for one in discover_readers(viewer) if one.robot == "r1"} == {
+            "robot_description",
+            "tf_static",
+            "tf",
+        }
+
+
 def test_a_robot_that_is_a_viewer_too_sees_the_others_move(tmp_path):
     with (
         a_site(tmp_path, Fleet(("r1", "r2"), ("r2",))) as site,
@@ -220,7 +237,7 @@ def test_the_text_says_the_same_to_zenoh():
 
 def test_only_the_rules_that_somebody_has_are_there():
     rules = [rule["id"] for rule in access_control(Fleet(viewers=("desk", "desk")))["rules"]]
-    assert rules == ["viewers read", "viewers are given"]
+    assert rules == ["viewers read", "viewers are given", "readers are known"]
 
 
 @pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])

@@ -1,5 +1,6 @@
 import os
 import time
+from contextlib import ExitStack
 
 import pytest
 from hypothesis import given
@@ -7,8 +8,18 @@ from hypothesis import strategies as st
 from support import Child, until
 
 from zstate.errors import InvalidInput
-from zstate.net.presence import Announcement, RobotInfo, announce, discover, watch, writer_here
+from zstate.net.presence import (
+    Announcement,
+    RobotInfo,
+    announce,
+    announce_reader,
+    discover,
+    discover_readers,
+    watch,
+    writer_here,
+)
 from zstate.net.session import Session, connect
+from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, check_writer, writer_key
 from zstate.wire.writer import Announced, Writer
 
@@ -100,6 +111,25 @@ def test_discover_of_nobody_takes_its_time_and_no_more():
         for timeout_s in (0.0, -1.0, float("nan")):
             with pytest.raises(InvalidInput, match="timeout_s"):
                 discover(session, timeout_s=timeout_s)
+
+
+def test_readers_are_announced_apart_from_writers_each_by_itself():
+    with connect() as one, connect() as asker, ExitStack() as reading:
+        wire = wire_named("native")
+        for robot, streams in (("r1", ("tf", "tf_static")), ("*", ("tf",)), ("*", ("tf",))):
+            for announcement in announce_reader(one, wire, robot, streams):
+                reading.enter_context(announcement)
+        readers = discover_readers(asker)
+        assert [(said.robot, said.stream) for said in readers] == [
+            ("*", "tf"),
+            ("*", "tf"),
+            ("r1", "tf"),
+            ("r1", "tf_static"),
+        ]
+        assert {said.writer.pid for said in readers} == {os.getpid()}
+        assert discover(asker, timeout_s=0.1) == ()
+        reading.close()
+        until(lambda: not discover_readers(asker, timeout_s=0.1))
 
 
 def test_tokens_that_are_not_ours_are_passed_over_and_counted():

@@ -23,6 +23,22 @@ def test_an_expression_hears_one_robot_or_all_and_every_static_writer():
     assert keys.writer_expression("*") == "zstate/*/@writer/*/*"
 
 
+@pytest.mark.parametrize("robot", ["panda", "*", "%2A", "a@b"])
+def test_a_reader_stands_apart_from_robots_and_tells_whose_stream_it_reads(robot: str):
+    key = keys.reader_key(robot, "joint_states", "x")
+    assert key.startswith("zstate/@reader/")
+    assert "*" not in key
+    assert keys.parse_reader_key(key) == (robot, "joint_states", "x")
+
+
+@pytest.mark.parametrize(
+    "key", ["zstate/panda/@writer/tf/x", "zstate/@reader/panda/songs/x", "zstate/@reader/panda/tf/x/y"]
+)
+def test_other_keys_are_no_readers(key: str):
+    with pytest.raises(InvalidInput, match="@reader"):
+        keys.parse_reader_key(key)
+
+
 @pytest.mark.parametrize(
     "name",
     [

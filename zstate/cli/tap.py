@@ -12,6 +12,7 @@ from zstate.cli.roster import Roster
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import MessageError
+from zstate.net.presence import announce_reader
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, check_robot
@@ -44,8 +45,11 @@ class Tap(Closing):
         self._roster = Roster(session, robot, wire)
         key = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, key, self._take)
+        self._announcements = announce_reader(session, self._wire, robot, (stream,))
 
     def close(self) -> None:
+        for announcement in self._announcements:
+            announcement.close()
         self._subscriber.close()
         self._roster.close()
 

@@ -3,7 +3,7 @@
 What nobody is allowed is denied. Zenoh allows a message when a rule's key expression includes that of
 the message, so that a robot cannot write to others by a wildcard either. ``**`` goes past chunks
 that begin with ``@``, which are named apart: late joiners ask under ``@adv``, presence stands under
-``@writer``, and clocks are compared under ``@clock``.
+``@writer``, and clocks are compared under ``@clock``. Whoever reads may say so, under ``@reader``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Rule = dict[str, object]
 
 _SAYS = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
 _ASKS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-_APART = ("@adv", "@writer", "@clock")
+_APART = ("@adv", "@writer", "@clock", "@reader")
 _IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 _HEAD = """\
@@ -122,6 +122,7 @@ def _roles(name: str, fleet: Fleet) -> Iterator[str]:
     if name in fleet.robots:
         yield from (f"{name} writes", f"{name} reads", f"{name} is given")
         yield from ("robots read", "robots are given", "robots are asked")
+    yield "readers are known"
     if name in (*fleet.viewers, *fleet.operators, *fleet.timekeepers):
         yield from ("viewers read", "viewers are given")
     if name in fleet.operators:
@@ -146,6 +147,7 @@ def _rules(fleet: Fleet) -> Iterator[Rule]:
     yield _rule("robots are asked", "egress", _ASKS, everything)
     yield _rule("viewers read", "ingress", _ASKS, everything)
     yield _rule("viewers are given", "egress", _SAYS, everything)
+    yield _rule("readers are known", "ingress", ("liveliness_token",), (f"{root}/@reader/**",))
     yield _rule("operators command", "ingress", ("put",), (f"{root}/*/joint_commands",))
     yield _rule("timekeepers write", "ingress", ("put",), (clock,))
 

@@ -18,7 +18,7 @@ from zstate.net.receiver import Receiver, Ring
 from zstate.net.router_losses import RouterLosses
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
-from zstate.wire.keys import ANY, Stream
+from zstate.wire.keys import ANY, READERS, Stream, parse_reader_key
 from zstate.wire.wire import Wire
 from zstate.wire.writer import Announced, Writer
 
@@ -69,8 +69,7 @@ def announce_reader(
     session: Session, wire: Wire, robot: str, streams: Sequence[Stream]
 ) -> list[Announcement]:
     """Tell everybody that this program reads ``streams`` of ``robot``, on wires that tell such things."""
-    program = writer_here(0).program
-    tokens = wire.reader_tokens(robot, streams, program, session.zid, session.next_number)
+    tokens = wire.reader_tokens(robot, streams, writer_here(0), session.zid, session.next_number)
     return [announce(session, token) for token in tokens]
 
 
@@ -84,6 +83,23 @@ def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") 
     tokens = living_tokens(session, spoken.writers_expression(ANY), timeout_s)
     announced = (spoken.announced(token, ANY) for token in tokens)
     return by_robot({one for one in announced if one is not None})
+
+
+def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announced, ...]:
+    """Every reader that is announced on the native wire, sorted; the robot "*" stands for all robots.
+
+    Asks as ``discover`` does. Programs that subscribe to keys by themselves are not announced.
+    """
+    tokens = living_tokens(session, READERS, timeout_s)
+    found = {one for one in map(_reader, tokens) if one is not None}
+    return tuple(sorted(found, key=lambda one: (one.robot, one.stream, one.writer)))
+
+
+def _reader(token: str) -> Announced | None:
+    try:
+        return Announced.parse(*parse_reader_key(token))
+    except InvalidInput:
+        return None
 
 
 def living_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> frozenset[str]:

@@ -10,6 +10,7 @@
 ``zstate/<robot>/status/<id>``              Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<stream>/<id>``    liveliness token of one writer
 ``zstate/<robot>/@clock/<id>``              a queryable: what time it is by that writer's clock
+``zstate/@reader/<robot>/<stream>/<id>``    liveliness token of one reader
 ``zstate/clock``                            Clock
 ==========================================  ==========================================
 """
@@ -17,6 +18,7 @@
 from __future__ import annotations
 
 from typing import Literal, get_args
+from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
 
@@ -24,6 +26,9 @@ Stream = Literal["joint_states", "tf", "tf_static", "robot_description", "joint_
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
+
+READERS = "zstate/@reader/*/*/*"
+"""The key expression of the tokens of all readers."""
 
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
@@ -111,6 +116,21 @@ def parse_writer_key(key: str) -> tuple[str, Stream, str]:
             if chunks[3] == stream:
                 return chunks[1], stream, chunks[4]
     raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@writer/<stream>/<identity>'")
+
+
+def reader_key(robot: str, stream: Stream, identity: str) -> str:
+    """The liveliness token of one reader; robot ``"*"`` means all. Readers write below no robot's prefix."""
+    return f"zstate/@reader/{quote(robot, safe='')}/{stream}/{identity}"
+
+
+def parse_reader_key(key: str) -> tuple[str, Stream, str]:
+    """Robot, stream and identity in a ``reader_key``. Raises InvalidInput for any other key."""
+    chunks = key.split("/")
+    if len(chunks) == 5 and chunks[:2] == ["zstate", "@reader"]:
+        for stream in get_args(Stream):
+            if chunks[3] == stream:
+                return unquote(chunks[2]), stream, chunks[4]
+    raise InvalidInput(f"the key {key!r} is not of the form 'zstate/@reader/<robot>/<stream>/<identity>'")
 
 
 def clock_key(robot: str, identity: str) -> str:

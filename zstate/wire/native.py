@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import msgspec
@@ -12,6 +13,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import (
     Stream,
     parse_writer_key,
+    reader_key,
     robot_of,
     stream_expression,
     stream_key,
@@ -122,9 +124,10 @@ class NativeWire:
         return NativeVoice(robot, writer)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], program: str, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
-        return ()  # writers are announced, readers are not
+        identity = replace(reader, session=number()).identity
+        return tuple(reader_key(robot, stream, identity) for stream in streams)
 
     def expression(self, robot: str, stream: Stream) -> str:
         return stream_expression(robot, stream)

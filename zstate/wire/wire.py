@@ -95,9 +95,9 @@ class Wire(Protocol):
         ...
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], program: str, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
-        """The liveliness tokens by which ``program`` is known to read ``streams``, where the wire has that.
+        """The liveliness tokens by which ``reader`` is known to read ``streams`` of ``robot``, or of all.
 
         ``number()`` gives each thing of a session another number.
         """

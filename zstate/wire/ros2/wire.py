@@ -82,13 +82,13 @@ class Ros2Wire:
         return NodeToken(self.options.domain, place.zid, place.number, "/", namespace, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], program: str, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         if robot == ANY:
             if self.options.namespace == ANY:
                 return ()  # a subscription in the graph is to one topic, and these are any number
             robot = SHARED
-        node = self._node(robot, program, Place(zid, number()))
+        node = self._node(robot, reader.program, Place(zid, number()))
         endpoints = [self.endpoint_token(node, robot, stream, "MS", number()) for stream in streams]
         return tuple(token for token in (self.node_token(node), *endpoints) if token is not None)
 
