@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 HOME = Path(os.environ.get("ZSTATE_BENCH_HOME") or Path(__file__).parents[1] / ".bench")
+
+
+def place(name: str) -> str:
+    """Where ``name`` lives, as a command names it that is run in the checkout."""
+    return shlex.quote(os.environ.get("ZSTATE_BENCH_HOME", ".bench") + f"/{name}")
 
 
 def venv_python(name: str) -> str | None:
