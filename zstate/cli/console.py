@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -36,6 +37,13 @@ def note(text: str, *, event: str = "note", robot: str | None = None) -> None:
 def fail(text: str) -> NoReturn:
     """End the command with exit code 1 and this cause."""
     raise click.ClickException(text)
+
+
+def colored(text: str, color: str | None) -> str:
+    """``text`` in a colour where a person sees it who has not asked for none (NO_COLOR)."""
+    if color is None or not is_terminal() or os.environ.get("NO_COLOR"):
+        return text
+    return click.style(text, fg=color)
 
 
 def is_terminal() -> bool:

@@ -92,6 +92,11 @@ def warn_on_standard_error() -> None:
         logger.propagate = False
 
 
+def keep_warnings_back() -> None:
+    """Warnings of the library go nowhere from now on: the command says them itself."""
+    logging.getLogger("zstate").setLevel(logging.CRITICAL)
+
+
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         facts = {name: getattr(record, name, None) for name in _FACTS}

@@ -27,6 +27,7 @@ _COMMANDS = {
     "listen": ("Look", "Follow robots: rates, latencies, losses."),
     "echo": ("Look", "Joint states, one document each."),
     "hz": ("Look", "The rate at which samples come in."),
+    "doctor": ("Look", "What is wrong, and what to do next."),
     "check": ("Look", "What is right and wrong with a robot model."),
     "record": ("Record", "What robots say, into MCAP files."),
     "replay": ("Record", "What was recorded, said again."),

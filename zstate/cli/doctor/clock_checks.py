@@ -1,0 +1,106 @@
+"""Time: the clocks of the writers, and what they stamp."""
+
+from __future__ import annotations
+
+from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
+from zstate.cli.doctor.ear import Ear
+from zstate.clock import SYSTEM, stamp_text
+from zstate.errors import NoClock, duration_text
+from zstate.following.off_clock import FAR_NS, likely_cause
+from zstate.net.clock_offset import ClockOffset
+from zstate.net.session import Session
+
+_DISTURBS_NS = 20_000_000
+_BREAKS_NS = 1_000_000_000
+_DAY_NS = 86_400_000_000_000
+
+_SET_CLOCKS = "timedatectl  # on both machines: is each synchronized?"
+
+
+def clocks_check(ear: Ear) -> Check:
+    """How far the clocks of the writers are from the one here."""
+    if not ear.offsets:
+        return skipped("clocks", "no writer tells the time by its clock")
+    worst = max(ear.offsets, key=lambda one: abs(one.offset_ns))
+    text = _offset_text(worst)
+    known = max(abs(worst.offset_ns) - worst.uncertainty_ns, 0)
+    if known > _BREAKS_NS:
+        return broken("clocks", text, _SET_CLOCKS)
+    if known > _DISTURBS_NS:
+        return warning("clocks", text, _SET_CLOCKS)
+    return ok("clocks", text)
+
+
+def _offset_text(one: ClockOffset) -> str:
+    side = "ahead of" if one.offset_ns > 0 else "behind"
+    size, bound = duration_text(abs(one.offset_ns)), duration_text(one.uncertainty_ns)
+    return f"that of {one.writer} is {size} {side} this one (± {bound})"
+
+
+def stamps_check(ear: Ear, session: Session) -> Check:
+    """Whether samples are stamped with the time at which they were taken."""
+    if ear.samples.last_stamp is None:
+        return skipped("stamps", "there is no sample")
+    if ear.description is not None and ear.description.clock not in ("", SYSTEM):
+        return _simulated_check(ear.description.clock, session)
+    return _far_check(ear) or _standing_check(ear) or _near_check(ear)
+
+
+def _far_check(ear: Ear) -> Check | None:
+    least, stamp = ear.samples.delays[0], ear.samples.last_stamp or 0
+    if abs(least) <= FAR_NS:
+        return None
+    size = f"{_size(least)} {'before' if least > 0 else 'after'}"
+    text = (
+        f"{ear.samples_writer} stamps samples {size} the time here ({stamp_text(stamp)}): "
+        f"{likely_cause(stamp, stamp + least)}"
+    )
+    return broken("stamps", text, "date +%s.%N  # here and where the writer runs; stamps are time.time_ns()")
+
+
+def _standing_check(ear: Ear) -> Check | None:
+    if ear.samples.count < 3 or not ear.samples.stands_still:
+        return None
+    stamp = stamp_text(ear.samples.last_stamp or 0)
+    text = f"{ear.samples_writer} gives every sample the same stamp, {stamp}: what it reads stands still"
+    return broken("stamps", text, f"zstate echo {ear.info.name}")
+
+
+def _near_check(ear: Ear) -> Check:
+    least, greatest = ear.samples.delays
+    if least < -_DISTURBS_NS:
+        text = f"{ear.samples_writer} stamps samples up to {duration_text(-least)} in the future{_blame(ear)}"
+        return (broken if least < -_BREAKS_NS else warning)("stamps", text, _SET_CLOCKS)
+    if least > _BREAKS_NS:
+        text = f"samples of {ear.samples_writer} come {duration_text(least)} after their stamps{_blame(ear)}"
+        return warning("stamps", text, f"zstate listen {ear.info.name}")
+    return ok("stamps", f"{_delay_text(least)} to {_delay_text(greatest)} old as they come")
+
+
+def _blame(ear: Ear) -> str:
+    for offset in ear.offsets:
+        if offset.writer.session == ear.samples.session and abs(offset.offset_ns) > _DISTURBS_NS:
+            return f"; the clock of {offset.writer} is the cause"
+    return ", and it is not the clock of the writer" if ear.offsets else ""
+
+
+def _simulated_check(domain: str, session: Session) -> Check:
+    from zstate.simulated_clock import SimulatedClock
+
+    with SimulatedClock(session) as clock:
+        try:
+            now = clock.wait(0.5)
+        except NoClock as error:
+            return broken(
+                "stamps", f"of the simulated time {domain!r}: {error}", "zstate replay FILE --clock"
+            )
+    return ok("stamps", f"of the simulated time {domain!r}, where it is {stamp_text(now)}")
+
+
+def _delay_text(nanoseconds: int) -> str:
+    return duration_text(max(nanoseconds, 0))
+
+
+def _size(nanoseconds: int) -> str:
+    size = abs(nanoseconds)
+    return f"{size / _DAY_NS:.1f} days" if size >= 2 * _DAY_NS else duration_text(size)

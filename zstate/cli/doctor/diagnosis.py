@@ -1,0 +1,111 @@
+"""Diagnosis: the links of the chain in their order, each as soon as it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli.doctor.check import Check, broken, ok
+from zstate.cli.doctor.network_checks import (
+    access_check,
+    elsewhere,
+    installation_check,
+    network_check,
+    refused_check,
+)
+from zstate.cli.network import Network, open_session
+from zstate.errors import ZStateError
+from zstate.wire.keys import ANY
+
+if TYPE_CHECKING:
+    from zstate.net.presence import RobotInfo
+    from zstate.net.session import Session
+
+
+def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
+    """The links to ``robot``, or to every robot for "*".
+
+    What is behind a broken link of all robots is not looked at.
+    """
+    yield installation_check()
+    with ExitStack() as opened:
+        try:
+            session = opened.enter_context(open_session(network, (wire,)))
+        except ZStateError as error:
+            yield refused_check(error, network)
+            return
+        except click.UsageError:
+            raise
+        except click.ClickException as error:
+            yield broken("network", error.format_message(), "zstate router --ros2")
+            return
+        yield from _behind(session, network, robot, wire, timeout_s)
+
+
+def _behind(session: Session, network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
+    from zstate.net.presence import discover
+
+    robots = discover(session, wire=wire)
+    check = network_check(session, network)  # later than the others, whom it counts
+    yield check
+    if check.state == "broken":
+        return
+    access = None if robot == ANY else access_check(session, network, robot)
+    if access is not None:
+        yield access
+    wanted = [info for info in robots if robot in (ANY, info.name)]
+    if not wanted:
+        yield _absent_check(session, network, robot, robots, wire)
+        return
+    yield ok("robots", f"{', '.join(repr(info.name) for info in robots)} announced")
+    yield from _of_robots(session, wanted, wire, timeout_s)
+
+
+def _of_robots(session: Session, wanted: list[RobotInfo], wire: str, timeout_s: float) -> Iterator[Check]:
+    from zstate.cli.doctor.ear import Ear, listen
+    from zstate.cli.doctor.robot_checks import robot_checks
+    from zstate.net.clock_offset import measure_offsets
+
+    with ExitStack() as listening:
+        ears = [listening.enter_context(Ear(session, info, wire)) for info in wanted]
+        if wire == "native":
+            for offset in measure_offsets(session, ANY):
+                for ear in ears:
+                    ear.offsets += (offset,) if offset.robot == ear.info.name else ()
+        listen(ears, timeout_s)
+        for ear in ears:
+            for check in robot_checks(ear, session):
+                yield check.of(ear.info.name)
+
+
+def _absent_check(
+    session: Session, network: Network, robot: str, robots: tuple[RobotInfo, ...], wire: str
+) -> Check:
+    names = [info.name for info in robots]
+    near = get_close_matches(robot, names, n=1)
+    what = "no robot is announced" if robot == ANY else f"nobody announces the robot {robot!r}"
+    if names:
+        text = f"{what}; announced: {', '.join(map(repr, names))}"
+        return broken("robots", text, f"zstate doctor {(near or names)[0]}{_connecting(network)}")
+    for options, others in elsewhere(network) if wire == "native" else ():
+        found = next((name for name in others if name == robot), others[0])
+        where = f"with{options}" if options else "without options, among the programs of this host"
+        text = f"{what} here; {where}: {', '.join(map(repr, others))}"
+        return broken("robots", text, f"zstate doctor {found}{options}")
+    if session.twin is not None:
+        what += f", or its router shows none to {session.twin.identity}"
+    name = "panda" if robot == ANY else robot
+    then = (
+        "zstate ls --wire ros2"
+        if wire != "native"
+        else f"zstate publish {name} --source sine{_connecting(network)}"
+    )
+    return broken("robots", what, then)
+
+
+def _connecting(network: Network) -> str:
+    return "".join(f" --connect {endpoint}" for endpoint in network.connect)

@@ -1,0 +1,117 @@
+"""Ear: everything that one robot says for a moment."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack
+
+from zstate.cli.doctor.samples import Samples
+from zstate.closing import Closing
+from zstate.errors import MessageError
+from zstate.following.events import Event
+from zstate.listener import Follow, TransformListener
+from zstate.net.clock_offset import ClockOffset
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.presence import RobotInfo
+from zstate.net.session import Session
+from zstate.net.status import watch_status
+from zstate.net.wires import wire_named
+from zstate.wire.keys import Stream, clock_key
+from zstate.wire.messages import RobotDescription, Status
+from zstate.wire.wire import Arrival
+from zstate.wire.writer import Writer
+
+AT_LEAST_S = 1.2
+"""Writers say once a second how they do."""
+
+_LOOK_EVERY_S = 0.02
+_ANSWERS_WITHIN_S = 0.4
+
+
+class Ear(Closing):
+    """Hears the robot ``info``, and how its writers do."""
+
+    def __init__(self, session: Session, info: RobotInfo, wire: str) -> None:
+        self.info = info
+        self.streams = frozenset(stream for stream, _ in info.writers)
+        is_native = wire == "native"
+        moves_by_joints = "joint_states" in self.streams or "tf" not in self.streams
+        self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
+        self.description: RobotDescription | None = None
+        self.statuses: dict[int, Status] = {}
+        self.events: list[Event] = []
+        self.offsets: tuple[ClockOffset, ...] = ()
+        self._session, self._wire = session, wire_named(wire)
+        with ExitStack() as opening:
+            key = self._wire.expression(info.name, "robot_description")
+            opening.enter_context(LatchedSubscriber(session, key, self._take_description))
+            self.samples = opening.enter_context(Samples(session, info.name, self.followed, self._wire))
+            if is_native:
+                opening.enter_context(watch_status(session, info.name, self._take_status))
+            self.listener = opening.enter_context(
+                TransformListener(
+                    session,
+                    info.name,
+                    wire=wire,
+                    follow=self.followed,
+                    history_on_join=False,
+                    on_event=self.events.append,
+                )
+            )
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def _take_description(self, arrival: Arrival) -> None:
+        try:
+            for said in self._wire.decode("robot_description", arrival, self.info.name):
+                if isinstance(said, RobotDescription):
+                    self.description = said
+        except MessageError:
+            pass  # withdrawn; or broken, which the listener counts and names
+
+    def _take_status(self, _: str, status: Status) -> None:
+        self.statuses[status.session] = status
+
+    def writers(self, stream: Stream) -> list[Writer]:
+        """Who is announced to write ``stream``, the newest last."""
+        found = [writer for said, writer in self.info.writers if said == stream]
+        return sorted(found, key=lambda writer: writer.since)
+
+    @property
+    def samples_writer(self) -> str:
+        """Who writes the samples that come."""
+        writers = {writer.session: str(writer) for _, writer in self.info.writers}
+        return writers.get(self.samples.session or 0, "somebody who is not announced")
+
+    @property
+    def lacks(self) -> bool:
+        """Whether something that is announced has not come yet."""
+        lacks_model = "robot_description" in self.streams and self.description is None
+        return lacks_model or (self.followed in self.streams and self.samples.count < 2)
+
+    @property
+    def is_mute(self) -> bool:
+        """Whether nothing at all has come but that somebody is there."""
+        frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
+        return not (self.description or self.samples.count or self.statuses or self.offsets or frames)
+
+    def is_stuck(self, writer: Writer) -> bool:
+        """Whether questions reach ``writer``, and it does not answer; who is kept from asking is told so
+        at once, by silence."""
+        asked = time.monotonic()
+        key = clock_key(self.info.name, writer.identity)
+        answers = list(self._session.zenoh.get(key, timeout=_ANSWERS_WITHIN_S))
+        is_answered = any(answer.ok is not None for answer in answers)
+        return not is_answered and time.monotonic() - asked > 0.9 * _ANSWERS_WITHIN_S
+
+
+def listen(ears: Iterable[Ear], timeout_s: float) -> None:
+    """Until all has come that is announced, a little more than a second at least, ``timeout_s`` at most."""
+    began, ears = time.monotonic(), list(ears)
+    while (lasting_s := time.monotonic() - began) < timeout_s:
+        if lasting_s > AT_LEAST_S and not any(ear.lacks for ear in ears):
+            break
+        time.sleep(_LOOK_EVERY_S)

@@ -1,0 +1,140 @@
+"""The links that all robots share: this installation, and the way to the others."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator
+from importlib import metadata
+
+from zstate import __version__
+from zstate.cli.console import count_text
+from zstate.cli.doctor.check import Check, broken, ok, warning
+from zstate.cli.doctor.probe import is_open, objection
+from zstate.cli.network import Network
+from zstate.errors import AccessDenied, Unreachable, ZStateError
+from zstate.extension import VARIABLE, kernel
+from zstate.net.config import ROUTER_ENDPOINT
+from zstate.net.connections import connections
+from zstate.net.presence import announce, discover
+from zstate.net.refusal import knock
+from zstate.net.rendezvous import rendezvous_address
+from zstate.net.session import Session, connect
+
+_DIFFERENTLY = {
+    "TLS demanded": "--certs DIR --identity NAME",
+    "certificate demanded": "--certs DIR --identity NAME",
+    "wrong CA": "--certs DIR --identity NAME",
+    "user demanded": "--user NAME",
+}
+
+
+def installation_check() -> Check:
+    """What runs here."""
+    zenoh = metadata.version("eclipse-zenoh")
+    text = f"zstate {__version__}, kernel {kernel}, Zenoh {zenoh}, Python {platform.python_version()}"
+    if kernel == "c" or kernel.reason.startswith(VARIABLE):
+        return ok("zstate", text)
+    return warning(
+        "zstate",
+        f"{text}: {kernel.reason}; lookups give the same answers and take longer",
+        "pip install --force-reinstall --no-deps zstate",
+    )
+
+
+def refused_check(error: ZStateError, network: Network) -> Check:
+    """There is no session, and ``error`` says why."""
+    if isinstance(error, Unreachable) and error.endpoints:
+        reasons = [f"{endpoint!r} ({objection(endpoint) or 'no answer'})" for endpoint in error.endpoints]
+        text = f"nothing answers at {' or '.join(reasons)}"
+        return broken("network", text, f"zstate router --listen {error.endpoints[0]}")
+    if isinstance(error, AccessDenied):
+        endpoint = error.endpoint
+        if error.reason in ("TLS demanded", "no TLS there"):
+            protocol = "tls/" if error.reason == "TLS demanded" else "tcp/"
+            endpoint = protocol + endpoint.partition("/")[2]
+        options = " ".join(filter(None, (f"--connect {endpoint}", _DIFFERENTLY.get(error.reason))))
+        known = error.reason in _DIFFERENTLY or endpoint != error.endpoint
+        return broken("network", str(error), f"zstate doctor {options}" if known else "zstate config")
+    return broken("network", str(error), f"zstate config{_options(network)}")
+
+
+def network_check(session: Session, network: Network) -> Check:
+    """Whom the session has links to."""
+    if not network.is_given:
+        return _host_check(session)
+    met = connections(session)
+    parts = [count_text(number, kind) for kind, number in met.sessions.items() if number]
+    links = ", ".join(sorted({str(link.dst) for link in session.zenoh.info.links()}))
+    text = f"{network.joins_as}, linked to {' and '.join(parts) or 'nobody'}{f' ({links})' if links else ''}"
+    for endpoint in network.connect if network.joins_as != "client" else ():
+        reason = objection(endpoint)
+        if reason:
+            text = f"nothing answers at {endpoint!r} ({reason}); a peer goes on trying"
+            return broken("network", text, f"zstate router --listen {endpoint}")
+        answers = knock([endpoint], network.credentials)
+        if answers.are_refusals and not parts:
+            return broken("network", str(answers.error), f"zstate config{_options(network)}")
+    return ok("network", text)
+
+
+def _host_check(session: Session) -> Check:
+    host, port = rendezvous_address()
+    where = f"{host}:{port}"
+    count = connections(session).sessions["peer"]
+    if not count:
+        return broken(
+            "network",
+            f"programs of this host meet at {where}, and what listens there is not zstate",
+            f"ZSTATE_RENDEZVOUS={host}:{port + 1} zstate doctor  # and for all other programs, too",
+        )
+    return ok("network", f"programs of this host, which meet at {where}: {count - 1} besides this one")
+
+
+def access_check(session: Session, network: Network, robot: str) -> Check | None:
+    """Whether whoever is called like ``robot`` may write as it; None for others, and where nobody asks."""
+    from zstate.net.permission import check_may_write
+
+    credentials = network.credentials
+    if session.twin is None or credentials is None or robot not in _names(network):
+        return None
+    # Among the keys of its writers, and none that a reader could take for a writer's.
+    token = f"zstate/{robot}/@writer/doctor/{session.zid}"
+    with announce(session, token):
+        try:
+            check_may_write(session, robot, token)
+        except AccessDenied as error:
+            return broken("access", str(error), f"zstate acl --robot {robot}")
+    return ok("access", f"the router lets {credentials.identity} write as {robot!r}")
+
+
+def _names(network: Network) -> set[str]:
+    from pathlib import Path
+
+    credentials = network.credentials
+    if credentials is None:
+        return set()
+    certificate = Path(credentials.certificate).stem if credentials.certificate else ""
+    return {credentials.user or "", certificate} - {""}
+
+
+def elsewhere(network: Network) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Options with which other robots than now would be seen, and which."""
+    router = Network("client", (ROUTER_ENDPOINT,))
+    others = [("", Network())] if network.is_given else []
+    if ROUTER_ENDPOINT not in network.connect and is_open(ROUTER_ENDPOINT):
+        others.append((f" --connect {ROUTER_ENDPOINT}", router))
+    for options, other in others:
+        try:
+            with connect(mode=other.joins_as, endpoints=other.connect, timeout_s=1.0) as session:
+                robots = discover(session, 0.4)
+                ros = discover(session, 0.4, wire="ros2") if other is router and not robots else ()
+        except ZStateError:
+            continue
+        if robots:
+            yield options, tuple(info.name for info in robots)
+        elif ros:
+            yield f"{options} --wire ros2", tuple(info.name for info in ros)
+
+
+def _options(network: Network) -> str:
+    return "".join(f" --connect {endpoint}" for endpoint in network.connect)

@@ -1,0 +1,233 @@
+"""The links of one robot: its writers, its model, its samples, its fixed edges, and the poses at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from zstate.cli.console import count_text
+from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
+from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
+from zstate.cli.doctor.ear import Ear
+from zstate.cli.telling_links import telling_links
+from zstate.errors import LookupFailed, ModelError, duration_text
+from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
+from zstate.net.session import Session
+from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.messages import Status
+
+_FEWER = 0.8
+"""Of what is sent, at least so much is to arrive."""
+
+_KEPT = 0.95
+"""Of the rate it is to keep, so much is good enough."""
+
+_OF_VERSIONS = ("newer version", "foreign")
+_OF_THE_MODEL = ("robot description", "no description")
+_OF_STATICS = "static edge of"
+"""So begin the texts of refused ones."""
+
+
+def robot_checks(ear: Ear, session: Session) -> Iterator[Check]:
+    """Every link of the robot that ``ear`` has heard for a while."""
+    yield _writers_check(ear)
+    if ear.is_mute and ear.info.writers:
+        yield _mute_check(ear, session)
+        return
+    versions = _version_check(ear)
+    if versions is not None:
+        yield versions
+    model, check = _model_check(ear)
+    yield check
+    yield _samples_check(ear)
+    yield clocks_check(ear)
+    yield stamps_check(ear, session)
+    yield _statics_check(ear)
+    yield _poses_check(ear, model)
+
+
+def _writers_check(ear: Ear) -> Check:
+    for event in ear.events:
+        if event.kind == "conflict":
+            then = (
+                f"zstate ls  # shows both; end one of them, or give it --name, another than {ear.info.name}"
+            )
+            return warning("writers", event.text, then)
+    for status in ear.statuses.values():
+        if status.level == "error" or (status.level == "warn" and not _keeps_its_rate(status)):
+            text = f"{status.program}@{status.host} pid {status.pid} says: {status.text}"
+            return warning("writers", text, f"zstate listen {ear.info.name}")
+    streams: dict[str, list[str]] = {}
+    for stream, writer in ear.info.writers:
+        streams.setdefault(str(writer), []).append(stream)
+    said = [f"{writer} ({', '.join(streams)})" for writer, streams in streams.items()]
+    return ok("writers", "; ".join(said))
+
+
+def _keeps_its_rate(status: Status) -> bool:
+    """Whether it only was late now and then."""
+    commanded = status.values.get("commanded", "").partition(" ")[0]
+    return bool(commanded) and status.rate_hz >= _KEPT * float(commanded)
+
+
+def _mute_check(ear: Ear, session: Session) -> Check:
+    """Writers are announced, and nothing that they say arrives."""
+    robot, writer = ear.info.name, ear.info.writers[0][1]
+    if ear.is_stuck(writer):
+        text = f"{writer} is announced and answers nothing: it is stopped, frozen, or behind a dead link"
+        return broken("writers", text, f"ps -o stat= -p {writer.pid}  # on {writer.host}; T: it is stopped")
+    if session.zenoh.info.routers_zid():
+        who = "to this identity" if session.twin is None else f"to {session.twin.identity}"
+        text = (
+            f"{robot!r} is alive, and nothing it says arrives: the router denies zstate/{robot}/** {who}; "
+            "its access control lets those read whom it names as viewers"
+        )
+        return broken("access", text, "zstate acl --viewer NAME  # for the router; then it is started anew")
+    text = f"{writer} is announced, and nothing it says arrives"
+    return broken("writers", text, f"zstate echo {robot}")
+
+
+def _version_check(ear: Ear) -> Check | None:
+    for reason in _OF_VERSIONS:
+        text = ear.listener.refusals.get(reason)
+        if text:
+            then = (
+                "pip install -U zstate"
+                if reason == "newer version"
+                else f"zstate ls  # who is {ear.info.name}?"
+            )
+            return broken("version", text, then)
+    return None
+
+
+def _model_check(ear: Ear) -> tuple[RobotModel | None, Check]:
+    robot = ear.info.name
+    if ear.description is None:
+        return None, _no_model_check(ear)
+    try:
+        model = parse_urdf(ear.description.urdf, f"the URDF of {robot!r}")
+    except ModelError as error:
+        return None, broken("model", str(error), "zstate check FILE  # the file that its publisher was given")
+    refused = ear.listener.refusals.get("robot description")
+    if refused:
+        return None, broken("model", refused, f"zstate tree {robot}")
+    size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
+    text = f"{model.name!r}: {size}, root {model.root!r}"
+    if model.findings:
+        first = model.findings[0]
+        text += f"; {count_text(len(model.findings), 'warning')}, such as line {first.line}: {first.message}"
+        return model, warning("model", text, "zstate check FILE")
+    return model, ok("model", text)
+
+
+def _no_model_check(ear: Ear) -> Check:
+    robot = ear.info.name
+    writers = ear.writers("robot_description")
+    if writers:
+        text = f"{writers[-1]} announces the model, which has not arrived"
+        return broken("model", text, f"zstate doctor {robot} --timeout 10")
+    if ear.followed == "tf":
+        return ok("model", "nobody publishes one, and none is needed: poses come ready made on tf")
+    return broken("model", f"nobody publishes the model of {robot!r}", f"zstate publish FILE --name {robot}")
+
+
+def _samples_check(ear: Ear) -> Check:
+    stream, robot, samples = ear.followed, ear.info.name, ear.samples
+    writers = ear.writers(stream)
+    if not writers and not samples.count:
+        return _nobody_check(ear)
+    who = str(writers[-1]) if writers else "somebody unannounced"
+    if not samples.count:
+        return broken(
+            stream, f"{who} is there, but no sample comes: {_idle_text(ear)}", f"zstate echo {robot}"
+        )
+    refused = _refused_check(ear)
+    if refused is not None:
+        return refused
+    rate_hz = samples.rate_hz
+    if rate_hz is None:
+        return warning(stream, f"one sample came from {who}; too few to tell a rate", f"zstate hz {robot}")
+    if samples.silent_ns > max(500_000_000, 10e9 / rate_hz):
+        text = f"samples of {who} came, and none for {duration_text(samples.silent_ns)}"
+        return broken(stream, text, f"zstate hz {robot} --stream {stream}")
+    return _rate_check(ear, rate_hz, who)
+
+
+def _nobody_check(ear: Ear) -> Check:
+    robot = ear.info.name
+    if "robot_description" not in ear.streams:
+        text = f"nobody writes joint_states of {robot!r}, nor tf: it stands still"
+        return warning("joint_states", text, f"zstate joints {robot}  # moves it, for a try")
+    text = f"nobody writes joint_states of {robot!r}: its driver is not running, or writes under another name"
+    return broken("joint_states", text, f"zstate joints {robot}  # a sine, in the place of the driver")
+
+
+def _idle_text(ear: Ear) -> str:
+    writer = ear.writers(ear.followed)[-1]
+    status = ear.statuses.get(writer.session)
+    if status is None:
+        return "it says nothing else either: stopped, or frozen" if ear.is_stuck(writer) else "it is slow"
+    return f"it runs, but {status.text or 'publishes nothing'}"
+
+
+def _refused_check(ear: Ear) -> Check | None:
+    refused, texts = ear.listener.stats.refused, ear.listener.refusals
+    reasons = [
+        reason
+        for reason, text in texts.items()
+        if reason not in (*_OF_THE_MODEL, *_OF_VERSIONS) and not text.startswith(_OF_STATICS)
+    ]
+    if not reasons:
+        return None
+    reason = max(reasons, key=lambda one: refused[one])
+    text = f"{count_text(refused[reason], 'message')} cannot be used ({reason}): {texts[reason]}"
+    if ear.listener.stats.received:
+        return warning(ear.followed, text, f"zstate listen {ear.info.name}")
+    return broken(ear.followed, text, f"zstate echo {ear.info.name} --once")
+
+
+def _rate_check(ear: Ear, rate_hz: float, who: str) -> Check:
+    stream, robot, stats = ear.followed, ear.info.name, ear.listener.stats
+    text = f"{rate_hz:.1f} Hz from {who}"
+    status = ear.statuses.get(ear.samples.session or 0)
+    if status is not None and rate_hz < _FEWER * status.rate_hz:
+        text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost, or thinned by a router, on the way"
+        return warning(stream, text, f"zstate hz {robot} --stream {stream}")
+    if stats.missed + stats.dropped > _FEWER * ear.samples.count:
+        text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
+        return warning(stream, text, f"zstate listen {robot}")
+    return ok(stream, f"{text}, newest {duration_text(ear.samples.silent_ns)} ago")
+
+
+def _statics_check(ear: Ear) -> Check:
+    frames = ear.listener.buffer.frames()
+    owned = [frame for frame in frames if frame.kind == "static"]
+    heard = {frame.writer for frame in owned}
+    others = {name: writer for name, writer in ear.info.static_names if name != MODEL_WRITER}
+    silent = [name for name in others if name not in heard]
+    for text in ear.listener.refusals.values():
+        if text.startswith(_OF_STATICS):
+            return warning("tf_static", text, f"zstate tree {ear.info.name}")
+    if silent:
+        text = f"{others[silent[0]]} announces static edges as {silent[0]!r}, and places no frame"
+        return warning("tf_static", text, f"zstate tree {ear.info.name}")
+    return ok("tf_static", f"{count_text(len(owned), 'fixed edge')}")
+
+
+def _poses_check(ear: Ear, model: RobotModel | None) -> Check:
+    frames, robot = ear.listener.buffer.frames(), ear.info.name
+    if not frames:
+        return skipped("poses", "no frame is known")
+    roots = [frame.name for frame in frames if frame.parent is None]
+    if len(roots) > 1:
+        text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(roots)}"
+        return warning("poses", text, f"zstate static {roots[0]} {roots[1]} --xyz 0 0 0  # joins two of them")
+    ends = telling_links(model, 1) if model is not None else ()
+    target, source = roots[0], f"{robot}/{ends[0]}" if ends else frames[-1].name
+    try:
+        ear.listener.buffer.lookup(target, source)
+    except LookupFailed as error:
+        if not ear.samples.count:
+            return skipped("poses", f"the links move with joints of which nothing is heard: {error}")
+        return broken("poses", str(error), f"zstate tf {target} {source}")
+    return ok("poses", f"{count_text(len(frames), 'frame')} in one tree; {source} in {target} is known")

@@ -1,0 +1,62 @@
+"""Samples: how the samples of one stream of one robot come in, whatever they say."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+
+from zstate.closing import Closing
+from zstate.errors import MessageError
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber
+from zstate.wire.keys import Stream
+from zstate.wire.messages import Sample
+from zstate.wire.wire import Arrival, Wire
+
+
+class Samples(Closing):
+    """Counts samples, with when they came and what they are stamped; durations in nanoseconds."""
+
+    def __init__(self, session: Session, robot: str, stream: Stream, wire: Wire) -> None:
+        self.count = 0
+        self.last_stamp: int | None = None
+        self.delays: tuple[int, int] = (0, 0)
+        """From the stamp to the arrival here: the least and the greatest there was."""
+        self.stands_still = True
+        """Whether all have the same stamp."""
+        self.session: int | None = None
+        """Of the writer of the newest."""
+        self._came: tuple[int, int] = (0, 0)
+        self._robot, self._wire = robot, wire
+        self._stream: Stream = stream
+        self._subscriber = StreamSubscriber(session, wire.expression(robot, stream), self._take)
+
+    def close(self) -> None:
+        self._subscriber.close()
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Samples a second, as they come; None for fewer than two."""
+        first, last = self._came
+        return (self.count - 1) * 1e9 / (last - first) if last > first else None
+
+    @property
+    def silent_ns(self) -> int:
+        """How long there has been none."""
+        return time.monotonic_ns() - self._came[1]
+
+    def _take(self, arrivals: list[Arrival]) -> None:
+        for arrival in arrivals:
+            with suppress(MessageError):  # the listener beside this counts and names them
+                for sample in self._wire.decode(self._stream, arrival, self._robot):
+                    assert isinstance(sample, Sample)
+                    self._note(sample)
+
+    def _note(self, sample: Sample) -> None:
+        came, delay = time.monotonic_ns(), time.time_ns() - sample.stamp
+        least, greatest = self.delays if self.count else (delay, delay)
+        self.delays = min(least, delay), max(greatest, delay)
+        self._came = self._came[0] if self.count else came, came
+        self.stands_still = self.stands_still and self.last_stamp in (None, sample.stamp)
+        self.last_stamp, self.session = sample.stamp, sample.session
+        self.count += 1
