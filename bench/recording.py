@@ -81,19 +81,32 @@ def reader_figures(
 ) -> dict[str, float | int | list[float] | None]:
     """How one reader did.
 
-    ``rate_hz`` counts the answers that were made within the window; the others are about the samples that
-    were stamped in it: ``lost`` were never answered, ``late`` later than a period after their stamp.
+    ``rate_hz`` is that of the answers made within the window; the others are about the samples that were
+    stamped in it: ``lost`` were never answered, ``late`` later than a period after their stamp.
     """
     asked = sent.keys(window.begin)[window.holds(sent.stamps)]
     latencies = (heard.times - heard.stamps)[window.holds(heard.stamps)] * 1e-3
     period_us = 1e6 / rate_hz if rate_hz else None
     return {
-        "rate_hz": round(int(window.holds(heard.times).sum()) / window.seconds, 3),
+        "rate_hz": round(rate_in(heard.times, window), 3),
         "answered": len(latencies),
         "lost": int((~np.isin(asked, heard.keys(window.begin))).sum()),
         "late": None if period_us is None else int((latencies > period_us).sum()),
         "latency_us": latency_grid(latencies),
     }
+
+
+def rate_in(times: Numbers, window: Window) -> float:
+    """How many a second [Hz]: from the first in the window to the first behind it, both known to the ns.
+
+    Their number over the window's length would be wrong by up to one, which is much where there are few.
+    Where nothing comes after the window, it is that.
+    """
+    ordered = np.sort(times)
+    first, after = np.searchsorted(ordered, (window.begin, window.end))
+    if first == after or after == len(ordered):
+        return float(after - first) / window.seconds
+    return float(after - first) / ((ordered[after] - ordered[first]) * 1e-9)
 
 
 def latency_grid(latencies_us: NDArray[np.float64]) -> list[float]:

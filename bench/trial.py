@@ -15,7 +15,7 @@ from bench.job import Job
 from bench.measure import Costs
 from bench.poses import pose_errors
 from bench.process import Process, RunFailed
-from bench.recording import Recording, Window, reader_figures
+from bench.recording import Recording, Window, rate_in, reader_figures
 from bench.robot import BenchRobot, bench_robot
 from bench.scenario import Scenario
 from bench.subjects.subject import Service, Subject
@@ -79,6 +79,7 @@ class Trial:
         return {
             "window_s": round(window.seconds, 4),
             "sent": int(window.holds(sent.stamps).sum()),
+            "sent_hz": round(rate_in(sent.stamps, window), 3),
             "readers": [reader_figures(sent, one, window, self._scenario.rate_hz) for one in heard],
             **costs.figures(),
             "poses": pose_errors(sent, self._robot.poses, poses, window.begin),

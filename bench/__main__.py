@@ -1,0 +1,163 @@
+"""The benchmark: ``python -m bench setup``, then ``run``, then ``report``."""
+
+from __future__ import annotations
+
+import secrets
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from bench import results
+from bench.plots import PlotsMissing, write_plots
+from bench.process import ROOT
+from bench.report import write_report
+from bench.run import Turn, run, seconds, turns
+from bench.scenario import FULL, QUICK, named
+from bench.subjects import NAMES, subject_named
+from bench.subjects.subject import Subject
+from bench.trial import Facts
+
+CONSOLE = Console()
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def main() -> None:
+    """Compare zstate with the real systems: rates, latency and cost."""
+
+
+@main.command()
+@click.argument("names", nargs=-1, metavar="[SUBJECT]...")
+def setup(names: tuple[str, ...]) -> None:
+    """Show what is installed; install each SUBJECT that is named, by the commands shown."""
+    for name in names:
+        for command in _subject(name).install:
+            CONSOLE.print(f"[bold]$ {command}[/]", highlight=False)
+            # What is shown is what is run; it is written in this repository.
+            if subprocess.run(command, shell=True, cwd=ROOT, check=False).returncode:
+                raise click.ClickException(f"{name}: this command failed; the others were not run")
+    table = Table("subject", "is", "installed", "to install it", box=None)
+    for subject in map(subject_named, NAMES):
+        installed = subject.python() is not None
+        versions = (
+            ", ".join(f"{what} {number}" for what, number in subject.versions().items()) if installed else ""
+        )
+        table.add_row(
+            subject.name,
+            subject.title,
+            versions or "[red]no[/]",
+            "" if installed else "\n".join(subject.install),
+        )
+    CONSOLE.print(table)
+
+
+@main.command("run")
+@click.option(
+    "--quick", is_flag=True, help="A few scenarios with short windows: minutes instead of most of an hour."
+)
+@click.option("--subject", "subjects", multiple=True, metavar="NAME", help="Only this one; may be repeated.")
+@click.option(
+    "--scenario",
+    "words",
+    multiple=True,
+    metavar="NAME",
+    help="Only this one, or this group; may be repeated.",
+)
+@click.option(
+    "--repeat", default=1, show_default=True, type=click.IntRange(min=1), help="So many times the rounds."
+)
+@click.option("--seed", type=int, help="Of the order of subjects; drawn unless given.")
+@click.option("--list", "only_list", is_flag=True, help="Say what would be run, and how long that takes.")
+def run_command(
+    *,
+    quick: bool,
+    subjects: tuple[str, ...],
+    words: tuple[str, ...],
+    repeat: int,
+    seed: int | None,
+    only_list: bool,
+) -> None:
+    """Measure, and write the report."""
+    try:
+        scenarios = named(QUICK if quick else FULL, words)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--scenario") from None
+    chosen = [_subject(name) for name in subjects or NAMES]
+    seed = secrets.randbits(32) if seed is None else seed
+    planned = turns([one for one in chosen if one.python() is not None], scenarios, repeat, seed)
+    CONSOLE.print(
+        f"{len(planned)} runs, about {seconds(planned) / 60:.0f} minutes, seed {seed}", highlight=False
+    )
+    for one in chosen:
+        if one.python() is None:
+            CONSOLE.print(f"not installed: {one.title}; python -m bench setup {one.name}", highlight=False)
+    if only_list:
+        for turn in planned:
+            CONSOLE.print(f"{turn.scenario.name}  {turn.subject.name}", highlight=False)
+        return
+    folder = results.new_folder()
+    results.begin(folder, shlex.join(["python", "-m", "bench", *sys.argv[1:]]), chosen, scenarios, seed)
+    _run(folder, planned)
+    _report(folder)
+
+
+def _run(folder: Path, planned: list[Turn]) -> None:
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    # Drawn between the runs only: a bar that moves would be measured, too.
+    with Progress(*columns, console=CONSOLE, auto_refresh=False) as progress:
+        task = progress.add_task("", total=len(planned))
+
+        def show(number: int, turn: Turn, facts: Facts | None) -> None:
+            what = f"{turn.scenario.name}  {turn.subject.title}"
+            if facts is None:
+                progress.update(task, description=what, completed=number, refresh=True)
+            else:
+                progress.update(task, completed=number + 1)
+                progress.print(f"{what}: {_outcome(facts)}", highlight=False, markup=False, soft_wrap=True)
+
+        run(folder, planned, show)
+        progress.update(task, description="done", refresh=True)
+
+
+def _outcome(facts: Facts) -> str:
+    if "failed" in facts:
+        return f"FAILED, {facts['failed']}"
+    if "whole_ms" in facts:
+        return f"whole tree within {max(facts['whole_ms']):g} ms"
+    rates = [one["rate_hz"] for one in facts["readers"]]
+    cpu = ", ".join(f"{role} {percent:g} %" for role, percent in facts["cpu_percent"].items())
+    medians = [one["latency_us"][50] for one in facts["readers"] if one["latency_us"]]
+    return f"{min(rates):.1f} Hz, {max(medians, default=float('nan')):.0f} us, {cpu}"
+
+
+@main.command()
+@click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
+def report(folder: Path | None) -> None:
+    """Write tables and plots of a run again: the last one, or that in FOLDER."""
+    _report(folder or results.newest())
+
+
+def _report(folder: Path) -> None:
+    found = results.Results.read(folder)
+    plots: list[Path] = []
+    try:
+        plots = write_plots(found)
+    except PlotsMissing as reason:
+        CONSOLE.print(str(reason), highlight=False, markup=False)
+    for path in (write_report(found, plots), *plots):
+        CONSOLE.print(str(path), highlight=False, soft_wrap=True)
+
+
+def _subject(name: str) -> Subject:
+    if name not in NAMES:
+        raise click.BadParameter(f"{name!r} is not one of {', '.join(NAMES)}", param_hint="subject")
+    return subject_named(name)
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m bench")

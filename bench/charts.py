@@ -1,0 +1,334 @@
+"""The charts: each answers one question of the issue at hand, in one figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.drawing import INK, ROLE_SHADES, label_ends, note, pen, plain_ticks, styled
+from bench.outcome import Outcome, outcomes
+from bench.results import Results
+from bench.scenario import Scenario
+
+# A reader that is nearer to the commanded rate than this has kept up.
+KEPT_UP = 0.995
+
+Lines = Mapping[str, Sequence[tuple[float, float]]]
+
+
+@styled
+def overview(results: Results, scenario: Scenario) -> Figure:
+    """Rate, latency and CPU of everybody in one scenario: the one for a talk."""
+    found = outcomes(results, scenario)
+    figure = Figure(figsize=(13.0, 1.6 + 0.42 * len(found)))
+    rate, latency, cpu = figure.subplots(1, 3, sharey=True, width_ratios=(1.0, 1.25, 1.25))
+    _name_rows(rate, results, found)
+    for row, (name, one) in enumerate(found.items()):
+        _rate_bar(rate, row, name, one)
+        _latency_row(latency, row, name, one)
+        _cpu_bar(cpu, row, name, one)
+    rate.set(
+        title="Rate at the reader",
+        xlim=(0, 1.28 * scenario.rate_hz),
+        xticks=(0, scenario.rate_hz / 2, scenario.rate_hz),
+    )
+    rate.set_xlabel("Hz")
+    _time_axis(latency, "Latency, from stamp to answer")
+    cpu.set(title="CPU, all processes", xlabel="% of a core: writer, reader, others")
+    cpu.margins(x=0.18)
+    for axes in (rate, latency, cpu):
+        axes.grid(axis="x")
+        axes.tick_params(axis="y", length=0)
+        axes.set_axisbelow(True)
+    figure.suptitle(
+        f"{scenario.robot}, {_joints(results, scenario)} joints, {scenario.rate} commanded",
+        x=0.0,
+        ha="left",
+        fontsize=15,
+        fontweight="bold",
+    )
+    figure.tight_layout(rect=(0, 0, 1, 0.99), w_pad=2.5)
+    _sign(figure, results, "Latency: bar from p1 to p99, dark from p25 to p75, dot p50, tick p99.9.")
+    return figure
+
+
+@styled
+def latencies(results: Results, scenarios: Sequence[Scenario]) -> Figure | None:
+    """The distribution of latencies, a panel for each rate."""
+    if not scenarios:
+        return None
+    names = {name: one for scenario in scenarios for name, one in outcomes(results, scenario).items()}
+    figure = Figure(figsize=(2.4 + 4.6 * len(scenarios), 1.6 + 0.42 * len(names)))
+    panels = figure.subplots(1, len(scenarios), sharey=True, sharex=True, squeeze=False)[0]
+    _name_rows(panels[0], results, names)
+    for axes, scenario in zip(panels, scenarios, strict=True):
+        found = outcomes(results, scenario)
+        for row, name in enumerate(names):
+            if name in found:
+                _latency_row(axes, row, name, found[name])
+        _time_axis(axes, f"{scenario.robot} at {scenario.rate}")
+        axes.grid(axis="x")
+        axes.tick_params(axis="y", length=0)
+        axes.set_axisbelow(True)
+    figure.tight_layout(w_pad=2.5)
+    _sign(
+        figure,
+        results,
+        "From stamp to the answer of the reader's own buffer. "
+        "Bar from p1 to p99, dark from p25 to p75, dot p50, tick p99.9.",
+    )
+    return figure
+
+
+@styled
+def rates(results: Results, scenarios: Sequence[Scenario]) -> Figure:
+    """Commanded against achieved rate."""
+    lines = _lines(results, scenarios, lambda scenario: scenario.rate_hz, lambda one: one.rate_hz)
+    commanded = sorted({scenario.rate_hz for scenario in scenarios})
+    figure = Figure(figsize=(8.6, 5.4))
+    axes = figure.subplots()
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="commanded, Hz",
+        title=f"Achieved rate at the reader, Hz: {scenarios[0].robot}",
+    )
+    axes.plot(commanded, commanded, color="#CCCCCC", lw=8, solid_capstyle="round", zorder=1)
+    kept = {name for name, points in lines.items() if all(y >= KEPT_UP * x for x, y in points)}
+    ends = _draw(axes, results, {name: points for name, points in lines.items() if name not in kept})
+    for name in kept:
+        axes.plot(
+            *zip(*lines[name], strict=True),
+            color=pen(name).color,
+            marker=pen(name).marker,
+            ls="",
+            ms=5,
+            zorder=3,
+        )
+    text = "on the line at every rate:\n" + "\n".join(_title(results, name) for name in lines if name in kept)
+    axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=9.5, linespacing=1.45)
+    plain_ticks(axes, "x", commanded)
+    plain_ticks(axes, "y", commanded)
+    axes.grid()
+    label_ends(axes, ends)
+    _sign(figure, results, f"On the line: never below {100 * KEPT_UP:g} % of the commanded rate.")
+    return figure
+
+
+@styled
+def cpu_by_rate(results: Results, scenarios: Sequence[Scenario]) -> Figure:
+    """CPU of all processes at each rate."""
+    lines = _lines(results, scenarios, lambda scenario: scenario.rate_hz, lambda one: one.cpu_total)
+    figure = _line_chart(
+        results, lines, f"CPU of all processes, % of a core: {scenarios[0].robot}", "commanded, Hz"
+    )
+    _sign(figure, results, "Writer, reader, and whatever else the system needs between them.")
+    return figure
+
+
+@styled
+def by_joints(results: Results, scenarios: Sequence[Scenario]) -> Figure:
+    """Bytes of a sample, and CPU, against the number of joints."""
+    figure = Figure(figsize=(13.0, 5.0))
+    left, right = figure.subplots(1, 2)
+
+    def joints(scenario: Scenario) -> float:
+        return float(_joints(results, scenario))
+
+    figures: tuple[tuple[Axes, str, Callable[[Outcome], float]], ...] = (
+        (left, "Bytes on loopback for each sample", lambda one: one.bytes_per_sample),
+        (right, "CPU of all processes, % of a core", lambda one: one.cpu_total),
+    )
+    for axes, title, figure_of in figures:
+        _plot_lines(axes, results, _lines(results, scenarios, joints, figure_of), title, "joints")
+    figure.subplots_adjust(wspace=0.62)
+    for axes, _, figure_of in figures:
+        label_ends(axes, _ends(results, _lines(results, scenarios, joints, figure_of)))
+    robots = ", ".join(f"{one.robot} {_joints(results, one)}" for one in sorted(scenarios, key=joints))
+    _sign(
+        figure,
+        results,
+        f"At {scenarios[0].rate}, one reader. Joints: {robots}. Heads of IP and TCP included.",
+    )
+    return figure
+
+
+@styled
+def by_readers(results: Results, scenarios: Sequence[Scenario]) -> Figure:
+    """CPU of all processes against the number of readers."""
+    lines = _lines(results, scenarios, lambda scenario: float(scenario.readers), lambda one: one.cpu_total)
+    figure = _line_chart(
+        results,
+        lines,
+        f"CPU of all processes, % of a core: {scenarios[0].robot} at {scenarios[0].rate}",
+        "readers",
+    )
+    _sign(figure, results, "Each reader is a process with a buffer of its own.")
+    return figure
+
+
+@styled
+def joins(results: Results, scenario: Scenario) -> Figure:
+    """How long late joiners took, each of them a dot."""
+    found = outcomes(results, scenario)
+    figure = Figure(figsize=(8.2, 1.5 + 0.4 * len(found)))
+    axes = figure.subplots()
+    _name_rows(axes, results, found)
+    for row, (name, one) in enumerate(found.items()):
+        axes.plot(
+            one.joins_ms,
+            [row] * len(one.joins_ms),
+            ls="",
+            marker="o",
+            ms=6,
+            color=pen(name).color,
+            alpha=0.6,
+            mew=0,
+        )
+        axes.annotate(
+            f"{one.joins_ms[len(one.joins_ms) // 2]:.0f} ms",
+            (max(one.joins_ms), row),
+            xytext=(9, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=9.5,
+        )
+    axes.set(xscale="log", title="A late joiner has the whole tree after")
+    low, high = axes.get_xlim()
+    plain_ticks(
+        axes,
+        "x",
+        [tick for tick in (1, 3, 10, 30, 100, 300, 1000, 3000, 10000) if low <= tick <= 2 * high],
+        "{:g} ms",
+    )
+    axes.set_xlim(low, 2 * high)
+    axes.grid(axis="x")
+    axes.tick_params(axis="y", length=0)
+    figure.tight_layout()
+    _sign(
+        figure,
+        results,
+        f"{scenario.robot} at {scenario.rate}; from the opening of the session. The figure is the median.",
+    )
+    return figure
+
+
+def _line_chart(results: Results, lines: Lines, title: str, x_label: str) -> Figure:
+    figure = Figure(figsize=(8.6, 5.4))
+    axes = figure.subplots()
+    _plot_lines(axes, results, lines, title, x_label)
+    label_ends(axes, _ends(results, lines))
+    return figure
+
+
+def _plot_lines(axes: Axes, results: Results, lines: Lines, title: str, x_label: str) -> None:
+    axes.set(xscale="log", yscale="log", title=title, xlabel=x_label)
+    _draw(axes, results, lines)
+    plain_ticks(axes, "x", sorted({x for points in lines.values() for x, _ in points}))
+    low, high = axes.get_ylim()
+    ticks = [digit * 10.0**power for power in range(-1, 7) for digit in (1, 2, 5)]
+    plain_ticks(axes, "y", [tick for tick in ticks if low <= tick <= high], "{:,g}")
+    axes.grid()
+
+
+def _lines(
+    results: Results,
+    scenarios: Sequence[Scenario],
+    x: Callable[[Scenario], float],
+    y: Callable[[Outcome], float],
+) -> Lines:
+    """The points of each subject, by ascending x; only those that were measured."""
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for scenario in sorted(scenarios, key=x):
+        for name, one in outcomes(results, scenario).items():
+            lines.setdefault(name, []).append((x(scenario), y(one)))
+    return {name: lines[name] for name in results.subjects if name in lines}
+
+
+def _draw(axes: Axes, results: Results, lines: Lines) -> list[tuple[float, float, str, str]]:
+    for name, points in lines.items():
+        how = pen(name)
+        axes.plot(
+            *zip(*points, strict=True),
+            color=how.color,
+            marker=how.marker,
+            ls=how.dashes,
+            mec="white",
+            mew=0.8,
+        )
+    return _ends(results, lines)
+
+
+def _ends(results: Results, lines: Lines) -> list[tuple[float, float, str, str]]:
+    return [(*points[-1], _title(results, name), pen(name).color) for name, points in lines.items()]
+
+
+def _name_rows(axes: Axes, results: Results, names: Mapping[str, object]) -> None:
+    axes.set_yticks(range(len(names)), [_title(results, name) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    for label, name in zip(axes.get_yticklabels(), names, strict=True):
+        label.set(color=pen(name).color if name.startswith("zstate") else INK, fontsize=11)
+        label.set_fontweight("bold" if name == "zstate_peer" else "normal")
+
+
+def _rate_bar(axes: Axes, row: int, name: str, one: Outcome) -> None:
+    axes.barh(row, one.rate_hz, height=0.56, color=pen(name).color)
+    axes.annotate(
+        f"{one.rate_hz:,.0f}",
+        (one.rate_hz, row),
+        xytext=(5, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=9.5,
+    )
+
+
+def _latency_row(axes: Axes, row: int, name: str, one: Outcome) -> None:
+    found = [one.latency_us(percent) for percent in (1, 25, 50, 75, 99, 99.9)]
+    if None in found:
+        return
+    p1, p25, p50, p75, p99, p999 = (max(1.0, value or 0.0) for value in found)
+    color = pen(name).color
+    axes.plot([p1, p99], [row, row], color=color, lw=7, alpha=0.28, solid_capstyle="butt")
+    axes.plot([p25, p75], [row, row], color=color, lw=7, solid_capstyle="butt")
+    axes.plot([p99, p999], [row, row], color=color, lw=1)
+    axes.plot([p999], [row], color=color, marker="|", ms=9, mew=1.6)
+    axes.plot([p50], [row], color="white", marker="o", ms=5.5, mec=color, mew=1.6)
+
+
+def _cpu_bar(axes: Axes, row: int, name: str, one: Outcome) -> None:
+    cpu = one.cpu_percent()
+    parts = (cpu["writer"], cpu["reader"], one.cpu_total - cpu["writer"] - cpu["reader"])
+    left = 0.0
+    for part, shade in zip(parts, ROLE_SHADES, strict=True):
+        axes.barh(row, part, left=left, height=0.56, color=pen(name).color, alpha=shade, lw=0)
+        left += part
+    axes.annotate(
+        f"{left:.0f} %", (left, row), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9.5
+    )
+
+
+def _time_axis(axes: Axes, title: str) -> None:
+    axes.set(xscale="log", title=title)
+    low, high = axes.get_xlim()
+    ticks = {100.0: "0.1 ms", 1e3: "1 ms", 1e4: "10 ms", 1e5: "100 ms", 1e6: "1 s", 1e7: "10 s"}
+    shown = [tick for tick in ticks if low <= tick <= high]
+    axes.set_xticks(shown, [ticks[tick] for tick in shown])
+    axes.set_xticks([], minor=True)
+
+
+def _joints(results: Results, scenario: Scenario) -> int:
+    return int(results.about["robots"][scenario.robot]["joints"])
+
+
+def _title(results: Results, name: str) -> str:
+    return str(results.subjects[name]["title"])
+
+
+def _sign(figure: Figure, results: Results, text: str) -> None:
+    note(
+        figure,
+        f"{text}\n{results.about['machine']}; commit {results.about['commit']}, {results.about['began'][:10]}.",
+    )

@@ -1,0 +1,34 @@
+"""Markdown: tables, and numbers with as many digits as they deserve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """The lines of a table, with an empty one behind it; the first column is text, the others numbers."""
+    yield _line(head)
+    yield _line(["---", *["--:"] * (len(head) - 1)])
+    yield from map(_line, rows)
+    yield ""
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def number(value: float) -> str:
+    """Three or four digits, more only before the point: 0.513, 12.3, 123.4, 12,345."""
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    if abs(value) >= 100:
+        return f"{value:.1f}".removesuffix(".0")
+    return f"{value:.3g}"
+
+
+def dash(value: T | None, text: Callable[[T], str]) -> str:
+    """``text(value)``, or a dash where there is none: nothing is ever filled in."""
+    return "-" if value is None else text(value)
