@@ -1,0 +1,69 @@
+"""Cyclone DDS in Python: the messages of ROS 2, without ROS."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+from collections.abc import Mapping
+
+from bench.home import place, venv_python
+from bench.job import Job
+from bench.subjects.dds import NO_STATE_PUBLISHER, free_domain
+from bench.subjects.subject import Roles, Subject
+
+DOMAIN_VARIABLE = "BENCH_DDS_DOMAIN"
+PACKAGE = "cyclonedds==11.0.1"
+# This host only, and as many participants as a run may have.
+CONFIG = """
+<CycloneDDS><Domain Id="any">
+  <General>
+    <Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast>
+  </General>
+  <Discovery>
+    <ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
+    <Peers><Peer Address="127.0.0.1"/></Peers>
+  </Discovery>
+</Domain></CycloneDDS>
+"""
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    ask = "from importlib.metadata import version; print(version('cyclonedds'))"
+    said = subprocess.run(
+        [str(venv_python("cyclone")), "-c", ask], check=True, capture_output=True, text=True
+    )
+    return {"cyclonedds": said.stdout.strip()}
+
+
+def _environment(job: Job) -> Mapping[str, str]:
+    return {DOMAIN_VARIABLE: str(free_domain(job.ports)), "CYCLONEDDS_URI": CONFIG}
+
+
+def _load() -> Roles:
+    from bench.subjects import cyclone_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+
+    return roles.Writer, roles.Reader
+
+
+SUBJECT = Subject(
+    name="cyclone",
+    title="Cyclone DDS messages, Python",
+    settings=(
+        "Eclipse Cyclone DDS from PyPI with ROS 2's IDL of the messages; unicast on loopback, peers named; "
+        "UDP, for the wheel has no shared memory",
+        "the writer publishes JointState (from one object for all samples, serialized by cyclonedds; "
+        "reliable, keep last 10) and TFMessage (reliable, keep last 100), static edges transient local; XCDR1",
+        *NO_STATE_PUBLISHER,
+        "reader: a listener's on_data_available, in Cyclone's own receiving thread, takes what is there; it "
+        "does not subscribe to the joint states",
+    ),
+    install=(
+        f"python -m venv {place('cyclone')}",
+        f"{place('cyclone')}/bin/python -m pip install {PACKAGE}",
+    ),
+    python=lambda: venv_python("cyclone"),
+    versions=_versions,
+    load=_load,
+    environment=_environment,
+)

@@ -1,0 +1,68 @@
+"""ROS 2 Kilted itself: rclpy on Fast DDS, from its wheels."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+from collections.abc import Mapping
+
+from bench.home import place, venv_python
+from bench.job import Job
+from bench.subjects.dds import NO_STATE_PUBLISHER, free_domain
+from bench.subjects.subject import Roles, Subject
+
+VERSIONS = """
+from importlib.metadata import version
+for name in ("ros-kilted-rclpy", "ros-rmw-fastrtps-cpp", "ros-fastdds"):
+    print(name, version(name))
+"""
+
+
+def _python() -> str | None:
+    """The environment of the tests with ROS 2 serves as well."""
+    return venv_python("ros2") or os.environ.get("ZSTATE_KILTED_PYTHON")
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    said = subprocess.run([str(_python()), "-c", VERSIONS], check=True, capture_output=True, text=True).stdout
+    return dict(line.split() for line in said.splitlines())
+
+
+def _environment(job: Job) -> Mapping[str, str]:
+    return {
+        "ROS_DOMAIN_ID": str(free_domain(job.ports)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
+        "ROS_LOG_DIR": f"{job.folder}/log",
+    }
+
+
+def _load() -> Roles:
+    from bench.subjects import ros2_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+
+    return roles.Writer, roles.Reader
+
+
+SUBJECT = Subject(
+    name="ros2",
+    title="ROS 2 messages, rclpy on Fast DDS",
+    settings=(
+        "ROS 2 Kilted's own rclpy and Fast DDS, discovery LOCALHOST, Fast DDS's default transports: shared "
+        "memory on, so that most bytes are not seen on loopback",
+        "the writer publishes sensor_msgs/JointState (rclpy, one message object for all samples, reliable, "
+        "depth 10) and tf2_msgs/TFMessage on /tf (reliable, depth 100) and /tf_static (transient local)",
+        *NO_STATE_PUBLISHER,
+        "reader: rclpy.spin of the default single-threaded executor; /tf reliable, depth 100, as tf2_ros "
+        "asks for; it does not subscribe to the joint states",
+    ),
+    install=(
+        "apt-get install -y --no-install-recommends g++",
+        f"python tests/ros2/oracles.py kilted {place('ros2')}",
+    ),
+    python=_python,
+    versions=_versions,
+    load=_load,
+    environment=_environment,
+)
