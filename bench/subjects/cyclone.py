@@ -53,7 +53,8 @@ SUBJECT = Subject(
         "Eclipse Cyclone DDS from PyPI with ROS 2's IDL of the messages; unicast on loopback, peers named; "
         "UDP, for the wheel has no shared memory",
         "the writer publishes JointState (from one object for all samples, serialized by cyclonedds; "
-        "reliable, keep last 10) and TFMessage (reliable, keep last 100), static edges transient local; XCDR1",
+        "reliable, keep last 10) and TFMessage (reliable, keep last 100), static edges transient local; "
+        "XCDR1",
         *NO_STATE_PUBLISHER,
         "reader: a listener's on_data_available, in Cyclone's own receiving thread, takes what is there; it "
         "does not subscribe to the joint states",

@@ -1,6 +1,6 @@
 """A robot's edges as ROS names them, out of its URDF, and their poses; nothing but the standard library.
 
-It does what robot_state_publisher does, for systems that have none, and is apart from zstate on purpose.
+For systems that have no state publisher; apart from zstate on purpose, as a second opinion.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Edge:
     origin: Pose
     axis: Vector
     joint: str
-    multiplier: float = 1.0
-    offset: float = 0.0
+    multiplier: float
+    offset: float
 
     @property
     def moves(self) -> bool:
@@ -51,7 +51,8 @@ class Edge:
 
 def edges_of(urdf: str) -> list[Edge]:
     """All of them, in the order of the file ``urdf``."""
-    return [_edge(joint) for joint in ET.parse(urdf).getroot().findall("joint")]
+    joints = {joint.get("name", ""): joint for joint in ET.parse(urdf).getroot().findall("joint")}
+    return [_edge(joint, *_mover(name, joints)) for name, joint in joints.items()]
 
 
 def path_between(edges: Sequence[Edge], base: str, tip: str) -> list[str]:
@@ -88,17 +89,26 @@ def product(a: Pose, b: Pose) -> Pose:
     )
 
 
-def _edge(joint: ET.Element) -> Edge:
-    mimic = joint.find("mimic")
+def _mover(name: str, joints: Mapping[str, ET.Element]) -> tuple[str, float, float]:
+    """The joint whose position moves this one, with multiplier and offset; a mimic may follow another."""
+    multiplier, offset = 1.0, 0.0
+    while (mimic := joints[name].find("mimic")) is not None:
+        offset += multiplier * float(mimic.get("offset", 0.0))
+        multiplier *= float(mimic.get("multiplier", 1.0))
+        name = mimic.get("joint", "")
+    return name, multiplier, offset
+
+
+def _edge(joint: ET.Element, mover: str, multiplier: float, offset: float) -> Edge:
     return Edge(
         parent=_child(joint, "parent").get("link", ""),
         child=_child(joint, "child").get("link", ""),
         kind=joint.get("type", ""),
         origin=_origin(joint.find("origin")),
         axis=_axis(joint.find("axis")),
-        joint=joint.get("name", "") if mimic is None else mimic.get("joint", ""),
-        multiplier=1.0 if mimic is None else float(mimic.get("multiplier", 1.0)),
-        offset=0.0 if mimic is None else float(mimic.get("offset", 0.0)),
+        joint=mover,
+        multiplier=multiplier,
+        offset=offset,
     )
 
 
