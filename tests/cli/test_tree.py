@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from xml.etree import ElementTree
 
 import pytest
 from looking import failure, standing, zstate
@@ -69,6 +70,17 @@ def test_dot_and_mermaid_have_an_edge_for_each_frame_but_the_root():
     assert mermaid[0] == "graph TD"
     assert '  f0["rrbot/world"]' in mermaid
     assert sum("-->" in line for line in mermaid) == 6
+
+
+def test_the_picture_is_svg_with_every_frame_and_writer():
+    with standing(), connect() as session, StaticPublisher(session, "rrbot", "<mount>") as statics:
+        statics.set(Transform("tool", "gauge & dial", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+        root = ElementTree.fromstring("\n".join(drawn("rrbot", "--svg")))
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    texts = [element.text or "" for element in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"rrbot/world", "base", "upper", "lower", "tool", "gauge & dial"} <= set(texts)
+    assert "<mount>: 1 edge" in texts
+    assert sum(text.startswith("joint · ") and "Hz" in text for text in texts) == 2
 
 
 def test_a_robot_that_is_not_there_is_an_error_that_lists_the_others():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -49,6 +50,11 @@ def colored(text: str, color: str | None) -> str:
 def is_terminal() -> bool:
     """Whether a person looks at standard output."""
     return sys.stdout.isatty()
+
+
+def terminal_width() -> int:
+    """How many letters fit on a line of the terminal; COLUMNS says otherwise."""
+    return shutil.get_terminal_size().columns
 
 
 def duration_or_dash(nanoseconds: int | None) -> str:

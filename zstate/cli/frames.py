@@ -28,8 +28,9 @@ def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     """
     from zstate.listener import TransformListener
 
-    robots = announced_robots(session, robot)
+    # Models and statics come while those who write them are asked for.
     with TransformListener(session, robot) as listener:
+        robots = announced_robots(session, robot)
         _wait_for_models(listener, robots)
         _wait_for_samples(listener, robots)
         return listener.buffer.frames()

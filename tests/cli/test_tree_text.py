@@ -1,0 +1,68 @@
+"""The tree as text, where the terminal is wide and where it is narrow."""
+
+from __future__ import annotations
+
+from zstate.buffer.frames import FrameInfo
+from zstate.cli.tree_text import tree_text
+
+NOW = 5_000_000_000
+WRITER = "driver@jetson pid 412"
+
+
+def joint(name: str, parent: str) -> FrameInfo:
+    return FrameInfo(name, parent, "joint", WRITER, 100.0, NOW - 1_000_000_000, NOW - 2_000_000, 101)
+
+
+FRAMES = (
+    FrameInfo("r1/base", None, "root", None, None, None, None, 0),
+    joint("r1/upper", "r1/base"),
+    joint("r1/lower", "r1/upper"),
+    FrameInfo("r1/tool", "r1/lower", "static", WRITER, None, None, None, 0),
+    FrameInfo("r1/camera", "r1/lower", "static", "mount", None, None, None, 0),
+)
+
+
+def lines(width: int | None) -> list[str]:
+    return tree_text(FRAMES, NOW, in_full=False, width=width).splitlines()
+
+
+def test_where_there_is_room_everything_stands_on_the_line_of_its_frame():
+    assert (
+        lines(None)
+        == lines(120)
+        == [
+            "frame               edge    rate      age     writer",
+            "r1/base             root",
+            "└── upper           joint   100.0 Hz  2.0 ms  driver@jetson pid 412",
+            "    └── lower       joint   100.0 Hz  2.0 ms  driver@jetson pid 412",
+            "        ├── tool    static                    driver@jetson pid 412",
+            "        └── camera  static                    mount",
+        ]
+    )
+
+
+def test_a_narrow_terminal_has_letters_for_the_writers():
+    assert lines(55) == [
+        "frame               edge    rate      age     writer",
+        "r1/base             root",
+        "└── upper           joint   100.0 Hz  2.0 ms  a",
+        "    └── lower       joint   100.0 Hz  2.0 ms  a",
+        "        ├── tool    static                    a",
+        "        └── camera  static                    b",
+        "a: driver@jetson pid 412",
+        "b: mount",
+    ]
+
+
+def test_a_narrower_one_is_indented_only_where_the_tree_forks():
+    assert lines(45)[1:6] == [
+        "r1/base   root",
+        "↓ upper   joint   100.0 Hz  2.0 ms  a",
+        "↓ lower   joint   100.0 Hz  2.0 ms  a",
+        "├ tool    static                    a",
+        "└ camera  static                    b",
+    ]
+
+
+def test_in_the_narrowest_the_kind_of_what_moves_is_left_out():
+    assert lines(33)[1] == "↓ upper   100.0 Hz 2.0 ms  a"

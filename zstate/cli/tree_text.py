@@ -1,0 +1,98 @@
+"""The frame tree as lines of text, as wide as the terminal lets them be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from zstate.cli.console import age_text, rate_text
+from zstate.cli.layout import in_columns, tree_lines
+from zstate.cli.pictures.frames import below, roots, short_name
+
+if TYPE_CHECKING:
+    from zstate.buffer.frames import FrameInfo
+
+_HEADINGS = ("frame", "edge", "rate", "age", "writer")
+
+Guides = Callable[[str, Mapping[str, Sequence[str]]], Iterator[tuple[str, str]]]
+Cells = Callable[["FrameInfo", int], tuple[str, ...]]
+
+
+def _cells(frame: FrameInfo, now: int) -> tuple[str, ...]:
+    """Kind, rate and age."""
+    if frame.kind not in ("joint", "pose"):
+        return frame.kind, "", ""
+    age = "no sample" if frame.newest is None else age_text(frame.newest, now)
+    return frame.kind, rate_text(frame.rate_hz), age
+
+
+def _fewer_cells(frame: FrameInfo, now: int) -> tuple[str, ...]:
+    kind, rate, age = _cells(frame, now)
+    return (f"{rate} {age}" if rate else kind,)
+
+
+def tree_text(frames: Sequence[FrameInfo], now: int, *, in_full: bool, width: int | None = None) -> str:
+    """One line for each frame; ``now`` [ns] tells ages.
+
+    Where that is wider than ``width``, writers become letters that are explained below, then a frame that is
+    its parent's only child stands right under it, and at last moving edges have no kind.
+    """
+    lines = _lines(frames, now, in_full=in_full, guides=tree_lines)
+    if width is None or _fits(lines, width):
+        return "\n".join(lines)
+    letters = _letters(frames)
+    legend = [f"{letter}: {writer}" for writer, letter in letters.items()]
+    for guides, cells in ((tree_lines, _cells), (chain_lines, _cells), (chain_lines, _fewer_cells)):
+        lines = _lines(frames, now, in_full=in_full, guides=guides, cells=cells, names=letters)
+        if _fits(lines, width):
+            break
+    return "\n".join([*lines, *legend])
+
+
+def chain_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
+    """As ``tree_lines``, but two columns deep, and only where the tree forks."""
+    stack = [(root, "", "")]
+    while stack:
+        name, guide, rail = stack.pop()
+        yield guide, name
+        children_here = children.get(name, ())
+        if len(children_here) == 1:
+            stack.append((children_here[0], f"{rail}↓ ", rail))
+            continue
+        for position in reversed(range(len(children_here))):
+            is_last = position == len(children_here) - 1
+            fork, below_it = ("└ ", "  ") if is_last else ("├ ", "│ ")
+            stack.append((children_here[position], rail + fork, rail + below_it))
+
+
+def _lines(
+    frames: Sequence[FrameInfo],
+    now: int,
+    *,
+    in_full: bool,
+    guides: Guides,
+    cells: Cells = _cells,
+    names: Mapping[str, str] | None = None,
+) -> list[str]:
+    by_name, children = {frame.name: frame for frame in frames}, below(frames)
+    rows: list[tuple[str, ...]] = [] if cells is _fewer_cells else [_HEADINGS]
+    for root in roots(frames):
+        for guide, name in guides(root, children):
+            frame = by_name[name]
+            writer = frame.writer or ""
+            shown = name if in_full else short_name(frame)
+            rows.append((guide + shown, *cells(frame, now), names.get(writer, "") if names else writer))
+    return in_columns(rows)
+
+
+def _letters(frames: Sequence[FrameInfo]) -> dict[str, str]:
+    writers = dict.fromkeys(frame.writer for frame in frames if frame.writer)
+    return {writer: _letter(number) for number, writer in enumerate(writers) if writer}
+
+
+def _letter(number: int) -> str:
+    return chr(ord("a") + number) if number < 26 else str(number + 1)
+
+
+def _fits(lines: Sequence[str], width: int) -> bool:
+    return max(map(len, lines), default=0) <= width
