@@ -15,6 +15,7 @@ _BREAKS_NS = 1_000_000_000
 _DAY_NS = 86_400_000_000_000
 
 _SET_CLOCKS = "timedatectl  # on both machines: is each synchronized?"
+_STAMPS = "date +%s.%N  # is it this time where the writer runs? It is to stamp with time.time_ns()"
 
 
 def clocks_check(ear: Ear) -> Check:
@@ -55,7 +56,7 @@ def _far_check(ear: Ear) -> Check | None:
         f"{ear.samples_writer} stamps samples {size} the time here ({stamp_text(stamp)}): "
         f"{likely_cause(stamp, stamp + least)}"
     )
-    return broken("stamps", text, "date +%s.%N  # here and where the writer runs; stamps are time.time_ns()")
+    return broken("stamps", text, _STAMPS)
 
 
 def _standing_check(ear: Ear) -> Check | None:
@@ -69,19 +70,24 @@ def _standing_check(ear: Ear) -> Check | None:
 def _near_check(ear: Ear) -> Check:
     least, greatest = ear.samples.delays
     if least < -_DISTURBS_NS:
-        text = f"{ear.samples_writer} stamps samples up to {duration_text(-least)} in the future{_blame(ear)}"
-        return (broken if least < -_BREAKS_NS else warning)("stamps", text, _SET_CLOCKS)
+        text, then = _cause(ear)
+        text = f"{ear.samples_writer} stamps samples up to {duration_text(-least)} in the future{text}"
+        return (broken if least < -_BREAKS_NS else warning)("stamps", text, then)
     if least > _BREAKS_NS:
-        text = f"samples of {ear.samples_writer} come {duration_text(least)} after their stamps{_blame(ear)}"
-        return warning("stamps", text, f"zstate listen {ear.info.name}")
+        text, then = _cause(ear)
+        text = f"samples of {ear.samples_writer} come {duration_text(least)} after their stamps{text}"
+        return warning("stamps", text, then)
     return ok("stamps", f"{_delay_text(least)} to {_delay_text(greatest)} old as they come")
 
 
-def _blame(ear: Ear) -> str:
-    for offset in ear.offsets:
-        if offset.writer.session == ear.samples.session and abs(offset.offset_ns) > _DISTURBS_NS:
-            return f"; the clock of {offset.writer} is the cause"
-    return ", and it is not the clock of the writer" if ear.offsets else ""
+def _cause(ear: Ear) -> tuple[str, str]:
+    """Whether the clock of the writer explains it, and what to do."""
+    measured = [one for one in ear.offsets if one.writer.session == ear.samples.session]
+    if not measured:
+        return "", _SET_CLOCKS
+    if abs(measured[0].offset_ns) > _DISTURBS_NS:
+        return f": {_offset_text(measured[0])}", _SET_CLOCKS
+    return ", though its clock is right: it stamps another instant than that of the sample", _STAMPS
 
 
 def _simulated_check(domain: str, session: Session) -> Check:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ from zstate.cli.doctor.network_checks import (
     refused_check,
 )
 from zstate.cli.network import Network, open_session
-from zstate.errors import ZStateError
+from zstate.errors import ModelError, ZStateError
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
@@ -62,16 +62,18 @@ def _behind(session: Session, network: Network, robot: str, wire: str, timeout_s
         yield _absent_check(session, network, robot, robots, wire)
         return
     yield ok("robots", f"{', '.join(repr(info.name) for info in robots)} announced")
-    yield from _of_robots(session, wanted, wire, timeout_s)
+    yield from _of_robots(session, wanted, robots, wire, timeout_s)
 
 
-def _of_robots(session: Session, wanted: list[RobotInfo], wire: str, timeout_s: float) -> Iterator[Check]:
+def _of_robots(
+    session: Session, wanted: Sequence[RobotInfo], robots: Sequence[RobotInfo], wire: str, timeout_s: float
+) -> Iterator[Check]:
     from zstate.cli.doctor.ear import Ear, listen
     from zstate.cli.doctor.robot_checks import robot_checks
     from zstate.net.clock_offset import measure_offsets
 
     with ExitStack() as listening:
-        ears = [listening.enter_context(Ear(session, info, wire)) for info in wanted]
+        ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in wanted]
         if wire == "native":
             for offset in measure_offsets(session, ANY):
                 for ear in ears:
@@ -97,14 +99,23 @@ def _absent_check(
         text = f"{what} here; {where}: {', '.join(map(repr, others))}"
         return broken("robots", text, f"zstate doctor {found}{options}")
     if session.twin is not None:
-        what += f", or its router shows none to {session.twin.identity}"
-    name = "panda" if robot == ANY else robot
-    then = (
-        "zstate ls --wire ros2"
-        if wire != "native"
-        else f"zstate publish {name} --source sine{_connecting(network)}"
-    )
-    return broken("robots", what, then)
+        what += f", or the router shows none to {session.twin.identity}"
+    text = f"{what}: its publisher is not running" if robot != ANY else what
+    return broken("robots", text, f"{_start(robot, wire)}{_connecting(network)}")
+
+
+def _start(robot: str, wire: str) -> str:
+    """What would put ``robot`` there."""
+    from zstate.model.known import find
+
+    if wire != "native":
+        return f"zstate ls --wire {wire}"
+    if robot == ANY:
+        return "zstate publish panda --source sine"
+    try:
+        return f"zstate publish {find(robot).name} --source sine"
+    except ModelError:
+        return f"zstate publish FILE --name {robot}"
 
 
 def _connecting(network: Network) -> str:

@@ -32,8 +32,12 @@ _ANSWERS_WITHIN_S = 0.4
 class Ear(Closing):
     """Hears the robot ``info``, and how its writers do."""
 
-    def __init__(self, session: Session, info: RobotInfo, wire: str) -> None:
+    def __init__(
+        self, session: Session, info: RobotInfo, wire: str, neighbours: Iterable[RobotInfo] = ()
+    ) -> None:
         self.info = info
+        self.neighbours = tuple(neighbours)
+        """All robots that are announced."""
         self.streams = frozenset(stream for stream, _ in info.writers)
         is_native = wire == "native"
         moves_by_joints = "joint_states" in self.streams or "tf" not in self.streams

@@ -44,9 +44,10 @@ def installation_check() -> Check:
 def refused_check(error: ZStateError, network: Network) -> Check:
     """There is no session, and ``error`` says why."""
     if isinstance(error, Unreachable) and error.endpoints:
-        reasons = [f"{endpoint!r} ({objection(endpoint) or 'no answer'})" for endpoint in error.endpoints]
-        text = f"nothing answers at {' or '.join(reasons)}"
-        return broken("network", text, f"zstate router --listen {error.endpoints[0]}")
+        found = {endpoint: objection(endpoint) for endpoint in error.endpoints}
+        reasons = [f"{endpoint!r} ({why.text if why else 'no answer'})" for endpoint, why in found.items()]
+        then = next((why.next for why in found.values() if why), f"zstate config{_options(network)}")
+        return broken("network", f"nothing answers at {' or '.join(reasons)}", then)
     if isinstance(error, AccessDenied):
         endpoint = error.endpoint
         if error.reason in ("TLS demanded", "no TLS there"):
@@ -67,10 +68,10 @@ def network_check(session: Session, network: Network) -> Check:
     links = ", ".join(sorted({str(link.dst) for link in session.zenoh.info.links()}))
     text = f"{network.joins_as}, linked to {' and '.join(parts) or 'nobody'}{f' ({links})' if links else ''}"
     for endpoint in network.connect if network.joins_as != "client" else ():
-        reason = objection(endpoint)
-        if reason:
-            text = f"nothing answers at {endpoint!r} ({reason}); a peer goes on trying"
-            return broken("network", text, f"zstate router --listen {endpoint}")
+        why = objection(endpoint)
+        if why is not None:
+            text = f"nothing answers at {endpoint!r} ({why.text}); a peer goes on trying"
+            return broken("network", text, why.next)
         answers = knock([endpoint], network.credentials)
         if answers.are_refusals and not parts:
             return broken("network", str(answers.error), f"zstate config{_options(network)}")

@@ -4,29 +4,47 @@ from __future__ import annotations
 
 import re
 import socket
+from typing import NamedTuple
 
 _ADDRESS = re.compile(r"(?:tcp|tls|ws)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
 _ANSWERS_WITHIN_S = 1.0
 
 
-def objection(endpoint: str) -> str:
-    """Why no connection comes about; empty where one does, or where it cannot be tried."""
+class Objection(NamedTuple):
+    """Why no connection comes about, and the command to go on with."""
+
+    text: str
+    next: str
+
+
+def objection(endpoint: str) -> Objection | None:
+    """What keeps one from ``endpoint``; None where nothing does, or where it cannot be tried."""
     match = _ADDRESS.match(endpoint)
     if match is None:
-        return ""
+        return None
+    host, port = match["host"], int(match["port"])
     try:
-        socket.create_connection((match["host"], int(match["port"])), _ANSWERS_WITHIN_S).close()
+        socket.create_connection((host, port), _ANSWERS_WITHIN_S).close()
     except socket.gaierror:
-        return f"the name {match['host']!r} is not known here"
+        return Objection(f"the name {host!r} is not known here", f"getent hosts {host}")
     except ConnectionRefusedError:
-        return "connection refused: the host is there, and nobody listens at that port"
+        text = "connection refused: the host is there, and nobody listens at that port"
+        return Objection(text, _listening(host, port, endpoint))
     except TimeoutError:
-        return f"no answer within {_ANSWERS_WITHIN_S:g} s: is the host switched on, and no firewall between?"
+        text = f"no answer within {_ANSWERS_WITHIN_S:g} s: is the host switched on, and no firewall between?"
+        return Objection(text, f"ping -c 3 {host}")
     except (OSError, UnicodeError) as error:
-        return (getattr(error, "strerror", None) or str(error)).lower()
-    return ""
+        text = (getattr(error, "strerror", None) or str(error)).lower()
+        return Objection(text, f"ping -c 3 {host}")
+    return None
+
+
+def _listening(host: str, port: int, endpoint: str) -> str:
+    if host == "localhost" or host.startswith(("127.", "::1")):
+        return f"zstate router --listen {endpoint}"
+    return f"zstate router --listen {endpoint.partition('/')[0]}/0.0.0.0:{port}  # on {host}"
 
 
 def is_open(endpoint: str) -> bool:
     """Whether somebody listens there by TCP, whoever that is."""
-    return bool(_ADDRESS.match(endpoint)) and not objection(endpoint)
+    return bool(_ADDRESS.match(endpoint)) and objection(endpoint) is None

@@ -12,6 +12,7 @@ from zstate.cli.telling_links import telling_links
 from zstate.errors import LookupFailed, ModelError, duration_text
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import Status
@@ -134,7 +135,7 @@ def _no_model_check(ear: Ear) -> Check:
 def _samples_check(ear: Ear) -> Check:
     stream, robot, samples = ear.followed, ear.info.name, ear.samples
     writers = ear.writers(stream)
-    if not writers and not samples.count:
+    if not samples.count and (not writers or "joint_states" not in ear.streams):
         return _nobody_check(ear)
     who = str(writers[-1]) if writers else "somebody unannounced"
     if not samples.count:
@@ -154,12 +155,21 @@ def _samples_check(ear: Ear) -> Check:
 
 
 def _nobody_check(ear: Ear) -> Check:
-    robot = ear.info.name
-    if "robot_description" not in ear.streams:
+    robot, waiting = ear.info.name, ear.writers("tf")
+    if "robot_description" not in ear.streams and not waiting:
         text = f"nobody writes joint_states of {robot!r}, nor tf: it stands still"
         return warning("joint_states", text, f"zstate joints {robot}  # moves it, for a try")
-    text = f"nobody writes joint_states of {robot!r}: its driver is not running, or writes under another name"
-    return broken("joint_states", text, f"zstate joints {robot}  # a sine, in the place of the driver")
+    waits = f", for which {waiting[-1]} waits" if waiting else ""
+    text = f"nobody writes joint_states of {robot!r}{waits}: its driver is not running (any more)"
+    others = [info.name for info in ear.neighbours if _streams(info) == {"joint_states"}]
+    if others:
+        text += f", or calls the robot {others[0]!r}, of which there are joint_states and no model"
+        return broken("joint_states", text, f"zstate publish FILE --name {others[0]}")
+    return broken("joint_states", text, f"zstate joints {robot}  # moves it, until the driver runs")
+
+
+def _streams(info: RobotInfo) -> set[str]:
+    return {stream for stream, _ in info.writers}
 
 
 def _idle_text(ear: Ear) -> str:
