@@ -16,6 +16,7 @@ from rich.table import Table
 from bench import results
 from bench.plots import PlotsMissing, write_plots
 from bench.process import ROOT
+from bench.readme import renewed
 from bench.report import write_report
 from bench.run import Turn, run, seconds, turns
 from bench.scenario import FULL, QUICK, named
@@ -137,9 +138,16 @@ def _outcome(facts: Facts) -> str:
 
 @main.command()
 @click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
-def report(folder: Path | None) -> None:
+@click.option(
+    "--readme", is_flag=True, help="Write the tables of README.md anew, each from the folder it names."
+)
+def report(*, folder: Path | None, readme: bool) -> None:
     """Write tables and plots of a run again: the last one, or that in FOLDER."""
-    _report(folder or results.newest())
+    if readme:
+        path = ROOT / "README.md"
+        path.write_text(renewed(path.read_text(encoding="utf-8")), encoding="utf-8")
+    else:
+        _report(folder or results.newest())
 
 
 def _report(folder: Path) -> None:

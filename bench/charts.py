@@ -15,6 +15,8 @@ from bench.scenario import Scenario
 # A reader that is nearer to the commanded rate than this has kept up.
 KEPT_UP = 0.995
 
+OURS = "zstate_peer"
+
 Lines = Mapping[str, Sequence[tuple[float, float]]]
 
 
@@ -36,7 +38,7 @@ def overview(results: Results, scenario: Scenario) -> Figure:
     )
     rate.set_xlabel("Hz")
     _time_axis(latency, "Latency, from stamp to answer")
-    cpu.set(title="CPU, all processes", xlabel="% of a core: writer, reader, others")
+    cpu.set(title="CPU, all processes", xlabel="% of a core; dark to light: writer, reader, others")
     cpu.margins(x=0.18)
     for axes in (rate, latency, cpu):
         axes.grid(axis="x")
@@ -269,8 +271,8 @@ def _name_rows(axes: Axes, results: Results, names: Mapping[str, object]) -> Non
     axes.set_yticks(range(len(names)), [_title(results, name) for name in names])
     axes.set_ylim(len(names) - 0.4, -0.6)
     for label, name in zip(axes.get_yticklabels(), names, strict=True):
-        label.set(color=pen(name).color if name.startswith("zstate") else INK, fontsize=11)
-        label.set_fontweight("bold" if name == "zstate_peer" else "normal")
+        label.set(color=pen(OURS).color if name.startswith("zstate") else INK, fontsize=11)
+        label.set_fontweight("bold" if name == OURS else "normal")
 
 
 def _rate_bar(axes: Axes, row: int, name: str, one: Outcome) -> None:
@@ -328,7 +330,5 @@ def _title(results: Results, name: str) -> str:
 
 
 def _sign(figure: Figure, results: Results, text: str) -> None:
-    note(
-        figure,
-        f"{text}\n{results.about['machine']}; commit {results.about['commit']}, {results.about['began'][:10]}.",
-    )
+    about = results.about
+    note(figure, f"{text}\n{about['machine']}; commit {about['commit']}, {about['began'][:10]}.")

@@ -43,6 +43,7 @@ PENS: Mapping[str, Pen] = {
     "raw_zenoh_router": Pen("#888888", "s", "--"),
 }
 OTHER = Pen("#000000", "x")
+NEAR = 1.2
 ROLE_SHADES = (1.0, 0.62, 0.34)
 """How dark the CPU of writer, reader and others is drawn, in the subject's colour."""
 
@@ -103,6 +104,7 @@ def note(figure: Figure, text: str) -> None:
 
 def label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]], gap: float = 0.052) -> None:
     """Each line's name at its end, moved apart where they would touch: x, y, text and colour."""
+    axes.autoscale_view()  # else the places of points are not known yet
     to_axes = axes.transAxes.inverted()
     placed = [
         (to_axes.transform(axes.transData.transform((x, y))), text, color) for x, y, text, color in ends
@@ -127,6 +129,7 @@ def label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]], gap: f
                 "lw": 0.7,
                 "shrinkA": 1,
                 "shrinkB": 5,
+                "relpos": (0, 0.5),
             },
         )
 
@@ -151,8 +154,14 @@ def _top(cluster: Sequence[float], gap: float) -> float:
 
 
 def plain_ticks(axes: Axes, which: str, ticks: Sequence[float], text: str = "{:g}") -> None:
-    """These ticks and no others, written out."""
+    """These ticks and no others, written out unless the one before is too near (on a logarithmic axis)."""
+    labels: list[str] = []
+    last = 0.0
+    for tick in ticks:
+        is_clear = tick > NEAR * last
+        labels.append(text.format(tick) if is_clear else "")
+        last = tick if is_clear else last
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(matplotlib.ticker.FixedLocator(list(ticks)))
-    axis.set_major_formatter(matplotlib.ticker.FixedFormatter([text.format(tick) for tick in ticks]))
+    axis.set_major_formatter(matplotlib.ticker.FixedFormatter(labels))
     axis.set_minor_locator(matplotlib.ticker.NullLocator())

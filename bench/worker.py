@@ -21,7 +21,7 @@ import traceback
 from array import array
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from bench.job import Job
 from bench.subjects import subject_named
@@ -36,19 +36,18 @@ MOST_BEHIND_NS = 50_000_000
 
 
 class Told:
-    """The runner's side of the conversation: its commands, and lines for it."""
+    """The runner's side of the conversation: the job, its commands, and lines for it."""
 
-    def __init__(self) -> None:
-        # What a library prints must not come between the lines of JSON.
-        self._out = os.fdopen(os.dup(1), "w", encoding="utf-8")
-        os.dup2(2, 1)
-        self.job = Job.from_json(sys.stdin.readline())
+    def __init__(self, commands: TextIO, out: TextIO) -> None:
+        self._said = commands
+        self._out = out
+        self.job = Job.from_json(commands.readline())
         self.ended = threading.Event()
         self._commands: queue.Queue[dict[str, Any]] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
-        for line in sys.stdin:
+        for line in self._said:
             command = json.loads(line)
             if command["do"] == "stop":
                 self.ended.set()
@@ -58,7 +57,7 @@ class Told:
             self._commands.put({"do": "close"})
 
     def wait_for(self, do: str) -> dict[str, Any]:
-        """The next command of that name; whatever it was at the end of the input."""
+        """The next command of that name; at the end of the input, to close."""
         while (command := self._commands.get())["do"] not in (do, "close"):
             pass
         return command
@@ -208,7 +207,9 @@ def ignore(stamp: int, robot: int = 0) -> None:
 def main() -> None:
     """Be what the command line says."""
     name, role, label = sys.argv[1:]
-    told = Told()
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what a library prints must not come between the lines of JSON
+    told = Told(sys.stdin, out)
     try:
         roles = subject_named(name).load()
         {"writer": write, "reader": read, "joiner": join}[role](roles, told, label)

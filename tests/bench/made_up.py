@@ -1,0 +1,113 @@
+"""Results of a run that never was: two rounds of every scenario, with figures that tests can foresee."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from bench.recording import GRID
+from bench.results import ABOUT, RUNS, Results
+from bench.scenario import Scenario
+
+TITLES = {"zstate_peer": "zstate", "ros1": "ROS 1", "raw_zenoh": "raw Zenoh (floor)"}
+SCENARIOS = (
+    Scenario("rate", "talos", 100.0, repeats=2),
+    Scenario("rate", "talos", 1000.0, repeats=2),
+    Scenario("robot", "g1", 100.0),
+    Scenario("readers", "talos", 100.0, readers=5),
+    Scenario("load", "talos", 100.0, load="busy"),
+    Scenario("late", "talos", 100.0, joins=3),
+    Scenario("fleet", "panda", 50.0, fleet=100, writers=4),
+)
+JOINTS = {"panda": 8, "g1": 29, "talos": 32, "tiago_dual": 101}
+
+
+def about(subjects: dict[str, str], scenarios: Sequence[Scenario]) -> dict[str, Any]:
+    installed = {
+        name: {
+            "title": title,
+            "installed": True,
+            "floor": name.startswith("raw"),
+            "settings": [f"how {name} is set"],
+            "install": [],
+            "versions": {name: "1.0"},
+        }
+        for name, title in subjects.items()
+    }
+    absent = {"title": "Absent DDS", "installed": False, "install": ["pip install absent-dds"]}
+    return {
+        "command": "python -m bench run",
+        "began": "2026-01-02 03:04:05 +0000",
+        "commit": "abc1234",
+        "machine": "2 x a processor, Linux 6",
+        "python": "3.11.2",
+        "seed": 7,
+        "scenarios": [asdict(one) for one in scenarios],
+        "robots": {
+            name: {
+                "joints": joints,
+                "moving_edges": joints,
+                "links": joints + 1,
+                "base": "base",
+                "tip": "tip",
+            }
+            for name, joints in JOINTS.items()
+        },
+        "subjects": {**installed, "absent": {**absent, "floor": False, "settings": [], "versions": {}}},
+    }
+
+
+def a_run(subject: str, scenario: Scenario, number: int, factor: float) -> dict[str, Any]:
+    """It costs ``factor`` times what it costs zstate; a factor of 3 or more halves the rate at 1 kHz."""
+    head = {"subject": subject, "scenario": scenario.name, "round": number, "turn": 0, "load_before": 0.5}
+    if scenario.joins:
+        joins = [20.0 * factor, 30.0 * factor, 40.0 * factor][: scenario.joins]
+        return {**head, "whole_ms": joins, "connected_ms": [0.5 * one for one in joins]}
+    rate = scenario.rate_hz or 50_000.0 / factor
+    slow = 0.5 if factor >= 3 and rate >= 1000 else 1.0
+    grid = [factor * 100.0 * (1.0 + 0.01 * percent + (percent / 99.0) ** 40) for percent in GRID]
+    sent = round(rate * scenario.fleet * 4)
+    reader = {
+        "rate_hz": rate * scenario.fleet * slow,
+        "answered": round(sent * slow),
+        "lost": round(sent * (1 - slow)),
+        "late": 1,
+        "latency_us": grid,
+    }
+    others = {"state publisher": 3.0 * factor} if subject == "ros1" else {}
+    cpu = {"writer": 0.01 * factor * rate, "reader": 0.02 * factor * rate * scenario.readers, **others}
+    return {
+        **head,
+        "window_s": 4.0,
+        "sent": sent,
+        "sent_hz": rate * scenario.fleet,
+        "readers": [reader] * scenario.readers,
+        "cpu_percent": cpu,
+        "others_cpu_percent": 2.0,
+        "bytes_per_s": rate * factor * 9.0 * JOINTS[scenario.robot],
+        "packets_per_s": 2 * rate,
+        "peak_memory_mb": dict.fromkeys(cpu, 50.0),
+        "poses": {"compared": 20, "most_m": 1e-15, "most_rad": 1e-15, "errors": 0, "first_error": None},
+    }
+
+
+def write_results(
+    folder: Path, factors: dict[str, float], titles: dict[str, str], scenarios: Sequence[Scenario] = SCENARIOS
+) -> Results:
+    """A folder in which ``factors`` says how dear each subject is, and ROS 1 has failed in one scenario."""
+    folder.mkdir(parents=True, exist_ok=True)
+    runs = [
+        a_run(name, one, number, factor)
+        for one in scenarios
+        for name, factor in factors.items()
+        for number in range(one.repeats)
+        if one.fleet == 1 or name != "ros1"
+    ]
+    runs = [run for run in runs if (run["subject"], run["scenario"]) != ("ros1", "talos-100-busy")]
+    failed = {"subject": "ros1", "scenario": "talos-100-busy", "round": 0, "failed": "roscore was not ready"}
+    (folder / ABOUT).write_text(json.dumps(about(titles, scenarios)), encoding="utf-8")
+    (folder / RUNS).write_text("".join(json.dumps(run) + "\n" for run in [*runs, failed]), encoding="utf-8")
+    return Results.read(folder)

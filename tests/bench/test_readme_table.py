@@ -1,0 +1,48 @@
+"""Tables of the benchmark in documents are those of the results they name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from made_up import TITLES, write_results
+
+from bench.readme import END, renewed, short_table
+
+ROOT = Path(__file__).parents[2]
+FOLDER = "bench/results/2026-01-02-abc1234"
+FACTORS = {"zstate_peer": 1.0, "ros1": 4.0, "raw_zenoh": 0.8}
+
+
+@pytest.mark.parametrize("name", ["README.md", "bench/README.md"])
+def test_the_tables_of_our_documents_are_those_of_the_results_they_name(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert renewed(text, ROOT) == text, "python -m bench report --readme writes them anew"
+
+
+def test_every_results_folder_that_a_document_names_is_there() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert text.count("<!-- bench: ") == text.count(END)
+
+
+def test_a_table_between_the_marks_is_made_anew_and_nothing_else_is_touched(tmp_path: Path) -> None:
+    results = write_results(tmp_path / FOLDER, FACTORS, TITLES)
+    before = f"# Title\n<!-- bench: {FOLDER} -->\nan old table\n{END}\nthe rest\n"
+    after = renewed(before, tmp_path)
+    assert after == f"# Title\n<!-- bench: {FOLDER} -->\n\n{short_table(results)}\n{END}\nthe rest\n"
+    assert renewed(after, tmp_path) == after
+
+
+def test_the_short_table_has_a_row_for_everybody_that_was_measured(tmp_path: Path) -> None:
+    lines = short_table(write_results(tmp_path, FACTORS, TITLES)).splitlines()
+    cells = {
+        line.split("|")[1].strip(): [one.strip() for one in line.split("|")[2:-1]] for line in lines if line
+    }
+    assert cells["**zstate**"] == ["1000.0 Hz", "150 / 299 us", "10.0 + 20.0 %", "", "288", "30 ms"]
+    assert cells["ROS 1"][0] == "500.0 Hz"
+    assert cells["ROS 1"][3] == "12.0 %"
+    assert cells["raw Zenoh (floor)"][-1] == "24 ms"
+
+
+def test_a_document_without_marks_stays_as_it_is(tmp_path: Path) -> None:
+    assert renewed("no table\n", tmp_path) == "no table\n"

@@ -1,0 +1,115 @@
+"""A real run, a second long, and what is measured from outside."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support import Child, until
+
+from bench.measure import Traffic, cpu_ns, family, peak_memory_kb
+from bench.process import Process, RunFailed
+from bench.recording import percentile
+from bench.scenario import Scenario
+from bench.subjects import subject_named
+from bench.trial import free_ports, try_subject
+
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(sys.platform != "linux", reason="the harness reads /proc"),
+]
+
+
+@pytest.mark.robots
+def test_the_floor_at_50_hz_loses_nothing_and_tells_what_it_costs() -> None:
+    facts = try_subject(subject_named("raw_zenoh"), Scenario("rate", "panda", 50.0, seconds=1.0))
+    assert "failed" not in facts, facts
+    [reader] = facts["readers"]
+    assert (reader["lost"], reader["answered"]) == (0, facts["sent"])
+    assert reader["rate_hz"] == pytest.approx(50.0, rel=0.1)
+    assert 0.0 < percentile(reader["latency_us"], 50) <= percentile(reader["latency_us"], 100)
+    assert set(facts["cpu_percent"]) == {"writer", "reader"}
+    assert all(percent > 0.0 for percent in facts["cpu_percent"].values())
+    assert facts["bytes_per_s"] > 50 * 8 * 8  # eight joints
+
+
+@pytest.mark.robots
+def test_zstate_answers_right_and_a_late_joiner_has_the_whole_tree() -> None:
+    subject = subject_named("zstate_peer")
+    facts = try_subject(subject, Scenario("rate", "panda", 50.0, seconds=1.0))
+    assert "failed" not in facts, facts
+    assert facts["readers"][0]["lost"] == 0
+    assert facts["poses"]["compared"] >= 10
+    assert facts["poses"]["errors"] == 0
+    assert facts["poses"]["most_m"] < 1e-12
+    assert facts["poses"]["most_rad"] < 1e-12
+    joins = try_subject(subject, Scenario("late", "panda", 100.0, joins=1))
+    assert 0.0 < joins["connected_ms"][0] <= joins["whole_ms"][0]
+
+
+@pytest.mark.robots
+def test_a_worker_that_fails_is_a_failed_run_with_its_last_words() -> None:
+    subject = replace(subject_named("raw_zenoh"), name="no_such_subject")
+    facts = try_subject(subject, Scenario("rate", "panda", 50.0, seconds=1.0))
+    assert "No module named 'bench.subjects.no_such_subject'" in facts["failed"]
+
+
+def test_cpu_time_of_another_process_is_what_it_tells_of_itself(spawn: Callable[..., Child]) -> None:
+    child = spawn(
+        """
+        import sys, threading, time
+        def work():
+            end = time.thread_time() + 0.2
+            while time.thread_time() < end: pass
+        thread = threading.Thread(target=work); thread.start(); thread.join()  # it counts though it has ended
+        print(time.process_time_ns(), flush=True)
+        sys.stdin.readline()
+        """
+    )
+    told = int(child.line())
+    assert 200_000_000 <= told <= cpu_ns(child.process.pid) <= told + 50_000_000
+    assert peak_memory_kb(child.process.pid) > 1000
+
+
+def test_loopback_counts_what_is_sent_over_it() -> None:
+    before = Traffic.now()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for _ in range(10):
+            sender.sendto(bytes(1000), ("127.0.0.1", 9))
+    after = Traffic.now()
+    assert after.bytes - before.bytes >= 10 * 1028
+    assert after.packets - before.packets >= 10
+
+
+def test_the_end_of_a_process_is_that_of_everything_it_started() -> None:
+    script = "sleep 60 & echo started; wait"
+    process = Process("shell", ["sh", "-c", script], {}, is_service=True)
+    process.expect_text("started", 10.0)
+    members = family(process.pid)
+    assert len(members) == 2
+    process.end()
+    until(lambda: not any(_lives(pid) for pid in members))
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_a_service_that_ends_before_it_is_ready_is_told_with_its_last_words() -> None:
+    process = Process("router", ["sh", "-c", "echo port is busy; exit 1"], {}, is_service=True)
+    with pytest.raises(
+        RunFailed, match="the router ended before it said 'listens'; it said last: port is busy"
+    ):
+        process.expect_text("listens", 10.0)
+    process.end()
+
+
+def test_free_ports_differ() -> None:
+    assert len(set(free_ports(6))) == 6
