@@ -1,11 +1,13 @@
 import socket
+import threading
+import time
 
 import pytest
 from support import Child, until
 
 from zstate.errors import ConfigError
 from zstate.net.rendezvous import RENDEZVOUS, rendezvous_address
-from zstate.net.session import connect
+from zstate.net.session import Session, connect
 
 # Says its zid, then puts its name on k/<name> until it is told to stop; says every name it hears.
 NODE = """
@@ -70,6 +72,33 @@ def test_the_lobby_passes_on_when_its_session_closes():
     with connect() as newcomer:
         until(lambda: heir.zid in [str(zid) for zid in newcomer.zenoh.info.peers_zid()])
     heir.close()
+
+
+def have_met(one: Session, other: Session) -> bool:
+    return other.zid in [str(zid) for zid in one.zenoh.info.peers_zid()]
+
+
+def connect_while_closing(owner: Session, delay_s: float) -> Session:
+    """A session that opens while ``owner`` closes, which it begins ``delay_s`` later."""
+    closing = threading.Timer(delay_s, owner.close)
+    closing.start()
+    newcomer = connect()
+    closing.join()
+    return newcomer
+
+
+def test_who_connects_while_the_lobby_closes_still_meets_who_comes_later():
+    connect().close()
+    started = time.monotonic()
+    connect().close()
+    usual_s = time.monotonic() - started
+    rounds = 30
+    for index in range(rounds):  # from both at once to one after the other
+        with (
+            connect_while_closing(connect(), usual_s * index / rounds) as early,
+            connect() as late,
+        ):
+            until(lambda early=early, late=late: have_met(early, late) and have_met(late, early))
 
 
 def test_a_session_that_is_told_where_to_go_leaves_the_rendezvous_alone(rendezvous: str, free_port: int):

@@ -2,7 +2,8 @@
 
 Every session of the default mode connects to one fixed loopback port. Whichever process holds that
 port keeps a *lobby* there: a tiny Zenoh peer that tells newcomers where the others listen, and
-carries no data. When its process dies, another one takes the port over; links that exist stay.
+carries no data. When its process dies, another one takes the port over; links that exist stay. Each
+session looks several times a second whether the lobby knows it, and is introduced again if not.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -14,15 +15,19 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Callable
+from contextlib import suppress
 
 import zenoh
 
 from zstate.errors import ConfigError
+from zstate.net.forked import new_lock
+from zstate.net.lobby import Lobby
+from zstate.net.membership import Membership
 
 RENDEZVOUS_VARIABLE = "ZSTATE_RENDEZVOUS"
 RENDEZVOUS = "127.0.0.1:7450"
 PROBE_PERIOD_S = 0.2
+JOIN_WITHIN_S = 0.3
 
 _HOST_PORT = re.compile(r"([\w.-]+):([1-9]\d{0,4})")
 
@@ -40,20 +45,15 @@ def rendezvous_address() -> tuple[str, int]:
 
 
 class Rendezvous:
-    """This process's readiness to keep the lobby: at once if the port is free, else when it falls free.
+    """This process's readiness to keep the lobby: at once if the port is free, else when it falls free."""
 
-    ``open_lobby(endpoint)`` opens a Zenoh session that listens there, or raises ZError.
-    """
-
-    def __init__(self, address: tuple[str, int], open_lobby: Callable[[str], zenoh.Session]) -> None:
+    def __init__(self, address: tuple[str, int]) -> None:
         self._address = address
-        self._open_lobby = open_lobby
-        self._lobby: zenoh.Session | None = None
+        self._lobby: Lobby | None = None
+        self._lock = new_lock()
         self._stop = threading.Event()
         self._watcher: threading.Thread | None = None
-        if not self._take_over():
-            self._watcher = threading.Thread(target=self._watch, name="zstate rendezvous", daemon=True)
-            self._watcher.start()
+        self._take_over()
 
     @property
     def endpoint(self) -> str:
@@ -65,28 +65,42 @@ class Rendezvous:
         """Whether this process keeps the lobby."""
         return self._lobby is not None
 
+    def watch(self, session: zenoh.Session, endpoint: str) -> None:
+        """Take over when the port falls free; keep ``session`` at ``endpoint`` known there."""
+        membership = Membership(session, endpoint, self.endpoint)
+        self._watcher = threading.Thread(
+            target=self._watch, args=(membership,), name="zstate rendezvous", daemon=True
+        )
+        self._watcher.start()
+
     def close(self) -> None:
         """Give the port up, if it is ours; another process takes it over."""
         self._stop.set()
         if self._watcher is not None:
-            self._watcher.join(1.0)
-        if self._lobby is not None:
-            self._lobby.close()
-            self._lobby = None
+            self._watcher.join(JOIN_WITHIN_S)
+        with self._lock:
+            lobby, self._lobby = self._lobby, None
+        if lobby is not None:
+            lobby.close()
 
-    def _watch(self) -> None:
-        while not self._stop.wait(PROBE_PERIOD_S):
-            if self._take_over():
-                return
+    def _watch(self, membership: Membership) -> None:
+        with suppress(zenoh.ZError):  # the session was closed
+            while not self._stop.wait(PROBE_PERIOD_S):
+                self._take_over()
+                membership.renew(self._stop)
 
-    def _take_over(self) -> bool:
-        if not _port_is_free(self._address):
-            return False
+    def _take_over(self) -> None:
+        if self.owner or not _port_is_free(self._address):
+            return
         try:
-            self._lobby = self._open_lobby(self.endpoint)
+            lobby = Lobby(self.endpoint)
         except zenoh.ZError:
-            return False  # another process was quicker
-        return True
+            return  # another process was quicker
+        with self._lock:
+            if not self._stop.is_set():
+                self._lobby = lobby
+                return
+        lobby.close()
 
 
 def _port_is_free(address: tuple[str, int]) -> bool:
@@ -98,3 +112,10 @@ def _port_is_free(address: tuple[str, int]) -> bool:
         except OSError:
             return False
     return True
+
+
+def free_endpoint() -> str:
+    """A loopback endpoint where nobody listens now: unlike port 0, it is known before Zenoh opens it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -16,9 +16,8 @@ from contextlib import suppress
 import zenoh
 
 from zstate.closing import Closing
-from zstate.errors import Closed, ConfigError, InvalidInput
+from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
 from zstate.net.config import (
-    ANY_LOOPBACK_PORT,
     CONFIG_VARIABLE,
     ConfigSource,
     Mode,
@@ -37,8 +36,7 @@ from zstate.net.modes import (
 )
 from zstate.net.opening import open_within, patience_in
 from zstate.net.refusal_watch import RefusalWatch
-from zstate.net.rendezvous import Rendezvous, rendezvous_address
-from zstate.net.runtime import open_zenoh
+from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_address
 from zstate.net.security import Credentials
 from zstate.net.twin import Twin
 from zstate.net.undeclaring import Undeclarable, undeclare
@@ -155,17 +153,21 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
     if mode == "loopback":
         check_stays_here([f"tcp/{host}:{port}"])
     # The lobby first: while the rendezvous is silent, opening a session takes half a second longer.
-    rendezvous = Rendezvous((host, port), _open_lobby)
+    rendezvous = Rendezvous((host, port))
     try:
-        raw = open_within(our_config("peer", [rendezvous.endpoint], [ANY_LOOPBACK_PORT]), ())
+        raw, endpoint = _open_on_this_host(rendezvous.endpoint)
+        rendezvous.watch(raw, endpoint)
     except BaseException:
         rendezvous.close()
         raise
     return Session(raw, rendezvous)
 
 
-def _open_lobby(endpoint: str) -> zenoh.Session:
-    return open_zenoh(our_config("peer", (), [endpoint]))
+def _open_on_this_host(lobby: str) -> tuple[zenoh.Session, str]:
+    while True:
+        endpoint = free_endpoint()
+        with suppress(PortBusy):  # somebody took it in between
+            return open_within(our_config("peer", [lobby], [endpoint]), ()), endpoint
 
 
 class Session(Closing):

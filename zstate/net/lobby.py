@@ -1,0 +1,31 @@
+"""The lobby: where the processes of one host are told of each other. It carries no data."""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import zenoh
+
+from zstate.net.config import our_config
+from zstate.net.runtime import open_zenoh
+
+# The @ keeps it out of what is asked for with wildcards.
+LOBBY_KEY = "@zstate/lobby"
+
+
+class Lobby:
+    """A Zenoh peer that listens at ``endpoint``, and subscribes to ``LOBBY_KEY`` to show that it is open.
+
+    Raises ZError where somebody listens already.
+    """
+
+    def __init__(self, endpoint: str) -> None:
+        self._session = open_zenoh(our_config("peer", (), [endpoint]))
+        self._sign = self._session.declare_subscriber(LOBBY_KEY, zenoh.handlers.RingChannel(1))
+
+    def close(self) -> None:
+        """Leave."""
+        # Closing undeclares nothing, and whoever connects at that moment would see the sign for ever.
+        self._sign.undeclare()
+        self._session.close()
