@@ -23,6 +23,7 @@ NATIVE = ("native",)
 
 # A router of this host answers in milliseconds; one elsewhere is given the library's time.
 _ROS_ROUTER_WITHIN_S = 2.0
+_ROUTER_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,27 +50,31 @@ class Network:
 
 
 @contextmanager
-def open_session(network: Network, wires: tuple[str, ...] = NATIVE) -> Generator[Session]:
+def open_session(
+    network: Network, wires: tuple[str, ...] = NATIVE, *, timeout_s: float | None = None
+) -> Generator[Session]:
     """A session as the options say, for commands that speak ``wires``.
 
     Where all of these are ROS's and the options say nothing, it is a client of the router of this
-    host, where ROS nodes are. Warnings of the library go to standard error from now on.
+    host, where ROS nodes are. A router is given ``timeout_s`` to answer, or a few seconds. Warnings of the
+    library go to standard error from now on.
     """
     configured = network.config or os.environ.get("ZENOH_CONFIG")
     if network.mode == "client" and not network.connect and not configured:
         raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
     warn_on_standard_error()
-    with _connect_to_ros(network) if all(map(is_ros, wires)) else _connect(network) as session:
+    joined = _connect_to_ros if all(map(is_ros, wires)) else _connect
+    with joined(network, timeout_s) as session:
         yield session
 
 
-def _connect_to_ros(network: Network) -> Session:
+def _connect_to_ros(network: Network, timeout_s: float | None) -> Session:
     from zstate.net.config import ROUTER_ENDPOINT
 
     try:
         if network.is_given:
-            return _connect(network)
-        return _connect(Network("client", (ROUTER_ENDPOINT,)), _ROS_ROUTER_WITHIN_S)
+            return _connect(network, timeout_s)
+        return _connect(Network("client", (ROUTER_ENDPOINT,)), timeout_s or _ROS_ROUTER_WITHIN_S)
     except Unreachable as error:
         where = " or ".join(map(repr, error.endpoints)) or "the configured endpoints"
         fail(
@@ -79,7 +84,7 @@ def _connect_to_ros(network: Network) -> Session:
         )
 
 
-def _connect(network: Network, timeout_s: float = 5.0) -> Session:
+def _connect(network: Network, timeout_s: float | None) -> Session:
     from zstate.cli.worker import Worker
     from zstate.net.session import connect
 
@@ -91,7 +96,7 @@ def _connect(network: Network, timeout_s: float = 5.0) -> Session:
             mode=network.joins_as,
             endpoints=network.connect,
             listen=network.listen,
-            timeout_s=timeout_s,
+            timeout_s=timeout_s or _ROUTER_WITHIN_S,
             credentials=network.credentials,
         ),
     ).result()

@@ -1,0 +1,134 @@
+"""zstate wait: until a robot, a pose or a router is there."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import click
+
+from zstate.cli.console import count_text, fail, note, say, say_json
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_seconds, session_options, wire_option
+from zstate.errors import Unreachable, ZStateError
+
+_GRACE_S = 0.5
+
+
+@click.command("wait")
+@click.argument("what", type=click.Choice(["robot", "frame", "router"]), metavar="robot|frame|router")
+@click.argument("names", nargs=-1, metavar="[NAME]...")
+@click.option(
+    "--timeout",
+    type=float,
+    callback=checked_seconds,
+    default=30.0,
+    show_default=True,
+    metavar="S",
+    help="Give up after so long, with the reason.",
+)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object, also after the timeout.")
+@wire_option
+@session_options
+def wait_command(
+    *, network: Network, what: str, names: tuple[str, ...], timeout: float, as_json: bool, wire: str
+) -> None:
+    """Wait until something is there, and end.
+
+    A robot is there when its poses can be looked up: it has a model, and samples come. A frame is there
+    when its pose in another one is known. A router is there when it lets this command in; it is the one of
+    --connect, or of this host. Exit code 0 when it is there, 1 when it is not in time: the reason is said.
+
+    \b
+    zstate wait robot panda && python my_program.py
+    zstate wait robot left right --timeout 60
+    zstate wait frame panda_link0 panda_hand
+    zstate wait router tcp/192.168.1.10:7447
+    """
+    _check_count(what, names)
+    began = time.monotonic()
+    ways = {"robot": _await_robots, "frame": _await_frame, "router": _await_router}
+    try:
+        told = ways[what](network, names, wire, timeout)
+    except click.UsageError:
+        raise
+    except (ZStateError, click.ClickException) as failure:
+        if not as_json:
+            raise
+        _tell(what, names, began, str(failure))
+        raise SystemExit(1) from None
+    if as_json:
+        _tell(what, names, began, None)
+    else:
+        say(told)
+
+
+def _check_count(what: str, names: tuple[str, ...]) -> None:
+    if what == "robot" and not names:
+        raise click.UsageError("which robot? For instance `zstate wait robot panda`")
+    if what == "frame" and len(names) != 2:
+        raise click.UsageError("a pose has two frames: `zstate wait frame A B` waits for that of B in A")
+
+
+def _tell(what: str, names: tuple[str, ...], began: float, reason: str | None) -> None:
+    waited_s = round(time.monotonic() - began, 3)
+    say_json({"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason})
+
+
+def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.readiness import Readiness
+    from zstate.wire.keys import check_robot
+
+    for name in names:
+        check_robot(name)
+    deadline = time.monotonic() + timeout_s
+    with (
+        open_session(network, (wire,), timeout_s=timeout_s) as session,
+        Readiness(session, names, wire) as readiness,
+    ):
+        reason = readiness.wait(max(deadline - time.monotonic(), 0.0))
+        if reason:
+            fail(f"gave up after {timeout_s:g} s: {reason}")
+        ready = [f"{name!r} ({count_text(len(readiness.frames(name)), 'frame')})" for name in names]
+        return f"ready: {', '.join(ready)}"
+
+
+def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.awaited_pose import AwaitedPose
+    from zstate.cli.roster import Roster
+    from zstate.cli.words import followed
+    from zstate.listener import TransformListener
+
+    target, source = names
+    deadline = time.monotonic() + timeout_s
+    with (
+        open_session(network, (wire,), timeout_s=timeout_s) as session,
+        Roster(session, "*", wire) as roster,
+        TransformListener(session, wire=wire, follow=followed(wire)) as listener,
+    ):
+        awaited = AwaitedPose(listener, roster, target, source)
+        awaited.answer(timeout_s=max(round(deadline - time.monotonic(), 1), 0.1))
+    return f"ready: the pose of {source!r} in {target!r} is known"
+
+
+def _await_router(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.worker import Worker
+    from zstate.net.config import ROUTER_ENDPOINT
+
+    endpoints = names or network.connect or (() if network.is_given else (ROUTER_ENDPOINT,))
+    client = replace(network, mode="client", connect=endpoints)
+    where = " or ".join(map(repr, endpoints)) or "the configured endpoints"
+
+    def join() -> None:
+        with open_session(client, timeout_s=timeout_s):
+            pass
+
+    worker = Worker("zstate wait", join)
+    try:
+        worker.result(min(_GRACE_S, timeout_s))
+    except Unreachable:
+        raise
+    except TimeoutError:
+        note(f"waiting: nobody answers at {where} yet", event="waiting")
+        worker.result()
+    return f"ready: the router at {where}"
