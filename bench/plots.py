@@ -24,7 +24,7 @@ def write_plots(results: Results) -> list[Path]:
         from bench import charts, drawing  # noqa: PLC0415 - tables can be had without matplotlib
     except ImportError as error:
         raise PlotsMissing(
-            f"there are no plots without matplotlib ({error}): pip install -e '.[bench]'"
+            f"there are no plots without matplotlib ({error}): pip install -e '.[robots,bench]'"
         ) from error
     rates = [one for one in find(results, group="rate", robot=ROBOT) if one.rate_hz]
     talk = [one for one in rates if one.rate_hz == TALK_RATE_HZ]

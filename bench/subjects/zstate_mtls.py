@@ -46,7 +46,7 @@ SUBJECT = Subject(
         "certificate of `zstate certs`, and checks the other's; native wire",
         *HOW_READ,
     ),
-    install=("pip install -e '.[bench,certs]'",),
+    install=("pip install -e '.[robots,bench,certs]'",),
     python=lambda: here() if find_spec(LIBRARY) else None,
     versions=lambda: {**our_versions(), LIBRARY: version(LIBRARY)},
     load=_load,
