@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from types import FrameType
@@ -120,7 +122,20 @@ def main() -> NoReturn:
     except ZStateError as error:
         _complain(str(error))
         code = 1
-    sys.exit(code or 0)
+    except SystemExit as leaving:
+        code = leaving.code
+    _leave(code)
+
+
+def _leave(code: str | int | None) -> NoReturn:
+    # A thread that is inside Zenoh as Python shuts down, such as one that still connects, aborts the process.
+    code = code or 0
+    if isinstance(code, int) and any(thread.daemon for thread in threading.enumerate()):
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _end(number: int, _: FrameType | None) -> None:
