@@ -1,0 +1,1 @@
+"""zstate graph: who writes and reads what."""
