@@ -66,6 +66,11 @@ def router_identity_options(command: Command) -> Command:
     return _with_credentials(command, (*_OPTIONS, _USERS))
 
 
+def plain_identity_options(command: Command) -> Command:
+    """The options of ``identity_options`` as they are said, and nothing made of them."""
+    return _with_options(command, _OPTIONS)
+
+
 def _with_credentials(command: Command, options: Sequence[Callable[[Any], Any]]) -> Command:
     @functools.wraps(command)
     def with_credentials(
@@ -77,16 +82,19 @@ def _with_credentials(command: Command, options: Sequence[Callable[[Any], Any]])
         users: str | None = None,
         **others: Any,
     ) -> Any:
-        credentials = _credentials(certs, identity, user, password_file, users)
+        credentials = credentials_of(certs, identity, user, password_file, users)
         return command(credentials=credentials, **others)
 
-    decorated: Any = with_credentials
+    return _with_options(with_credentials, options)
+
+
+def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
     for option in reversed(options):
-        decorated = option(decorated)
-    return decorated
+        command = option(command)
+    return command
 
 
-def _credentials(
+def credentials_of(
     certs: str | None,
     identity: str | None,
     user: str | None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from zstate.cli.identity import identity_options
+from zstate.cli.identity import identity_options, plain_identity_options
 from zstate.cli.network import Network
 from zstate.errors import InvalidInput
 
@@ -37,9 +37,16 @@ def session_options(command: Command) -> Command:
     ) -> Any:
         return command(network=Network(mode, connect, listen, config, credentials), **options)
 
-    for option in reversed(_SESSION_OPTIONS):
+    for option in reversed((*_HOW_TO_JOIN, identity_options)):
         with_network = option(with_network)
     return with_network  # type: ignore[return-value]
+
+
+def plain_session_options(command: Command) -> Command:
+    """The same options as they are said, and nothing made of them."""
+    for option in reversed((*_HOW_TO_JOIN, plain_identity_options)):
+        command = option(command)
+    return command
 
 
 config_option = click.option(
@@ -50,7 +57,7 @@ config_option = click.option(
     help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
 )
 
-_SESSION_OPTIONS = (
+_HOW_TO_JOIN = (
     click.option(
         "--mode",
         type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
@@ -74,7 +81,6 @@ _SESSION_OPTIONS = (
         help="Where to listen, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
     config_option,
-    identity_options,
 )
 
 

@@ -1,0 +1,1 @@
+"""What a command is told from outside: options, the environment, files."""
