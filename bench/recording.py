@@ -106,7 +106,7 @@ def rate_in(times: Numbers, window: Window) -> float:
     first, after = np.searchsorted(ordered, (window.begin, window.end))
     if first == after or after == len(ordered):
         return float(after - first) / window.seconds
-    return float(after - first) / ((ordered[after] - ordered[first]) * 1e-9)
+    return float((after - first) / ((ordered[after] - ordered[first]) * 1e-9))
 
 
 def latency_grid(latencies_us: NDArray[np.float64]) -> list[float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import tempfile
@@ -14,7 +15,7 @@ from typing import Any, TypeAlias
 from bench.job import Job
 from bench.measure import Costs
 from bench.poses import pose_errors
-from bench.process import Process, RunFailed
+from bench.process import ROOT, Process, RunFailed
 from bench.recording import Recording, Window, rate_in, reader_figures
 from bench.robot import BenchRobot, bench_robot
 from bench.scenario import Scenario
@@ -195,6 +196,8 @@ def _answers(service: Service, environment: Mapping[str, str]) -> bool:
             if probe.connect_ex(("127.0.0.1", service.port)) != 0:
                 return False
     if service.probe:
-        done = subprocess.run(service.probe, env=environment, capture_output=True, check=False, timeout=10)
+        done = subprocess.run(
+            service.probe, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, check=False
+        )
         return done.returncode == 0
     return True
