@@ -65,6 +65,10 @@ class AwaitedPose:
             return None
         return transform.age(buffer.clock)
 
+    def explained(self, text: str) -> str:
+        """What the library says of the frames, with the names that serve here."""
+        return self._words.explained(text)
+
     def _say_once(self, reason: LookupFailed) -> None:
         hint = self._hint(reason)
         key = (type(reason), reason.edge, getattr(reason, "name", ""), hint)

@@ -1,0 +1,1 @@
+"""zstate monitor: how the samples behind one pose come in."""

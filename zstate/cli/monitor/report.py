@@ -1,0 +1,146 @@
+"""What is reported of a path: a table for a person, facts for a program."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from zstate.cli.console import rate_text
+from zstate.cli.layout import in_columns
+from zstate.cli.monitor.meter import Measure, PathMeter
+from zstate.errors import duration_text
+
+if TYPE_CHECKING:
+    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.tracks import Offset
+
+_HEADINGS = ("frame", "edge", "rate", "latency", "max", "jitter", "missed", "clock", "writer")
+# What a narrow terminal does without, in this order.
+_DISPENSABLE = ("max", "clock", "edge", "jitter")
+
+_SILENT_S, _SILENT_PERIODS = 1.0, 10
+_OFFSET_NS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A frame on the path and the edge that leads to it, with what was measured; None for the first frame."""
+
+    frame: str
+    edge: FrameInfo | None
+    measure: Measure | None
+    offset: Offset | None
+
+    def facts(self) -> dict[str, Any] | None:
+        """The same as JSON has it; None for the first frame."""
+        edge, offset = self.edge, self.offset
+        if edge is None:
+            return None
+        return {
+            "parent": edge.parent,
+            "child": edge.name,
+            "kind": edge.kind,
+            "writer": edge.writer,
+            **(dict[str, Any]() if self.measure is None else asdict(self.measure)),
+            "clock_offset_s": None if offset is None else offset.offset_ns * 1e-9,
+            "clock_uncertainty_s": None if offset is None else offset.uncertainty_ns * 1e-9,
+        }
+
+
+def report_text(rows: Sequence[Row], *, width: int | None = None) -> str:
+    """The table; where it is wider than ``width``, writers are letters and some columns are left out."""
+    lines = in_columns([_HEADINGS, *_cells(rows, {})])
+    if width is not None and max(map(len, lines)) > width:
+        letters = _letters(rows)
+        lines = _narrowed([_HEADINGS, *_cells(rows, letters)], width)
+        lines += [f"{letter}: {writer}" for writer, letter in letters.items()]
+    return "\n".join([*lines, *_clock_notes(rows)])
+
+
+def _narrowed(table: list[tuple[str, ...]], width: int) -> list[str]:
+    lines = in_columns(table)
+    for column in _DISPENSABLE:
+        if max(map(len, lines)) <= width:
+            break
+        place = table[0].index(column)
+        table = [row[:place] + row[place + 1 :] for row in table]
+        lines = in_columns(table)
+    return lines
+
+
+def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """Edges whose samples are those of the edge above have only their kind: one robot's joints, mostly."""
+    cells: list[tuple[str, ...]] = []
+    said: set[str] = set()
+    for frame, row in zip(_names(rows), rows, strict=True):
+        edge = row.edge
+        if edge is None:
+            cells.append((frame, *[""] * (len(_HEADINGS) - 1)))
+            continue
+        writer = letters.get(edge.writer or "", edge.writer or "")
+        if edge.kind == "static":
+            cells.append((frame, edge.kind, *[""] * (len(_HEADINGS) - 3), writer))
+            continue
+        source = PathMeter.source(edge)
+        numbers = [""] * (len(_HEADINGS) - 3) if source in said else _numbers(row.measure, row.offset)
+        cells.append((frame, edge.kind, *numbers, writer if source not in said else ""))
+        said.add(source)
+    return cells
+
+
+def _names(rows: Sequence[Row]) -> list[str]:
+    """The frames, without their robot where there is one only."""
+    robots = {row.frame.partition("/")[0] for row in rows if "/" in row.frame}
+    full = [row.frame for row in rows]
+    return [name.partition("/")[2] or name for name in full] if len(robots) == 1 else full
+
+
+def _numbers(measure: Measure | None, offset: Offset | None) -> list[str]:
+    if measure is None:
+        return ["no sample", "", "", "", "", ""]
+    return [
+        _rate_text(measure),
+        *(_time_text(seconds) for seconds in (measure.latency_s, measure.latency_max_s, measure.jitter_s)),
+        str(measure.missed),
+        "" if offset is None else _ahead_text(offset),
+    ]
+
+
+def _rate_text(measure: Measure) -> str:
+    pause_s = max(_SILENT_S, _SILENT_PERIODS / measure.rate_hz if measure.rate_hz else 0.0)
+    silent = measure.silent_s > pause_s
+    return f"silent {_time_text(measure.silent_s)}" if silent else rate_text(measure.rate_hz)
+
+
+def _time_text(seconds: float | None) -> str:
+    return "-" if seconds is None else duration_text(round(seconds * 1e9))
+
+
+def _ahead_text(offset: Offset) -> str:
+    """What is smaller than its uncertainty is none."""
+    if abs(offset.offset_ns) <= offset.uncertainty_ns:
+        return "0"
+    return f"{'+' if offset.offset_ns > 0 else ''}{duration_text(offset.offset_ns)}"
+
+
+def _letters(rows: Sequence[Row]) -> dict[str, str]:
+    writers = dict.fromkeys(row.edge.writer for row in rows if row.edge is not None and row.edge.writer)
+    return {writer: chr(ord("a") + number) for number, writer in enumerate(writers) if writer}
+
+
+def _clock_notes(rows: Sequence[Row]) -> list[str]:
+    """Clocks that are off by more than the network alone explains."""
+    notes: dict[str, str] = {}
+    for row in rows:
+        offset, writer = row.offset, row.edge.writer if row.edge is not None else None
+        if offset is None or writer is None:
+            continue
+        off_ns = abs(offset.offset_ns)
+        if off_ns > max(_OFFSET_NS, offset.uncertainty_ns):
+            side = "ahead of" if offset.offset_ns > 0 else "behind"
+            notes[writer] = (
+                f"the clock of {writer} is {duration_text(off_ns)} {side} the one here "
+                f"(± {duration_text(offset.uncertainty_ns)}), and its latencies are off by that"
+            )
+    return list(notes.values())
