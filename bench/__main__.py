@@ -6,6 +6,7 @@ import secrets
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -42,19 +43,21 @@ def setup(names: tuple[str, ...]) -> None:
             # What is shown is what is run; it is written in this repository.
             if subprocess.run(command, shell=True, cwd=ROOT, check=False).returncode:
                 raise click.ClickException(f"{name}: this command failed; the others were not run")
-    table = Table("subject", "is", "installed", "to install it", box=None)
-    for subject in map(subject_named, NAMES):
-        installed = subject.python() is not None
-        versions = (
-            ", ".join(f"{what} {number}" for what, number in subject.versions().items()) if installed else ""
-        )
-        table.add_row(
-            subject.name,
-            subject.title,
-            versions or "[red]no[/]",
-            "" if installed else "\n".join(subject.install),
-        )
+    _show_installed([subject_named(name) for name in NAMES])
+
+
+def _show_installed(subjects: Sequence[Subject]) -> None:
+    table = Table("subject", "is", "installed", box=None)
+    missing = [one for one in subjects if one.python() is None]
+    for one in subjects:
+        versions = "[red]no[/]" if one in missing else ", ".join(map(" ".join, one.versions().items()))
+        table.add_row(one.name, one.title, versions)
     CONSOLE.print(table)
+    for one in missing:
+        CONSOLE.print(f"\n[bold]{one.name}[/]: python -m bench setup {one.name}, which is", highlight=False)
+        for command in one.install:
+            # Unbroken, so that it can be pasted.
+            CONSOLE.print(f"  {command}", highlight=False, markup=False, soft_wrap=True)
 
 
 @main.command("run")
