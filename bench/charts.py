@@ -7,15 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.drawing import INK, ROLE_SHADES, label_ends, note, pen, plain_ticks, styled
+from bench.drawing import label_ends, note, pen, plain_ticks, styled
 from bench.outcome import Outcome, outcomes
 from bench.results import Results
+from bench.rows import cpu_bar, latency_row, name_rows, rate_bar, time_axis
 from bench.scenario import Scenario
 
 # A reader that is nearer to the commanded rate than this has kept up.
 KEPT_UP = 0.995
-
-OURS = "zstate_peer"
 
 Lines = Mapping[str, Sequence[tuple[float, float]]]
 
@@ -26,18 +25,18 @@ def overview(results: Results, scenario: Scenario) -> Figure:
     found = outcomes(results, scenario)
     figure = Figure(figsize=(13.0, 1.6 + 0.42 * len(found)))
     rate, latency, cpu = figure.subplots(1, 3, sharey=True, width_ratios=(1.0, 1.25, 1.25))
-    _name_rows(rate, results, found)
+    name_rows(rate, results, found)
     for row, (name, one) in enumerate(found.items()):
-        _rate_bar(rate, row, name, one)
-        _latency_row(latency, row, name, one)
-        _cpu_bar(cpu, row, name, one)
+        rate_bar(rate, row, name, one)
+        latency_row(latency, row, name, one)
+        cpu_bar(cpu, row, name, one)
     rate.set(
         title="Rate at the reader",
         xlim=(0, 1.28 * scenario.rate_hz),
         xticks=(0, scenario.rate_hz / 2, scenario.rate_hz),
     )
     rate.set_xlabel("Hz")
-    _time_axis(latency, "Latency, from stamp to answer")
+    time_axis(latency, "Latency, from stamp to answer")
     cpu.set(title="CPU, all processes", xlabel="% of a core; dark to light: writer, reader, others")
     cpu.margins(x=0.18)
     for axes in (rate, latency, cpu):
@@ -64,13 +63,13 @@ def latencies(results: Results, scenarios: Sequence[Scenario]) -> Figure | None:
     names = {name: one for scenario in scenarios for name, one in outcomes(results, scenario).items()}
     figure = Figure(figsize=(2.4 + 4.6 * len(scenarios), 1.6 + 0.42 * len(names)))
     panels = figure.subplots(1, len(scenarios), sharey=True, sharex=True, squeeze=False)[0]
-    _name_rows(panels[0], results, names)
+    name_rows(panels[0], results, names)
     for axes, scenario in zip(panels, scenarios, strict=True):
         found = outcomes(results, scenario)
         for row, name in enumerate(names):
             if name in found:
-                _latency_row(axes, row, name, found[name])
-        _time_axis(axes, f"{scenario.robot} at {scenario.rate}")
+                latency_row(axes, row, name, found[name])
+        time_axis(axes, f"{scenario.robot} at {scenario.rate}")
         axes.grid(axis="x")
         axes.tick_params(axis="y", length=0)
         axes.set_axisbelow(True)
@@ -177,7 +176,7 @@ def joins(results: Results, scenario: Scenario) -> Figure:
     found = outcomes(results, scenario)
     figure = Figure(figsize=(8.2, 1.5 + 0.4 * len(found)))
     axes = figure.subplots()
-    _name_rows(axes, results, found)
+    name_rows(axes, results, found)
     for row, (name, one) in enumerate(found.items()):
         axes.plot(
             one.joins_ms,
@@ -265,60 +264,6 @@ def _draw(axes: Axes, results: Results, lines: Lines) -> list[tuple[float, float
 
 def _ends(results: Results, lines: Lines) -> list[tuple[float, float, str, str]]:
     return [(*points[-1], _title(results, name), pen(name).color) for name, points in lines.items()]
-
-
-def _name_rows(axes: Axes, results: Results, names: Mapping[str, object]) -> None:
-    axes.set_yticks(range(len(names)), [_title(results, name) for name in names])
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    for label, name in zip(axes.get_yticklabels(), names, strict=True):
-        label.set(color=pen(OURS).color if name.startswith("zstate") else INK, fontsize=11)
-        label.set_fontweight("bold" if name == OURS else "normal")
-
-
-def _rate_bar(axes: Axes, row: int, name: str, one: Outcome) -> None:
-    axes.barh(row, one.rate_hz, height=0.56, color=pen(name).color)
-    axes.annotate(
-        f"{one.rate_hz:,.0f}",
-        (one.rate_hz, row),
-        xytext=(5, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=9.5,
-    )
-
-
-def _latency_row(axes: Axes, row: int, name: str, one: Outcome) -> None:
-    found = [one.latency_us(percent) for percent in (1, 25, 50, 75, 99, 99.9)]
-    if None in found:
-        return
-    p1, p25, p50, p75, p99, p999 = (max(1.0, value or 0.0) for value in found)
-    color = pen(name).color
-    axes.plot([p1, p99], [row, row], color=color, lw=7, alpha=0.28, solid_capstyle="butt")
-    axes.plot([p25, p75], [row, row], color=color, lw=7, solid_capstyle="butt")
-    axes.plot([p99, p999], [row, row], color=color, lw=1)
-    axes.plot([p999], [row], color=color, marker="|", ms=9, mew=1.6)
-    axes.plot([p50], [row], color="white", marker="o", ms=5.5, mec=color, mew=1.6)
-
-
-def _cpu_bar(axes: Axes, row: int, name: str, one: Outcome) -> None:
-    cpu = one.cpu_percent()
-    parts = (cpu["writer"], cpu["reader"], one.cpu_total - cpu["writer"] - cpu["reader"])
-    left = 0.0
-    for part, shade in zip(parts, ROLE_SHADES, strict=True):
-        axes.barh(row, part, left=left, height=0.56, color=pen(name).color, alpha=shade, lw=0)
-        left += part
-    axes.annotate(
-        f"{left:.0f} %", (left, row), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9.5
-    )
-
-
-def _time_axis(axes: Axes, title: str) -> None:
-    axes.set(xscale="log", title=title)
-    low, high = axes.get_xlim()
-    ticks = {100.0: "0.1 ms", 1e3: "1 ms", 1e4: "10 ms", 1e5: "100 ms", 1e6: "1 s", 1e7: "10 s"}
-    shown = [tick for tick in ticks if low <= tick <= high]
-    axes.set_xticks(shown, [ticks[tick] for tick in shown])
-    axes.set_xticks([], minor=True)
 
 
 def _joints(results: Results, scenario: Scenario) -> int:
