@@ -5,9 +5,14 @@ import os
 import socket
 
 import pytest
-from looking import EVERYTHING, failure, standing, zstate
+from looking import EVERYTHING, Spawn, failure, interrupted, standing, started, zstate
+from support import until
 
 from zstate import StaticPublisher, connect
+from zstate.cli.robot_list import robots_text
+from zstate.cli.sampling import Sampler
+from zstate.net.presence import RobotInfo
+from zstate.wire.writer import Writer
 
 pytestmark = pytest.mark.processes
 
@@ -48,3 +53,52 @@ def test_nobody_is_no_error():
 
 def test_an_endpoint_that_cannot_be_is_named():
     assert "nonsense" in failure("ls", "--connect", "nonsense")
+
+
+def test_joint_states_have_a_rate_and_an_age_and_nothing_is_made_to_say_more():
+    with standing():
+        lines = {line.split()[0]: line for line in zstate("ls").stdout.decode().splitlines()}
+        (robot,) = json.loads(zstate("ls", "--json").stdout)
+    assert " Hz  " in lines["joint_states"]
+    assert " Hz  " not in lines["tf"]
+    (joints,) = [writer for writer in robot["writers"] if writer["stream"] == "joint_states"]
+    assert 20.0 < joints["rate_hz"] < 200.0
+    assert 0.0 <= joints["silent_s"] < 1.0
+
+
+def test_watched_the_list_comes_anew_when_somebody_comes_or_goes(spawn: Spawn):
+    command = started(spawn, "ls", "--watch")
+    assert command.line().startswith("no robot is announced")
+    with standing(streams=("joint_states",)):
+        until(lambda: command.line() == "rrbot")
+        assert command.line().split()[0] == "joint_states"
+    until(lambda: command.line().startswith("no robot is announced"))
+    interrupted(command)
+
+
+def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
+    with standing():
+        command = started(spawn, "ls", "--watch", "--json")
+        documents = [json.loads(command.line()) for _ in range(2)]
+    assert [robot["robot"] for robot in documents[-1]] == ["rrbot"]
+    interrupted(command)
+
+
+def test_a_narrow_terminal_has_less_of_when_and_of_age():
+    writer = Writer("driver", "jetson", 412, 0, 7)
+    robots = (RobotInfo("arm", (("joint_states", writer),)),)
+    with connect() as session, Sampler(session) as sampler:
+        wide, narrow = (robots_text(robots, sampler, width=width).splitlines()[1] for width in (None, 55))
+        narrowest = robots_text(robots, sampler, width=40).splitlines()[1]
+    assert "since 1970-01-01" in wide
+    assert "since" not in narrow
+    assert len(narrow) <= 55
+    assert narrowest.split() == ["joint_states", "driver@jetson", "pid", "412"]
+
+
+def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
+    command = started(spawn, "ls", "--watch")
+    assert command.line().startswith("no ROS 2 node")
+    with standing(wire="ros2", router=ros_router):
+        until(lambda: "/joint_states" in command.line())
+    interrupted(command)

@@ -27,3 +27,18 @@ def in_columns(rows: Sequence[Sequence[str]]) -> list[str]:
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
+
+
+def narrowed(rows: Sequence[Sequence[str]], width: int | None, dispensable: Sequence[int] = ()) -> list[str]:
+    """``in_columns``, without as many of the ``dispensable`` columns, the first first, as ``width`` asks for.
+
+    Columns are counted from 0 in ``rows``. Lines may still be too wide when all of them are gone.
+    """
+    lines, gone = in_columns(rows), set[int]()
+    for column in dispensable:
+        if width is None or max(map(len, lines), default=0) <= width:
+            break
+        gone.add(column)
+        kept = [[cell for place, cell in enumerate(row) if place not in gone] for row in rows]
+        lines = in_columns(kept)
+    return lines

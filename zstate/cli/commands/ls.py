@@ -3,118 +3,130 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
-from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.console import note, say, say_json
-from zstate.cli.layout import in_columns
+from zstate.cli.console import is_terminal, note, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import session_options, wire_option
 from zstate.cli.words import is_ros, words_of
-from zstate.errors import duration_text
 
 if TYPE_CHECKING:
+    from zstate.cli.sampling import Sampler
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
-    from zstate.wire.keys import Stream
-    from zstate.wire.writer import Writer
+
+_MEASURED_WITHIN_S = 0.3
+_AGAIN_S = 0.5
+# Meeting everybody takes less.
+_MEETING_S = 0.5
 
 
 @click.command("ls")
+@click.option("--watch", is_flag=True, help="Keep the list up to date, until Ctrl-C.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON array; on ROS's side one object.")
 @wire_option
 @session_options
-def ls_command(network: Network, as_json: bool, wire: str) -> None:
+def ls_command(network: Network, *, watch: bool, as_json: bool, wire: str) -> None:
     """List the announced robots and, for each stream, who writes it since when.
 
-    On ROS's side: the nodes, and who publishes and subscribes the topics of robots' states, with QoS.
+    Of joint states also the rate, by their own stamps, and how long ago the last one came. On ROS's side:
+    the nodes, and who publishes and subscribes the topics of robots' states, with QoS. With --watch a
+    pipe gets the list anew whenever somebody comes or goes; with --json, one document a second.
 
     \b
     zstate ls
+    zstate ls --watch
     zstate ls --json --connect tcp/192.168.1.10:7447
     zstate ls --wire ros2:domain=5
     """
     with open_session(network, (wire,)) as session:
         if is_ros(wire):
-            _list_graph(session, wire, as_json=as_json)
+            _list_graph(session, wire, watch=watch, as_json=as_json)
         else:
-            _list_robots(session, as_json=as_json)
+            _list_robots(session, watch=watch, as_json=as_json)
 
 
-def _list_graph(session: Session, wire: str, *, as_json: bool) -> None:
-    from zstate.cli.ros_graph import heard_graph
+def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> None:
+    from zstate.cli.ros_graph import RosGraph, heard_graph
     from zstate.cli.ros_graph_text import graph_facts, graph_text, namespaces_hint, nobody_text
     from zstate.net.wires import wire_named
     from zstate.wire.ros2.wire import Ros2Wire
 
     spoken = wire_named(wire)
     assert isinstance(spoken, Ros2Wire)
+
+    def text(graph: RosGraph) -> str:
+        return graph_text(graph, spoken) if graph.nodes or graph.topics else nobody_text(spoken)
+
+    if watch and as_json:
+        _repeat_json(lambda: graph_facts(heard_graph(session, spoken), spoken))
+    if watch:
+        _show(lambda: text(heard_graph(session, spoken)), lambda: heard_graph(session, spoken))
     graph = heard_graph(session, spoken)
     if as_json:
         say_json(graph_facts(graph, spoken))
     elif graph.nodes or graph.topics:
-        say(graph_text(graph, spoken))
+        say(text(graph))
         hint = namespaces_hint(graph, spoken)
         if hint:
             note(hint)
     else:
-        note(nobody_text(spoken))
+        note(text(graph))
 
 
-def _list_robots(session: Session, *, as_json: bool) -> None:
+def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
+    from zstate.cli.robot_list import robots_facts, robots_text, sources
+    from zstate.cli.sampling import Sampler
     from zstate.net.presence import discover
 
-    robots = discover(session)
-    if as_json:
-        say_json([_facts(robot) for robot in robots])
-    elif robots:
-        say("\n".join(_lines(robots)))
-    else:
-        note(words_of("native").announced(robots))
+    with Sampler(session) as sampler:
+        sampler.hear("joint_states")
+        if watch:
+            _watch_robots(session, sampler, as_json=as_json)
+        robots = discover(session)
+        sampler.wait(sources(robots), _MEASURED_WITHIN_S)
+        if as_json:
+            say_json(robots_facts(robots, sampler))
+        elif robots:
+            say(robots_text(robots, sampler, width=terminal_width() if is_terminal() else None))
+        else:
+            note(words_of("native").announced(robots))
 
 
-def _lines(robots: tuple[RobotInfo, ...]) -> list[str]:
-    rows = in_columns(
-        [
-            (f"  {_said(robot, stream, writer)}", str(writer), _since(writer))
-            for robot in robots
-            for stream, writer in robot.writers
-        ]
-    )
-    lines: list[str] = []
-    for robot in robots:
-        count = len(robot.writers)
-        lines += [robot.name, *rows[:count]]
-        rows = rows[count:]
-    return lines
+def _watch_robots(session: Session, sampler: Sampler, *, as_json: bool) -> NoReturn:
+    from zstate.cli.robot_list import robots_facts, robots_text
+    from zstate.cli.roster import Roster
+
+    def text(robots: tuple[RobotInfo, ...], width: int | None) -> str:
+        return robots_text(robots, sampler, width=width) if robots else roster.words.announced(robots)
+
+    with Roster(session) as roster:
+        time.sleep(_MEETING_S)
+        if as_json:
+            _repeat_json(lambda: robots_facts(roster.robots(), sampler))
+        width = terminal_width if is_terminal() else lambda: None
+        _show(lambda: text(roster.robots(), width()), roster.robots)
 
 
-def _said(robot: RobotInfo, stream: Stream, writer: Writer) -> str:
-    from zstate.wire.keys import MODEL_WRITER
-
-    names = [name for name in robot.names_of(writer) if stream == "tf_static" and name != MODEL_WRITER]
-    return f"{stream}/{','.join(names)}" if names else stream
-
-
-def _since(writer: Writer) -> str:
-    began = datetime.fromtimestamp(writer.since // 1_000_000_000).astimezone()
-    return f"since {began:%Y-%m-%d %H:%M:%S}, {_lasting(time.time_ns() - writer.since)}"
+def _repeat_json(facts: Callable[[], Any]) -> NoReturn:
+    while True:
+        say_json(facts())
+        time.sleep(1.0)
 
 
-def _lasting(nanoseconds: int) -> str:
-    minutes, seconds = divmod(nanoseconds // 1_000_000_000, 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {seconds:02d} s" if minutes else duration_text(nanoseconds)
+def _show(text: Callable[[], str], state: Callable[[], object]) -> NoReturn:
+    """Keep ``text`` on the screen up to date; in a pipe say it whenever ``state`` is another one."""
+    if is_terminal():
+        from zstate.cli.live_text import keep_showing
 
-
-def _facts(robot: RobotInfo) -> dict[str, Any]:
-    writers = [
-        {"stream": stream, **asdict(writer), "names": robot.names_of(writer) if stream == "tf_static" else ()}
-        for stream, writer in robot.writers
-    ]
-    return {"robot": robot.name, "writers": writers}
+        keep_showing(text)
+    said: object = None
+    while True:
+        now = state()
+        if now != said:
+            say(f"{text()}\n")
+        said = now
+        time.sleep(_AGAIN_S)

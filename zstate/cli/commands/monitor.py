@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -121,16 +120,11 @@ class _Monitored:
         else:
             say(f"{self._text(transform, rows, None)}\n")
 
-    def show(self) -> None:
-        """A report that keeps up to date. Never returns."""
-        from rich.live import Live
-        from rich.text import Text
+    def show(self) -> NoReturn:
+        """A report that keeps up to date."""
+        from zstate.cli.live_text import keep_showing
 
-        with Live(auto_refresh=False, vertical_overflow="visible") as live:
-            while True:
-                text = self._text(self._awaited.answer(), self._rows(), terminal_width())
-                live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
-                time.sleep(0.5)
+        keep_showing(lambda: self._text(self._awaited.answer(), self._rows(), terminal_width()))
 
     def _rows(self) -> list[Row]:
         from zstate.cli.monitor.path import path_between

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from zstate.cli.console import rate_text
-from zstate.cli.layout import in_columns
+from zstate.cli.layout import in_columns, narrowed
 from zstate.cli.monitor.meter import Measure, PathMeter
 from zstate.errors import duration_text
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _HEADINGS = ("frame", "edge", "rate", "latency", "max", "jitter", "missed", "clock", "writer")
 # What a narrow terminal does without, in this order.
-_DISPENSABLE = ("max", "clock", "edge", "jitter")
+_DISPENSABLE = tuple(map(_HEADINGS.index, ("max", "clock", "edge", "jitter")))
 
 _SILENT_S, _SILENT_PERIODS = 1.0, 10
 _OFFSET_NS = 1_000_000
@@ -53,20 +53,9 @@ def report_text(rows: Sequence[Row], *, width: int | None = None) -> str:
     lines = in_columns([_HEADINGS, *_cells(rows, {})])
     if width is not None and max(map(len, lines)) > width:
         letters = _letters(rows)
-        lines = _narrowed([_HEADINGS, *_cells(rows, letters)], width)
+        lines = narrowed([_HEADINGS, *_cells(rows, letters)], width, _DISPENSABLE)
         lines += [f"{letter}: {writer}" for writer, letter in letters.items()]
     return "\n".join([*lines, *_clock_notes(rows)])
-
-
-def _narrowed(table: list[tuple[str, ...]], width: int) -> list[str]:
-    lines = in_columns(table)
-    for column in _DISPENSABLE:
-        if max(map(len, lines)) <= width:
-            break
-        place = table[0].index(column)
-        table = [row[:place] + row[place + 1 :] for row in table]
-        lines = in_columns(table)
-    return lines
 
 
 def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> list[tuple[str, ...]]:

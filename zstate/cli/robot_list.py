@@ -1,0 +1,105 @@
+"""The announced robots as a list: each stream with its writer, its rate, and how fresh it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+from zstate.cli.console import rate_text
+from zstate.cli.layout import narrowed
+from zstate.cli.sampling import Sampler, Source
+from zstate.errors import duration_text
+
+if TYPE_CHECKING:
+    from zstate.net.presence import RobotInfo
+    from zstate.wire.keys import Stream
+    from zstate.wire.writer import Writer
+
+# So long without a sample is worth a word, rather than no number.
+_SILENT_NS = 2_000_000_000
+
+_AGE, _SINCE = 2, 4
+
+
+def sources(robots: Sequence[RobotInfo]) -> list[Source]:
+    """What can be measured without making anybody say more: joint states."""
+    return [
+        Source(robot.name, stream, writer.session)
+        for robot in robots
+        for stream, writer in robot.writers
+        if stream == "joint_states"
+    ]
+
+
+def robots_text(robots: Sequence[RobotInfo], sampler: Sampler, *, width: int | None = None) -> str:
+    """Each robot, and below it each stream: rate, age of the newest sample, writer, since when.
+
+    Where that is wider than ``width``, the date is left out, then all of since when, then the age.
+    """
+    rows = [_row(robot, stream, writer, sampler) for robot in robots for stream, writer in robot.writers]
+    lines = narrowed(rows, None)
+    if width is not None and max(map(len, lines), default=0) > width:
+        short = [(*row[:_SINCE], row[_SINCE].rpartition(", ")[2]) for row in rows]
+        lines = narrowed(short, width, (_SINCE, _AGE))
+    text: list[str] = []
+    for robot in robots:
+        count = len(robot.writers)
+        text += [robot.name, *lines[:count]]
+        lines = lines[count:]
+    return "\n".join(text)
+
+
+def _row(robot: RobotInfo, stream: Stream, writer: Writer, sampler: Sampler) -> tuple[str, ...]:
+    pulse = sampler.pulse(Source(robot.name, stream, writer.session))
+    if pulse is None:
+        rate, age = "", ""
+    else:
+        rate = "silent" if pulse.silent_ns > _SILENT_NS else rate_text(pulse.rate_hz)
+        age = duration_text(pulse.silent_ns)
+    return f"  {_said(robot, stream, writer)}", rate, age, str(writer), _since(writer)
+
+
+def _said(robot: RobotInfo, stream: Stream, writer: Writer) -> str:
+    names = _static_names(robot, stream, writer)
+    return f"{stream}/{','.join(names)}" if names else stream
+
+
+def _static_names(robot: RobotInfo, stream: Stream, writer: Writer) -> list[str]:
+    from zstate.wire.keys import MODEL_WRITER
+
+    return [name for name in robot.names_of(writer) if stream == "tf_static" and name != MODEL_WRITER]
+
+
+def _since(writer: Writer) -> str:
+    began = datetime.fromtimestamp(writer.since // 1_000_000_000).astimezone()
+    return f"since {began:%Y-%m-%d %H:%M:%S}, {_lasting(time.time_ns() - writer.since)}"
+
+
+def _lasting(nanoseconds: int) -> str:
+    minutes, seconds = divmod(nanoseconds // 1_000_000_000, 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {seconds:02d} s" if minutes else duration_text(nanoseconds)
+
+
+def robots_facts(robots: Sequence[RobotInfo], sampler: Sampler) -> list[dict[str, Any]]:
+    """The same for a program."""
+    return [
+        {"robot": robot.name, "writers": [_facts(robot, *pair, sampler) for pair in robot.writers]}
+        for robot in robots
+    ]
+
+
+def _facts(robot: RobotInfo, stream: Stream, writer: Writer, sampler: Sampler) -> dict[str, Any]:
+    pulse = sampler.pulse(Source(robot.name, stream, writer.session))
+    return {
+        "stream": stream,
+        **asdict(writer),
+        "names": robot.names_of(writer) if stream == "tf_static" else (),
+        "rate_hz": None if pulse is None else pulse.rate_hz,
+        "silent_s": None if pulse is None else pulse.silent_ns * 1e-9,
+    }
