@@ -82,6 +82,8 @@ class Costs:
     def end(self) -> None:
         """The window ends."""
         self._ended = self._reading()
+        # Now: by the time anybody asks, some of them are gone.
+        self._peaks_kb = {pid: peak_memory_kb(pid) for pid in self._pids()}
 
     def _reading(self) -> tuple[float, dict[int, int], Traffic, float]:
         cpu = {pid: cpu_ns(pid) for pid in self._pids()}
@@ -105,7 +107,7 @@ class Costs:
             "bytes_per_s": round((after.bytes - before.bytes) / seconds),
             "packets_per_s": round((after.packets - before.packets) / seconds),
             "peak_memory_mb": {
-                role: round(sum(peak_memory_kb(pid) for pid in pids) / 1024, 1)
+                role: round(sum(self._peaks_kb[pid] for pid in pids) / 1024, 1)
                 for role, pids in self._roles.items()
             },
         }

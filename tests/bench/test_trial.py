@@ -34,6 +34,7 @@ def test_the_floor_at_50_hz_loses_nothing_and_tells_what_it_costs() -> None:
     assert 0.0 < percentile(reader["latency_us"], 50) <= percentile(reader["latency_us"], 100)
     assert set(facts["cpu_percent"]) == {"writer", "reader"}
     assert all(percent > 0.0 for percent in facts["cpu_percent"].values())
+    assert all(megabytes > 10.0 for megabytes in facts["peak_memory_mb"].values())
     assert facts["bytes_per_s"] > 50 * 8 * 8  # eight joints
 
 
