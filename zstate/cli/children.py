@@ -1,4 +1,4 @@
-"""Other zstate commands as processes of this one: their lines, their end, and ours with theirs."""
+"""Other processes of this one: their lines, their end, and ours with theirs."""
 
 from __future__ import annotations
 
@@ -7,19 +7,35 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import IO
 
 from zstate.cli.logs import text_in
 from zstate.closing import Closing
 
 END_WITHIN_S = 0.8
+_PROGRAM_ENDS_WITHIN_S = 3.0
+
+# Linux ends the program with whoever started it, however that ended. The rest of POSIX does not offer it.
+_TIED = """
+import ctypes, os, signal, sys
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+try:
+    os.execvp(sys.argv[1], sys.argv[1:])
+except OSError as error:
+    sys.exit(f"{sys.argv[1]!r} cannot be started: {error.strerror}")
+"""
 
 
 class ChildCommand(Closing):
     """``zstate ARGUMENTS`` in a process of its own, which ends with this one, however that ends.
 
-    Each line it says goes to ``on_line``, from a thread; ``on_end`` is called once it is gone and all
-    its lines are heard. ``last_error`` is what it said last on its standard error.
+    With ``is_program`` ARGUMENTS are a command of the user's own instead, in ``folder``. Each line it says
+    goes to ``on_line``, with whether it came on standard error, from a thread; ``on_end`` is called once it
+    is gone and all its lines are heard. ``last_error`` is what it said last on its standard error.
     """
 
     def __init__(
@@ -28,24 +44,37 @@ class ChildCommand(Closing):
         arguments: Sequence[str],
         *,
         on_end: Callable[[ChildCommand], None],
-        on_line: Callable[[str], None] = lambda _: None,
+        on_line: Callable[[str, bool], None] = lambda _, __: None,
+        is_program: bool = False,
+        folder: str | None = None,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
         self.last_error = ""
+        self._is_program = is_program
+        own = ["-c", _TIED] if is_program else ["-m", "zstate", "--until-eof"]
         # A session of its own: Ctrl-C at the terminal reaches this process alone, which ends the others.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "zstate", "--until-eof", *arguments],
+            [sys.executable, *own, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             errors="replace",
             start_new_session=True,
+            cwd=folder,
+            # Lines are to come when they are said.
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
         )
         self.pid = self._process.pid
         self._on_line = on_line
         self._on_end = on_end
-        threading.Thread(target=self._follow, name=f"zstate {name}", daemon=True).start()
+        self._readers = [
+            threading.Thread(target=read, name=f"zstate {name}", daemon=True)
+            for read in (self._follow_lines, self._follow_errors)
+        ]
+        for thread in (*self._readers, threading.Thread(target=self._follow, daemon=True)):
+            thread.start()
 
     @property
     def exit_code(self) -> int | None:
@@ -53,33 +82,50 @@ class ChildCommand(Closing):
         return self._process.poll()
 
     def close(self) -> None:
-        """End it and wait for that, less than a second. A second call does nothing."""
+        """End it and wait for that, less than a second; a program of the user's has three."""
         self.ask_to_end()
-        try:
-            self._process.wait(END_WITHIN_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self.wait(time.monotonic() + END_WITHIN_S)
 
     def ask_to_end(self) -> None:
-        """End it without waiting."""
+        """End it without waiting: as Ctrl-C does, for programs of the user's."""
         if self._process.poll() is None:
-            self._process.terminate()
+            self._signal(signal.SIGINT if self._is_program else signal.SIGTERM)
+
+    def wait(self, deadline: float) -> None:
+        """Wait until it has ended, which it was asked to, and make it end after ``deadline`` (monotonic)."""
+        later_s = _PROGRAM_ENDS_WITHIN_S if self._is_program else 0.0
+        try:
+            self._process.wait(max(0.0, deadline - time.monotonic()) + later_s)
+        except subprocess.TimeoutExpired:
+            self._signal(signal.SIGKILL)
+            self._process.wait()
+
+    def _signal(self, number: signal.Signals) -> None:
+        with suppress(ProcessLookupError):
+            # The whole group: a shell does not hand signals on to what it runs.
+            os.killpg(self.pid, number)
 
     def _follow(self) -> None:
-        errors = threading.Thread(target=self._follow_errors, daemon=True)
-        errors.start()
-        for line in self._process.stdout or ():
-            self._on_line(line.rstrip("\n"))
-        errors.join()
         self._process.wait()
+        # What it has started and left behind would hold its output open, and go on without it.
+        self._signal(signal.SIGTERM)
+        for reader in self._readers:
+            reader.join(END_WITHIN_S)
         self._on_end(self)
 
+    def _follow_lines(self) -> None:
+        for line in _lines(self._process.stdout):
+            self._on_line(line, False)
+
     def _follow_errors(self) -> None:
-        for line in self._process.stderr or ():
+        for line in _lines(self._process.stderr):
             if line.strip():
                 self.last_error = text_in(line.strip())
-                self._on_line(line.rstrip("\n"))
+                self._on_line(line, True)
+
+
+def _lines(stream: IO[str] | None) -> Iterator[str]:
+    return (line.rstrip("\n") for line in stream or ())
 
 
 def end_with_parent() -> None:

@@ -44,6 +44,7 @@ def use_format_of_environment() -> None:
 def _use_chosen(_: click.Context, __: click.Parameter, name: str | None) -> None:
     if name is not None:
         use_format(name)
+        os.environ[FORMAT_VARIABLE] = name  # also for the commands that this one starts
 
 
 log_format_option = click.Option(
@@ -68,10 +69,31 @@ def write(text: str, *, level: str = "info", event: str = "note", **facts: objec
         line = json.dumps({"time": _time_text(), "level": level, "event": event, **known, "text": text})
     else:
         line = text if level == "info" else f"zstate: {text}"
+    _write_line(line)
+
+
+def _write_line(line: str) -> None:
     with suppress(OSError):  # nobody reads it any more
         stream = _standard_error()
         stream.write(line + "\n")
         stream.flush()
+
+
+def is_json() -> bool:
+    """Whether what goes on is said as JSON."""
+    return _Chosen.format == "json"
+
+
+def pass_on(line: str, **facts: object) -> None:
+    """As JSON, a line that another program wrote: an object of ours with ``facts`` besides, or any text."""
+    try:
+        said = json.loads(line)
+    except ValueError:
+        said = None
+    if isinstance(said, dict):
+        _write_line(json.dumps({**cast("dict[str, object]", said), **facts}))
+    else:
+        _write_line(json.dumps({"time": _time_text(), "event": "line", "text": line, **facts}))
 
 
 def text_in(line: str) -> str:

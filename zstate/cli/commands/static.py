@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from contextlib import ExitStack
 from math import degrees
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -15,7 +16,8 @@ from zstate.cli.options import session_options, takeover_option, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.cli.config_file import Quaternion, StaticSection, Vector3
+    from zstate.cli.up.edges import OwnedEdge
+    from zstate.cli.up.sections import Quaternion, Vector3
     from zstate.net.session import Session
     from zstate.statics import StaticPublisher
     from zstate.transform import Transform
@@ -34,7 +36,12 @@ if TYPE_CHECKING:
 )
 @click.option("--rpy", type=float, nargs=3, metavar="R P Y", help="The same in radians.")
 @click.option("--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="The same as a unit quaternion.")
-@click.option("--file", type=click.Path(exists=True, dir_okay=False), help="All [[static]] of a TOML file.")
+@click.option(
+    "--file",
+    type=click.Path(exists=True, dir_okay=False),
+    help="All [[static]] of a file of `zstate up`, or a calibration in YAML or JSON.",
+)
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter of --file.")
 @click.option("--robot", metavar="NAME", help="Whose edge it is; default: the only robot announced.")
 @click.option("--writer", metavar="NAME", help="Under which name; default: this program and its process id.")
 @takeover_option
@@ -49,6 +56,7 @@ def static_command(
     rpy: Vector3 | None,
     quat_xyzw: Quaternion | None,
     file: str | None,
+    settings: tuple[str, ...],
     robot: str | None,
     writer: str | None,
     takeover: bool,
@@ -64,60 +72,84 @@ def static_command(
     \b
     zstate static panda_hand camera --xyz 0.05 0 0.04 --rpy-deg 0 -90 0
     zstate static fleet/map r1/odom --xyz 2 1 0 --rpy-deg 0 0 90
-    zstate static --file cell.toml
+    zstate static --file cell.toml --set site=lab
+    zstate static --file handeye.yaml                              # of easy_handeye
+    zstate static panda_hand camera --file handeye.yaml            # with frames called otherwise
     zstate static base_link laser --xyz 0.2 0 0.1 --wire ros2      # on /tf_static
     """
-    from zstate.cli.config_file import StaticSection
     from zstate.clock import wait_in_slices
     from zstate.statics import StaticPublisher
 
     if file is not None:
-        from zstate.cli.config_file import read_config
-
-        if target is not None:
-            raise click.UsageError("give TARGET and SOURCE, or --file, not both")
-        statics = read_config(file).static
+        edges = _edges_of_file(file, settings, target, source)
     elif target is None or source is None or (xyz, rpy_deg, rpy, quat_xyzw) == (None,) * 4:
         raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
-        statics = (StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw, robot),)
-    if not statics:
-        fail(f"{file!r} has no [[static]]")
-    with open_session(network, (wire,)) as session, ExitStack() as publishers:
-        owned = _by_ros_owner(statics, robot, wire) if is_ros(wire) else _by_owner(session, statics, robot)
-        for owner, edges in owned.items():
+        from zstate.cli.up.edges import OwnedEdge
+        from zstate.cli.up.sections import StaticSection
+
+        edges = [OwnedEdge(StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform())]
+    spoken = {wire_of for edge in edges for wire_of in edge.wires or (wire,)}
+    with open_session(network, tuple(sorted(spoken))) as session, ExitStack() as publishers:
+        for (owner, wires), owned in _by_owner(session, edges, robot, wire).items():
             publisher = publishers.enter_context(
-                StaticPublisher(session, owner, writer, (wire,), takeover=takeover)
+                StaticPublisher(session, owner, writer, wires, takeover=takeover)
             )
-            for edge in edges:
+            for edge in owned:
                 publisher.set(edge)
-                say(_sentence(edge, publisher, wire))
+                say(_sentence(edge, publisher, wires))
         wait_in_slices(threading.Event())
 
 
+def _edges_of_file(
+    file: str, settings: tuple[str, ...], target: str | None, source: str | None
+) -> list[OwnedEdge]:
+    from zstate.cli.up.calibration import read_calibration, renamed
+    from zstate.cli.up.cell import read_cell
+    from zstate.cli.up.edges import OwnedEdge, owned_edges
+    from zstate.cli.up.parameters import parsed_settings
+    from zstate.cli.up.starts import robot_names
+
+    if not file.endswith(".toml"):
+        if settings:
+            raise click.UsageError(f"--set is for parameters of a .toml file, which {file!r} is not")
+        edges = read_calibration(Path(file))
+        if target is not None and len(edges) > 1:
+            raise click.UsageError(f"{file!r} has {len(edges)} transforms; leave out TARGET and SOURCE")
+        return [OwnedEdge(renamed(edge, target, source)) for edge in edges]
+    if target is not None:
+        raise click.UsageError("give TARGET and SOURCE, or a .toml file, not both")
+    cell = read_cell(file, parsed_settings(settings))
+    if not cell.static:
+        fail(f"{file!r} has no [[static]]")
+    return owned_edges(cell, robot_names(cell))
+
+
 def _by_owner(
-    session: Session, statics: tuple[StaticSection, ...], default: str | None
-) -> dict[str, list[Transform]]:
-    edges: dict[str, list[Transform]] = {}
-    for static in statics:
-        owner = static.owner or default
+    session: Session, edges: list[OwnedEdge], default: str | None, wire: str
+) -> dict[tuple[str, tuple[str, ...]], list[Transform]]:
+    """The edges of each robot that are said on the same wires."""
+    owned: dict[tuple[str, tuple[str, ...]], list[Transform]] = {}
+    for edge in edges:
+        wires = edge.wires or (wire,)
+        owner = edge.robot or _owner_by_name(edge.edge, wires) or default
         if owner is None:
-            owner = default = _only_robot(session)
-        edges.setdefault(owner, []).append(static.transform())
-    return edges
+            owner = default = _only_robot(session) if "native" in wires else _robot_of_wire(wires[0])
+        owned.setdefault((owner, wires), []).append(edge.edge)
+    return owned
 
 
-def _by_ros_owner(
-    statics: tuple[StaticSection, ...], default: str | None, wire: str
-) -> dict[str, list[Transform]]:
-    """On ROS's side frames are nobody's, and a slash in the name of one is just that."""
-    edges: dict[str, list[Transform]] = {}
-    for static in statics:
-        owner = static.robot or default or words_of(wire).robot
-        if owner is None:
-            raise click.UsageError("say --robot NAME; on this wire each robot has a namespace of its name")
-        edges.setdefault(owner, []).append(static.transform())
-    return edges
+def _owner_by_name(edge: Transform, wires: tuple[str, ...]) -> str | None:
+    # On ROS's side frames are nobody's, and a slash in the name of one is just that.
+    named = [frame.partition("/")[0] for frame in (edge.source, edge.target) if "/" in frame]
+    return named[0] if named and "native" in wires else None
+
+
+def _robot_of_wire(wire: str) -> str:
+    robot = words_of(wire).robot
+    if robot is None:
+        raise click.UsageError("say --robot NAME; on this wire each robot has a namespace of its name")
+    return robot
 
 
 def _only_robot(session: Session) -> str:
@@ -130,7 +162,7 @@ def _only_robot(session: Session) -> str:
     return robots[0].name
 
 
-def _sentence(edge: Transform, publisher: StaticPublisher, wire: str) -> str:
+def _sentence(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...]) -> str:
     x, y, z = edge.translation
     # Adding zero turns -0 into 0.
     roll, pitch, yaw = (round(degrees(angle), 6) + 0.0 for angle in edge.rpy)
@@ -138,7 +170,10 @@ def _sentence(edge: Transform, publisher: StaticPublisher, wire: str) -> str:
         f"pose of {edge.source} in {edge.target}: xyz [{x:g}, {y:g}, {z:g}] m, "
         f"rpy [{roll:g}, {pitch:g}, {yaw:g}] deg"
     )
-    if is_ros(wire):
-        place = words_of(wire).place(publisher.robot, ("tf_static",))
-        return f"{pose}, on {place}; Ctrl-C ends it for those who join later"
-    return f"{pose}, until Ctrl-C (robot {publisher.robot!r}, writer {publisher.writer!r})"
+    places = " and ".join(
+        words_of(wire).place(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
+    )
+    if "native" not in wires:
+        return f"{pose}, on {places}; Ctrl-C ends it for those who join later"
+    also = f", also on {places}" if places else ""
+    return f"{pose}{also}, until Ctrl-C (robot {publisher.robot!r}, writer {publisher.writer!r})"

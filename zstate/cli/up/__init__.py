@@ -1,0 +1,1 @@
+"""`zstate up`: from a file to processes that start, live and end in order."""
