@@ -5,13 +5,16 @@ import json
 import signal
 import subprocess
 import sys
+from math import nan
 from pathlib import Path
 
 import pytest
+from live import Tap
 from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
 from support import DEADLINE_S, until
 
 from zstate import connect
+from zstate.cli.document_text import Changes
 
 pytestmark = pytest.mark.processes
 
@@ -73,6 +76,38 @@ def test_csv_has_one_line_of_names(spawn: Spawn):
 def test_a_field_is_printed_alone(field: str, printed: str):
     with standing(velocities=(0.0, 0.125)):
         assert zstate("echo", "rrbot", "--once", "--field", field).stdout.decode() == f"{printed}\n"
+
+
+def test_changed_prints_only_what_is_news(spawn: Spawn):
+    command = started(spawn, "echo", "rrbot", "--changed", "--json")
+    with standing():
+        first = json.loads(command.line())
+        with connect() as reader:
+            settle = Tap(reader, "zstate/rrbot/joint_states")
+            settle.payloads(20)
+            settle.close()
+    with standing(positions=(SHOULDER, 0.25)):
+        second = json.loads(command.line())
+    assert first["positions"]["elbow"] == ELBOW
+    assert second["positions"] == {"shoulder": SHOULDER, "elbow": 0.25}
+    interrupted(command)
+
+
+def test_news_is_a_number_that_differs_by_more_than_asked_for():
+    changes = Changes(by=0.1)
+    states = [
+        {"stamp": stamp, "seq": stamp, "positions": {"elbow": elbow}, "velocities": {"elbow": velocity}}
+        for stamp, (elbow, velocity) in enumerate([(0.0, 0.0), (0.09, 0.0), (0.11, 0.0), (0.15, 1.0)])
+    ]
+    assert [changes.note(state) for state in states] == [True, False, True, True]
+    assert [changes.note(value) for value in (5, 5, nan, nan, 6)] == [True, False, True, False, True]
+    assert changes.note({"elbow": 6.0})
+    assert not changes.note({"elbow": 6.0})
+
+
+@pytest.mark.parametrize("amount", ["-1", "nan"])
+def test_an_amount_that_is_none_is_wrong_usage(amount: str):
+    assert "an amount is" in failure("echo", "rrbot", "--changed", "--by", amount, code=2)
 
 
 def test_an_unknown_field_lists_what_there_is():

@@ -43,6 +43,37 @@ def test_it_looks_as_tf2_echo_does():
     ]
 
 
+def test_the_twist_is_that_of_the_published_velocities():
+    shoulder_rate, elbow_rate = 0.5, 0.25
+    with standing(velocities=(shoulder_rate, elbow_rate)):
+        lines = zstate("tf", "base", "lower", "--once", "--twist").stdout.decode().splitlines()
+        facts = json.loads(zstate("tf", "base", "lower", "--once", "--twist", "--json").stdout)
+    linear = [0.7 * math.cos(SHOULDER) * shoulder_rate, 0.0, -0.7 * math.sin(SHOULDER) * shoulder_rate]
+    angular = [0.0, shoulder_rate + elbow_rate, 0.0]
+    assert lines[-2] == f"- Twist: linear [{linear[0]:.3f}, 0.000, {linear[2]:.3f}] m/s"
+    assert lines[-1] == "- Twist: angular [0.000, 0.750, 0.000] rad/s"
+    assert facts["linear"] == pytest.approx(linear, abs=1e-12)
+    assert facts["angular"] == pytest.approx(angular, abs=1e-12)
+
+
+def test_a_twist_of_what_never_moves_is_zero():
+    with standing():
+        lines = zstate("tf", "world", "base", "--once", "--twist").stdout.decode().splitlines()
+    assert lines[-2:] == [
+        "- Twist: linear [0.000, 0.000, 0.000] m/s",
+        "- Twist: angular [0.000, 0.000, 0.000] rad/s",
+    ]
+
+
+def test_the_precision_is_that_of_every_number():
+    lines = transform_text(Transform("a", "b", (1 / 3, 0.0, -2.0), (0.0, 0.0, 0.0, 1.0), 5), 5).splitlines()
+    assert lines[1] == "- Translation: [0.33333, 0.00000, -2.00000]"
+    assert lines[6] == "  1.00000  0.00000  0.00000  0.33333"
+    assert transform_text(Transform("a", "b", (0.6, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 5), 0).splitlines()[
+        1
+    ] == ("- Translation: [1, 0, 0]")
+
+
 def test_stamps_have_nine_digits_and_zeros_no_sign():
     lines = transform_text(Transform("a", "b", (-1e-9, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 5)).splitlines()
     assert lines[:2] == ["At time 0.000000005", "- Translation: [0.000, 0.000, 0.000]"]

@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
+from math import isnan
 from typing import TYPE_CHECKING, Any, cast
 
 from zstate.errors import InvalidInput
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 # Names that YAML would not read as text, were they not quoted.
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
+_ALWAYS_NEW = {"stamp", "seq"}
 _WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 
 
@@ -50,6 +52,29 @@ def columns(value: Any, name: str = "") -> dict[str, int | float]:
     for key, inner in items:
         found |= columns(inner, f"{name}.{key}" if name else key)
     return found
+
+
+class Changes:
+    """Which documents, or parts of them, differ from the last that did, in a number by more than ``by``."""
+
+    def __init__(self, by: float = 0.0) -> None:
+        self._by = by
+        self._last: dict[str, int | float] | None = None
+
+    def note(self, value: Any) -> bool:
+        """Whether ``value`` is news. A whole document's stamp and number are none."""
+        numbers, last = columns(value), self._last
+        if numbers.keys() >= _ALWAYS_NEW:
+            numbers = {name: number for name, number in numbers.items() if name not in _ALWAYS_NEW}
+        if last is not None and last.keys() == numbers.keys() and not self._differ(last, numbers):
+            return False
+        self._last = numbers
+        return True
+
+    def _differ(self, last: dict[str, int | float], numbers: dict[str, int | float]) -> bool:
+        pairs = [(last[name], number) for name, number in numbers.items()]
+        # NaN, by which ROS drivers say that they do not measure something, is no number and differs from any.
+        return any(abs(after - before) > self._by or isnan(after) != isnan(before) for before, after in pairs)
 
 
 class Columns:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from threading import Event
 from typing import TYPE_CHECKING, Any, cast
@@ -15,12 +16,19 @@ from zstate.closing import Closing
 from zstate.errors import MessageError
 
 if TYPE_CHECKING:
+    from zstate.cli.document_text import Changes
     from zstate.cli.tap import Tapped
     from zstate.net.session import Session
     from zstate.wire.wire import Arrival
 
 # A robot's description comes within milliseconds, if there is one.
 _NAMES_WITHIN_S = 1.0
+
+
+def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> float:
+    if not (math.isfinite(amount) and amount >= 0.0):
+        raise click.BadParameter(f"an amount is a number from 0 on; got {amount}")
+    return amount
 
 
 @click.command("echo")
@@ -36,6 +44,15 @@ _NAMES_WITHIN_S = 1.0
     help="How long --once waits.",
 )
 @click.option("--field", metavar="NAME", help="Only this: stamp, positions, positions.JOINT, or just JOINT.")
+@click.option("--changed", is_flag=True, help="Only what differs from what was printed last, stamps aside.")
+@click.option(
+    "--by",
+    type=float,
+    default=0.0,
+    callback=_checked_amount,
+    metavar="AMOUNT",
+    help="With --changed: at least one number by more than this.",
+)
 @click.option("--csv", "form", flag_value="csv", help="Comma-separated values below one line of names.")
 @click.option("--json", "form", flag_value="json", help="One JSON value a line.")
 @wire_option
@@ -47,6 +64,8 @@ def echo_command(
     once: bool,
     timeout: float,
     field: str | None,
+    changed: bool,
+    by: float,
     form: str | None,
     wire: str,
 ) -> None:
@@ -55,9 +74,11 @@ def echo_command(
     \b
     zstate echo panda
     zstate echo panda --field panda_joint1 --csv > joint1.csv
+    zstate echo panda --changed --by 0.001
     zstate echo --wire ros2 --once                     # /joint_states
     zstate echo --wire ros2:namespace=r1               # /r1/joint_states
     """
+    from zstate.cli.document_text import Changes
     from zstate.cli.tap import Tap
     from zstate.clock import LONGEST_WAIT_S
 
@@ -67,7 +88,7 @@ def echo_command(
         Named(session, heard, wire) as named,
         Tap(session, heard, "joint_states", wire) as tap,
     ):
-        show = _printer(form, field)
+        show = _printer(form, field, Changes(by) if changed else None)
         tapped = tap.first(timeout if once else None)
         show(named.document(tapped))
         while not once:
@@ -136,13 +157,15 @@ def _with_nulls(value: Any) -> Any:
     return None if value != value else value  # noqa: PLR0124 - what NaN is known by
 
 
-def _printer(form: str | None, field: str | None) -> Callable[[Any], None]:
+def _printer(form: str | None, field: str | None, changes: Changes | None) -> Callable[[Any], None]:
     from zstate.cli.document_text import Columns, field_of, yaml_text
 
     table = Columns()
 
     def show(document: Any) -> None:
         value = document if field is None else field_of(document, field)
+        if changes is not None and not changes.note(value):
+            return
         if form == "json":
             say_json(_with_nulls(value))
         elif form == "csv":

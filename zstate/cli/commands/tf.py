@@ -20,13 +20,20 @@ from zstate.cli.options import (
 )
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed
+from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
     from zstate.cli.awaited_pose import AwaitedPose
+    from zstate.listener import TransformListener
     from zstate.transform import Transform
+    from zstate.twist import Twist
 
 # So long without a newer answer is worth a word.
 _SILENCE_S = 2.0
+
+# The second sample of whoever has no velocities comes sooner.
+_SPEED_WITHIN_S = 1.0
+_LOOK_EVERY_S = 0.02
 
 
 def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | None:
@@ -67,6 +74,15 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
     metavar="HZ",
     help="At most so many answers a second.",
 )
+@click.option("--twist", is_flag=True, help="Also how fast B moves in A.")
+@click.option(
+    "--precision",
+    type=click.IntRange(0, 15),
+    default=3,
+    metavar="DIGITS",
+    show_default=True,
+    help="Digits behind the point; JSON has them all.",
+)
 @click.option("--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
 @wire_option
@@ -81,6 +97,8 @@ def tf_command(
     at: int | None,
     timeout: float,
     rate: float,
+    twist: bool,
+    precision: int,
     robot: str,
     wire: str,
     clock: str | None,
@@ -94,6 +112,7 @@ def tf_command(
     \b
     zstate tf panda_link0 panda_hand
     zstate tf left/panda_link0 right/panda_hand --once --json
+    zstate tf panda_link0 panda_hand --twist --precision 6
     zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
     from zstate.cli.awaited_pose import AwaitedPose
@@ -110,10 +129,13 @@ def tf_command(
         awaited = AwaitedPose(listener, roster, target, source)
 
         def show(transform: Transform) -> None:
+            speed = _speed(listener, transform) if twist else None
             if as_json:
-                _show_json(transform, awaited.age_s(transform))
+                _show_json(transform, awaited.age_s(transform), speed)
             else:
-                say(transform_text(transform))
+                say(transform_text(transform, precision))
+                if twist:
+                    say(twist_text(speed, precision))
 
         if not as_json:
             say(f"pose of {source} in {target}")
@@ -140,11 +162,31 @@ def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
             note(awaited.silence())
 
 
-def _show_json(transform: Transform, age_s: float | None) -> None:
-    say_json({**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s})
+def _speed(listener: TransformListener, transform: Transform) -> Twist | None:
+    """How fast the source moves, soon; None where one sample without velocities does not tell."""
+    deadline = time.monotonic() + _SPEED_WITHIN_S
+    speed = _twist(listener, transform)
+    while speed is None and time.monotonic() < deadline:
+        time.sleep(_LOOK_EVERY_S)
+        speed = _twist(listener, transform)
+    return speed
 
 
-def transform_text(transform: Transform) -> str:
+def _twist(listener: TransformListener, transform: Transform) -> Twist | None:
+    try:
+        return listener.buffer.twist(transform.source, transform.target, transform.stamp)
+    except LookupFailed:
+        return None
+
+
+def _show_json(transform: Transform, age_s: float | None, speed: Twist | None) -> None:
+    facts = {**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s}
+    if speed is not None:
+        facts |= {"linear": speed.linear.tolist(), "angular": speed.angular.tolist()}
+    say_json(facts)
+
+
+def transform_text(transform: Transform, precision: int = 3) -> str:
     """A transform as tf2_echo prints it, with all nine digits of the stamp."""
     from math import degrees
 
@@ -152,21 +194,30 @@ def transform_text(transform: Transform) -> str:
 
     pose, rpy = transform.pose7.tolist(), transform.rpy.tolist()
     when = "At any time (static)" if transform.stamp is None else f"At time {stamp_text(transform.stamp)}"
+    rows = [[_digits(value, precision) for value in row] for row in transform.matrix.tolist()]
     lines = [
         when,
-        f"- Translation: {_listed(pose[:3])}",
-        f"- Rotation: in Quaternion (xyzw) {_listed(pose[3:])}",
-        f"- Rotation: in RPY (radian) {_listed(rpy)}",
-        f"- Rotation: in RPY (degree) {_listed([degrees(angle) for angle in rpy])}",
+        f"- Translation: {_listed(pose[:3], precision)}",
+        f"- Rotation: in Quaternion (xyzw) {_listed(pose[3:], precision)}",
+        f"- Rotation: in RPY (radian) {_listed(rpy, precision)}",
+        f"- Rotation: in RPY (degree) {_listed([degrees(angle) for angle in rpy], precision)}",
         "- Matrix:",
-        *(" " + " ".join(f"{_digits(value):>6}" for value in row) for row in transform.matrix.tolist()),
+        *(" " + " ".join(cell.rjust(precision + 3) for cell in row) for row in rows),
     ]
     return "\n".join(lines)
 
 
-def _listed(values: list[float]) -> str:
-    return f"[{', '.join(map(_digits, values))}]"
+def twist_text(speed: Twist | None, precision: int = 3) -> str:
+    """A twist in the manner of ``transform_text``."""
+    if speed is None:
+        return "- Twist: not known yet"
+    linear, angular = (_listed(vector.tolist(), precision) for vector in (speed.linear, speed.angular))
+    return f"- Twist: linear {linear} m/s\n- Twist: angular {angular} rad/s"
 
 
-def _digits(value: float) -> str:
-    return f"{round(value, 3) + 0.0:.3f}"  # adding 0.0 takes the sign off a negative zero
+def _listed(values: list[float], precision: int) -> str:
+    return f"[{', '.join(_digits(value, precision) for value in values)}]"
+
+
+def _digits(value: float, precision: int) -> str:
+    return f"{round(value, precision) + 0.0:.{precision}f}"  # adding 0.0 takes the sign off a negative zero
