@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
     from zstate.listener import Follow, TransformListener
     from zstate.net.session import Session
+    from zstate.wire.keys import Stream
 
 # Who is ready is usually found so sooner; waiting is mentioned only afterwards.
 _GRACE_S = 0.5
@@ -70,8 +71,15 @@ class Readiness(Closing):
             return ""
         if not frames and self._listeners[robot].refusals:
             return "; ".join(self._listeners[robot].refusals.values())
-        stream = self._follow(robot) if frames or is_ros(self._wire) else "robot_description"
-        return words.silence(robot, stream, self._roster.robots(), ended=False)
+        return words.silence(robot, self._lacking(robot, frames), self._roster.robots(), ended=False)
+
+    def _lacking(self, robot: str, frames: Sequence[FrameInfo]) -> Stream:
+        """Of which stream nothing comes."""
+        if is_ros(self._wire):
+            return "tf"
+        # Transforms are made of joint states, where somebody is to write those.
+        is_described = frames or "robot_description" in self._roster.streams(robot)
+        return "joint_states" if is_described else "robot_description"
 
     def _listen(self, robot: str) -> None:
         from zstate.listener import TransformListener
@@ -82,7 +90,6 @@ class Readiness(Closing):
         self._listeners[robot] = self._opened.enter_context(listener)
 
     def _follow(self, robot: str) -> Follow:
-        if is_ros(self._wire):
-            return "tf"
-        has_model = {"joint_states", "robot_description"} & self._roster.streams(robot)
-        return "joint_states" if has_model else "tf"
+        streams = self._roster.streams(robot)
+        by_joints = "joint_states" in streams or "tf" not in streams
+        return "joint_states" if by_joints and not is_ros(self._wire) else "tf"

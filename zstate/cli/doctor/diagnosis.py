@@ -75,9 +75,10 @@ def _of_robots(
     with ExitStack() as listening:
         ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in wanted]
         if wire == "native":
-            for offset in measure_offsets(session, ANY):
-                for ear in ears:
-                    ear.offsets += (offset,) if offset.robot == ear.info.name else ()
+            offsets = measure_offsets(session, ANY)
+            for ear in ears:
+                ear.offsets = tuple(one for one in offsets if one.robot == ear.info.name)
+                ear.ask()
         listen(ears, timeout_s)
         for ear in ears:
             for check in robot_checks(ear, session):

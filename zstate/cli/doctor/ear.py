@@ -46,6 +46,7 @@ class Ear(Closing):
         self.statuses: dict[int, Status] = {}
         self.events: list[Event] = []
         self.offsets: tuple[ClockOffset, ...] = ()
+        self.stuck: set[Writer] = set()
         self._session, self._wire = session, wire_named(wire)
         with ExitStack() as opening:
             key = self._wire.expression(info.name, "robot_description")
@@ -102,14 +103,20 @@ class Ear(Closing):
         frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
         return not (self.description or self.samples.count or self.statuses or self.offsets or frames)
 
-    def is_stuck(self, writer: Writer) -> bool:
-        """Whether questions reach ``writer``, and it does not answer; who is kept from asking is told so
-        at once, by silence."""
-        asked = time.monotonic()
-        key = clock_key(self.info.name, writer.identity)
-        answers = list(self._session.zenoh.get(key, timeout=_ANSWERS_WITHIN_S))
-        is_answered = any(answer.ok is not None for answer in answers)
-        return not is_answered and time.monotonic() - asked > 0.9 * _ANSWERS_WITHIN_S
+    def ask(self) -> None:
+        """Find out which writers are stuck, of those that have not told the time.
+
+        Questions reach such a one, and it does not answer; who is kept from asking by a router is told at
+        once that there is no answer.
+        """
+        known = {offset.writer.session for offset in self.offsets}
+        for writer in {writer for _, writer in self.info.writers if writer.session not in known}:
+            asked = time.monotonic()
+            key = clock_key(self.info.name, writer.identity)
+            answers = list(self._session.zenoh.get(key, timeout=_ANSWERS_WITHIN_S))
+            is_answered = any(answer.ok is not None for answer in answers)
+            if not is_answered and time.monotonic() - asked > 0.9 * _ANSWERS_WITHIN_S:
+                self.stuck.add(writer)
 
 
 def listen(ears: Iterable[Ear], timeout_s: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import time
 from collections.abc import Iterator
 from importlib import metadata
 
@@ -15,10 +16,14 @@ from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.connections import connections
+from zstate.net.lobby import LOBBY_KEY
 from zstate.net.presence import announce, discover
 from zstate.net.refusal import knock
 from zstate.net.rendezvous import rendezvous_address
 from zstate.net.session import Session, connect
+from zstate.net.streams import StreamPublisher
+
+_MET_WITHIN_S = 1.0
 
 _DIFFERENTLY = {
     "TLS demanded": "--certs DIR --identity NAME",
@@ -80,15 +85,25 @@ def network_check(session: Session, network: Network) -> Check:
 
 def _host_check(session: Session) -> Check:
     host, port = rendezvous_address()
-    where = f"{host}:{port}"
-    count = connections(session).sessions["peer"]
-    if not count:
-        return broken(
-            "network",
-            f"programs of this host meet at {where}, and what listens there is not zstate",
-            f"ZSTATE_RENDEZVOUS={host}:{port + 1} zstate doctor  # and for all other programs, too",
+    if not _is_met(session):
+        text = (
+            f"programs of this host meet at {host}:{port}, and whoever has that port does not answer: it is "
+            "another program, or one of zstate that is stopped"
         )
-    return ok("network", f"programs of this host, which meet at {where}: {count - 1} besides this one")
+        return broken("network", text, f"ss -ltnp 'sport = :{port}'  # who is it?")
+    count = connections(session).sessions["peer"] - 1
+    return ok("network", f"programs of this host, which meet at {host}:{port}: {count} besides this one")
+
+
+def _is_met(session: Session) -> bool:
+    """Whether there is a lobby; who has just joined may not know yet."""
+    deadline = time.monotonic() + _MET_WITHIN_S
+    with StreamPublisher(session, LOBBY_KEY, "") as probe:
+        while not probe.has_readers:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+    return True
 
 
 def access_check(session: Session, network: Network, robot: str) -> Check | None:

@@ -74,7 +74,7 @@ def _keeps_its_rate(status: Status) -> bool:
 def _mute_check(ear: Ear, session: Session) -> Check:
     """Writers are announced, and nothing that they say arrives."""
     robot, writer = ear.info.name, ear.info.writers[0][1]
-    if ear.is_stuck(writer):
+    if writer in ear.stuck:
         text = f"{writer} is announced and answers nothing: it is stopped, frozen, or behind a dead link"
         return broken("writers", text, f"ps -o stat= -p {writer.pid}  # on {writer.host}; T: it is stopped")
     if session.zenoh.info.routers_zid():
@@ -176,7 +176,7 @@ def _idle_text(ear: Ear) -> str:
     writer = ear.writers(ear.followed)[-1]
     status = ear.statuses.get(writer.session)
     if status is None:
-        return "it says nothing else either: stopped, or frozen" if ear.is_stuck(writer) else "it is slow"
+        return "it says nothing else either: stopped, or frozen" if writer in ear.stuck else "it is slow"
     return f"it runs, but {status.text or 'publishes nothing'}"
 
 
