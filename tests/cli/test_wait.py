@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 
 import pytest
 from looking import EVERYTHING, RRBOT, Spawn, failure, interrupted, standing, started, zstate
@@ -51,6 +52,13 @@ def test_every_robot_that_is_named_has_to_be_there():
 def test_a_robot_that_says_transforms_needs_no_joint_states():
     with standing(streams=("tf", "robot_description")):
         assert waited("robot", "rrbot", code=0)["ready"] is True
+
+
+def test_a_robot_that_cannot_move_is_ready_with_its_model(tmp_path: Path):
+    table = tmp_path / "table.urdf"
+    table.write_text('<robot name="table"><link name="top"/></robot>')
+    with connect() as session, StatePublisher(session, load_model(table)):
+        assert waited("robot", "table", code=0)["ready"] is True
 
 
 def test_a_pose_is_waited_for_with_the_reason():
