@@ -55,8 +55,8 @@ SUBJECT = Subject(
         "depth 10) and tf2_msgs/TFMessage on /tf (reliable, depth 100) and /tf_static (transient local)",
         *NO_STATE_PUBLISHER,
         "reader: rclpy.spin of the default single-threaded executor; /tf reliable, depth 100, as tf2_ros "
-        "asks for; it does not subscribe to the joint states. Kilted's experimental EventsExecutor is not used: "
-        "spun in a thread beside the main one, it blocked the process",
+        "asks for; it does not subscribe to the joint states. Kilted's experimental EventsExecutor is not "
+        "used: spun in a thread beside the main one, it blocked the process",
     ),
     install=(
         "apt-get install -y --no-install-recommends g++",
