@@ -46,6 +46,24 @@ def test_each_error_stands_with_its_line():
     assert "'wrist'" in finding
 
 
+def test_what_to_write_instead_stands_below_each_finding(tmp_path: Path):
+    file = tmp_path / "my arm.urdf"
+    file.write_text(WITHOUT_LIMIT)
+    *_, advice = zstate("check", str(file)).stdout.decode().splitlines()
+    assert advice == f"`zstate check '{file}' --fix-hints` says what to write instead"
+    _, _, fix = zstate("check", str(file), "--fix-hints").stdout.decode().splitlines()
+    assert fix.strip().startswith('fix: <limit lower="-3.14" upper="3.14"')
+    broken = zstate("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
+    assert json.loads(broken.stdout)["findings"][0]["fix"] in fix
+
+
+def test_the_joints_are_a_table_in_the_order_of_their_positions():
+    _, headings, *rows = zstate("check", RRBOT, "--joints").stdout.decode().splitlines()
+    assert headings.split()[:5] == ["joint", "type", "parent", "child", "position"]
+    moving = [row.split() for row in rows if " - " not in row[:60]]
+    assert [(row[0], row[4]) for row in moving] == [("shoulder", "0"), ("elbow", "1")]
+
+
 def test_a_warning_is_told_but_does_not_fail():
     ended = zstate("check", "-", stdin=HEAVY.encode())
     assert ended.returncode == 0

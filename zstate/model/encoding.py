@@ -16,11 +16,15 @@ _DECLARED = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]*)["']"""
 
 
 class TextFault(ValueError):
-    """Bytes that are not the text they should be; ``line`` is where, when that can be said."""
+    """Bytes that are not the text they should be; ``line`` is where, when that can be said.
 
-    def __init__(self, message: str, line: int | None = None) -> None:
+    ``fix`` is what to write instead.
+    """
+
+    def __init__(self, message: str, line: int | None = None, fix: str = "") -> None:
         super().__init__(message)
         self.line = line
+        self.fix = fix
 
 
 def decode(data: str | bytes) -> str:

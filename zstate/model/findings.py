@@ -21,12 +21,14 @@ _LONGEST_QUOTED = 80
 class Finding:
     """One fault or doubt: in which line (None: of the file as a whole), what, and how bad.
 
-    An "error" makes the model unusable; a "warning" is something its author should know.
+    An "error" makes the model unusable; a "warning" is something its author should know. ``fix`` says
+    what to write instead, where that can be said.
     """
 
     line: int | None
     message: str
     severity: Severity
+    fix: str = ""
 
 
 class Findings:
@@ -37,20 +39,16 @@ class Findings:
         self._found: list[Finding] = []
         self._suggestions_left = _MOST_SUGGESTIONS
 
-    def error(self, line: int | None, message: str) -> None:
-        """Note a fault that makes the model unusable."""
-        self._found.append(Finding(line, message, "error"))
+    def error(self, line: int | None, message: str, fix: str = "") -> None:
+        """Note a fault that makes the model unusable, and what to write instead."""
+        self._found.append(Finding(line, message, "error", fix))
 
-    def warning(self, line: int | None, message: str) -> None:
-        """Note something doubtful that does not prevent use."""
-        self._found.append(Finding(line, message, "warning"))
+    def warning(self, line: int | None, message: str, fix: str = "") -> None:
+        """Note something doubtful that does not prevent use, and what to write instead."""
+        self._found.append(Finding(line, message, "warning", fix))
 
-    def suggestion(self, name: str, candidates: Iterable[str]) -> str:
-        """``; did you mean 'x'?``, or nothing when no candidate is close to ``name``."""
-        near = self._near_miss(name, candidates)
-        return "" if near is None else f"; did you mean {near!r}?"
-
-    def _near_miss(self, name: str, candidates: Iterable[str]) -> str | None:
+    def near_miss(self, name: str, candidates: Iterable[str]) -> str | None:
+        """The candidate that was probably meant by ``name``, if there is one."""
         if not self._suggestions_left or len(name) > _LONGEST_COMPARED:
             return None
         self._suggestions_left -= 1
@@ -71,6 +69,16 @@ class Findings:
             raise ModelError(self.source, self.sorted())
 
 
+def did_you_mean(near: str | None) -> str:
+    """``; did you mean 'x'?``, or nothing for no near miss."""
+    return "" if near is None else f"; did you mean {near!r}?"
+
+
 def quoted(text: str) -> str:
     """``text`` in quotes, shortened where a file holds something endless."""
-    return repr(text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}...")
+    return repr(shortened(text))
+
+
+def shortened(text: str) -> str:
+    """``text``, without its end where a file holds something endless."""
+    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."

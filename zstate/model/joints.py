@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Final
 
-from zstate.model.findings import Findings, quoted
+from zstate.model.findings import Findings, did_you_mean, quoted, shortened
 from zstate.model.numbers import NumberFault, read_number, read_numbers
 from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic
 from zstate.model.xml import Element
@@ -19,6 +20,11 @@ _X: Final = (1.0, 0.0, 0.0)
 _Z: Final = (0.0, 0.0, 1.0)
 _SMALLEST_AXIS = 1e-6
 _AXIS_TOLERANCE = 1e-3  # files round axes to three or four digits; that is no reason for a warning
+_SOME_AXIS = '<axis xyz="0 0 1"/>: what it turns about, or slides along'
+_SOME_LIMITS = {
+    "revolute": '<limit lower="-3.14" upper="3.14" effort="10" velocity="1"/> in rad, or type="continuous"',
+    "prismatic": '<limit lower="0" upper="0.1" effort="10" velocity="1"/> in m',
+}
 _ONCE = ("parent", "child", "origin", "axis", "limit", "mimic")
 
 
@@ -39,7 +45,8 @@ class JointReader:
         label = f"joint {quoted(name)}"
         for tag in _ONCE:
             for again in element.all(tag)[1:]:
-                self._findings.error(again.line, f"{label} has more than one <{tag}>")
+                message = f"{label} has more than one <{tag}>"
+                self._findings.error(again.line, message, f"delete this <{tag}>, or the one above")
         kind = self._type(element, label)
         return Joint(
             name=name,
@@ -59,37 +66,48 @@ class JointReader:
             if given == known:
                 return known
         if given is None:
-            message = f"{label} has no type; one of {', '.join(POSITION_COUNTS)}"
+            near, message = None, f"{label} has no type; one of {', '.join(POSITION_COUNTS)}"
         else:
-            near = self._findings.suggestion(given, POSITION_COUNTS)
-            message = f"{label} has the unknown type {quoted(given)}{near or _choices(POSITION_COUNTS)}"
-        self._findings.error(element.line, message)
+            near = self._findings.near_miss(given, POSITION_COUNTS)
+            choice = did_you_mean(near) or _choices(POSITION_COUNTS)
+            message = f"{label} has the unknown type {quoted(given)}{choice}"
+        self._findings.error(element.line, message, f'type="{near or "revolute"}"')
         return "fixed"
 
     def _end(self, element: Element, label: str, tag: str) -> str:
         """The link named by <parent> or <child>, or "" when there is none of that name."""
         ends = element.all(tag)
         if not ends:
-            self._findings.error(element.line, f'{label} has no <{tag} link="..."/>')
+            fix = f'<{tag} link="{self._some_link}"/> inside the joint'
+            self._findings.error(element.line, f'{label} has no <{tag} link="..."/>', fix)
             return ""
         link = ends[0].attributes.get("link")
         if link is None:
-            self._findings.error(
-                ends[0].line, f'{label}: its <{tag}> names no link; write <{tag} link="..."/>'
-            )
+            message = f'{label}: its <{tag}> names no link; write <{tag} link="..."/>'
+            self._findings.error(ends[0].line, message, f'<{tag} link="{self._some_link}"/>')
             return ""
         if link not in self._links:
-            near = self._findings.suggestion(link, self._links)
-            self._findings.error(ends[0].line, f"{label}: its {tag} {quoted(link)} is not a link{near}")
+            near = self._findings.near_miss(link, self._links)
+            message = f"{label}: its {tag} {quoted(link)} is not a link{did_you_mean(near)}"
+            fix = (
+                f'<link name="{shortened(link)}"/> in <robot>' if near is None else f'<{tag} link="{near}"/>'
+            )
+            self._findings.error(ends[0].line, message, fix)
             return ""
         return link
+
+    @property
+    def _some_link(self) -> str:
+        """One of several links would have to be guessed."""
+        return next(iter(self._links)) if len(self._links) == 1 else "LINK"
 
     def _origin(self, element: Element, label: str) -> Pose7:
         origins = element.all("origin")
         if not origins:
             return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         if "quat_xyzw" in origins[0].attributes:
-            self._findings.error(origins[0].line, f"{label}: origin quat_xyzw is not read; write rpy")
+            message = f"{label}: origin quat_xyzw is not read; write rpy"
+            self._findings.error(origins[0].line, message, '<origin xyz="X Y Z" rpy="R P Y"/> in rad')
         x, y, z = self._vector(origins[0], label, "xyz")
         return (x, y, z, *quaternion_of_rpy(*self._vector(origins[0], label, "rpy")))
 
@@ -100,21 +118,21 @@ class JointReader:
         if not axes or kind in {"fixed", "floating"}:
             return default
         if "xyz" not in axes[0].attributes:
-            self._findings.error(axes[0].line, f"{label}: its <axis> has no xyz")
+            self._findings.error(axes[0].line, f"{label}: its <axis> has no xyz", _SOME_AXIS)
             return default
         x, y, z = self._vector(axes[0], label, "xyz", default)
         length = math.hypot(x, y, z)
         if length < _SMALLEST_AXIS:
-            self._findings.error(
-                axes[0].line, f"{label} has the axis {_text(x, y, z)}, which has no direction"
-            )
+            message = f"{label} has the axis {_text(x, y, z)}, which has no direction"
+            self._findings.error(axes[0].line, message, _SOME_AXIS)
             return default
+        axis = (x / length, y / length, z / length)
         if abs(length - 1.0) > _AXIS_TOLERANCE:
             message = (
                 f"{label} has the axis {_text(x, y, z)} of length {length:.4g}; it is made a unit vector"
             )
-            self._findings.warning(axes[0].line, message)
-        axis = (x / length, y / length, z / length)
+            fix = f'<axis xyz="{" ".join(f"{part:.6g}" for part in axis)}"/>'
+            self._findings.warning(axes[0].line, message, fix)
         if kind == "planar":
             self._check_planar_axis(axes[0], label, axis)
         return axis
@@ -125,6 +143,7 @@ class JointReader:
                 element.line,
                 f"{label} is planar about the axis {_text(*axis)}; planar joints move in the x-y plane of "
                 "their own frame and turn about +z: turn its origin instead",
+                '<axis xyz="0 0 1"/>, and <origin rpy="R P Y"/> that turns the joint',
             )
 
     def _limits(self, element: Element, label: str, kind: JointType) -> Limits:
@@ -132,7 +151,7 @@ class JointReader:
         if not limits:
             if kind in {"revolute", "prismatic"}:
                 message = f'{label} is {kind} and has no <limit lower="..." upper="..."/>'
-                self._findings.error(element.line, message)
+                self._findings.error(element.line, message, _SOME_LIMITS[kind])
             return Limits()
         limit = limits[0]
         lower, upper, velocity, effort = (
@@ -145,13 +164,13 @@ class JointReader:
             return Limits(*self._range(limit, label, lower or 0.0, upper or 0.0), *rest)
         if kind == "continuous" and (lower, upper) != (None, None):
             message = f"{label} is continuous, so its lower and upper limits are not used"
-            self._findings.warning(limit.line, message)
+            self._findings.warning(limit.line, message, 'delete lower and upper, or type="revolute"')
         return Limits(-math.inf, math.inf, *rest)
 
     def _range(self, limit: Element, label: str, lower: float, upper: float) -> tuple[float, float]:
         if lower > upper:
             message = f"{label} has its limits reversed: lower {lower:g}, upper {upper:g}"
-            self._findings.error(limit.line, message)
+            self._findings.error(limit.line, message, f'<limit lower="{upper:g}" upper="{lower:g}"/>')
         return lower, upper
 
     def _mimic(self, element: Element, label: str, kind: JointType) -> Mimic | None:
@@ -159,15 +178,19 @@ class JointReader:
         if not mimics:
             return None
         if "joint" not in mimics[0].attributes:
-            self._findings.error(mimics[0].line, f'{label}: its <mimic> names no joint="..."')
+            fix = '<mimic joint="JOINT" multiplier="1" offset="0"/>'
+            self._findings.error(mimics[0].line, f'{label}: its <mimic> names no joint="..."', fix)
             return None
         if kind in {"floating", "planar"}:
             message = f"{label} is {kind} and cannot mimic: a mimic is one number"
-            self._findings.error(mimics[0].line, message)
+            self._findings.error(mimics[0].line, message, "delete the <mimic>")
         multiplier = self._number(mimics[0], label, "multiplier")
         offset = self._number(mimics[0], label, "offset")
         if kind == "fixed":
-            self._findings.warning(mimics[0].line, f"{label} is fixed, so its <mimic> is not used")
+            message = f"{label} is fixed, so its <mimic> is not used"
+            self._findings.warning(
+                mimics[0].line, message, "delete the <mimic>, or give the joint a type that moves"
+            )
             return None
         return Mimic(mimics[0].attributes["joint"], 1.0 if multiplier is None else multiplier, offset or 0.0)
 
@@ -178,7 +201,8 @@ class JointReader:
         try:
             x, y, z = read_numbers(text, 3)
         except NumberFault as fault:
-            self._findings.error(element.line, f"{label}: {element.tag} {name}: {fault}")
+            message = f"{label}: {element.tag} {name}: {fault}"
+            self._findings.error(element.line, message, f'{name}="{_as_numbers(text, 3)}"')
             return default
         return x, y, z
 
@@ -190,8 +214,17 @@ class JointReader:
         try:
             return read_number(text)
         except NumberFault as fault:
-            self._findings.error(element.line, f"{label}: {element.tag} {name}: {fault}")
+            message = f"{label}: {element.tag} {name}: {fault}"
+            self._findings.error(element.line, message, f'{name}="{_as_numbers(text, 1)}"')
             return None
+
+
+def _as_numbers(text: str, count: int) -> str:
+    """``text`` as ``count`` numbers, where a comma is all that is wrong with it; else zeros."""
+    for guess in (text.replace(",", "."), text.replace(",", " ")):
+        with suppress(NumberFault):
+            return " ".join(f"{number:g}" for number in read_numbers(guess, count))
+    return " ".join(["0.0"] * count)
 
 
 def _text(*numbers: float) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from zstate.model.findings import Findings, quoted
+from zstate.model.findings import Findings, did_you_mean, quoted
 from zstate.model.robot import POSITION_COUNTS, Joint
 
 MAX_CHAIN = 100
+
+_FOLLOW = '<mimic joint="JOINT"/> with a joint that leads'
 
 
 def check_mimics(findings: Findings, joints: Sequence[Joint]) -> None:
@@ -23,15 +25,17 @@ def _check_master(findings: Findings, joint: Joint, name: str, by_name: Mapping[
     label = f"joint {quoted(joint.name)} mimics"
     master = by_name.get(name)
     if master is None:
-        near = findings.suggestion(name, (other for other in by_name if other != joint.name))
-        findings.error(joint.line, f"{label} {quoted(name)}, which does not exist{near}")
+        near = findings.near_miss(name, (other for other in by_name if other != joint.name))
+        fix = _FOLLOW if near is None else f'<mimic joint="{near}"/>'
+        findings.error(joint.line, f"{label} {quoted(name)}, which does not exist{did_you_mean(near)}", fix)
     elif master is joint:
-        findings.error(joint.line, f"{label} itself")
+        findings.error(joint.line, f"{label} itself", _FOLLOW)
     elif POSITION_COUNTS[master.type] != 1:
         findings.error(
             joint.line,
             f"{label} {quoted(name)} (line {master.line}), which is {master.type}; a mimic follows a "
             "revolute, continuous or prismatic joint",
+            _FOLLOW,
         )
 
 
@@ -52,10 +56,13 @@ def _check_chains(findings: Findings, by_name: Mapping[str, Joint]) -> None:
             lengths[name] = length
             if length == MAX_CHAIN + 1:
                 message = f"joint {quoted(name)} ends a chain of {length} mimics; the limit is {MAX_CHAIN}"
-                findings.error(by_name[name].line, message)
+                fix = "let it follow the joint that leads, with the products of the multipliers"
+                findings.error(by_name[name].line, message, fix)
 
 
 def _report_cycle(findings: Findings, by_name: Mapping[str, Joint], cycle: Sequence[str]) -> None:
     if len(cycle) > 1:  # a joint that mimics itself is named by itself
         named = " -> ".join(quoted(name) for name in [*cycle, cycle[0]])
-        findings.error(by_name[cycle[-1]].line, f"the mimics {named} form a cycle, so no joint leads")
+        message = f"the mimics {named} form a cycle, so no joint leads"
+        fix = f"delete the <mimic> of one of them, such as {quoted(cycle[0])}, which then leads"
+        findings.error(by_name[cycle[-1]].line, message, fix)

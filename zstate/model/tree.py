@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from zstate.model.findings import Findings, quoted
+from zstate.model.findings import Findings, quoted, shortened
 from zstate.model.robot import Joint
 
 MAX_DEPTH = 500
@@ -30,7 +30,7 @@ def _check_ends(findings: Findings, joints: Sequence[Joint]) -> None:
     for joint in joints:
         if joint.parent and joint.parent == joint.child:
             message = f"joint {quoted(joint.name)} joins link {quoted(joint.child)} to itself"
-            findings.error(joint.line, message)
+            findings.error(joint.line, message, '<child link="LINK"/> with another link')
 
 
 def _check_pairs(findings: Findings, joints: Sequence[Joint]) -> None:
@@ -42,6 +42,7 @@ def _check_pairs(findings: Findings, joints: Sequence[Joint]) -> None:
                 joint.line,
                 f"joints {quoted(earlier.name)} (line {earlier.line}) and {quoted(joint.name)} "
                 f"(line {joint.line}) join the same links {quoted(joint.parent)} and {quoted(joint.child)}",
+                "delete one of them, or put a link between two joints that both move",
             )
 
 
@@ -54,7 +55,8 @@ def _check_parents(findings: Findings, joints: Sequence[Joint]) -> None:
             count = "two" if len(by_parent) == 2 else str(len(by_parent))
             named = [f"{quoted(parent)} (line {joint.line})" for parent, joint in by_parent.items()]
             line = list(by_parent.values())[1].line
-            findings.error(line, f"link {quoted(child)} has {count} parents: {_and(named)}")
+            fix = "keep one of these joints; where a mechanism is a loop, leave it open there"
+            findings.error(line, f"link {quoted(child)} has {count} parents: {_and(named)}", fix)
 
 
 def _check_cycles(findings: Findings, links: Mapping[str, int], joints: Sequence[Joint]) -> None:
@@ -66,7 +68,8 @@ def _check_cycles(findings: Findings, links: Mapping[str, int], joints: Sequence
         for cycle, closing in _cycles_below(link, below, done):
             named = " -> ".join(quoted(name) for name in _middle_cut([*cycle, cycle[0]]))
             message = f"the links {named} form a cycle, closed by joint {quoted(closing.name)}"
-            findings.error(closing.line, message)
+            fix = f"delete joint {quoted(closing.name)}, or give it another child"
+            findings.error(closing.line, message, fix)
 
 
 def _cycles_below(
@@ -97,7 +100,10 @@ def _check_roots(findings: Findings, links: Mapping[str, int], joints: Sequence[
         named = _and(_middle_cut([f"{quoted(root)} (line {links[root]})" for root in roots]))
         count = "two" if len(roots) == 2 else str(len(roots))
         message = f"{count} links have no parent: {named}; a robot has one root: add a joint between them"
-        findings.error(links[roots[1]], message)
+        parent, child = map(shortened, roots[:2])
+        ends = f'<parent link="{parent}"/><child link="{child}"/>'
+        fix = f'<joint name="{parent}_to_{child}" type="fixed">{ends}</joint>'
+        findings.error(links[roots[1]], message, fix)
     return roots[0] if roots else ""
 
 
@@ -114,7 +120,8 @@ def _check_depth(findings: Findings, root: str, joints: Sequence[Joint]) -> None
     depth = len(levels) - 2
     if depth > MAX_DEPTH:
         deepest = quoted(levels[depth][0])
-        findings.error(None, f"link {deepest} lies {depth} joints below the root; the limit is {MAX_DEPTH}")
+        message = f"link {deepest} lies {depth} joints below the root; the limit is {MAX_DEPTH}"
+        findings.error(None, message, "merge links that fixed joints join")
 
 
 def _middle_cut(names: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from zstate.model.findings import Findings, quoted
+from zstate.model.findings import Findings, quoted, shortened
 from zstate.model.joints import JointReader
 from zstate.model.mimics import check_mimics
 from zstate.model.numbers import NumberFault, read_number
@@ -22,6 +22,7 @@ MAX_VELOCITIES = 200
 
 _XACRO_NAMESPACES = ("www.ros.org/wiki/xacro", "ros.org/wiki/xacro", "wiki.ros.org/xacro")
 _OTHER_FORMATS = {"sdf": "an SDF file", "mujoco": "a MuJoCo file", "html": "a web page"}
+_SMALLER = "merge links that fixed joints join, or split the robot into several"
 _ROBOT_PARTS = {"link", "joint", "group"}
 # These hold <joint> and <link> elements that are not the robot's own.
 _OTHER_GROUPS = {"gazebo", "transmission", "ros2_control"}
@@ -69,25 +70,27 @@ def _check_format(findings: Findings, robot: Element) -> None:
         findings.error(
             xacro[0].line,
             f"this is a xacro file; its {len(xacro)} xacro tags, such as <{xacro[0].tag}>, must be expanded",
+            "pip install 'zstate[xacro]', and name the .xacro file; or xacro FILE > robot.urdf",
         )
     elif robot.tag != "robot":
         what = _OTHER_FORMATS.get(robot.tag.lower(), "not a URDF")
         message = f"the document is <{quoted(robot.tag)[1:-1]}>, not <robot>: {what}"
-        findings.error(robot.line, message)
+        findings.error(robot.line, message, 'a URDF begins with <robot name="NAME">')
     elif not robot.all("link"):
-        findings.error(robot.line, "the robot has no <link>")
+        findings.error(robot.line, "the robot has no <link>", '<link name="base_link"/>')
 
 
 def _check_sizes(findings: Findings, robot: Element) -> None:
     links, joints = robot.all("link"), robot.all("joint")
     if len(links) > MAX_LINKS:
-        findings.error(None, f"the robot has {len(links)} links; the limit is {MAX_LINKS}")
+        findings.error(None, f"the robot has {len(links)} links; the limit is {MAX_LINKS}", _SMALLER)
     elif len(joints) > MAX_LINKS:
-        findings.error(None, f"the robot has {len(joints)} joints; the limit is {MAX_LINKS}")
+        findings.error(None, f"the robot has {len(joints)} joints; the limit is {MAX_LINKS}", _SMALLER)
     counts = {str(kind): count for kind, count in VELOCITY_COUNTS.items()}
     velocities = sum(counts.get(joint.attributes.get("type", ""), 0) for joint in joints)
     if velocities > MAX_VELOCITIES:
-        findings.error(None, f"the robot has {velocities} velocities; the limit is {MAX_VELOCITIES}")
+        message = f"the robot has {velocities} velocities; the limit is {MAX_VELOCITIES}"
+        findings.error(None, message, _SMALLER)
 
 
 def _check_names(findings: Findings, robot: Element) -> None:
@@ -99,37 +102,42 @@ def _check_names(findings: Findings, robot: Element) -> None:
             earlier = first.setdefault(name, element)
             if name.strip() and earlier is not element:
                 message = f"a second {tag} {quoted(name)}; the first is in line {earlier.line}"
-                findings.error(element.line, message)
+                findings.error(
+                    element.line, message, f'<{tag} name="{shortened(name)}_2">, or delete one of them'
+                )
 
 
 def _check_name(findings: Findings, element: Element) -> str:
     name = element.attributes.get("name", "")
     if not name.strip():
         given = "a name that is empty" if "name" in element.attributes else 'no name="..."'
-        findings.error(element.line, f"<{element.tag}> has {given}")
+        findings.error(element.line, f"<{element.tag}> has {given}", f'<{element.tag} name="NAME">')
     elif name.startswith("/"):
         bare = name.lstrip("/")
-        findings.error(
-            element.line, f"{element.tag} {quoted(name)} begins with a slash; write {quoted(bare)}"
-        )
+        message = f"{element.tag} {quoted(name)} begins with a slash; write {quoted(bare)}"
+        findings.error(element.line, message, f'<{element.tag} name="{shortened(bare)}">')
     elif "${" in name or "$(" in name:
-        findings.error(element.line, f"{element.tag} {quoted(name)} is a xacro expression, not a name")
+        message = f"{element.tag} {quoted(name)} is a xacro expression, not a name"
+        findings.error(element.line, message, "expand the file: pip install 'zstate[xacro]', name it .xacro")
     return name
 
 
 def _check_nesting(findings: Findings, robot: Element) -> None:
     for again in robot.all("robot"):
-        findings.error(again.line, f"a second <robot>; the first begins in line {robot.line}")
+        message = f"a second <robot>; the first begins in line {robot.line}"
+        findings.error(again.line, message, "delete this tag and its end, and leave what is between")
     for part in robot.children:
         if part.tag in _OTHER_GROUPS:
             continue
         for lost in _parts_below(part):
             where = f"inside <{part.tag}> (line {part.line})"
+            fix = f"</{part.tag}> before it, and delete the </{part.tag}> that comes later"
             if part.tag in _ROBOT_PARTS:
-                findings.error(lost.line, f"<{lost.tag}> stands {where}; it must be directly in <robot>")
+                message = f"<{lost.tag}> stands {where}; it must be directly in <robot>"
+                findings.error(lost.line, message, fix)
             else:
                 message = f"<{lost.tag}> stands {where}, so it is no part of the robot"
-                findings.warning(lost.line, message)
+                findings.warning(lost.line, message, fix)
 
 
 def _parts_below(element: Element) -> list[Element]:
@@ -159,10 +167,11 @@ def _check_mass(findings: Findings, link: str, mass: Element) -> None:
     try:
         value = read_number(mass.attributes.get("value", ""))
     except NumberFault as fault:
-        findings.warning(mass.line, f"link {quoted(link)}: mass: {fault}")
+        findings.warning(mass.line, f"link {quoted(link)}: mass: {fault}", '<mass value="1.0"/> in kg')
         return
     if value < 0.0:
-        findings.warning(mass.line, f"link {quoted(link)} has the negative mass {value:g} kg")
+        message = f"link {quoted(link)} has the negative mass {value:g} kg"
+        findings.warning(mass.line, message, f'<mass value="{-value:g}"/>')
 
 
 def _read_joints(findings: Findings, robot: Element, links: dict[str, int]) -> Sequence[Joint]:

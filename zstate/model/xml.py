@@ -25,6 +25,7 @@ _UNFINISHED = (
     _CODES[expat.errors.XML_ERROR_NO_ELEMENTS],
     _CODES[expat.errors.XML_ERROR_UNCLOSED_TOKEN],
 )
+_MALFORMED = '&lt; for <, &amp; for &, and quotes around each value: name="..."'
 _MISMATCH = _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]
 
 
@@ -61,7 +62,7 @@ def read_document(data: str | bytes, source: str) -> Document:
     try:
         return _read(data)
     except TextFault as fault:
-        raise ModelError(source, [Finding(fault.line, str(fault), "error")]) from None
+        raise ModelError(source, [Finding(fault.line, str(fault), "error", fault.fix)]) from None
 
 
 def _read(data: str | bytes) -> Document:
@@ -70,7 +71,8 @@ def _read(data: str | bytes) -> Document:
     text = decode(data)
     body = text.lstrip()
     if not body:
-        raise TextFault('the text is empty; a URDF begins with <robot name="...">')
+        whole = '<robot name="NAME"><link name="base_link"/></robot>'
+        raise TextFault('the text is empty; a URDF begins with <robot name="...">', fix=whole)
     lines_before = text.count("\n", 0, len(text) - len(body))
     return Document(body, _Reader(body, lines_before).read())
 
@@ -92,7 +94,8 @@ class _Reader:
             self._parser.Parse(self._text, True)
         except expat.ExpatError as error:
             line = error.lineno + self._lines_before
-            raise TextFault(f"column {error.offset + 1}: {self._cause(error)}", line) from None
+            cause, fix = self._cause(error)
+            raise TextFault(f"column {error.offset + 1}: {cause}", line, fix) from None
         assert self._root is not None, "expat accepts no document without an element"
         return self._root
 
@@ -121,16 +124,19 @@ class _Reader:
                 "a DOCTYPE with declarations (entities) or a reference to a file is refused: it can make "
                 "a small file huge or read others; remove it",
                 self._line(),
+                "delete the DOCTYPE, and write what its entities stand for",
             )
 
-    def _cause(self, error: expat.ExpatError) -> str:
+    def _cause(self, error: expat.ExpatError) -> tuple[str, str]:
+        """What is wrong, and what to write instead."""
         if self._root is not None and not self._open:
-            return self._after_root(error, self._root)
+            return self._after_root(error, self._root), "delete what stands there, or move it before that"
+        closing = f"</{_short(self._open[-1].tag)}>" if self._open else ""
         if error.code == _MISMATCH:
-            return f"{self._markup_at(error)}> closes {self._innermost()}"
+            return f"{self._markup_at(error)}> closes {self._innermost()}", f"{closing} before it"
         if error.code in _UNFINISHED and self._open:
-            return f"the file ends inside {self._innermost()}; is it truncated?"
-        return f"malformed XML: {expat.ErrorString(error.code)}"
+            return f"the file ends inside {self._innermost()}; is it truncated?", f"{closing} at its end"
+        return f"malformed XML: {expat.ErrorString(error.code)}", _MALFORMED
 
     def _after_root(self, error: expat.ExpatError, root: Element) -> str:
         if self._markup_at(error).startswith("<robot") and root.tag == "robot":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,20 +17,31 @@ from zstate.errors import Found, ModelError
 if TYPE_CHECKING:
     from zstate.model.robot import Joint, RobotModel
 
+_STDIN = "standard input"
+_WITHOUT_AXIS = ("fixed", "floating")
+_JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "velocity", "effort", "axis")
+
 
 @click.command("check")
 @click.argument("file")
+@click.option("--fix-hints", is_flag=True, help="Below each finding, what to write instead.")
+@click.option("--joints", "joint_table", is_flag=True, help="The joints as a table, instead of the tree.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object.")
-def check_command(file: str, as_json: bool) -> None:
+def check_command(file: str, fix_hints: bool, joint_table: bool, as_json: bool) -> None:
     """Say what is right and wrong with the robot model in FILE.
 
     FILE is URDF or xacro, "-" for standard input, or a name such as "panda". Prints every finding with
     its line, then the tree of links and joints. Exit code 1 when the model cannot be used; warnings do
     not count.
+
+    \b
+    zstate check arm.urdf --fix-hints
+    zstate check panda --joints                        # the order of positions, limits, axes, mimics
+    xacro arm.xacro | zstate check -
     """
     from zstate.model.catalog import load_model
 
-    name = "standard input" if file == "-" else file
+    name = _STDIN if file == "-" else file
     model, findings = None, ()
     try:
         model = load_model(sys.stdin.buffer.read() if file == "-" else file)
@@ -41,15 +53,27 @@ def check_command(file: str, as_json: bool) -> None:
     if as_json:
         say_json(_facts(name, model, findings))
     else:
-        say(_report(name, model, findings))
+        say(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
     raise SystemExit(0 if model else 1)
 
 
-def _report(name: str, model: RobotModel | None, findings: Sequence[Found]) -> str:
+def _report(
+    name: str, model: RobotModel | None, findings: Sequence[Found], *, fix_hints: bool, joint_table: bool
+) -> str:
     lines = [_headline(name, model, findings)]
-    lines += [f"  {row}" for row in in_columns([_finding_row(finding) for finding in findings])]
+    rows = in_columns([_finding_row(finding) for finding in findings])
+    for row, finding in zip(rows, findings, strict=True):
+        lines += [f"  {row}"]
+        if fix_hints and finding.fix:
+            lines += [f"      fix: {finding.fix}"]
     if model is not None:
-        lines += in_columns(_link_rows(model))
+        lines += in_columns(_joint_rows(model) if joint_table else _link_rows(model))
+    elif not fix_hints and any(finding.fix for finding in findings):
+        lines += (
+            [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
+            if name != _STDIN
+            else []
+        )
     return "\n".join(lines)
 
 
@@ -78,6 +102,39 @@ def _link_rows(model: RobotModel) -> list[tuple[str, str, str, str]]:
     ]
 
 
+def _joint_rows(model: RobotModel) -> list[tuple[str, ...]]:
+    """Each joint with its place among the positions; those that do not move of their own have none."""
+    places = _places(model)
+    rows = [
+        (
+            *(joint.name, joint.type, joint.parent, joint.child, places.get(joint.name, "-")),
+            _mimic_text(joint) or _limits_text(joint) or "-",
+            *(f"{limit:g}" if math.isfinite(limit) else "-" for limit in _greatest(joint)),
+            " ".join(f"{part:g}" for part in joint.axis) if joint.type not in _WITHOUT_AXIS else "-",
+        )
+        for joint in model.joints
+    ]
+    return [_JOINT_HEADINGS, *rows]
+
+
+def _places(model: RobotModel) -> dict[str, str]:
+    """Which of the positions are a joint's own: "3", or "0..6"."""
+    from zstate.model.robot import POSITION_COUNTS
+
+    counts = {joint.name: POSITION_COUNTS[joint.type] for joint in model.joints}
+    places: dict[str, str] = {}
+    first = 0
+    for name in model.joint_names:
+        last = first + counts[name] - 1
+        places[name] = f"{first}" if first == last else f"{first}..{last}"
+        first = last + 1
+    return places
+
+
+def _greatest(joint: Joint) -> tuple[float, float]:
+    return (joint.limits.velocity, joint.limits.effort) if joint.type != "fixed" else (math.inf, math.inf)
+
+
 def _joint_cells(joint: Joint | None) -> tuple[str, str, str]:
     if joint is None:
         return "", "", ""
@@ -103,7 +160,12 @@ def _facts(name: str, model: RobotModel | None, findings: Sequence[Found]) -> di
         "source": name,
         "usable": model is not None,
         "findings": [
-            {"line": finding.line, "severity": finding.severity, "message": finding.message}
+            {
+                "line": finding.line,
+                "severity": finding.severity,
+                "message": finding.message,
+                "fix": finding.fix,
+            }
             for finding in findings
         ],
     }
