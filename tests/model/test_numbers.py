@@ -18,6 +18,8 @@ from zstate.model.urdf import parse_urdf
         ('<origin xyz="0 0 1_000"/>', "'1_000' is a number to Python only; write 1000.0"),
         ('<origin xyz="0 0 \u0663"/>', "'\u0663' is a number to Python only; write 3.0"),
         ('<origin xyz="0 0 x"/>', "'x' is not a number"),
+        ('<origin xyz="0 0 ${a + b}"/>', "'0 0 ${a + b}' is a xacro expression, not a number"),
+        ('<limit velocity="$(arg v)"/>', "'$(arg v)' is a xacro expression, not a number"),
         ('<origin xyz="0 0 1e999"/>', "'1e999' is too large"),
         ('<axis xyz="nan 0 1"/>', "axis xyz: 'nan' is not a finite number"),
         ('<limit velocity="fast"/>', "limit velocity: 'fast' is not a number"),

@@ -17,6 +17,7 @@ class NumberFault(ValueError):
 
 def read_numbers(text: str, count: int) -> tuple[float, ...]:
     """``count`` finite numbers separated by blanks. Raises NumberFault saying which is wrong."""
+    _refuse_expression(text)
     tokens = [token for token in _BLANKS.split(text) if token]
     if len(tokens) != count:
         commas = "; separate them by blanks, not commas" if "," in text else ""
@@ -26,6 +27,7 @@ def read_numbers(text: str, count: int) -> tuple[float, ...]:
 
 def read_number(text: str) -> float:
     """One finite number. Raises NumberFault."""
+    _refuse_expression(text)
     token = text.strip(" \t\r\n")
     if not _DECIMAL.fullmatch(token):
         raise NumberFault(_complaint(token))
@@ -33,6 +35,11 @@ def read_number(text: str) -> float:
     if not math.isfinite(value):
         raise NumberFault(f"{quoted(token)} is too large to be a number here")
     return value
+
+
+def _refuse_expression(text: str) -> None:
+    if "${" in text or "$(" in text:
+        raise NumberFault(f"{quoted(text.strip())} is a xacro expression, not a number")
 
 
 def _complaint(token: str) -> str:
