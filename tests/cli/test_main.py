@@ -23,6 +23,17 @@ def await_samples() -> None:
         assert next(readings).stamp != next(readings).stamp
 
 
+def test_a_path_that_the_shell_has_torn_apart_is_put_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "my arm").mkdir()
+    (tmp_path / "my arm" / "arm.urdf").write_text(Path(RRBOT).read_text())
+    monkeypatch.chdir(tmp_path)
+    for arguments in (("check",), ("publish", "--source", "sine"), ("up",)):
+        message = failure(*arguments, "my", "arm/arm.urdf", code=2)
+        assert "one path with a space in it; write it in quotes: 'my arm/arm.urdf'" in message
+
+
 def test_a_mistyped_command_is_met_with_the_nearest():
     message = failure("jonts", code=2)
     assert "there is no command 'jonts'; did you mean 'joints'?" in message

@@ -34,6 +34,7 @@ _COMMANDS = {
     "doctor": ("Look", "What is wrong, and what to do next."),
     "wait": ("Look", "Wait until a robot, a pose or a router is there."),
     "config": ("Look", "What commands go by here, and who said so."),
+    "plot": ("Look", "Joint positions, or the path of a frame, over time."),
     "check": ("Look", "What is right and wrong with a robot model."),
     "record": ("Record", "What robots say, into MCAP files."),
     "replay": ("Record", "What was recorded, said again."),
@@ -151,7 +152,9 @@ def _end_at_once(number: int, _: FrameType | None) -> None:
 
 
 def _usage_text(error: click.UsageError) -> str:
-    text = error.format_message()
+    from zstate.cli.torn_path import torn_path_hint
+
+    text = torn_path_hint(sys.argv[1:]) or error.format_message()
     return f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text
 
 
