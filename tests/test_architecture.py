@@ -71,6 +71,7 @@ HOMES = {
     "prometheus_client": "metrics",
     "viser": "view",
     "click": "cli",
+    "matplotlib": "cli",  # `zstate plot`
     "rich": "cli",
     "tomli": "cli",  # a part of Python from 3.11 on, as tomllib
     "tomllib": "cli",

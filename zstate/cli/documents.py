@@ -31,6 +31,11 @@ class DocumentWriter:
         self._names: tuple[str, ...] = ()
         self._order = b""
 
+    @property
+    def model(self) -> RobotModel | None:
+        """What was described last, if its URDF can be read."""
+        return self._model
+
     def describe(self, description: RobotDescription) -> None:
         """Learn the names of the joints."""
         self._names = description.joint_names

@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from threading import Event
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from zstate.cli.console import note, say, say_json
+from zstate.cli.console import say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, named_robot, session_options, wire_option
-from zstate.closing import Closing
-from zstate.errors import MessageError
 
 if TYPE_CHECKING:
     from zstate.cli.document_text import Changes
-    from zstate.cli.tap import Tapped
-    from zstate.net.session import Session
-    from zstate.wire.wire import Arrival
-
-# A robot's description comes within milliseconds, if there is one.
-_NAMES_WITHIN_S = 1.0
 
 
 def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> float:
@@ -79,6 +70,7 @@ def echo_command(
     zstate echo --wire ros2:namespace=r1               # /r1/joint_states
     """
     from zstate.cli.document_text import Changes
+    from zstate.cli.named_joints import Named
     from zstate.cli.tap import Tap
     from zstate.clock import LONGEST_WAIT_S
 
@@ -95,57 +87,6 @@ def echo_command(
             tapped = tap.next(LONGEST_WAIT_S)
             if tapped is not None:
                 show(named.document(tapped))
-
-
-class Named(Closing):
-    """Names the joints in samples of ``robot``, once it has been described."""
-
-    def __init__(self, session: Session, robot: str, wire: str = "native") -> None:
-        from zstate.cli.documents import DocumentWriter
-        from zstate.net.latched import LatchedSubscriber
-        from zstate.net.wires import wire_named
-
-        self._robot = robot
-        self._wire = wire_named(wire)
-        self._writer = DocumentWriter()
-        self._described = Event()
-        self._warned = False
-        key = self._wire.expression(robot, "robot_description")
-        self._subscriber = LatchedSubscriber(session, key, self._describe)
-
-    def close(self) -> None:
-        self._subscriber.close()
-
-    def _describe(self, arrival: Arrival) -> None:
-        from zstate.wire.messages import RobotDescription
-
-        if not arrival.payload:
-            return
-        try:
-            (description,) = self._wire.decode("robot_description", arrival, self._robot)
-        except MessageError as error:
-            note(f"{arrival.key}: {error}")
-            return
-        assert isinstance(description, RobotDescription)
-        self._writer.describe(description)
-        self._described.set()
-
-    def document(self, tapped: Tapped) -> Any:
-        """What a sample says, with the names of its joints if they can be known."""
-        from zstate.clock import wait_in_slices
-        from zstate.wire.messages import JointState
-
-        assert isinstance(tapped.sample, JointState)
-        if not self._writer.knows(tapped.sample) and not self._warned:
-            wait_in_slices(self._described, _NAMES_WITHIN_S)
-        if not self._writer.knows(tapped.sample) and not self._warned:
-            self._warned = True
-            why = "is of another model" if self._described.is_set() else "is missing"
-            note(
-                f"the description of {self._robot!r} {why}, so its joints have no names here; "
-                f"`zstate publish {self._robot}` publishes it"
-            )
-        return self._writer.document(tapped.sample)
 
 
 def _with_nulls(value: Any) -> Any:

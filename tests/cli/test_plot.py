@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from looking import RRBOT, failure, standing, zstate
+
+from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
+from zstate.cli.plot.curves import joint_curves, path_curves
+from zstate.errors import InvalidInput
+
+SECOND = 1_000_000_000
+DOCUMENTS = [
+    {"stamp": SECOND, "seq": 1, "positions": {"slide": 0.25, "turn": 1.0, "flight": [1.0, 2.0]}},
+    {"stamp": 0, "seq": 0, "positions": {"slide": 0.5, "turn": 3.0, "flight": [4.0, 5.0]}},
+]
+MODEL = """
+<robot name="r"> <link name="a"/> <link name="b"/> <link name="c"/>
+  <joint name="slide" type="prismatic"> <parent link="a"/> <child link="b"/> <axis xyz="1 0 0"/>
+    <limit lower="0" upper="1" velocity="1" effort="1"/> </joint>
+  <joint name="turn" type="continuous"> <parent link="b"/> <child link="c"/> <axis xyz="0 0 1"/> </joint>
+</robot>
+"""
+
+
+def needs_matplotlib() -> None:
+    pytest.importorskip("matplotlib", reason="pip install 'zstate[plot]'")
+
+
+def texts(file: Path) -> str:
+    """What stands in a picture, which Matplotlib has as comments beside the outlines of the letters."""
+    ElementTree.parse(file)
+    return file.read_text()
+
+
+def test_positions_become_curves_in_the_order_of_time_with_the_units_of_their_joints():
+    curves = joint_curves(DOCUMENTS, load_model(MODEL))  # type: ignore[arg-type]
+    assert curves.names == ("slide", "turn", "flight.0", "flight.1")
+    assert curves.units == ("m", "rad", "", "")
+    assert curves.seconds.tolist() == [0.0, 1.0]
+    assert curves.values.tolist() == [[0.5, 3.0, 4.0, 5.0], [0.25, 1.0, 1.0, 2.0]]
+    assert curves.chosen(["turn", "flight"]).names == ("turn", "flight.0", "flight.1")
+    assert curves.of_unit("m").values.tolist() == [[0.5], [0.25]]
+
+
+def test_a_joint_that_there_is_not_is_refused_with_those_that_there_are():
+    curves = joint_curves(DOCUMENTS, None)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match=r"did you mean 'slide'.*joints: slide, turn"):
+        curves.chosen(["slid"])
+
+
+def circling() -> TransformBuffer:
+    """A car that drives round a circle of radius 2 m, in 4 s."""
+    buffer = TransformBuffer()
+    for stamp in range(0, 4 * SECOND + 1, SECOND // 50):
+        angle = stamp / SECOND * math.pi / 2
+        place = (2.0 * math.cos(angle), 2.0 * math.sin(angle), 0.0)
+        buffer.insert(Transform("map", "car", place, (0.0, 0.0, 0.0, 1.0), stamp))
+    return buffer
+
+
+def test_a_path_is_asked_for_at_even_times_over_all_that_is_known():
+    curves = path_curves(circling(), "map", "car")
+    assert (curves.stamps[0], curves.stamps[-1]) == (0, 4 * SECOND)
+    assert np.hypot(curves.values[:, 0], curves.values[:, 1]) == pytest.approx(2.0, abs=1e-3)
+    part = path_curves(circling(), "map", "car", start_s=1.0, seconds=2.0)
+    assert (part.stamps[0], part.stamps[-1]) == (SECOND, 3 * SECOND)
+    with pytest.raises(InvalidInput, match=r"there are 4\.000 s; nothing is left after the first 9 s"):
+        path_curves(circling(), "map", "car", start_s=9.0)
+
+
+@pytest.mark.processes
+def test_what_a_robot_says_is_drawn(tmp_path: Path):
+    needs_matplotlib()
+    file = tmp_path / "joints.svg"
+    with standing():
+        ended = zstate("plot", "--seconds", "0.5", "--output", str(file))
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.decode().startswith(f"wrote {file}: 2 curves, ")
+    assert all(name in texts(file) for name in ("rrbot: joint positions", "shoulder", "elbow", "[rad]"))
+
+
+@pytest.mark.processes
+def test_the_path_of_a_frame_is_drawn(tmp_path: Path):
+    needs_matplotlib()
+    file = tmp_path / "path.png"
+    with standing():
+        ended = zstate("plot", "--path", "base", "tool", "--seconds", "0.5", "--output", str(file))
+    assert ended.returncode == 0, ended.stderr
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.processes
+def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
+    needs_matplotlib()
+    recording, joints, path = (tmp_path / name for name in ("run.mcap", "joints.svg", "path.svg"))
+    with standing():
+        assert zstate("record", str(recording), "--duration", "1.5").returncode == 0
+    ended = zstate("plot", "--file", str(recording), "--joint", "elbow", "--output", str(joints))
+    assert "1 curve, " in ended.stdout.decode(), ended.stderr
+    assert "shoulder" not in texts(joints)
+    options = ("--path", "base", "tool", "--start", "0.5", "--seconds", "0.5", "--output", str(path))
+    ended = zstate("plot", "rrbot", "--file", str(recording), *options)
+    assert "in 0.5 s" in ended.stdout.decode(), ended.stderr
+    message = failure("plot", "--file", str(recording), "--start", "60")
+    assert "no joint state of 'rrbot' in that time" in message
+    assert "no robot" not in message
+    assert "its robots: 'rrbot'" in failure("plot", "panda", "--file", str(recording))
+
+
+@pytest.mark.processes
+def test_mistakes_are_told(tmp_path: Path):
+    needs_matplotlib()
+    assert ".png, .svg, .pdf" in failure("plot", "rrbot", "--output", "plot.jpg", code=2)
+    assert "two different pictures" in failure("plot", "--joint", "a", "--path", "a", "b", code=2)
+    assert "--start is for recordings" in failure("plot", "rrbot", "--start", "1", code=2)
+    assert "no robot is announced" in failure("plot")
+    with standing("left"), standing("right"):
+        assert "which robot? announced: 'left', 'right'" in failure("plot")
+        nowhere = tmp_path / "nowhere" / "plot.png"
+        assert "cannot write" in failure("plot", "left", "--seconds", "0.2", "--output", str(nowhere))
+    with connect() as session, StaticPublisher(session, "cell") as statics:
+        statics.set(Transform("floor", "table", (0.0, 0.0, 0.7), (0.0, 0.0, 0.0, 1.0)))
+        assert "static" in failure("plot", "--path", "floor", "table", "--seconds", "0.2")
+
+
+def test_without_matplotlib_it_says_what_to_install():
+    hidden = "import sys; sys.modules['matplotlib'] = None; from zstate.cli.main import main; main()"
+    ended = subprocess.run([sys.executable, "-c", hidden, "plot", RRBOT], capture_output=True, check=False)
+    assert ended.returncode == 1
+    assert b"pip install 'zstate[plot]'" in ended.stderr
+    assert b"Traceback" not in ended.stderr

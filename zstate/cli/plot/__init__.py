@@ -1,0 +1,1 @@
+"""zstate plot: numbers over time, as a picture."""

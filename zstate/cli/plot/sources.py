@@ -1,0 +1,107 @@
+"""Where curves come from: what is said now, and recordings."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from zstate.cli.awaited_pose import AwaitedPose
+from zstate.cli.console import fail, note
+from zstate.cli.documents import Document, DocumentWriter
+from zstate.cli.named_joints import Named
+from zstate.cli.plot.curves import Curves, joint_curves, path_curves
+from zstate.cli.roster import Roster
+from zstate.cli.tap import Tap
+from zstate.cli.words import followed
+from zstate.following.recorded import check_recorded
+from zstate.listener import TransformListener
+from zstate.record.models import first_descriptions
+from zstate.record.reader import RecordReader
+from zstate.record.transcript import Transcript
+from zstate.recording import Recording
+from zstate.wire.messages import JointState, RobotDescription
+
+if TYPE_CHECKING:
+    from zstate.net.session import Session
+
+_WAIT_S = 10.0
+_LOG = logging.getLogger("zstate")
+
+
+def live_joints(session: Session, robot: str, wire: str, seconds: float) -> Curves:
+    """The joints of ``robot`` for ``seconds`` from now on. Fails when no sample comes."""
+    with Named(session, robot, wire) as named, Tap(session, robot, "joint_states", wire) as tap:
+        documents = [named.document(tap.first(_WAIT_S))]
+        note(f"listening to {robot} for {seconds:g} s ...")
+        deadline = time.monotonic() + seconds
+        while (left_s := deadline - time.monotonic()) > 0.0:
+            tapped = tap.next(left_s)
+            if tapped is not None:
+                documents.append(named.document(tapped))
+        return joint_curves(documents, named.model)
+
+
+def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], seconds: float) -> Curves:
+    """The path of frame B in frame A for ``seconds`` from now on. Fails when no pose comes."""
+    with (
+        Roster(session, robot, wire) as roster,
+        TransformListener(
+            session,
+            robot,
+            wire=wire,
+            follow=followed(wire),
+            history_s=seconds + 1.0,
+            history_on_join=False,
+        ) as listener,
+    ):
+        AwaitedPose(listener, roster, *frames).answer(timeout_s=_WAIT_S)
+        note(f"listening for {seconds:g} s ...")
+        time.sleep(seconds)
+        return path_curves(listener.buffer, *frames)
+
+
+def recorded_joints(path: str, robot: str | None, start_s: float, seconds: float | None) -> Curves:
+    """The joints of ``robot``, or of the only one, in a recording. Raises RecordingError and InvalidInput."""
+    with RecordReader(path) as reader:
+        transcript = Transcript(reader, _refuse)
+        name = _only(transcript.robots) if robot is None else check_recorded(transcript, robot)
+        writer = DocumentWriter()
+        for described in first_descriptions(transcript, (name,)).values():
+            if isinstance(described.message, RobotDescription):
+                writer.describe(described.message)
+        first, _ = reader.span or (0, 0)
+        begin = first + round(start_s * 1e9)
+        end = None if seconds is None else begin + round(seconds * 1e9)
+        documents = list(_documents(transcript, name, writer, begin, end))
+    if not documents:
+        fail(f"{path}: no joint state of {name!r}{' in that time' if start_s or seconds else ''}")
+    return joint_curves(documents, writer.model)
+
+
+def _documents(
+    transcript: Transcript, robot: str, writer: DocumentWriter, begin: int, end: int | None
+) -> Iterator[Document]:
+    for said in transcript.said((robot,), ("joint_states",), begin, end):
+        if isinstance(said.message, JointState):
+            yield writer.document(said.message)
+
+
+def recorded_path(
+    path: str, robot: str | None, frames: tuple[str, str], start_s: float, seconds: float | None
+) -> Curves:
+    """The path of frame B in frame A in a recording. Raises RecordingError, InvalidInput, LookupFailed."""
+    with Recording(path, robot) as recording:
+        return path_curves(recording.buffer(), *frames, start_s=start_s, seconds=seconds)
+
+
+def _only(robots: tuple[str, ...]) -> str:
+    if len(robots) != 1:
+        there = f"robots {', '.join(robots)}: name one of them" if robots else "no robot"
+        fail(f"the recording has {there}")
+    return robots[0]
+
+
+def _refuse(reason: str, text: str) -> None:
+    _LOG.warning("left out (%s): %s", reason, text)
