@@ -46,6 +46,7 @@ _COMMANDS = {
     "certs": ("Run", "Certificates for tests: an authority and identities."),
     "ros1": ("Run", "A bridge to ROS 1, in either direction."),
     "up": ("Run", "Start several of these from one file."),
+    "init": ("Run", "A commented file for `zstate up`, to begin with."),
 }
 
 
