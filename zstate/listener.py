@@ -23,7 +23,7 @@ from zstate.net.history import PastReader
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
-from zstate.net.streams import CAPACITY, StreamSubscriber
+from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
@@ -97,6 +97,7 @@ class TransformListener(Closing):
         key = expression(robot, "tf_static")
         opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
         key = expression(robot, self._follow)
+        self._capacity = capacity_for(key)
         opening.enter_context(StreamSubscriber(session, key, self._on_samples))
         if self._recalls and self._wire.name == "native":
             self._past = PastReader(session, self._on_past, self._note_broken)
@@ -152,7 +153,7 @@ class TransformListener(Closing):
         return follower
 
     def _on_samples(self, arrivals: list[Arrival]) -> None:
-        if len(arrivals) >= CAPACITY:
+        if len(arrivals) >= self._capacity:
             # A ring that is full has lost samples, of whoever sent any.
             self._overflowed = set(self._followers.values())
         earliest, latest = self._off_clock.look()

@@ -27,6 +27,34 @@ def test_samples_arrive_in_order_with_key_and_encoding(sessions):
     assert (subscriber.full_batches, subscriber.failures) == (0, 0)
 
 
+def test_readers_of_many_keys_and_writers_of_a_session_go_on_when_one_of_its_readers_closes(sessions):
+    here, there = sessions
+    ours, theirs = "zstate/ours/joint_states", "zstate/theirs/joint_states"
+    gone: list[Arrival] = []
+    heard: dict[str, list[Arrival]] = {"here": [], "there": []}
+    many = "zstate/*/joint_states"
+    with (
+        StreamPublisher(here, ours, "") as mine,
+        StreamPublisher(there, theirs, "") as other,
+        StreamSubscriber(here, many, heard["here"].extend),
+        StreamSubscriber(there, many, heard["there"].extend),
+    ):
+        until(lambda: mine.has_readers and other.has_readers)
+
+        def all_say(payload: bytes) -> None:
+            mine.put(payload)
+            other.put(payload)
+            said = {(ours, payload), (theirs, payload)}
+            for ear in heard.values():
+                until(lambda ear=ear: said <= {arrival[:2] for arrival in ear})
+
+        with StreamSubscriber(here, many, gone.extend):
+            all_say(b"while both are there")
+            until(lambda: len(gone) == 2)
+        all_say(b"afterwards")
+    assert len(gone) == 2
+
+
 def test_what_goes_beside_a_sample_arrives_with_it(sessions):
     got: list[Arrival] = []
     with (

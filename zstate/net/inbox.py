@@ -10,7 +10,7 @@ from typing import NamedTuple
 from zstate.closing import Closing
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
-from zstate.net.streams import CAPACITY, StreamSubscriber
+from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire.keys import Stream
 from zstate.wire.wire import Arrival
 
@@ -45,9 +45,10 @@ class Inbox(Closing):
 
     def hear(self, stream: Stream, expression: str, robot: str | None) -> None:
         """Subscribe to samples."""
+        capacity = capacity_for(expression)
 
         def put(arrivals: list[Arrival]) -> None:
-            self._put(Heard(stream, robot, arrivals, time.time_ns(), len(arrivals) >= CAPACITY))
+            self._put(Heard(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity))
 
         self._opened.enter_context(StreamSubscriber(self._session, expression, put))
 

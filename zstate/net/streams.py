@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 
 import zenoh
 
@@ -16,6 +17,20 @@ from zstate.net.session import Session
 from zstate.wire.wire import Arrival
 
 CAPACITY = 1024
+"""So many samples of one key wait for a reader that is held up: a second at 1 kHz."""
+
+CAPACITY_OF_MANY = 4096
+"""And so many of an expression that hears many keys: 0.8 s of 100 robots at 50 Hz.
+
+Not more, because a sample that waits holds the memory it was received in, 10 to 20 kB.
+"""
+
+_MOST_KEYS = 4096
+
+
+def capacity_for(keyexpr: str) -> int:
+    """How many samples of ``keyexpr`` wait for who reads them; of more the oldest are lost."""
+    return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
 
 
 def arrival_of(sample: zenoh.Sample) -> Arrival:
@@ -74,11 +89,16 @@ class StreamSubscriber(Closing):
         session: Session,
         keyexpr: str,
         on_samples: Callable[[list[Arrival]], None],
-        capacity: int = CAPACITY,
+        capacity: int | None = None,
     ) -> None:
-        def hand_over(batch: list[zenoh.Sample]) -> None:
-            on_samples([arrival_of(sample) for sample in batch if sample.kind == zenoh.SampleKind.PUT])
+        self._keys = keys = _Keys(session, keyexpr)
 
+        def hand_over(batch: list[zenoh.Sample]) -> None:
+            arrivals = [arrival_of(sample) for sample in batch if sample.kind == zenoh.SampleKind.PUT]
+            keys.learn(arrival.key for arrival in arrivals)
+            on_samples(arrivals)
+
+        capacity = capacity or capacity_for(keyexpr)
         ring: Ring = zenoh.handlers.RingChannel(capacity)
         self._receiver = Receiver(
             session, session.zenoh.declare_subscriber(keyexpr, ring), hand_over, capacity
@@ -97,3 +117,42 @@ class StreamSubscriber(Closing):
     def close(self) -> None:
         """Stop within a second, also from inside ``on_samples``. A second call does nothing."""
         self._receiver.close()
+        self._keys.close()
+
+
+class _Keys:
+    """The keys on which samples of an expression come, which are declared to Zenoh.
+
+    It keeps the way of samples on keys that it knows. On others it searches all that was declared under
+    them for each sample anew: beside the tokens of 100 robots that is a quarter of what a reader's sample
+    costs.
+    """
+
+    def __init__(self, session: Session, keyexpr: str) -> None:
+        self._session = session
+        self._known: dict[str, _Key] = {}
+        self._most = _MOST_KEYS if "*" in keyexpr else 0  # of a single key Zenoh knows already
+
+    def learn(self, keys: Iterable[str]) -> None:
+        """Samples have come on ``keys``."""
+        if len(self._known) < self._most:
+            for key in set(keys).difference(self._known):
+                with suppress(Closed, zenoh.ZError):  # closed meanwhile: then nothing more will come
+                    self._known[key] = _Key(self._session, key)
+
+    def close(self) -> None:
+        """Declare them no more. A second call does nothing."""
+        self._most = 0
+        while self._known:
+            self._session.release(self._known.popitem()[1])
+
+
+class _Key:
+    """A key that is declared to Zenoh."""
+
+    def __init__(self, session: Session, key: str) -> None:
+        self._session = session.zenoh
+        self._expression: zenoh.KeyExpr = self._session.declare_keyexpr(key)
+
+    def undeclare(self) -> None:
+        self._session.undeclare(self._expression)
