@@ -1,0 +1,230 @@
+"""A tutorial's exercise, from an empty folder and without ROS: make a robot, look, break it, be told why."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from looking import Spawn, failure, started, zstate
+from support import Child
+
+pytestmark = pytest.mark.processes
+
+ARM = """\
+<robot name="arm">
+  <link name="base"/>
+  <link name="upper"/>
+  <link name="lower"/>
+  <joint name="shoulder" type="revolute">
+    <parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.5"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="10" velocity="3"/>
+  </joint>
+  <joint name="elbow" type="continuous">
+    <parent link="upper"/><child link="lower"/>
+    <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
+  </joint>
+</robot>
+"""
+
+SWING = """\
+import math
+import time
+
+from zstate import StatePublisher, connect, load_model
+
+model = load_model("arm.urdf")
+with connect() as session, StatePublisher(session, model, streams=("joint_states",)) as arm:
+    while True:
+        angle = 1.2 * math.sin(time.time())
+        arm.publish({"shoulder": angle, "elbow": -angle})
+        time.sleep(0.02)
+"""
+"""The driver: joint states, and nothing else."""
+
+CELL = '[[robot]]\nmodel = "./arm.urdf"\n'
+"""What makes poses of them."""
+
+XACRO = """\
+<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:property name="length" value="0.4"/>
+  <link name="base"/>
+  <link name="upper"/>
+  <joint name="shoulder" type="continuous">
+    <parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 ${length}"/>
+  </joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the exercise is done; no more is in it than its three files."""
+    monkeypatch.chdir(tmp_path)
+    for name, text in (("arm.urdf", ARM), ("swing.py", SWING), ("cell.toml", CELL)):
+        Path(name).write_text(text)
+    return tmp_path
+
+
+@pytest.fixture
+def cell(folder: Path, spawn: Spawn) -> Child:
+    """`zstate up cell.toml`, which waits for the driver."""
+    child = started(spawn, "up", "cell.toml")
+    ready(child, "publishing 'arm'")
+    return child
+
+
+@pytest.fixture
+def driver(folder: Path) -> Iterator[Callable[[], subprocess.Popen[bytes]]]:
+    """Starts `python swing.py`, as it is in the folder."""
+    running: list[subprocess.Popen[bytes]] = []
+
+    def start() -> subprocess.Popen[bytes]:
+        running.append(subprocess.Popen([sys.executable, "swing.py"], stderr=subprocess.PIPE))
+        return running[-1]
+
+    yield start
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def ready(child: Child, text: str) -> None:
+    while text not in child.line():
+        pass
+
+
+def stamped(stamp: str) -> None:
+    """Have the driver stamp its samples so."""
+    Path("swing.py").write_text(SWING.replace("-angle})", f"-angle}}, stamp={stamp})"))
+
+
+def doctor(*arguments: str, code: int) -> dict[str, Any]:
+    ended = zstate("doctor", *arguments, "--json")
+    assert ended.returncode == code, ended.stdout
+    return json.loads(ended.stdout)
+
+
+def test_the_driver_is_a_dozen_lines():
+    assert len(SWING.splitlines()) <= 12
+
+
+def test_the_robot_runs_and_can_be_looked_at(cell: Child, driver):
+    driver()
+    assert zstate("wait", "robot", "arm").stdout == b"ready: 'arm' (3 frames)\n"
+    (robot,) = json.loads(zstate("ls", "--json").stdout)
+    writers = {writer["stream"]: writer["program"] for writer in robot["writers"]}
+    assert writers == {
+        "joint_states": "swing",
+        "robot_description": "zstate-publish",
+        "tf": "zstate-publish",
+        "tf_static": "zstate-publish",
+    }
+    pose = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
+    # The elbow undoes what the shoulder does: the lower link stays upright on a circle of 0.4 m.
+    x, y, z = pose["translation"]
+    assert math.isclose(math.hypot(x, z - 0.5), 0.4, abs_tol=1e-9)
+    assert abs(y) < 1e-9
+    assert math.isclose(abs(pose["rotation"][3]), 1.0, abs_tol=1e-9)
+    tree = zstate("tree").stdout.decode()
+    assert all(frame in tree for frame in ("base", "upper", "lower"))
+    assert doctor("arm", code=0)["sound"]
+
+
+def test_1_a_driver_that_died_is_missed(cell: Child, driver):
+    process = driver()
+    assert zstate("wait", "robot", "arm").returncode == 0
+    process.kill()
+    process.wait()
+    found = doctor(code=1)["first_broken"]
+    assert (found["name"], found["robot"]) == ("joint_states", "arm")
+    assert "nobody writes joint_states of 'arm', for which zstate-publish@" in found["text"]
+    assert "its driver is not running" in found["text"]
+
+
+def test_1_where_the_driver_was_all_there_was_the_robot_is_missed(folder: Path):
+    found = doctor("arm", code=1)["first_broken"]
+    assert (found["name"], found["next"]) == ("robots", "zstate publish FILE --name arm")
+    assert "its publisher is not running" in found["text"]
+
+
+def test_2_a_path_with_a_space_works_and_is_named_where_the_quotes_are_forgotten(folder: Path, spawn: Spawn):
+    place = folder / "my robot"
+    place.mkdir()
+    for name in ("arm.urdf", "cell.toml"):
+        (place / name).write_bytes((folder / name).read_bytes())
+    ready(started(spawn, "up", "my robot/cell.toml"), "publishing 'arm'")
+    assert zstate("check", "my robot/arm.urdf").returncode == 0
+    for command in ("check", "publish"):
+        message = failure(command, "my", "robot/arm.urdf", code=2)
+        assert "is one path with a space in it; write it in quotes: 'my robot/arm.urdf'" in message
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ('child link="lower"', 'child link="lowr"', "its child 'lowr' is not a link; did you mean 'lower'?"),
+        ("</joint>\n</robot>", "</robot>", "</robot> closes <joint>, which was opened in line 10"),
+        (ARM, "", "the text is empty"),
+    ],
+)
+def test_3_a_bad_urdf_is_refused_by_whoever_reads_it(folder: Path, driver, right: str, wrong: str, told: str):
+    Path("arm.urdf").write_text(ARM.replace(right, wrong))
+    assert told in zstate("check", "arm.urdf").stdout.decode()
+    assert told in failure("publish", "arm.urdf")
+    assert told in failure("up", "cell.toml")
+    process = driver()
+    assert process.wait(15.0) == 1
+    assert process.stderr
+    assert told in process.stderr.read().decode()
+
+
+@pytest.mark.parametrize(
+    ("stamp", "cause"),
+    [
+        ("time.time_ns() + 3_600_000_000_000", "3600.0 s after the time here"),
+        ("time.time_ns() + 2_000_000_000", "in the future"),
+        ("time.monotonic_ns()", "1970 and after"),
+        ("0", "1970 and after"),
+    ],
+)
+def test_4_stamps_of_the_future_and_of_1970_are_used_and_named(cell: Child, driver, stamp: str, cause: str):
+    stamped(stamp)
+    process = driver()
+    assert zstate("wait", "robot", "arm").returncode == 0
+    said = doctor("arm", code=1)
+    found = said["first_broken"]
+    assert found["name"] == "stamps"
+    assert cause in found["text"]
+    assert f"swing@{os.uname().nodename} pid {process.pid}" in found["text"]
+    # Nothing is dropped for it: the pose is known.
+    assert [check["state"] for check in said["checks"] if check["name"] == "poses"] == ["ok"]
+
+
+def test_5_a_xacro_that_nobody_has_expanded_is_recognised(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    Path("arm.urdf").write_text(XACRO)
+    # As where nobody has installed the expander.
+    (folder / "without").mkdir()
+    for name in ("xacro", "xacrodoc"):
+        (folder / "without" / f"{name}.py").write_text("raise ImportError")
+    monkeypatch.setenv("PYTHONPATH", str(folder / "without"), prepend=os.pathsep)
+    told = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
+    assert told in zstate("check", "arm.urdf").stdout.decode()
+    assert told in failure("publish", "arm.urdf")
+    assert told in failure("up", "cell.toml")
+
+
+def test_5_a_xacro_expression_that_was_left_over_is_recognised(folder: Path):
+    lines = XACRO.splitlines(keepends=True)
+    Path("arm.urdf").write_text('<robot name="arm">\n' + "".join(lines[2:]))
+    told = failure("publish", "arm.urdf")
+    assert "line 6" in told
+    assert "'0 0 ${length}' is a xacro expression, not a number" in told
