@@ -100,5 +100,6 @@ def test_a_robot_that_nobody_speaks_of_is_an_error_and_no_robot_at_all_is_none()
 def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
     with standing(wire="ros2", router=ros_router):
         text = zstate("graph").stdout.decode()
-    assert "/joint_states" in text
-    assert "written by" in text
+    assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
+    assert text.count("written by  /") == 1
+    assert text.count("read by     nobody") == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,6 +16,7 @@ from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
+    from zstate.cli.words import Words
 
 _NO_FRAMES = "announced, but without any frame: who publishes the model? `zstate publish ROBOT` does"
 
@@ -55,7 +56,14 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
         say_json([_facts(frame, now) for frame in frames])
     elif frames:
         title = "Frames" if robot == "*" else f"Frames of {robot}"
-        say(words_of(wire).explained(_drawn(frames, now, form, in_full=is_ros(wire), title=title)))
+        named = [_named(frame, words_of(wire)) for frame in frames]
+        say(_drawn(named, now, form, in_full=is_ros(wire), title=title))
+
+
+def _named(frame: FrameInfo, words: Words) -> FrameInfo:
+    """The same with the names by which its wire calls frames."""
+    parent = None if frame.parent is None else words.explained(frame.parent)
+    return replace(frame, name=words.explained(frame.name), parent=parent)
 
 
 def _drawn(frames: Sequence[FrameInfo], now: int, form: str | None, *, in_full: bool, title: str) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 class StreamUse:
     """One stream of ``robot``, called ``name``, with the programs at its ends, each once, sorted.
 
+    A topic of ROS belongs to no robot: ``robot`` is empty, ``name`` has the namespace.
     ``rate_hz`` is None for what is said once, and where it was not measured.
     """
 
@@ -86,7 +87,7 @@ def graph_text(graph: Graph) -> str:
 
 def _bundle_lines(bundle: Bundle) -> list[str]:
     return [
-        f"{bundle.robot}: {', '.join(stream.label for stream in bundle.streams)}",
+        f"{bundle.robot}{': ' * bool(bundle.robot)}{', '.join(stream.label for stream in bundle.streams)}",
         *_ends_lines("written by", bundle.writers),
         *_ends_lines("read by", bundle.readers),
     ]

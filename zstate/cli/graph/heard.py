@@ -43,7 +43,7 @@ def ros_graph(session: Session, wire: str) -> Graph:
     return Graph(
         tuple(
             StreamUse(
-                topic.namespace or "/",
+                "",
                 topic.name,
                 None,
                 tuple(sorted({end.node for end in topic.publishers})),

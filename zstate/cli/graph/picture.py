@@ -37,7 +37,8 @@ class _Nodes:
 
 
 def _bundle_lines(bundle: Bundle) -> list[str]:
-    return [bundle.robot, *(stream.label for stream in bundle.streams)]
+    labels = [stream.label for stream in bundle.streams]
+    return [bundle.robot, *labels] if bundle.robot else labels
 
 
 def _program_lines(program: str) -> list[str]:
