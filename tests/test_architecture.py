@@ -80,6 +80,8 @@ HOMES = {
 EVERYWHERE = {"numpy"}
 GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
+    ("cli/snapshot/snapshot.py", "msgspec"),
+    ("cli/snapshot/text.py", "msgspec"),
     ("cli/up/sections.py", "msgspec"),
     ("cli/up/tables.py", "msgspec"),
 }

@@ -40,6 +40,7 @@ _COMMANDS = {
     "replay": ("Record", "What was recorded, said again."),
     "recover": ("Record", "A complete file of a recording that was cut off."),
     "info": ("Record", "What is in a recording."),
+    "snapshot": ("Record", "Robots as they are now, into a file and out of it again."),
     "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),
     "router": ("Run", "A Zenoh router."),
     "acl": ("Run", "Who may do what behind a router, for its configuration."),
