@@ -119,6 +119,7 @@ def test_mistakes_are_told(tmp_path: Path):
     assert ".png, .svg, .pdf" in failure("plot", "rrbot", "--output", "plot.jpg", code=2)
     assert "two different pictures" in failure("plot", "--joint", "a", "--path", "a", "b", code=2)
     assert "--start is for recordings" in failure("plot", "rrbot", "--start", "1", code=2)
+    assert "a duration is" in failure("plot", "--file", "x.mcap", "--start", "nan", code=2)
     assert "no robot is announced" in failure("plot")
     with standing("left"), standing("right"):
         assert "which robot? announced: 'left', 'right'" in failure("plot")

@@ -42,7 +42,7 @@ def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> flo
     default=0.0,
     callback=_checked_amount,
     metavar="AMOUNT",
-    help="With --changed: at least one number by more than this.",
+    help="Only where at least one number differs by more than this.",
 )
 @click.option("--csv", "form", flag_value="csv", help="Comma-separated values below one line of names.")
 @click.option("--json", "form", flag_value="json", help="One JSON value a line.")
@@ -65,7 +65,7 @@ def echo_command(
     \b
     zstate echo panda
     zstate echo panda --field panda_joint1 --csv > joint1.csv
-    zstate echo panda --changed --by 0.001
+    zstate echo panda --by 0.001
     zstate echo --wire ros2 --once                     # /joint_states
     zstate echo --wire ros2:namespace=r1               # /r1/joint_states
     """
@@ -80,7 +80,7 @@ def echo_command(
         Named(session, heard, wire) as named,
         Tap(session, heard, "joint_states", wire) as tap,
     ):
-        show = _printer(form, field, Changes(by) if changed else None)
+        show = _printer(form, field, Changes(by) if changed or by else None)
         tapped = tap.first(timeout if once else None)
         show(named.document(tapped))
         while not once:

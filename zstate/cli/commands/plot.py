@@ -35,7 +35,11 @@ def _checked_output(_: click.Context, __: click.Parameter, file: str | None) -> 
 @click.option("--path", "frames", nargs=2, metavar="A B", help="The path of frame B in frame A instead.")
 @click.option("--file", metavar="RECORDING", help="From a recording, instead of what is said now.")
 @click.option(
-    "--start", type=float, default=0.0, metavar="S", help="In a recording: from so long after its begin [s]."
+    "--start",
+    type=float,
+    callback=checked_seconds,
+    metavar="S",
+    help="In a recording: from so long after its begin [s].",
 )
 @click.option(
     "--seconds",
@@ -56,7 +60,7 @@ def plot_command(
     joints: tuple[str, ...],
     frames: tuple[str, str] | None,
     file: str | None,
-    start: float,
+    start: float | None,
     seconds: float | None,
     output: Path | None,
     wire: str,
@@ -76,11 +80,11 @@ def plot_command(
 
     if joints and frames:
         raise click.UsageError("--joint and --path are two different pictures; give one of them")
-    if file is None and start:
+    if file is None and start is not None:
         raise click.UsageError("--start is for recordings: --file RECORDING")
     if file is not None:
         name = robot or Path(file).stem
-        curves = _recorded(file, robot, frames, start, seconds)
+        curves = _recorded(file, robot, frames, start or 0.0, seconds)
     else:
         with open_session(network, (wire,)) as session:
             name = robot or words_of(wire).robot or ("*" if frames else _only_robot(session))
