@@ -1,0 +1,1 @@
+"""The soak: a fleet through one router for a long time (``python -m bench.soak``)."""

@@ -1,0 +1,111 @@
+"""Watching: what a reader of all sees of each robot, in memory that does not grow."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.soak.task import EPOCH_S, Task, epoch
+from zstate import TransformBuffer, ZStateError, load_model
+
+STALE_MS = 1000.0
+
+Ends = list[tuple[str, str, str]]
+"""Of each robot the root of its model, its last link and its mark, by their names in a buffer."""
+
+
+def ends_of(task: Task) -> Ends:
+    """Those of all robots."""
+    model = load_model(task.model)
+    return [(f"{name}/{model.root}", f"{name}/{model.links[-1]}", f"{name}/mark") for name in task.names]
+
+
+class Watching:
+    """Looks at every robot when told to: how old it is, and which half minute its static edge names."""
+
+    def __init__(self, buffer: TransformBuffer, ends: Ends) -> None:
+        self._buffer = buffer
+        self._ends = ends
+        self._ages = _Ages()
+        self._epoch = 0
+        self._latched_after_s: list[float] = []
+        self._lost_latched = 0
+        self._is_complete = True
+
+    def look(self) -> None:
+        """Look at all of them."""
+        now = time.time_ns()
+        for root, tip, _ in self._ends:
+            try:
+                age = now - self._buffer.latest(root, tip)
+            except ZStateError:
+                continue
+            self._ages.add(age * 1e-6)
+        self._look_at_latched()
+
+    def _look_at_latched(self) -> None:
+        behind = missing(self._buffer, self._ends)
+        if epoch() != self._epoch:
+            # The half minute in which the soak begins is not counted: not everybody is there yet.
+            # Nor is the end, when the publishers have gone and taken their edges back.
+            if not self._is_complete and self._latched_after_s and behind < len(self._ends):
+                self._lost_latched += behind
+            self._epoch, self._is_complete = epoch(), False
+            behind = missing(self._buffer, self._ends)
+        if not behind and not self._is_complete:
+            self._is_complete = True
+            self._latched_after_s.append(time.time() - self._epoch * EPOCH_S)
+
+    def report(self) -> dict[str, Any]:
+        """What was seen."""
+        late = np.array(self._latched_after_s[1:] or [np.nan])  # the first is the time of joining
+        return {
+            **self._ages.report(),
+            "latched_rounds": len(self._latched_after_s),
+            "latched_lost": self._lost_latched,
+            "latched_within_s_median_max": [round(float(np.median(late)), 2), round(float(late.max()), 2)],
+        }
+
+
+class _Ages:
+    """Ages [ms], counted by tenths of a millisecond up to ten seconds."""
+
+    def __init__(self) -> None:
+        self._counts: NDArray[np.int64] = np.zeros(100_001, dtype=np.int64)
+        self._largest = 0.0
+        self._stale = 0
+
+    def add(self, age_ms: float) -> None:
+        self._counts[min(max(0, int(age_ms * 10.0)), len(self._counts) - 1)] += 1
+        self._largest = max(self._largest, age_ms)
+        self._stale += age_ms > STALE_MS
+
+    def report(self) -> dict[str, Any]:
+        seen: NDArray[np.int64] = np.cumsum(self._counts)
+        middle, high = (int(np.searchsorted(seen, part * seen[-1])) / 10.0 for part in (0.5, 0.99))
+        return {
+            "looks": int(seen[-1]),
+            "age_ms_p50_p99_max": [middle, high, round(self._largest, 2)],
+            "stale_looks": self._stale,
+        }
+
+
+def missing(buffer: TransformBuffer, ends: Ends) -> int:
+    """How many robots have not got the static edge of this half minute."""
+    present = float(epoch())
+    return sum(_marked(buffer, root, mark) != present for root, _, mark in ends)
+
+
+def all_answer(buffer: TransformBuffer, ends: Ends) -> bool:
+    """Whether there is a pose of every robot."""
+    return all(buffer.can_lookup(root, tip) for root, tip, _ in ends)
+
+
+def _marked(buffer: TransformBuffer, root: str, mark: str) -> float | None:
+    try:
+        return float(buffer.lookup(root, mark).translation[0])
+    except ZStateError:  # not there yet, or withdrawn at the end
+        return None
