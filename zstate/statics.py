@@ -9,10 +9,11 @@ from urllib.parse import quote
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
-from zstate.errors import Closed, InvalidInput
-from zstate.net.claims import Claim, check_edge
+from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.net.claims import Claim
 from zstate.net.forked import new_lock
 from zstate.net.outlets import Outlets
+from zstate.net.placing import placing
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named, wire_names
@@ -32,7 +33,8 @@ class StaticPublisher(Closing):
     number. ``program`` is the script's name unless given.
 
     On the native wire SecondWriter is raised, and names the first, where somebody else who lives writes
-    under the same name, and by ``set`` for a frame that another static writer of any robot places; not
+    under the same name, and by ``set`` for a frame that another static writer of any robot places; of two
+    that do so at the same moment by the later one, which is closed by it where both have one name. Not
     with ``takeover``.
     """
 
@@ -69,6 +71,8 @@ class StaticPublisher(Closing):
                 )
                 for wire in wire_names(wires)
             ]
+            if self._claim is not None:
+                self._claim.settle()
             self._opened = opening.pop_all()
 
     def set(self, transform: Transform) -> None:
@@ -79,17 +83,25 @@ class StaticPublisher(Closing):
         """
         parent = full_name(self.robot, transform.target)
         child = full_name(self.robot, transform.source)
-        with self._lock:
+        with self._lock, ExitStack() as placed:
             self._check_open()
             if self._claim is not None:
-                self._claim.check()
                 if child not in self._edges:
-                    check_edge(self._session, self._announced, (parent, child))
+                    placed.enter_context(placing(self._session, self._announced, [(parent, child)]))
+                # Now: of those who have answered we have heard, too, if they came before.
+                self._yield_to_the_first(self._claim)
             self._check.insert_static(
                 Transform(parent, child, transform.translation, transform.rotation), writer=self.writer
             )
             self._edges[child] = transform
             self._send()
+
+    def _yield_to_the_first(self, claim: Claim) -> None:
+        try:
+            claim.check()
+        except SecondWriter:
+            self._opened.close()  # not withdrawn: what is under this name is the first one's
+            raise
 
     def withdraw(self, child: str) -> None:
         """Take back the edge that places ``child``. Raises InvalidInput if it is not one of ours."""

@@ -10,7 +10,8 @@ import pytest
 from support import until
 
 from zstate.errors import Closed, SecondWriter
-from zstate.net.claims import GONE_WITHIN_S, Claim, check_edge
+from zstate.net.claims import GONE_WITHIN_S, Claim
+from zstate.net.placing import check_edges
 from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
 from zstate.statics import StaticPublisher
@@ -152,17 +153,17 @@ def test_a_frame_that_another_static_writer_places_is_refused_with_its_edge_and_
         mount.set(edge("r1/tool", "r1/camera"))
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="'r1/camera' on 'r1/tool' already, as 'mount'") as raised:
-            check_edge(ours, said(SECOND, "tf_static", "room"), ("r1/table", "r1/camera"))
+            check_edges(ours, said(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])
         assert raised.value.edge == ("r1/tool", "r1/camera")
         assert raised.value.first.program == "calibration"
-        check_edge(ours, said(SECOND, "tf_static", "room"), ("r1/tool", "r1/laser"))
+        check_edges(ours, said(SECOND, "tf_static", "room"), [("r1/tool", "r1/laser")])
         mount.withdraw("r1/camera")
         until(lambda: not is_placed(ours))
 
 
 def is_placed(session: Session) -> bool:
     try:
-        check_edge(session, said(SECOND, "tf_static", "room"), ("r1/table", "r1/camera"))
+        check_edges(session, said(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])
     except SecondWriter:
         return True
     return False

@@ -1,4 +1,5 @@
 import pytest
+import zenoh
 
 from zstate.errors import InvalidInput
 from zstate.wire import keys
@@ -37,6 +38,20 @@ def test_a_reader_stands_apart_from_robots_and_tells_whose_stream_it_reads(robot
 def test_other_keys_are_no_readers(key: str):
     with pytest.raises(InvalidInput, match="@reader"):
         keys.parse_reader_key(key)
+
+
+@pytest.mark.parametrize("edge", [("r1/tool", "r1/camera"), ("map", "@a*$#? /b"), ("r1/tool", "röbi/hand")])
+def test_an_edge_that_is_being_placed_is_found_by_its_child(edge: tuple[str, str]):
+    key = keys.edge_key("r1", edge, "x")
+    assert keys.parse_edge_key(key) == ("r1", edge, "x")
+    assert zenoh.KeyExpr(keys.edge_expression(edge[1])).includes(zenoh.KeyExpr(key))
+    assert not zenoh.KeyExpr(keys.edge_expression(edge[1] + "2")).intersects(zenoh.KeyExpr(key))
+
+
+@pytest.mark.parametrize("key", ["zstate/r1/@edge/a/b", "zstate/r1/@writer/a/b/x", "r1/zstate/@edge/a/b/x"])
+def test_other_keys_are_no_edges(key: str):
+    with pytest.raises(InvalidInput, match="@edge"):
+        keys.parse_edge_key(key)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 What nobody is allowed is denied. Zenoh allows a message when a rule's key expression includes that of
 the message, so that a robot cannot write to others by a wildcard either. ``**`` goes past chunks
 that begin with ``@``, which are named apart: late joiners ask under ``@adv``, presence stands under
-``@writer``, and clocks are compared under ``@clock``. Whoever reads may say so, under ``@reader``.
+``@writer``, static edges are announced under ``@edge``, and clocks are compared under ``@clock``.
+Whoever reads may say so, under ``@reader``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Rule = dict[str, object]
 
 _SAYS = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
 _ASKS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-_APART = ("@adv", "@writer", "@clock", "@reader")
+_APART = ("@adv", "@writer", "@clock", "@edge", "@reader")
 _IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 _HEAD = """\
@@ -135,7 +136,8 @@ def _rules(fleet: Fleet) -> Iterator[Rule]:
     """Ingress is what somebody sends to the router, egress what the router passes on to them."""
     root = f"{fleet.namespace}/zstate" if fleet.namespace else "zstate"
     everything, clock = _under(root), root.removesuffix("zstate") + CLOCK_KEY
-    shared = (f"{root}/*/tf_static/*", f"{root}/*/tf_static/*/@adv/**", f"{root}/*/@writer/**", clock)
+    statics = f"{root}/*/tf_static/*"
+    shared = (statics, f"{statics}/@adv/**", f"{root}/*/@edge/**", f"{root}/*/@writer/**", clock)
     for robot in dict.fromkeys(fleet.robots):
         own = _under(f"{root}/{check_robot(robot)}")
         yield _rule(f"{robot} writes", "ingress", _SAYS, own)

@@ -1,18 +1,19 @@
 """The native key space: one prefix for each robot, one chunk for its name.
 
-==========================================  ==========================================
-``zstate/<robot>/joint_states``             JointState, each sample; a query gets a Past, the last ones
-``zstate/<robot>/tf``                       TransformSample, each sample; likewise
-``zstate/<robot>/tf_static/<writer>``       StaticTransforms, latched
-``zstate/<robot>/robot_description``        RobotDescription, latched
-``zstate/<robot>/joint_commands``           JointCommand, to a driver
-``zstate/<robot>/lookup``                   a queryable
-``zstate/<robot>/status/<id>``              Status of one writer, once a second while read
-``zstate/<robot>/@writer/<stream>/<id>``    liveliness token of one writer
-``zstate/<robot>/@clock/<id>``              a queryable: what time it is by that writer's clock
-``zstate/@reader/<robot>/<stream>/<id>``    liveliness token of one reader
-``zstate/clock``                            Clock
-==========================================  ==========================================
+==============================================  ==========================================
+``zstate/<robot>/joint_states``                 JointState, each sample; a query gets a Past, the last ones
+``zstate/<robot>/tf``                           TransformSample, each sample; likewise
+``zstate/<robot>/tf_static/<writer>``           StaticTransforms, latched
+``zstate/<robot>/robot_description``            RobotDescription, latched
+``zstate/<robot>/joint_commands``               JointCommand, to a driver
+``zstate/<robot>/lookup``                       a queryable
+``zstate/<robot>/status/<id>``                  Status of one writer, once a second while read
+``zstate/<robot>/@writer/<stream>/<id>``        liveliness token of one writer
+``zstate/<robot>/@clock/<id>``                  a queryable: what time it is by that writer's clock
+``zstate/<robot>/@edge/<child>/<parent>/<id>``  liveliness token of one who is about to place a static edge
+``zstate/@reader/<robot>/<stream>/<id>``        liveliness token of one reader
+``zstate/clock``                                Clock
+==============================================  ==========================================
 """
 
 from __future__ import annotations
@@ -149,6 +150,27 @@ def parse_clock_key(key: str) -> tuple[str, str]:
     if len(chunks) == 4 and chunks[0] == "zstate" and chunks[2] == "@clock":
         return chunks[1], chunks[3]
     raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@clock/<identity>'")
+
+
+def edge_key(robot: str, edge: tuple[str, str], identity: str) -> str:
+    """The token of one who is about to place ``edge``: parent and child, named in full."""
+    parent, child = (quote(frame, safe="") for frame in edge)
+    return f"zstate/{check_robot(robot)}/@edge/{child}/{parent}/{identity}"
+
+
+def edge_expression(child: str) -> str:
+    """The key expression of all who are about to place ``child``, for whichever robot."""
+    return f"zstate/*/@edge/{quote(child, safe='')}/*/*"
+
+
+def parse_edge_key(key: str) -> tuple[str, tuple[str, str], str]:
+    """Robot, edge and identity in an ``edge_key``. Raises InvalidInput for any other key."""
+    chunks = key.split("/")
+    if len(chunks) == 6 and chunks[0] == "zstate" and chunks[2] == "@edge":
+        return chunks[1], (unquote(chunks[4]), unquote(chunks[3])), chunks[5]
+    raise InvalidInput(
+        f"the key {key!r} is not of the form 'zstate/<robot>/@edge/<child>/<parent>/<identity>'"
+    )
 
 
 def robot_of(key: str) -> str:
