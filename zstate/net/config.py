@@ -27,7 +27,8 @@ ROUTER_ENDPOINT = "tcp/127.0.0.1:7447"
 SETTINGS: dict[str, object] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": True,
-    "scouting/delay": 200,  # how long opening waits for peers where nobody answers yet
+    # How long opening waits for those it is told of. Who has just gone is told of, too, and never answers.
+    "scouting/delay": 20,
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
     "transport/link/tx/lease": 3000,
@@ -135,7 +136,12 @@ def given_config(
 
 def _mode(mode: Mode) -> dict[str, object]:
     if mode == "lan":
-        return {"mode": "peer", "scouting/multicast/enabled": True, "scouting/gossip/enabled": True}
+        return {
+            "mode": "peer",
+            "scouting/multicast/enabled": True,
+            "scouting/gossip/enabled": True,
+            "scouting/delay": 200,  # to be found takes a while
+        }
     return {"mode": "peer" if mode == "loopback" else mode}
 
 

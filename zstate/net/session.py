@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import math
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
@@ -192,6 +194,7 @@ class Session(Closing):
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
         self.twin = twin
+        _OPEN.add(self)
 
     def __repr__(self) -> str:
         return f"Session({self.zid}{', closed' if self._closed else ''})"
@@ -239,6 +242,16 @@ class Session(Closing):
         if self._companion is not None:
             self._companion.close()
         self._raw.close()
+
+
+_OPEN: weakref.WeakSet[Session] = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    # A thread that is inside Zenoh as Python shuts down aborts the process.
+    for session in tuple(_OPEN):
+        session.close()
 
 
 def _run_bounded(action: Callable[[], None]) -> None:
