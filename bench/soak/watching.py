@@ -85,7 +85,7 @@ class _Ages:
 
     def report(self) -> dict[str, Any]:
         seen: NDArray[np.int64] = np.cumsum(self._counts)
-        middle, high = (int(np.searchsorted(seen, part * seen[-1])) / 10.0 for part in (0.5, 0.99))
+        middle, high = (seen.searchsorted([0.5 * seen[-1], 0.99 * seen[-1]]) / 10.0).tolist()
         return {
             "looks": int(seen[-1]),
             "age_ms_p50_p99_max": [middle, high, round(self._largest, 2)],
