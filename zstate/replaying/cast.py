@@ -34,7 +34,7 @@ class Cast(Closing):
     Robots with one of ``models`` get a StatePublisher, which computes their transforms anew where it
     was their own publisher that wrote them; everything else is said as it was. ``standing`` is what
     holds from the beginning. What cannot be said is counted in ``tally``.
-    Raises SecondWriter for robots with a model that somebody else writes now, but with ``takeover``.
+    Raises SecondWriter where somebody else writes the same now, but with ``takeover``.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class Cast(Closing):
         self._tally = tally
         self._standing = standing
         self._modelled, self._computed = Unmodelled(), Unmodelled()
+        self._sessions: set[int] = set()
         self._robots: dict[str, _Robot] = {}
         self._others: dict[str, Verbatim] = {}
         with ExitStack() as opening:
@@ -61,7 +62,9 @@ class Cast(Closing):
             for robot, model in models.items():
                 self._robots[robot] = self._open(robot, model, _is_computed(robot, speakers))
             for robot, streams in self._verbatim_streams(speakers).items():
-                self._others[robot] = Verbatim(session, wires, robot, streams)
+                self._others[robot] = Verbatim(
+                    session, wires, robot, streams, cast=self._sessions, takeover=takeover
+                )
                 opening.enter_context(self._others[robot])
             for said in (*standing.descriptions.values(), *standing.statics):
                 self._say_counted(said)
@@ -71,7 +74,9 @@ class Cast(Closing):
         self._modelled.learn(robot, model)
         if is_computed:
             self._computed.learn(robot, model)
-        return _Robot(self._session, self._wires, robot, model, is_computed, self._takeover)
+        opened = _Robot(self._session, self._wires, robot, model, is_computed, self._takeover)
+        self._sessions.add(opened.session_id)
+        return opened
 
     def _verbatim_streams(self, speakers: Iterable[Speaker]) -> dict[str, list[Stream]]:
         streams: dict[str, list[Stream]] = {}
@@ -172,6 +177,11 @@ class _Robot(Closing):
             clock=ManualClock(domain=SIMULATED),
             takeover=takeover,
         )
+
+    @property
+    def session_id(self) -> int:
+        """What others know its messages by."""
+        return self._publisher.description().session
 
     def publish(self, state: JointState) -> None:
         """Raises MessageError and InvalidInput for what cannot be said."""

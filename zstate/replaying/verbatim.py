@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import secrets
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, contextmanager
 
 from zstate.clock import SIMULATED
 from zstate.closing import Closing
+from zstate.net.claims import Claim
 from zstate.net.outlets import LatchedOutlet, Outlets, StreamOutlet
+from zstate.net.placing import Edge, named_edges, placing
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
@@ -20,21 +22,40 @@ from zstate.wire.messages import (
     StaticTransforms,
     TransformSample,
 )
+from zstate.wire.writer import Announced
 
 
 class Verbatim(Closing):
     """Publishes messages of ``robot`` on all ``wires``, with a session and sequence numbers of its own.
 
     ``streams`` are announced at once, latched values with the first of their name. A message that one of
-    the wires cannot say raises InvalidInput, and is said on none.
+    the wires cannot say raises InvalidInput, and is said on none. Where somebody else who lives writes
+    the same on the native wire, SecondWriter is raised; not with ``takeover``. The static edges of those
+    whose sessions are in ``cast``, ours among them, may be of one frame, as they were.
     """
 
-    def __init__(self, session: Session, wires: Sequence[str], robot: str, streams: Sequence[Stream]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        wires: Sequence[str],
+        robot: str,
+        streams: Sequence[Stream],
+        *,
+        cast: set[int],
+        takeover: bool = False,
+    ) -> None:
+        self._session = session
         self._session_id = secrets.randbits(32)
+        self._robot = robot
+        self._cast = cast
+        self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[Stream] = Counter()
         self._latched: dict[tuple[Stream, str], list[LatchedOutlet]] = {}
-        writer = writer_here(self._session_id)
+        self._placed: dict[str, set[Edge]] = {}
+        self._writer = writer = writer_here(self._session_id)
+        cast.add(self._session_id)
         with ExitStack() as opening:
+            self._claim = self._claimed(opening, [Announced(robot, stream, writer) for stream in streams])
             self._outlets = [
                 opening.enter_context(Outlets(session, wire_named(wire), robot, writer)) for wire in wires
             ]
@@ -45,6 +66,8 @@ class Verbatim(Closing):
 
     def say(self, message: JointState | TransformSample) -> None:
         """One sample."""
+        if self._claim is not None:
+            self._claim.check()
         stream: Stream = "joint_states" if isinstance(message, JointState) else "tf"
         head = (message.stamp, self._seqs[stream], self._session_id, message.order)
         if isinstance(message, JointState):
@@ -70,17 +93,44 @@ class Verbatim(Closing):
         """All static edges of one ``writer``; none at all take back what it said before."""
         key: tuple[Stream, str] = ("tf_static", writer)
         if statics.edges:
-            for outlet in self._latch(*key):
-                outlet.set(StaticTransforms(self._session_id, statics.edges, statics.poses))
+            outlets = self._latch(*key)
+            with self._placing(statics, writer):
+                for outlet in outlets:
+                    outlet.set(StaticTransforms(self._session_id, statics.edges, statics.poses))
         else:
             for outlet in self._latched.get(key, ()):
                 outlet.withdraw()
+            self._placed.pop(writer, None)
 
     def _latch(self, stream: Stream, writer: str) -> list[LatchedOutlet]:
         if (stream, writer) not in self._latched:
-            opened = [outlets.latched(stream, writer) for outlets in self._outlets]
+            said = self._said(stream, writer)
+            with ExitStack() as opening:
+                claim = self._claimed(opening, [said])
+                opened = [outlets.latched(stream, writer) for outlets in self._outlets]
+                if claim is not None:
+                    claim.settle()
+                self._opened.push(opening.pop_all())
             self._latched[stream, writer] = opened
         return self._latched[stream, writer]
+
+    def _said(self, stream: Stream, writer: str) -> Announced:
+        return Announced(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
+
+    def _claimed(self, opening: ExitStack, wanted: Sequence[Announced]) -> Claim | None:
+        return opening.enter_context(Claim(self._session, wanted)) if self._is_alone and wanted else None
+
+    @contextmanager
+    def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:
+        """While edges of ``writer`` are said, some of them for the first time."""
+        edges = set(named_edges(self._robot, statics))
+        new = sorted(edges - self._placed.get(writer, set())) if self._is_alone else []
+        with ExitStack() as placed:
+            if new:
+                said = self._said("tf_static", writer)
+                placed.enter_context(placing(self._session, said, new, beside=self._cast))
+            yield
+        self._placed[writer] = edges
 
     def close(self) -> None:
         """Stop; who has the latched values keeps them. A second call does nothing."""
