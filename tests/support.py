@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 
 DEADLINE_S = 15.0
+SOON_S = 3.0
+"""Well within a second, and what a busy machine adds to that."""
 
 
 def a_free_port() -> int:
