@@ -108,6 +108,13 @@ def test_robots_on_the_other_side_of_an_option_are_found(spawn: Spawn, free_port
     assert found["next"] == "zstate doctor rrbot"
 
 
+def test_where_the_router_is_missing_robots_of_this_host_are_found(free_port: int):
+    with standing():
+        found = broken_link("--connect", f"tcp/127.0.0.1:{free_port}")
+    assert found["name"] == "network"
+    assert "without --connect, among the programs of this host: 'rrbot'" in found["text"]
+
+
 def test_a_robot_without_its_driver_lacks_joint_states():
     with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
         found = broken_link("rrbot")

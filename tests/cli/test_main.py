@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
+from support import SOON_S
 
 from zstate import connect, load_model
 from zstate.sources import SubscribedSource
@@ -68,7 +69,9 @@ def test_a_router_that_does_not_answer_is_named(tmp_path: Path, free_port: int):
     impatient = tmp_path / "impatient.json5"
     impatient.write_text("{connect: {timeout_ms: 200, exit_on_failure: true}}")
     given = ("--config", str(impatient), "--mode", "client", "--connect", endpoint)
-    assert f"nothing answers at {endpoint!r}" in failure("joints", RRBOT, *given)
+    message = failure("joints", RRBOT, *given)
+    assert f"nothing answers at {endpoint!r} (connection refused" in message
+    assert f"`zstate doctor --connect {endpoint}`" in message
 
 
 def test_ctrl_c_ends_also_the_wait_for_a_router(spawn: Spawn, free_port: int):
@@ -95,7 +98,7 @@ def test_being_asked_to_end_is_in_order_too(spawn: Spawn, number: signal.Signals
     began = time.monotonic()
     child.process.send_signal(number)
     assert child.wait() == 128 + number
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < SOON_S
     assert " samples; commanded 100 Hz" in child.line()
     assert "Traceback" not in child.stderr
 

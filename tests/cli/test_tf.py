@@ -138,7 +138,10 @@ def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
         answer = json.loads(zstate("tf", "base", "lower", "--at", as_printed, "--json").stdout)
         assert answer["stamp"] == soon
         message = failure("tf", "base", "lower", "--at", str(soon - 3_600 * 10**9))
+        other = failure("tf", "base", "lower", "--at", "250.655")
     assert "before the oldest sample heard of 'rrbot/base' -> 'rrbot/upper'" in message
+    assert "asked for 250.655000000, and samples of 'rrbot/base' -> 'rrbot/upper' are stamped" in other
+    assert "another time" in other
 
 
 @pytest.mark.parametrize("stamp", ["noon", "1.0000000001", "nan", "1e40"])

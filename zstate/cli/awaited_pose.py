@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from zstate.cli.console import fail, note
 from zstate.cli.roster import Roster
+from zstate.clock import stamp_text
 from zstate.errors import InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
 
 if TYPE_CHECKING:
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
 
 # Whoever has answers usually gives the first one sooner; waiting is mentioned only afterwards.
 _GRACE_S = 0.5
+
+# Nobody asks for what was so long before a command began; stamps of two clocks are further apart.
+_ANOTHER_TIME_NS = 365 * 86_400 * 1_000_000_000
 
 
 class AwaitedPose:
@@ -81,6 +85,12 @@ class AwaitedPose:
         assert reason.oldest is not None
         assert reason.edge is not None
         edge = self._words.explained(" -> ".join(map(repr, reason.edge)))
+        if reason.oldest - reason.requested > _ANOTHER_TIME_NS:
+            fail(
+                f"asked for {stamp_text(reason.requested)}, and samples of {edge} are stamped "
+                f"{stamp_text(reason.oldest)} and later: that is another time (of a simulation, or since a "
+                "machine was switched on), or another unit"
+            )
         fail(
             f"asked {duration_text(reason.oldest - reason.requested)} before the oldest sample heard of "
             f"{edge}; this command knows only what comes while it runs: "

@@ -89,7 +89,7 @@ def _connect(network: Network, timeout_s: float | None) -> Session:
     from zstate.net.session import connect
 
     # In a thread of its own: a signal ends the wait for it, which Zenoh's would not.
-    return Worker(
+    worker = Worker(
         "zstate connect",
         lambda: connect(
             network.config,
@@ -99,4 +99,23 @@ def _connect(network: Network, timeout_s: float | None) -> Session:
             timeout_s=timeout_s or _ROUTER_WITHIN_S,
             credentials=network.credentials,
         ),
-    ).result()
+    )
+    try:
+        return worker.result()
+    except Unreachable as error:
+        raise _explained(error) from None
+
+
+def _explained(error: Unreachable) -> Unreachable:
+    from zstate.cli.probe import unanswered
+
+    if not error.endpoints:
+        return error
+    text, then = unanswered(error.endpoints)
+    options = "".join(f" --connect {endpoint}" for endpoint in error.endpoints)
+    advice = (
+        f"try `{then.partition('  #')[0]}`, or `zstate doctor{options}`"
+        if then
+        else f"`zstate doctor{options}`"
+    )
+    return Unreachable(f"{text}; {advice}", endpoints=error.endpoints)

@@ -91,7 +91,8 @@ class NativeWords:
         if not streams:
             return self.unknown(robot, robots)
         if stream in streams:
-            return f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample comes"
+            what = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample comes"
+            return f"{what}; `zstate doctor {robot}` says why"
         command = "joints" if stream == "joint_states" else "publish"
         return f"nobody writes {stream} of {robot!r}{' any more' * ended}; `zstate {command} {robot}` would"
 

@@ -16,6 +16,7 @@ from zstate.cli.doctor.network_checks import (
     installation_check,
     network_check,
     refused_check,
+    with_options,
 )
 from zstate.cli.network import Network, open_session
 from zstate.errors import ModelError, ZStateError
@@ -96,8 +97,7 @@ def _absent_check(
         return broken("robots", text, f"zstate doctor {(near or names)[0]}{_connecting(network)}")
     for options, others in elsewhere(network) if wire == "native" else ():
         found = next((name for name in others if name == robot), others[0])
-        where = f"with{options}" if options else "without options, among the programs of this host"
-        text = f"{what} here; {where}: {', '.join(map(repr, others))}"
+        text = f"{what} here; {with_options(options)}: {', '.join(map(repr, others))}"
         return broken("robots", text, f"zstate doctor {found}{options}")
     if session.twin is not None:
         what += f", or the router shows none to {session.twin.identity}"

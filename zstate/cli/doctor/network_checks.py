@@ -10,8 +10,8 @@ from importlib import metadata
 from zstate import __version__
 from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, warning
-from zstate.cli.doctor.probe import is_open, objection
 from zstate.cli.network import Network
+from zstate.cli.probe import is_open, objection, unanswered
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
@@ -49,10 +49,10 @@ def installation_check() -> Check:
 def refused_check(error: ZStateError, network: Network) -> Check:
     """There is no session, and ``error`` says why."""
     if isinstance(error, Unreachable) and error.endpoints:
-        found = {endpoint: objection(endpoint) for endpoint in error.endpoints}
-        reasons = [f"{endpoint!r} ({why.text if why else 'no answer'})" for endpoint, why in found.items()]
-        then = next((why.next for why in found.values() if why), f"zstate config{_options(network)}")
-        return broken("network", f"nothing answers at {' or '.join(reasons)}", then)
+        text, then = unanswered(error.endpoints)
+        for options, robots in elsewhere(network):
+            text += f"; {with_options(options)}: {', '.join(map(repr, robots))}"
+        return broken("network", text, then or f"zstate config{_options(network)}")
     if isinstance(error, AccessDenied):
         endpoint = error.endpoint
         if error.reason in ("TLS demanded", "no TLS there"):
@@ -150,6 +150,11 @@ def elsewhere(network: Network) -> Iterator[tuple[str, tuple[str, ...]]]:
             yield options, tuple(info.name for info in robots)
         elif ros:
             yield f"{options} --wire ros2", tuple(info.name for info in ros)
+
+
+def with_options(options: str) -> str:
+    """Where robots are seen with ``options`` as ``elsewhere`` gives them."""
+    return f"with{options}" if options else "without --connect, among the programs of this host"
 
 
 def _options(network: Network) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
+from collections.abc import Sequence
 from typing import NamedTuple
 
 _ADDRESS = re.compile(r"(?:tcp|tls|ws)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
@@ -43,6 +44,14 @@ def _listening(host: str, port: int, endpoint: str) -> str:
     if host == "localhost" or host.startswith(("127.", "::1")):
         return f"zstate router --listen {endpoint}"
     return f"zstate router --listen {endpoint.partition('/')[0]}/0.0.0.0:{port}  # on {host}"
+
+
+def unanswered(endpoints: Sequence[str]) -> Objection:
+    """Why nobody answers at any of ``endpoints``."""
+    found = {endpoint: objection(endpoint) for endpoint in endpoints}
+    reasons = [f"{endpoint!r} ({why.text if why else 'no answer'})" for endpoint, why in found.items()]
+    then = next((why.next for why in found.values() if why), "")
+    return Objection(f"nothing answers at {' or '.join(reasons)}", then)
 
 
 def is_open(endpoint: str) -> bool:
