@@ -65,7 +65,8 @@ def stamping(stamp: Callable[[], int], streams: tuple[Stream, ...] = EVERYTHING)
             thread.join()
 
 
-def test_of_a_robot_that_is_well_every_link_is_ok():
+def test_of_a_robot_that_is_well_every_link_is_ok(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZSTATE_KERNEL", "reference")  # wanted, it is no worry
     with standing():
         said = diagnosed("rrbot", code=0)
         text = zstate("doctor", "rrbot").stdout.decode()
@@ -323,6 +324,15 @@ def test_who_shows_nothing_to_a_router_that_asks_is_told_what_to_show(guarded: s
 
 def test_a_file_is_for_another_command():
     assert "`zstate check arm.urdf`" in failure("doctor", "arm.urdf", code=2)
+
+
+def test_robots_of_ros_are_found_where_there_are_no_others(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    started(spawn, "router", "--ros2", "--listen", endpoint).line()
+    ros = ("--wire", "ros2", "--connect", endpoint)
+    started(spawn, "publish", RRBOT, "--source", "sine", *ros).line()
+    assert broken_link("--connect", endpoint)["next"] == f"zstate doctor --wire ros2 --connect {endpoint}"
+    assert diagnosed(*ros, code=0)["sound"]
 
 
 def test_a_ros_wire_without_a_router_is_told_how_to_begin(free_port: int):

@@ -99,10 +99,19 @@ def _absent_check(
         found = next((name for name in others if name == robot), others[0])
         text = f"{what} here; {with_options(options)}: {', '.join(map(repr, others))}"
         return broken("robots", text, f"zstate doctor {found}{options}")
+    if wire == "native" and session.zenoh.info.routers_zid() and _has_ros(session):
+        text = f"{what} on the native wire; ROS 2 nodes are behind this router, too"
+        return broken("robots", text, f"zstate doctor --wire ros2{_connecting(network)}")
     if session.twin is not None:
         what += f", or the router shows none to {session.twin.identity}"
     text = f"{what}: its publisher is not running" if robot != ANY else what
     return broken("robots", text, f"{_start(robot, wire)}{_connecting(network)}")
+
+
+def _has_ros(session: Session) -> bool:
+    from zstate.net.presence import discover
+
+    return bool(discover(session, 0.3, wire="ros2"))
 
 
 def _start(robot: str, wire: str) -> str:
