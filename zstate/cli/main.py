@@ -10,12 +10,15 @@ from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from types import FrameType
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
 from zstate.cli import logs
 from zstate.errors import ZStateError
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 # name: (section of the help, what it does); zstate.cli.commands.<name> holds the command <name>_command.
 _COMMANDS = {
@@ -48,7 +51,12 @@ _COMMANDS = {
     "ros1": ("Run", "A bridge to ROS 1, in either direction."),
     "up": ("Run", "Start several of these from one file."),
     "init": ("Run", "A commented file for `zstate up`, to begin with."),
+    "completion": ("Run", "What teaches a shell to complete all this."),
 }
+
+
+COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
+"""Set by the function of a shell while it asks what to offer."""
 
 
 class Commands(click.Group):
@@ -64,7 +72,19 @@ class Commands(click.Group):
         assert isinstance(command, click.Command)
         if logs.log_format_option not in command.params:
             command.params.append(logs.log_format_option)
+        if COMPLETION_VARIABLE in os.environ:
+            from zstate.cli.completing import taught
+
+            return taught(command)
         return command
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        from click.shell_completion import CompletionItem
+
+        # As click's own groups do, which import every command for its help.
+        names = [name for name in _COMMANDS if name.startswith(incomplete)]
+        commands = [CompletionItem(name, help=_COMMANDS[name][1]) for name in names]
+        return commands + click.Command.shell_complete(self, ctx, incomplete)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
