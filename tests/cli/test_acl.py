@@ -67,3 +67,13 @@ def test_access_control_for_nobody_is_refused(tmp_path: Path):
     file = tmp_path / "acl.json5"
     file.write_bytes(zstate("acl", "--robot", "r1").stdout)
     assert "nobody is asked for a name" in failure("router", "--acl", str(file))
+
+
+def test_robots_of_ros_are_told_apart_by_their_namespaces():
+    robots = ("--robot", "r1", "--robot", "r2")
+    printed = zstate(
+        "acl", *robots, "--wire", "native", "--wire", "ros2:domain=5,namespace=*"
+    ).stdout.decode()
+    for key in ("zstate/r1/**", "5/r1/**", "5/r1/**/@adv/**", "@ros2_lv/5/*/*/*/NN/*/%r2/**"):
+        assert f'"{key}"' in printed
+    assert "namespace=*" in failure("acl", *robots, "--wire", "ros2")

@@ -1,27 +1,22 @@
 """Who may do what behind a router: its access control, from the key space.
 
 What nobody is allowed is denied. Zenoh allows a message when a rule's key expression includes that of
-the message, so that a robot cannot write to others by a wildcard either. ``**`` goes past chunks
-that begin with ``@``, which are named apart: late joiners ask under ``@adv``, presence stands under
-``@writer``, static edges are announced under ``@edge``, and clocks are compared under ``@clock``.
-Whoever reads may say so, under ``@reader``.
+the message, so that a robot cannot write to others by a wildcard either.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from zstate.errors import InvalidInput
+from zstate.net.access_rule import Rule
 from zstate.net.json5 import json5_text
-from zstate.wire.keys import CLOCK_KEY, check_robot
+from zstate.net.native_access import NativeAccess
+from zstate.net.ros_access import RosAccess
+from zstate.net.wires import ros_options
+from zstate.wire.keys import check_robot
 
-Rule = dict[str, object]
-
-_SAYS = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
-_ASKS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-_APART = ("@adv", "@writer", "@clock", "@edge", "@reader")
 _IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 _HEAD = """\
@@ -41,7 +36,8 @@ class Fleet:
     which it must not contradict, and the simulated time. A viewer reads everything and writes nothing; an
     operator, moreover, commands joints. A timekeeper, moreover, writes the simulated time.
     Somebody may be several of these. ``namespace`` is that of the sessions behind the router, if they
-    have one. Raises InvalidInput for names that cannot be names of identities.
+    have one. ``wires`` are what they speak: "native", and "ros2" with its options, for which see RosAccess.
+    Raises InvalidInput for names that cannot be names of identities.
     """
 
     robots: tuple[str, ...] = ()
@@ -49,6 +45,7 @@ class Fleet:
     operators: tuple[str, ...] = ()
     timekeepers: tuple[str, ...] = ()
     namespace: str = ""
+    wires: tuple[str, ...] = ("native",)
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -91,18 +88,21 @@ def access_text(fleet: Fleet) -> str:
         "operators": fleet.operators,
         "timekeepers": fleet.timekeepers,
     }
+    if fleet.wires != ("native",):
+        roles["wires"] = fleet.wires
     lines = [f"{role + ':':<13}{', '.join(names)}\n" for role, names in roles.items() if names]
     return json5_text({"access_control": access_control(fleet)}, head=_HEAD.format(roles="".join(lines)))
 
 
 def access_control(fleet: Fleet) -> dict[str, object]:
     """The section ``access_control`` of a Zenoh configuration."""
-    roles = {name: list(_roles(name, fleet)) for name in fleet.names}
+    wires = [_access(fleet, wire) for wire in dict.fromkeys(fleet.wires)]
+    roles = {name: [rule for wire in wires for rule in wire.roles(name)] for name in fleet.names}
     used = {rule for rules in roles.values() for rule in rules}
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": [rule for rule in _rules(fleet) if rule["id"] in used],
+        "rules": [rule for wire in wires for rule in wire.rules() if rule["id"] in used],
         "subjects": [subject for name in fleet.names for subject in _subjects(name)],
         "policies": [
             {"id": name, "rules": rules, "subjects": [str(one["id"]) for one in _subjects(name)]}
@@ -111,58 +111,25 @@ def access_control(fleet: Fleet) -> dict[str, object]:
     }
 
 
+def _access(fleet: Fleet, wire: str) -> NativeAccess | RosAccess:
+    kind, _, options = wire.partition(":")
+    if wire == "native":
+        return NativeAccess(fleet)
+    if kind != "ros2":
+        raise InvalidInput(
+            f"there is no access control for the wire {wire!r}; there is for 'native' and 'ros2'"
+        )
+    if fleet.namespace:
+        raise InvalidInput(
+            f"ROS nodes have no Zenoh namespace, such as {fleet.namespace!r}; write 'ros2:namespace=NAME' "
+            "for that of their topics"
+        )
+    return RosAccess(fleet, ros_options(options))
+
+
 def _subjects(name: str) -> tuple[Rule, Rule]:
     # Apart, as one subject with both would be somebody who has both.
     return (
         {"id": f"certificate {name}", "cert_common_names": [name]},
         {"id": f"user {name}", "usernames": [name]},
     )
-
-
-def _roles(name: str, fleet: Fleet) -> Iterator[str]:
-    if name in fleet.robots:
-        yield from (f"{name} writes", f"{name} reads", f"{name} is given")
-        yield from ("robots read", "robots are given", "robots are asked")
-    yield "readers are known"
-    if name in (*fleet.viewers, *fleet.operators, *fleet.timekeepers):
-        yield from ("viewers read", "viewers are given")
-    if name in fleet.operators:
-        yield "operators command"
-    if name in fleet.timekeepers:
-        yield "timekeepers write"
-
-
-def _rules(fleet: Fleet) -> Iterator[Rule]:
-    """Ingress is what somebody sends to the router, egress what the router passes on to them."""
-    root = f"{fleet.namespace}/zstate" if fleet.namespace else "zstate"
-    everything, clock = _under(root), root.removesuffix("zstate") + CLOCK_KEY
-    statics = f"{root}/*/tf_static/*"
-    shared = (statics, f"{statics}/@adv/**", f"{root}/*/@edge/**", f"{root}/*/@writer/**", clock)
-    for robot in dict.fromkeys(fleet.robots):
-        own = _under(f"{root}/{check_robot(robot)}")
-        yield _rule(f"{robot} writes", "ingress", _SAYS, own)
-        yield _rule(f"{robot} reads", "ingress", _ASKS, own)
-        yield _rule(f"{robot} is given", "egress", _SAYS, own)
-    yield _rule("robots read", "ingress", _ASKS, shared)
-    yield _rule("robots are given", "egress", _SAYS, shared)
-    # What is asked of all robots at once is asked of each; only its own is in what it answers.
-    yield _rule("robots are asked", "egress", _ASKS, everything)
-    yield _rule("viewers read", "ingress", _ASKS, everything)
-    yield _rule("viewers are given", "egress", _SAYS, everything)
-    yield _rule("readers are known", "ingress", ("liveliness_token",), (f"{root}/@reader/**",))
-    yield _rule("operators command", "ingress", ("put",), (f"{root}/*/joint_commands",))
-    yield _rule("timekeepers write", "ingress", ("put",), (clock,))
-
-
-def _under(key: str) -> tuple[str, ...]:
-    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _APART))
-
-
-def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Rule:
-    return {
-        "id": name,
-        "permission": "allow",
-        "flows": [flow],
-        "messages": list(messages),
-        "key_exprs": list(keys),
-    }

@@ -34,7 +34,7 @@ class Outlets(Closing):
         place = Place(session.zid, session.next_number())
         self._voice = wire.voice(robot, writer, place, sample_names or SampleNames())
         self._robot = robot
-        self._is_permitted = wire.name != "native"  # what others are permitted, theirs have to say
+        self._is_permitted = wire.name == "ros2dds"  # what bridges are permitted, theirs have to say
         self._opened = ExitStack()
         if self._voice.token is not None:
             self._opened.enter_context(announce(session, self._voice.token))

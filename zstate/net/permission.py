@@ -55,7 +55,7 @@ def _denied(twin: Twin, robot: str, token: str) -> AccessDenied:
         f"the router does not let {twin.identity} write as robot {robot!r}: {token!r} does not come through, "
         "and samples would be lost like it, without a word. Is this the identity of that robot? If so, the "
         f"access control of the router lacks the rules '{robot} writes' and '{robot} reads', which "
-        f"`zstate acl --robot {robot}` prints; routers read it when they start",
+        f"`zstate acl --robot {robot}` prints, with --wire for those of ROS; routers read it when they start",
         reason="not allowed to write",
         endpoint=token,
     )

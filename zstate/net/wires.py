@@ -41,10 +41,11 @@ def wire_named(name: str) -> Wire:
     # Loaded for those who speak to ROS, with its hash library.
     from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire  # noqa: PLC0415
 
-    return Ros2Wire(_ros_options(options)) if kind == "ros2" else Ros2DdsWire(_ros_options(options))
+    return Ros2Wire(ros_options(options)) if kind == "ros2" else Ros2DdsWire(ros_options(options))
 
 
-def _ros_options(text: str) -> Ros2Options:
+def ros_options(text: str) -> Ros2Options:
+    """What follows "ros2:" in the name of a wire, with the domain of ROS_DOMAIN_ID. Raises InvalidInput."""
     from zstate.wire.ros2.options import Ros2Options  # noqa: PLC0415 - as above
 
     domain = os.environ.get(DOMAIN_VARIABLE, "")

@@ -22,21 +22,37 @@ def _named(option: str, what: str) -> Callable[[Command], Command]:
 @click.option(
     "--namespace", default="", metavar="KEY", help="The namespace of their sessions, if they have one."
 )
+@click.option(
+    "--wire",
+    "wires",
+    multiple=True,
+    default=("native",),
+    show_default=True,
+    metavar="WIRE",
+    envvar="ZSTATE_WIRE",
+    help="What they speak, as in `--wire native --wire 'ros2:domain=5,namespace=*'`; may be repeated.",
+)
 def acl_command(
+    *,
     robot: tuple[str, ...],
     viewer: tuple[str, ...],
     operator: tuple[str, ...],
     timekeeper: tuple[str, ...],
     namespace: str,
+    wires: tuple[str, ...],
 ) -> None:
     """Print who may do what in a fleet, as a router's configuration (JSON5).
 
     What is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`), or a
     user; that of a robot is also its name in the keys. Somebody may be several of these: a robot that
-    looks at the others is a viewer, too. The native keys are covered, not those of ROS wires.
+    looks at the others is a viewer, too.
+
+    Robots that speak ROS 2 (rmw_zenoh_cpp) have a namespace each: topics, services and nodes in it are
+    theirs, /tf and /tf_static everybody's unless tf=namespace. There an operator may call services.
 
     \b
     zstate acl --robot r1 --robot r2 --viewer desk >acl.json5
+    zstate acl --robot r1 --robot r2 --viewer rviz --wire 'ros2:namespace=*,tf=namespace' >acl.json5
     zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
     """
     from zstate.net.access import Fleet, access_text
@@ -45,4 +61,4 @@ def acl_command(
         raise click.UsageError(
             "name somebody: --robot NAME, --viewer NAME, --operator NAME or --timekeeper NAME"
         )
-    say(access_text(Fleet(robot, viewer, operator, timekeeper, namespace)).rstrip("\n"))
+    say(access_text(Fleet(robot, viewer, operator, timekeeper, namespace, wires)).rstrip("\n"))
