@@ -62,7 +62,7 @@ def test_static_edges_that_somebody_places_are_not_replayed_but_with_takeover(
 
 
 def test_a_replay_keeps_others_from_writing_the_same(sessions, cart: Path):
-    with Replayer(sessions[0], cart, loop=True) as replayer:
+    with Replayer(sessions[0], cart, rate=0.01) as replayer:
         thread = threading.Thread(target=replayer.run)
         thread.start()
         until(lambda: tokens_now(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
