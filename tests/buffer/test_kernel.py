@@ -58,8 +58,10 @@ def test_histories_keep_the_same_samples(column, order, width: int, shuffled: bo
     copy = compiled.History(width, SPAN_NS)
     copy.replace(theirs.view.kept_stamps(), theirs.view.kept_rows())
     assert kept(copy) == kept(theirs)
+    assert ours.newest == theirs.newest == max(column, default=None)
     ours.clear()
     assert kept(ours) == ([], [])
+    assert ours.newest is None
 
 
 @given(st.lists(st.integers(0, 400), min_size=1, max_size=80, unique=True), st.lists(st.integers(-5, 405)))

@@ -34,7 +34,7 @@
 
 /* Grows with every change of what Python sees of these files, so that a library built from an older
  * source (an editable install that was not built again) is recognised and not used. */
-#define REVISION 2
+#define REVISION 3
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import AsyncIterable, Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,7 +18,6 @@ from zstate.buffer.join import Join, frame_of, stamp_of
 from zstate.buffer.plan import Plan, check_stamps, joints_path
 from zstate.buffer.questions import Question, Questions, seconds
 from zstate.buffer.tracks import JointTrack
-from zstate.buffer.waiting import Waiter
 from zstate.buffer.watch import Watch
 from zstate.clock import Clock, check_stamp, wait_in_slices
 from zstate.errors import LookupFailed, timed_out
@@ -203,13 +203,7 @@ class TransformBuffer(Questions):
         still be unknown. The callback runs on the thread that inserts: keep it short.
         """
 
-        def look(waiter: Waiter) -> Transform | LookupFailed:
-            outcome = self._try(question, waiter)
-            if isinstance(outcome, Transform):
-                self._expect_newer(question, outcome, waiter)
-            return outcome
-
-        question = self._question(target, source, None)
+        look = partial(self._newest, self._question(target, source, None))
         return Watch(self._room, look, callback, translation_m, rotation_rad)
 
     def join(

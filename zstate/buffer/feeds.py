@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from zstate.buffer.edge import Edge
 from zstate.buffer.tracks import ClockOffsets, PoseTrack
-from zstate.buffer.tree import Edge, Tree
+from zstate.buffer.tree import Tree
 from zstate.errors import InsertRefused
 
 EdgeNames = tuple[str, str]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from zstate.buffer.edge import Edge
 from zstate.buffer.tracks import coverage
-from zstate.buffer.tree import Edge
 
 
 @dataclass(frozen=True, slots=True)

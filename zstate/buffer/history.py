@@ -63,6 +63,12 @@ class History:
         stamps = np.empty(capacity, dtype=np.int64)
         return View(stamps, np.empty((capacity, self.width)), 0, 0)
 
+    @property
+    def newest(self) -> int | None:
+        """The last stamp [ns]; None without any."""
+        view = self.view
+        return view.newest if view.size else None
+
     def replace(self, stamps: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
         """Hold a copy of these samples, ascending and already within the span, and no others."""
         fresh = self._empty(max(_SMALLEST_CAPACITY, len(stamps)))

@@ -64,6 +64,7 @@ class Path:
         self.steps_to_target = steps_to_target
         self.steps_to_source = steps_to_source
         self.uses = tuple(uses)
+        self.tracks = tuple(use.track for use in uses)
         self._take_views = take_views
 
     def at(self, stamp: object = None, /) -> Transform | None:

@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from zstate import se3
 from zstate.buffer.cells import Cell, Line, Pose7, Turn
 from zstate.buffer.compiled import make_path
+from zstate.buffer.edge import Edge
 from zstate.buffer.path import Path, Stamps, TrackUse, ViewTaker
 from zstate.buffer.steps import Fixed, Given, Hinge, Planar, Slide, Step
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
-from zstate.buffer.tree import Edge, Tree
+from zstate.buffer.tree import Tree
 from zstate.clock import check_stamp
 from zstate.errors import InvalidInput
 from zstate.transform import Transform

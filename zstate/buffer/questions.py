@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from zstate.buffer.footing import Footing
 from zstate.buffer.path import Path
 from zstate.buffer.plan import compile_path, transform_of
 from zstate.buffer.store import Store
 from zstate.buffer.tracks import Track
-from zstate.buffer.waiting import Waiter
+from zstate.buffer.waiting import Expected, Marks, Waiter
 from zstate.clock import Clock, check_stamp
 from zstate.errors import (
     AmbiguousFrame,
     ClockMismatch,
+    Disconnected,
     InFuture,
     InPast,
     InvalidInput,
@@ -26,6 +28,9 @@ from zstate.transform import Transform
 # So many pairs of frames are remembered compiled; more than any program asks for on purpose.
 _MOST_PATHS = 4096
 
+# What only a change of the tree can mend.
+_NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected)
+
 
 class Question(NamedTuple):
     """What is asked, checked."""
@@ -37,53 +42,52 @@ class Question(NamedTuple):
     max_age_s: float | None = None
 
 
+class KnownPath(NamedTuple):
+    """A compiled path, good at the ``version`` of the tree and while its ``footing`` holds."""
+
+    version: int
+    path: Path
+    footing: Footing
+
+
 class Questions(Store):
     """The half of ``TransformBuffer`` that finds one answer, or the reason why there is none."""
 
     def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
-        self._paths: dict[tuple[str, str], tuple[int, Path]] = {}
+        self._paths: dict[tuple[str, str], KnownPath] = {}
 
     def _try(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
         """An answer; or the reason against it, with ``waiter`` told what would change that."""
         version = self._tree.version
-        waiter.expect(version, ())
         try:
             return self._answer(question)
         except LookupFailed as reason:
+            waiter.expect(self._mending(question, reason), version)
             if _is_final(question, reason):
                 raise
-            waiter.expect(version, self._marks(question, reason), question.at)
-            # What arrived between the question and the expectation woke nobody.
-            if waiter.is_met(self._tree.version):
-                waiter.wake()
             return reason
 
-    def _marks(self, question: Question, reason: LookupFailed) -> list[tuple[Track, int | None]]:
-        """How new each track of the path must be before asking again may help."""
+    def _mending(self, question: Question, reason: LookupFailed) -> Expected:
+        """What may turn the reason into an answer."""
+        if isinstance(reason, _NO_PATH):
+            with self._lock:
+                return Expected(self._tree.footing(question.target, question.source))
         try:
-            uses = self._path(question.target, question.source).uses
+            known = self._known_path(question.target, question.source)
         except LookupFailed:
-            return []
-        at = None if question.at is None else question.at - question.predict_ns
-        if isinstance(reason, InPast):
-            at = reason.oldest
-        if isinstance(reason, Stale):
-            at = _after(reason.requested)
-        marks: list[tuple[Track, int | None]] = [(use.track, at) for use in uses]
-        if isinstance(reason, InFuture) and at is not None:
-            # Where prediction is not possible from the samples there are, only a newer one helps.
-            marks += [(use.track, _after(reason.newest)) for use in uses if use.edge == reason.edge]
-        return marks
+            return Expected()  # the tree has changed meanwhile, which is told by its version
+        return Expected(known.footing, _marks(question, reason, known.path), question.at)
 
-    def _expect_newer(self, question: Question, transform: Transform, waiter: Waiter) -> None:
-        """Tell ``waiter`` what would make an answer newer than ``transform``."""
+    def _newest(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
+        """As ``_try``, and ``waiter`` is told to expect a newer answer than this."""
         version = self._tree.version
-        uses = self._path(question.target, question.source).uses
-        newer = None if transform.stamp is None else transform.stamp + 1
-        waiter.expect(version, [(use.track, newer) for use in uses])
-        if waiter.is_met(self._tree.version):
-            waiter.wake()
+        outcome = self._try(question, waiter)
+        if isinstance(outcome, Transform):
+            known = self._known_path(question.target, question.source)
+            newer = None if outcome.stamp is None else outcome.stamp + 1
+            waiter.expect(Expected(known.footing, dict.fromkeys(known.path.tracks, newer)), version)
+        return outcome
 
     def _question(
         self,
@@ -128,15 +132,41 @@ class Questions(Store):
         self.domain.decide(clock.domain)
 
     def _path(self, target: str, source: str) -> Path:
-        cached = self._paths.get((target, source))
-        if cached is not None and cached[0] == self._tree.version:
-            return cached[1]
+        return self._known_path(target, source).path
+
+    def _known_path(self, target: str, source: str) -> KnownPath:
+        version = self._tree.version
+        known = self._paths.get((target, source))
+        if known is not None and known.version == version:
+            return known
+        if known is not None and self._tree.holds(known.footing):
+            known = known._replace(version=version)
+        else:
+            known = self._compiled(target, source)
+        if len(self._paths) >= _MOST_PATHS:
+            self._paths = {}
+        self._paths[target, source] = known
+        return known
+
+    def _compiled(self, target: str, source: str) -> KnownPath:
         with self._lock:
             path = compile_path(self._tree, target, source, self._take_views)
-            if len(self._paths) >= _MOST_PATHS:
-                self._paths = {}
-            self._paths[target, source] = (self._tree.version, path)
-        return path
+            return KnownPath(self._tree.version, path, self._tree.footing(target, source))
+
+
+def _marks(question: Question, reason: LookupFailed, path: Path) -> Marks:
+    """How new each track of the path must be before asking again may help."""
+    at = None if question.at is None else question.at - question.predict_ns
+    if isinstance(reason, InPast):
+        at = reason.oldest
+    if isinstance(reason, Stale):
+        at = _after(reason.requested)
+    marks: dict[Track, int | None] = {use.track: at for use in path.uses}
+    if isinstance(reason, InFuture) and at is not None and reason.newest is not None:
+        # Where prediction is not possible from the samples there are, only a newer one helps.
+        limiting = [use.track for use in path.uses if use.edge == reason.edge]
+        marks.update((track, max(at, reason.newest + 1)) for track in limiting)
+    return marks
 
 
 def _mismatch(kept: str, clock: Clock, occasion: str) -> ClockMismatch:

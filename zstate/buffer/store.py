@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.domain import Domain
+from zstate.buffer.edge import Edge
 from zstate.buffer.feeds import EdgeNames, Feed, Feeds, TooOld, second_writer
 from zstate.buffer.frames import FrameInfo, frame_info
 from zstate.buffer.history import View, thin
 from zstate.buffer.kernel import insert_together
 from zstate.buffer.path import TrackUse
-from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack
-from zstate.buffer.tree import Edge, Tree
+from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack, Track
+from zstate.buffer.tree import Tree
 from zstate.buffer.waiting import WaitingRoom
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import InsertRefused, InvalidInput
@@ -114,8 +115,12 @@ class Store:
         """
         with self._lock:
             taken = track.take(stamp, positions, velocities)
+        if taken:
+            # The way of nearly every sample, without the call in between.
+            self._room.notify(track)
+            return True
         if taken is not None:
-            return self._count(taken=taken)
+            return self._count(taken=False)
         stamp = check_stamp(stamp)
         numbers = track.check_positions(positions)
         rates = None if velocities is None else track.model.check_velocities(velocities)
@@ -123,13 +128,14 @@ class Store:
             had_velocities = track.has_velocities
             taken = track.insert(stamp, numbers, rates)
             if track.has_velocities != had_velocities:
-                self._tree.version += 1
-        return self._count(taken=taken)
+                self._tree.renew(track)
+        return self._count(track, taken=taken)
 
     def restart(self, track: JointTrack | PoseTrack) -> None:
         """A new epoch: forget the samples of one track, because its writer or its clock began anew."""
         with self._lock:
             track.history.clear()
+        self._room.begin_anew(track)
 
     def insert(self, transform: Transform, *, writer: str | None = None) -> bool:
         """One sample of a moving edge: ``transform.target`` is the parent, ``source`` the child.
@@ -169,7 +175,7 @@ class Store:
                 track.history.insert(stamp, poses[rows].ravel())
             else:
                 self._write_together(feed, stamp, poses)
-        return self._count(taken=True)
+        return self._count(*(track for track, _ in feed), taken=True)
 
     def _write_together(self, feed: Feed, stamp: int, poses: Poses) -> None:
         # Odd while tracks disagree: a reader that sees it asks again under the lock.
@@ -178,9 +184,9 @@ class Store:
         insert_together(histories, stamp, tuple(poses[rows].ravel() for _, rows in feed))
         self._writes += 1
 
-    def _count(self, *, taken: bool) -> bool:
+    def _count(self, *tracks: Track, taken: bool) -> bool:
         if taken:
-            self._room.notify()
+            self._room.notify(*tracks)
         else:
             with self._lock:
                 self.ignored += 1
@@ -206,7 +212,7 @@ class Store:
         with self._lock:
             name = self._tree.named_for_insert(child)
             if name not in self._tree.frames:
-                near = self._tree.near(child)
+                near = self._tree.names.near(child)()
                 hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
                 raise InvalidInput(f"there is no frame {child!r} to withdraw{hint}")
             edge = self._tree.frames[name]
@@ -223,9 +229,10 @@ class Store:
     def clear(self) -> None:
         """Forget every sample. Frames, static edges and robots stay."""
         with self._lock:
-            for edge in self._tree.frames.values():
-                if edge is not None and edge.track is not None and edge.track.history.view.size:
-                    edge.track.history.clear()
+            tracks = [track for track in self._tree.tracks() if track.history.view.size]
+            for track in tracks:
+                track.history.clear()
+        self._room.begin_anew(*tracks)
 
     def keep_around(self, stamps: NDArray[np.int64]) -> None:
         """Forget all samples but the first, the last, and those that answers at ``stamps`` [ns] are made of.
@@ -234,10 +241,8 @@ class Store:
         into memory for whoever asks for few instants of it.
         """
         with self._lock:
-            edges = [edge for edge in self._tree.frames.values() if edge is not None]
-            for track in {id(edge.track): edge.track for edge in edges}.values():
-                if track is not None:
-                    thin(track.history, stamps)
+            for track in self._tree.tracks():
+                thin(track.history, stamps)
 
     def frames(self) -> tuple[FrameInfo, ...]:
         """Every frame ever named, in the order of their first mention."""

@@ -2,93 +2,77 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
-from dataclasses import dataclass
-from difflib import get_close_matches
-from typing import Literal
+from dataclasses import replace
 
-from zstate import se3
-from zstate.buffer.tracks import JointTrack, PoseTrack
+from zstate.buffer.edge import Edge
+from zstate.buffer.footing import Footing
+from zstate.buffer.names import Names
+from zstate.buffer.tracks import JointTrack, Track
 from zstate.errors import AmbiguousFrame, Disconnected, InsertRefused, UnknownFrame
-
-EdgeKind = Literal["joint", "pose", "static"]
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """What places ``child`` on ``parent``.
-
-    A static edge holds its ``pose``; a moving one its ``track`` and its ``index`` among the track's
-    edges. ``robot`` is the joint track of the model the edge belongs to, fixed joints included.
-    """
-
-    parent: str
-    child: str
-    kind: EdgeKind
-    pose: se3.Pose = se3.IDENTITY
-    track: JointTrack | PoseTrack | None = None
-    index: int = 0
-    robot: JointTrack | None = None
-    own_writer: str | None = None
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """(parent, child)."""
-        return (self.parent, self.child)
-
-    @property
-    def writer(self) -> str | None:
-        """Who gives this edge, as far as anybody said."""
-        if self.robot is not None:
-            return self.robot.writer or f"the model of {self.robot.model.name!r}"
-        return self.track.writer if self.track is not None else self.own_writer
 
 
 class Tree:
     """Frames by name, one parent each. Whoever changes it holds the buffer's lock.
 
-    ``version`` grows with every change of an edge, so that compiled paths know when they are old.
+    ``version`` grows with every change of an edge: then what was made of the tree asks whether its footing
+    ``holds``.
     """
 
     def __init__(self) -> None:
         self.version = 0
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
-        self._bare: defaultdict[str, list[str]] = defaultdict(list)
+        self.names = Names()
+        # What placed each frame before the context of untouched_on_error changed that; None outside of it.
+        self._before: dict[str, Edge | None] | None = None
 
     def add_frame(self, name: str) -> None:
         """Know ``name``, for ever."""
         if name not in self.frames:
             self.frames[name] = None
-            _, slash, bare = name.partition("/")
-            if slash and not _name_problem(bare):
-                self._bare[bare].append(name)
+            self.names.add(name)
             self.version += 1
 
     @contextmanager
     def untouched_on_error(self) -> Generator[None]:
         """Changes inside the context are taken back when it raises."""
-        before = dict(self.frames), {bare: list(names) for bare, names in self._bare.items()}
+        count = len(self.names)
+        before: dict[str, Edge | None] = {}
+        self._before = before
         try:
             yield
         except Exception:
-            self.frames = before[0]
-            self._bare = defaultdict(list, before[1])
+            self.frames.update(before)
+            for name in self.names.cut(count):
+                del self.frames[name]
             self.version += 1
             raise
+        finally:
+            self._before = None
 
     def attach(self, edge: Edge) -> None:
         """Place a child, or replace the edge that places it. Checked before by ``check_edge``."""
         self.add_frame(edge.parent)
         self.add_frame(edge.child)
-        self.frames[edge.child] = edge
-        self.version += 1
+        self._place(edge.child, edge)
 
     def detach(self, child: str) -> None:
         """Take away what places ``child``; the frame stays known."""
-        self.frames[child] = None
+        self._place(child, None)
+
+    def renew(self, track: JointTrack) -> None:
+        """What was made of a robot's edges has to be made anew: samples have other columns now."""
+        for _, child in map(track.edge, track.forms):
+            edge = self.frames.get(child)
+            if edge is not None and edge.track is track:
+                self._place(child, replace(edge))
+
+    def _place(self, child: str, edge: Edge | None) -> None:
+        if self._before is not None:
+            self._before.setdefault(child, self.frames[child])
+        self.frames[child] = edge
         self.version += 1
 
     def check_edge(self, parent: str, child: str, writer: str | None) -> None:
@@ -149,11 +133,16 @@ class Tree:
             frame = edge.parent
         return frame
 
+    def tracks(self) -> Iterable[Track]:
+        """The tracks behind all moving edges, once each."""
+        edges = [edge for edge in self.frames.values() if edge is not None]
+        return dict.fromkeys(edge.track for edge in edges if edge.track is not None)
+
     def named_for_insert(self, name: str) -> str:
         """The frame an inserted edge means: the one of that name, or a robot's by its bare name."""
         if name in self.frames:
             return name
-        candidates = [full for full in self._bare.get(name, ()) if full.split("/", 1)[0] in self.robots]
+        candidates = [full for full in self.names.with_bare(name) if full.split("/", 1)[0] in self.robots]
         if len(candidates) > 1:
             raise InsertRefused(
                 f"the frame name {name!r} is not unique: {', '.join(candidates)}; name it in full",
@@ -166,20 +155,13 @@ class Tree:
         """The frame a question means. Raises UnknownFrame or AmbiguousFrame."""
         if name in self.frames:
             return name
-        candidates = self._bare.get(name, ())
+        candidates = self.names.with_bare(name)
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
             raise AmbiguousFrame(target, source, name=name, candidates=candidates)
-        raise UnknownFrame(
-            target, source, name=name, near_misses=self.near(name), frame_count=len(self.frames)
-        )
-
-    def near(self, name: str) -> list[str]:
-        """Names a question could use that look like ``name``, best first; bare ones where those do."""
-        unique = {full[0]: bare for bare, full in self._bare.items() if len(full) == 1}
-        known = [unique.get(frame, frame) if "/" not in name else frame for frame in self.frames]
-        return get_close_matches(name, known, n=3, cutoff=0.7)
+        near = self.names.near(name)
+        raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=len(self.names))
 
     def path(self, target: str, source: str) -> tuple[list[Edge], list[Edge]]:
         """The edges down to the target and down to the source, from where their ways up meet.
@@ -188,6 +170,13 @@ class Tree:
         """
         target_frame = self.resolve(target, target, source)
         source_frame = self.resolve(source, target, source)
+        ways = self._ways(target_frame, source_frame)
+        if ways is None:
+            roots = (self.root(target_frame), self.root(source_frame))
+            raise Disconnected(target, source, roots=roots)
+        return ways
+
+    def _ways(self, target_frame: str, source_frame: str) -> tuple[list[Edge], list[Edge]] | None:
         above_target = list(self.upwards(target_frame))
         above_source = list(self.upwards(source_frame))
         target_ends = {target_frame: 0} | {edge.parent: n for n, edge in enumerate(above_target, 1)}
@@ -195,8 +184,35 @@ class Tree:
         for count, name in enumerate(names):
             if name in target_ends:
                 return above_target[: target_ends[name]][::-1], above_source[:count][::-1]
-        roots = (self.root(target_frame), self.root(source_frame))
-        raise Disconnected(target, source, roots=roots)
+        return None
+
+    def footing(self, target: str, source: str) -> Footing:
+        """What decides the ``path`` between two frames, or the reason why there is none."""
+        meanings = {name: self._meaning(name) for name in (target, source)}
+        frames = [frame for frame in meanings.values() if frame is not None]
+        if len(frames) < len(meanings):
+            return Footing(tuple((name, frame) for name, frame in meanings.items() if frame is None))
+        ways = self._ways(frames[0], frames[-1])
+        if ways is not None:
+            edges = [(edge.child, edge) for way in ways for edge in way]
+        else:
+            edges = [(edge.child, edge) for frame in frames for edge in self.upwards(frame)]
+            edges += [(self.root(frame), None) for frame in frames]
+        return Footing(tuple(meanings.items()), tuple(edges))
+
+    def holds(self, footing: Footing) -> bool:
+        """Whether the same would be found now. May be asked without the lock."""
+        meaning, frames = self._meaning, self.frames
+        return all(meaning(name) == frame for name, frame in footing.names) and all(
+            frames.get(frame) is edge for frame, edge in footing.edges
+        )
+
+    def _meaning(self, name: str) -> str | None:
+        """The frame that a question means; None where no frame, or more than one, is called so."""
+        if name in self.frames:
+            return name
+        candidates = self.names.with_bare(name)
+        return candidates[0] if len(candidates) == 1 else None
 
 
 def _name_problem(name: str) -> str:

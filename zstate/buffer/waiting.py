@@ -3,75 +3,135 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
+from typing import NamedTuple, TypeAlias
 
+from zstate.buffer.footing import Footing
 from zstate.buffer.tracks import Track
 from zstate.buffer.tree import Tree
 
+Marks: TypeAlias = Mapping[Track, int | None]
+"""How new each track has to be [ns]; None is reached by any sample at all."""
+
+
+class Expected(NamedTuple):
+    """What ends a sleep: another footing in the tree, or each track at its mark.
+
+    A track whose samples all lie after ``instant`` ends it too, for then there will never be an answer.
+    """
+
+    footing: Footing = Footing()
+    marks: Marks = MappingProxyType({})
+    instant: int | None = None
+
+    def has_come(self) -> bool:
+        """Whether samples have, or can never."""
+        for track, stamp in self.marks.items():
+            newest = track.history.newest
+            if newest is None or (stamp is not None and newest < stamp):
+                return self.instant is not None and self._is_hopeless(self.instant)
+        return bool(self.marks)
+
+    def _is_hopeless(self, instant: int) -> bool:
+        views = [track.history.view for track in self.marks]
+        return any(view.size and view.oldest > instant for view in views)
+
 
 class Waiter:
-    """What somebody waits for: every track as new as its mark, one of them beyond hope, or another tree."""
+    """Somebody who sleeps until what is expected has come. ``wake`` may be called once too often."""
 
-    def __init__(self, wake: Callable[[], None]) -> None:
+    def __init__(self, room: WaitingRoom, wake: Callable[[], None]) -> None:
         self.wake = wake
-        self._marks: Sequence[tuple[Track, int | None]] = ()
-        self._instant: int | None = None
-        self._version = -1
+        self.expected = Expected()
+        self.tracks = self.expected.marks.keys()
+        """Where the room has it; the room's business."""
+        self._room = room
 
-    def expect(
-        self, version: int, marks: Sequence[tuple[Track, int | None]], instant: int | None = None
-    ) -> None:
-        """Sleep until the tree is of another version, or each track has reached its stamp.
+    def expect(self, expected: Expected, version: int) -> None:
+        """Sleep; or be woken at once where what is expected has come by now.
 
-        A track's mark of None is reached by any sample at all. A track whose samples all lie after
-        ``instant`` ends the sleep too, for then there will never be an answer.
+        ``version`` is that of the tree before the question was asked: a change since then may be one that
+        the expectation does not know of, and of which nobody will tell again.
         """
-        self._marks = marks
-        self._instant = instant
-        self._version = version
-
-    def is_met(self, version: int) -> bool:
-        """Whether it is worth looking again."""
-        if version != self._version:
-            return True
-        return bool(self._marks) and (all(map(self._reached, self._marks)) or self._is_hopeless())
-
-    def _is_hopeless(self) -> bool:
-        if self._instant is None:
-            return False
-        views = [track.history.view for track, _ in self._marks]
-        return any(view.size and view.oldest > self._instant for view in views)
-
-    @staticmethod
-    def _reached(mark: tuple[Track, int | None]) -> bool:
-        track, stamp = mark
-        view = track.history.view
-        return view.size > 0 and (stamp is None or view.newest >= stamp)
+        self.expected = expected
+        if expected.marks.keys() != self.tracks:
+            self._room.sort(self)
+        if self._room.tree.version != version or expected.has_come():
+            self.wake()
 
 
 class WaitingRoom:
-    """Everybody who waits for this buffer. ``notify`` is called after each insert."""
+    """Everybody who waits for this buffer, sorted by the tracks they wait for.
+
+    A sample is the business of those who wait for its track; a change of the tree is shown to everybody.
+    """
 
     def __init__(self, tree: Tree) -> None:
-        self._tree = tree
+        self.tree = tree
         self._lock = threading.Lock()
+        # Tuples that are replaced, never changed: ``notify`` takes no lock.
         self._waiters: tuple[Waiter, ...] = ()
+        self._by_track: dict[Track, tuple[Waiter, ...]] = {}
+        self._shown = tree.version
 
     @contextmanager
     def seat(self, wake: Callable[[], None]) -> Generator[Waiter]:
         """A waiter that is told of inserts for as long as the context lasts."""
-        waiter = Waiter(wake)
+        waiter = Waiter(self, wake)
         with self._lock:
             self._waiters = (*self._waiters, waiter)
         try:
             yield waiter
         finally:
             with self._lock:
-                self._waiters = tuple(other for other in self._waiters if other is not waiter)
+                self._waiters = _without(self._waiters, waiter)
+                self._put(waiter, {})
 
-    def notify(self) -> None:
-        """Wake those whose data is there."""
+    def sort(self, waiter: Waiter) -> None:
+        """Have ``waiter`` where the tracks are that it expects samples of."""
+        with self._lock:
+            # A watch that was closed meanwhile must not come back.
+            if waiter in self._waiters:
+                self._put(waiter, waiter.expected.marks)
+
+    def _put(self, waiter: Waiter, marks: Marks) -> None:
+        before, waiter.tracks = waiter.tracks, marks.keys()
+        for track in marks.keys() - before:
+            self._by_track[track] = (*self._by_track.get(track, ()), waiter)
+        for track in before - marks.keys():
+            left = _without(self._by_track.pop(track), waiter)
+            if left:
+                self._by_track[track] = left
+
+    def notify(self, *tracks: Track) -> None:
+        """Wake those whose data is there: samples of ``tracks`` have come, or the tree has changed."""
+        if self._shown != self.tree.version:
+            self._shown = self.tree.version
+            self._show_tree()
+        elif self._by_track:
+            for waiter in self._at(tracks):
+                if waiter.expected.has_come():
+                    waiter.wake()
+
+    def _show_tree(self) -> None:
         for waiter in self._waiters:
-            if waiter.is_met(self._tree.version):
+            expected = waiter.expected
+            if not self.tree.holds(expected.footing) or expected.has_come():
                 waiter.wake()
+
+    def begin_anew(self, *tracks: Track) -> None:
+        """Wake whoever waits for ``tracks``: their samples are gone, and newer ones may have older stamps."""
+        for waiter in self._at(tracks):
+            waiter.wake()
+
+    def _at(self, tracks: Sequence[Track]) -> Iterable[Waiter]:
+        if len(tracks) == 1:
+            return self._by_track.get(tracks[0], ())
+        # Once each, though many wait for several of them.
+        return dict.fromkeys(waiter for track in tracks for waiter in self._by_track.get(track, ()))
+
+
+def _without(waiters: tuple[Waiter, ...], waiter: Waiter) -> tuple[Waiter, ...]:
+    return tuple(other for other in waiters if other is not waiter)

@@ -9,8 +9,12 @@ from typing import Any, Protocol
 class ZStateError(Exception):
     """What every error of zstate is. Survives pickling, so that it can cross processes."""
 
+    def facts(self) -> dict[str, Any]:
+        """Everything it knows, by the names of its attributes."""
+        return self.__dict__
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), self.args, self.__dict__)
+        return _restored, (type(self), self.args, self.facts())
 
 
 def _restored(kind: type[ZStateError], texts: tuple[Any, ...], facts: dict[str, Any]) -> ZStateError:

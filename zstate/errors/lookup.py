@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, cached_property
 from typing import Any
 
 from zstate.errors.base import ZStateError
@@ -87,7 +87,11 @@ class LookupFailed(ZStateError):
 
 
 class UnknownFrame(LookupFailed):
-    """A frame that no model, static edge or sample has named so far."""
+    """A frame that no model, static edge or sample has named so far.
+
+    ``near_misses`` are looked for when they are first read, as that takes milliseconds among thousands of
+    frames; among those that there were when this was raised.
+    """
 
     def __init__(
         self,
@@ -95,14 +99,27 @@ class UnknownFrame(LookupFailed):
         source: str,
         *,
         name: str,
-        near_misses: Sequence[str] = (),
+        near_misses: Sequence[str] | Callable[[], Sequence[str]] = (),
         frame_count: int = 0,
         requested: int | None = None,
     ) -> None:
         super().__init__(target, source, requested=requested)
         self.name = name
-        self.near_misses = tuple(near_misses)
         self.frame_count = frame_count
+        if callable(near_misses):
+            self._search = near_misses
+        else:
+            self.near_misses = tuple(near_misses)
+
+    @cached_property
+    def near_misses(self) -> tuple[str, ...]:
+        """Known names that look like it, best first."""
+        return tuple(self._search())
+
+    def facts(self) -> dict[str, Any]:
+        facts = {**super().facts(), "near_misses": self.near_misses}
+        facts.pop("_search", None)
+        return facts
 
     def explanation(self) -> str:
         if self.name.startswith("/"):
@@ -236,7 +253,7 @@ class WaitTimeout(LookupFailed, TimeoutError):
         return f"after waiting {self.waited_s:g} s, {super().__str__()}"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored_timeout, (self.reason, self.__dict__)
+        return _restored_timeout, (self.reason, self.facts())
 
 
 @cache

@@ -54,7 +54,7 @@ def _stamp(text: str) -> int:
 
 def error_to_json(error: ZStateError) -> bytes:
     """``{"error": class name, "message": text, ...}``, with every attribute of the error."""
-    facts = {name: value for name, value in vars(error).items() if not name.startswith("_")}
+    facts = {name: value for name, value in error.facts().items() if not name.startswith("_")}
     return msgspec.json.encode({**facts, "error": type(error).__name__, "message": str(error)})
 
 

@@ -398,6 +398,14 @@ history_window(History *self, void *Py_UNUSED(closure))
     return Py_BuildValue("(Onn)", self->block, self->first, self->end);
 }
 
+static PyObject *
+history_newest_stamp(History *self, void *Py_UNUSED(closure))
+{
+    if (self->first == self->end)
+        Py_RETURN_NONE;
+    return PyLong_FromLongLong(self->block->stamps[self->end - 1]);
+}
+
 static PyMethodDef history_methods[] = {
     {"insert", (PyCFunction)(void (*)(void))history_insert, METH_FASTCALL,
      "insert(stamp, row): False when the stamp is older than the history reaches."},
@@ -419,6 +427,7 @@ static PyMemberDef history_members[] = {
 
 static PyGetSetDef history_getset[] = {
     {"window", (getter)history_window, NULL, "(block, first, end): where the samples are.", NULL},
+    {"newest", (getter)history_newest_stamp, NULL, "The last stamp [ns]; None without any.", NULL},
     {NULL},
 };
 

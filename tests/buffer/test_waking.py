@@ -1,0 +1,230 @@
+"""What is not done: a sample, or a change of the tree, is nobody's work whom it does not concern.
+
+Work is counted by calls of the functions that do it, as the interpreter sees them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import pickle
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+import pytest
+from worlds import MS, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.plan import compile_path
+from zstate.buffer.tracks import JointTrack
+from zstate.buffer.tree import Tree
+from zstate.buffer.waiting import Expected
+from zstate.errors import InsertRefused, UnknownFrame
+from zstate.model.catalog import load_model
+from zstate.transform import Transform
+
+RRBOT = load_model("rrbot")
+ZERO = [0.0, 0.0]
+
+
+@contextmanager
+def calls(function: Callable[..., object]) -> Iterator[list[str]]:
+    """Who called ``function`` in this thread meanwhile."""
+    callers: list[str] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code is function.__code__:
+            callers.append(frame.f_back.f_code.co_name if frame.f_back else "")
+
+    sys.setprofile(note)
+    try:
+        yield callers
+    finally:
+        sys.setprofile(None)
+
+
+class Seen(list[Transform]):
+    """What a watch told."""
+
+    def stamps(self) -> list[int | None]:
+        return [transform.stamp for transform in self]
+
+
+def watched(buffer: TransformBuffer, target: str, source: str) -> Seen:
+    seen = Seen()
+    buffer.watch(target, source, seen.append)
+    return seen
+
+
+def fleet(buffer: TransformBuffer, count: int) -> list[JointTrack]:
+    """Robots called r0, r1, ..., with a sample each at stamp 0."""
+    tracks = [buffer.add_robot(RRBOT, f"r{number}") for number in range(count)]
+    for track in tracks:
+        buffer.insert_joints(track, 0, ZERO)
+    return tracks
+
+
+def test_a_sample_is_shown_only_to_those_who_wait_for_its_track() -> None:
+    buffer = TransformBuffer()
+    one, other = fleet(buffer, 2)
+    for _ in range(30):
+        watched(buffer, "r1/base", "r1/tool")
+    with calls(Expected.has_come) as asked:
+        buffer.insert_joints(one, S, ZERO)
+    assert asked == []
+    with calls(Expected.has_come) as asked:
+        buffer.insert_joints(other, S, ZERO)
+    # Once before it is woken, and once when it has taken what was there.
+    assert len(asked) == 2 * 30
+
+
+def test_who_waits_for_two_tracks_is_shown_the_samples_of_both() -> None:
+    buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
+    seen = watched(buffer, "a", "c")
+    buffer.insert(moving("a", "b", S))
+    buffer.insert(moving("b", "c", S))
+    buffer.insert(moving("b", "c", 2 * S))
+    buffer.insert(moving("a", "b", 2 * S))
+    assert seen.stamps() == [0, S, 2 * S]
+
+
+def test_a_sample_of_many_tracks_is_shown_to_everybody_once() -> None:
+    buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
+    watched(buffer, "a", "c")
+    with calls(Expected.has_come) as asked:
+        buffer.insert_many([("a", "b"), ("b", "c")], S, [(0, 0, 0, 0, 0, 0, 1)] * 2)
+    assert asked == ["notify", "expect"]
+
+
+def test_a_robot_that_joins_wakes_nobody_who_waits_for_others() -> None:
+    buffer = TransformBuffer()
+    fleet(buffer, 2)
+    watched(buffer, "r0/base", "r0/tool")
+    watched(buffer, "r9/base", "r9/tool")
+    watched(buffer, "r0/base", "r1/base")
+    with calls(compile_path) as compiled, calls(difflib.get_close_matches) as searched:
+        buffer.add_robot(RRBOT, "r5")
+    assert (compiled, searched) == ([], [])
+
+
+def test_a_path_is_not_compiled_again_for_a_change_elsewhere_in_the_tree() -> None:
+    buffer = TransformBuffer()
+    fleet(buffer, 1)
+    buffer.lookup("r0/base", "r0/tool")
+    buffer.insert_static(static("table", "cup"))
+    with calls(compile_path) as compiled:
+        buffer.lookup("r0/base", "r0/tool")
+    assert compiled == []
+
+
+def test_an_insert_of_a_static_edge_copies_no_tree() -> None:
+    buffer = TransformBuffer()
+    fleet(buffer, 20)
+    frames = buffer._tree.frames
+    with pytest.raises(InsertRefused):
+        buffer.insert_static(static("r0/base", "r0/base"))
+    buffer.insert_static(static("table", "cup"))
+    assert buffer._tree.frames is frames
+
+
+def test_an_unknown_frame_is_looked_for_once_for_each_change_and_near_misses_never() -> None:
+    buffer = TransformBuffer()
+    for number in range(20):
+        watched(buffer, f"r{number}/base", f"r{number}/tool")
+    with calls(difflib.get_close_matches) as searched:
+        fleet(buffer, 20)
+    assert searched == []
+    with calls(Tree.footing) as footings:
+        buffer.insert_static(static("table", "cup"))
+    assert footings == []
+
+
+def test_near_misses_are_those_of_when_the_frame_was_unknown() -> None:
+    buffer = filled(static("base", "left_camera"))
+    error = failure(buffer, "base", "left_camra")
+    assert isinstance(error, UnknownFrame)
+    early = buffer.explain("base", "left_camra")
+    buffer.insert_static(static("base", "left_camara"))
+    late = buffer.explain("base", "left_camra")
+    assert isinstance(early, UnknownFrame)
+    assert isinstance(late, UnknownFrame)
+    assert early.near_misses == ("left_camera",)
+    assert set(late.near_misses) == {"left_camera", "left_camara"}
+
+
+def test_a_wait_that_runs_out_has_near_misses_too() -> None:
+    buffer = filled(static("base", "camera"))
+    with pytest.raises(UnknownFrame, match="did you mean 'camera'") as caught:
+        buffer.wait("base", "camra", timeout_s=0.001)
+    assert caught.value.near_misses == ("camera",)
+
+
+def test_an_error_crosses_processes_with_near_misses_that_nobody_has_read() -> None:
+    error = filled(static("base", "camera")).explain("base", "camra")
+    copy = pickle.loads(pickle.dumps(error))
+    assert copy.near_misses == ("camera",)
+
+
+def test_a_refused_insert_leaves_no_name_behind() -> None:
+    buffer = filled(static("r1/base", "r1/hand"))
+    seen = watched(buffer, "r2/base", "r2/hand")
+    edges = [("r2/base", "r2/hand"), ("r1/base", "r1/base")]
+    with pytest.raises(InsertRefused):
+        buffer.insert_many(edges, S, [(0, 0, 0, 0, 0, 0, 1)] * 2)
+    assert [frame.name for frame in buffer.frames()] == ["r1/base", "r1/hand"]
+    assert buffer.lookup("base", "hand").kind == "static"
+    error = buffer.explain("r1/base", "r2/hand")
+    assert isinstance(error, UnknownFrame)
+    assert (error.frame_count, error.near_misses) == (2, ("r1/hand",))
+    buffer.insert_static(static("r2/base", "r2/hand"))
+    assert len(seen) == 1
+
+
+def test_a_watch_by_bare_names_answers_while_they_are_unique() -> None:
+    buffer = TransformBuffer()
+    seen = watched(buffer, "base", "tool")
+    (one,) = fleet(buffer, 1)
+    other = buffer.add_robot(RRBOT, "again")
+    buffer.insert_joints(other, S, ZERO)
+    buffer.insert_joints(one, S, ZERO)
+    assert seen.stamps() == [0]
+
+
+def test_a_watch_goes_on_when_an_edge_comes_back_with_another_history() -> None:
+    buffer = filled(moving("a", "b", 5 * S, x=1.0))
+    seen = watched(buffer, "a", "b")
+    buffer.withdraw("b")
+    buffer.insert(moving("a", "b", S, x=2.0))
+    assert [x_of(transform) for transform in seen] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("forget", [TransformBuffer.restart, lambda buffer, _: buffer.clear()])
+def test_a_watch_goes_on_in_a_new_epoch_whose_stamps_are_older(forget) -> None:
+    buffer = TransformBuffer()
+    (track,) = fleet(buffer, 1)
+    seen = watched(buffer, "r0/base", "r0/tool")
+    buffer.insert_joints(track, 100 * S, ZERO)
+    forget(buffer, track)
+    buffer.insert_joints(track, 5 * S, ZERO)
+    buffer.insert_joints(track, 6 * S, ZERO)
+    assert seen.stamps() == [0, 100 * S, 5 * S, 6 * S]
+
+
+def test_the_first_velocities_of_a_robot_reach_paths_that_were_compiled_before() -> None:
+    buffer, track = every_joint()
+    buffer.insert_joints(track, 0, pose_of_every(track))
+    assert buffer.lookup("body", "lift").kind == "exact"
+    buffer.insert_joints(track, MS, pose_of_every(track), [0.0] * track.model.velocity_count)
+    assert buffer.lookup("body", "lift", 2 * MS, predict_s=1.0).kind == "predicted"
+
+
+def test_who_has_left_is_nowhere() -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(RRBOT)
+    # Closed while it is being told, after which it expects the next sample no more.
+    watch = buffer.watch("base", "tool", lambda _: watch.close())
+    buffer.insert_joints(track, S, ZERO)
+    buffer.wait("base", "tool", S)
+    assert watch.failures == 0
+    assert (buffer._room._waiters, buffer._room._by_track) == ((), {})
