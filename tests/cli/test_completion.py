@@ -52,7 +52,7 @@ def test_where_nobody_is_announced_nothing_is_offered_and_nothing_said():
 def test_parameters_of_a_file_are_offered(tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text("[parameters]\nspeed = 1\nsite = 'lab'\n")
-    assert offered("up", str(file), "s") == ["plain,speed=", "plain,site="]
+    assert offered("up", str(file), "s") == ["plain,speed=1", "plain,site=lab"]
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -10,6 +10,7 @@ from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import Child, until
 
 from zstate import TransformListener, connect, discover
+from zstate.cli.commands.up import up_command
 
 pytestmark = pytest.mark.processes
 
@@ -196,6 +197,21 @@ def test_in_json_each_line_of_a_part_says_whose_it_is(up):
     child.line()
     until(lambda: '"part": "rrbot"' in child.stderr or child.process.poll() is not None)
     interrupted(child)
+
+
+def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("ROBOTS", raising=False)
+    monkeypatch.setenv("SITE", "hall")
+    help_text = up_command.help or ""
+    (tmp_path / "network.toml").write_text("[network]\nmode = 'peer'\n")
+    (tmp_path / "handeye.yaml").write_text("{target: panda_link0, source: eye, xyz: [0, 0, 1]}")
+    lines = [line.strip() for line in help_text[help_text.index("include =") :].splitlines()]
+    text = "\n".join(lines).replace('model = "panda"', f'model = "{RRBOT}"')
+    shown = zstate("up", str(file_of(tmp_path, text)), "--check", "rate=20")
+    assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == (
+        ["router", "left", "right", "arm1", "arm2", "arm3", "static", "driver"]
+    ), shown.stderr
+    assert max(map(len, lines)) <= 78, "it wraps on a terminal of 80 columns"
 
 
 @pytest.mark.parametrize(

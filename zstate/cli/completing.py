@@ -46,7 +46,7 @@ class RobotName(click.types.StringParamType):
 
 
 class ParameterSetting(click.types.StringParamType):
-    """KEY= of a parameter that the file of `zstate up` has."""
+    """KEY=VALUE of a parameter that the file of `zstate up` has, as it is there."""
 
     name = "setting"
 
@@ -57,8 +57,8 @@ class ParameterSetting(click.types.StringParamType):
         from zstate.errors import ConfigError
 
         with suppress(ConfigError):
-            names = TomlFile(Path(str(ctx.params.get("file")))).tables.get("parameters", {})
-            return [CompletionItem(f"{name}=") for name in names if name.startswith(incomplete)]
+            known = TomlFile(Path(str(ctx.params.get("file")))).tables.get("parameters", {})
+            return [CompletionItem(f"{k}={value}") for k, value in known.items() if k.startswith(incomplete)]
         return []
 
 

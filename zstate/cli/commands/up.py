@@ -31,47 +31,54 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
 
     \b
     zstate up cell.toml
-    zstate up cell.toml rate=500 site=lab
+    zstate up cell.toml rate=500 robots="left right third"
     zstate up cell.toml --check
 
-    With a [router] the rest starts when it is ready, and comes to it unless [network] says otherwise.
-    FILE is TOML:
+    With a [router] the rest starts when that is ready, and comes to it unless [network] says otherwise.
+    Paths are beside FILE, which is TOML:
 
     \b
-    include = ["network.toml"]         # more such files, beside this one
-    [parameters]                       # "${rate}" anywhere below; then the environment is asked
+    include = ["network.toml"]        # more such files
+    [parameters]                      # "${rate}" below, "${HOME}" for others
     rate = 100.0
-    robots = "${ROBOTS:-left right}"   # with what holds where ROBOTS is not set
-    [router]                           # as `zstate router`; also acl, users, certs, identity, metrics
+    robots = "${ROBOTS:-left right}"  # left right where ROBOTS is not set
+    [router]                          # options of `zstate router`
     listen = ["tcp/0.0.0.0:7447"]
-    ros2 = true                        # in the place of rmw_zenohd; false unless given
-    [network]                          # session options of all that follows
-    mode = "peer"                      # or loopback, lan, client
-    connect = ["tcp/192.168.1.10:7447"]
-    certs = "fleet"                    # with identity, here or with each robot; user, password_file
-    [[robot]]                          # as `zstate publish`
-    model = "panda"                    # a name, or a file beside this one
-    names = "${robots}"                # one robot for each, "${name}" is its name; or count = 3, and then
-                                       # name = "arm${number}"; just name = "left" for one
-    source = "sine"                    # "joints", which is the default, or a recording
+    ros2 = true                       # in the place of rmw_zenohd
+    [network]                         # session options of all below
+    mode = "client"
+    connect = ["tcp/127.0.0.1:7447"]
+    certs = "fleet"                   # with identity = here, or with each robot
+    [[robot]]                         # options of `zstate publish`
+    model = "panda"                   # a name, or a file
+    names = "${robots}"               # a robot each; "${name}" is who it is
+    identity = "${name}"
+    source = "sine"                   # "joints" unless given; or a recording
     rate = "${rate}"
-    wires = ["native", "ros2"]         # "native" unless given
-    metrics = 9100                     # for Prometheus; the next robot of a loop has the next port
-    when = "${SITE:-lab} == lab"       # or true and false; also clock = "sim", takeover = true
-    restart = "on-failure"             # or "always"; else a failure ends everything
-    [[static]]                         # as `zstate static`
-    robot = "l*"                       # whose: a name, a pattern, a list; not needed for one robot
+    wires = ["native", "ros2"]        # "native" unless given
+    metrics = 9100                    # 9101 for the second robot of a loop
+    restart = "on-failure"            # or "always"; else a failure ends all
+    [[robot]]
+    model = "panda"
+    count = 3                         # a robot each, "${number}" is 1, 2, 3
+    name = "arm${number}"
+    when = "${SITE:-lab} != lab"      # or "${SITE} == lab", true, false
+    identity = "${name}"
+    [[static]]                        # options of `zstate static`
+    robot = "l*"                      # a name, a pattern, or a list of them
     target = "panda_hand"
     source = "camera"
-    xyz = [0.05, 0.0, 0.04]
-    rpy_deg = [0.0, -90.0, 0.0]        # or rpy, or quat_xyzw; left out: not turned
+    xyz = [0.05, 0.0, 0.04]           # [m]
+    rpy_deg = [0.0, -90.0, 0.0]       # or rpy, or quat_xyzw
     wires = ["native", "ros2"]
     [[static]]
-    file = "handeye.yaml"              # of easy_handeye, or printed by `ros2 topic echo /tf_static`
-    [[program]]                        # anything else; starts beside this file
-    run = "python driver.py ${rate}"   # or a command such as "zstate record run.mcap"
-    after = "left"                     # starts when that is ready: a robot, "router", "static", a program
-    ready = "driver runs"              # a line with this says it is ready itself; else when it runs
+    robot = "right"
+    file = "handeye.yaml"             # of easy_handeye, or ROS's TransformStamped
+    [[program]]                       # anything else, such as a driver
+    run = "python driver.py ${rate}"  # or "zstate record run.mcap"
+    identity = "left"
+    after = ["left", "static"]        # starts when these are ready
+    ready = "driver runs"             # what it says when it is ready itself
     """
     from zstate.cli.up.cell import read_cell
     from zstate.cli.up.parameters import parsed_settings

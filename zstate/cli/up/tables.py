@@ -55,10 +55,12 @@ def tables(file: TomlFile, kind: str, section: type[Section], scope: Scope) -> I
         place = f"{kind}[{number}]" if kind in LISTS else kind
         for turn, names in enumerate(_turns(file, place, table, scope)):
             inner = scope.with_names(names)
+            if "name" in table:
+                inner = inner.with_names(_filled(file, place, {"name": table["name"]}, inner))
             if _is_wanted(file, place, table, inner):
-                own = {"name": names["name"]} if "name" in names else {}
-                rest = {key: value for key, value in table.items() if key not in _OWN_KEYS}
-                values = _filled(file, place, {**rest, **own}, inner)
+                own = {"name": inner.names["name"]} if {"name", "names"} & set(table) else {}
+                rest = {key: value for key, value in table.items() if key not in (*_OWN_KEYS, "name")}
+                values = {**_filled(file, place, rest, inner), **own}
                 yield Placed(_converted(file, place, values, section), file, place, turn)
 
 
