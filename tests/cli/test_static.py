@@ -91,3 +91,19 @@ def test_a_rotation_left_out_is_none_and_so_is_a_translation(spawn: Spawn):
 def test_half_an_edge_is_wrong_usage():
     assert "--xyz" in failure("static", "a", "b", code=2)
     assert "TARGET" in failure("static", "--xyz", "0", "0", "0", code=2)
+
+
+def test_an_edge_of_a_file_is_said_on_each_of_its_wires(spawn: Spawn, ros_router: str, tmp_path: Path):
+    file = tmp_path / "cell.toml"
+    file.write_text(
+        '[parameters]\nheight = 1.0\n[[static]]\nrobot = "arm"\ntarget = "tool"\nsource = "camera"\n'
+        'xyz = [0, 0, "${height}"]\nwires = ["native", "ros2"]\n'
+    )
+    child = started(spawn, "static", "--file", str(file), "--set", "height=2.5")
+    line = child.line()
+    assert "xyz [0, 0, 2.5] m" in line
+    assert "also on ROS 2 topic /tf_static" in line
+    with connect(mode="client", endpoints=ros_router) as session:
+        for wire in ("native", "ros2"):
+            with TransformListener(session, wire=wire) as listener:
+                assert listener.buffer.wait("tool", "camera", timeout_s=10.0).translation[2] == 2.5
