@@ -63,13 +63,30 @@ class Questions(Store):
         try:
             return self._answer(question)
         except LookupFailed as reason:
-            waiter.expect(self._mending(question, reason), version)
-            if _is_final(question, reason):
-                raise
-            return reason
+            return self._expect_mending(question, reason, waiter, version)
+
+    def _newest(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
+        """The newest answer, with ``waiter`` told to expect a newer one; else as ``_try``."""
+        version = self._tree.version
+        try:
+            _, path, footing = self._known_path(question.target, question.source)
+            transform = transform_of(path, None)
+        except LookupFailed as reason:
+            return self._expect_mending(question, reason, waiter, version)
+        newer = None if transform.stamp is None else transform.stamp + 1
+        waiter.expect(Expected(footing, dict.fromkeys(path.tracks, newer)), version)
+        return transform
+
+    def _expect_mending(
+        self, question: Question, reason: LookupFailed, waiter: Waiter, version: int
+    ) -> LookupFailed:
+        """Tell ``waiter`` what may turn the reason into an answer. Raises a reason that nothing mends."""
+        waiter.expect(self._mending(question, reason), version)
+        if _is_final(question, reason):
+            raise reason
+        return reason
 
     def _mending(self, question: Question, reason: LookupFailed) -> Expected:
-        """What may turn the reason into an answer."""
         if isinstance(reason, _NO_PATH):
             with self._lock:
                 return Expected(self._tree.footing(question.target, question.source))
@@ -78,16 +95,6 @@ class Questions(Store):
         except LookupFailed:
             return Expected()  # the tree has changed meanwhile, which is told by its version
         return Expected(known.footing, _marks(question, reason, known.path), question.at)
-
-    def _newest(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
-        """As ``_try``, and ``waiter`` is told to expect a newer answer than this."""
-        version = self._tree.version
-        outcome = self._try(question, waiter)
-        if isinstance(outcome, Transform):
-            known = self._known_path(question.target, question.source)
-            newer = None if outcome.stamp is None else outcome.stamp + 1
-            waiter.expect(Expected(known.footing, dict.fromkeys(known.path.tracks, newer)), version)
-        return outcome
 
     def _question(
         self,
