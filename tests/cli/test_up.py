@@ -121,7 +121,9 @@ def test_a_part_that_dies_ends_all_with_its_last_error(up):
 
 
 def test_a_part_that_may_starts_again_and_the_others_live_on(up):
-    child = up(table("program", name="shell", run=["sh", "-c", "echo at $$; sleep 60"], restart="on-failure"))
+    child = up(
+        table("program", name="shell", run=["sh", "-c", "echo at $$; exec sleep 60"], restart="on-failure")
+    )
     first = pid_said(child, "at")
     os.kill(first, signal.SIGKILL)
     assert pid_said(child, "at") != first
@@ -137,11 +139,21 @@ def test_the_last_error_of_a_part_is_the_cause_that_is_told(up, free_port: int):
     assert f"'rrbot' ended with exit code 1: zstate: somebody listens at {endpoint!r}" in child.stderr
 
 
+def test_an_error_of_several_lines_is_told_whole(up):
+    says = "echo Trouble >&2; echo 'Bad: a file' >&2; echo '  line 3  it has no end' >&2; exit 3"
+    child = up(table("program", name="driver", run=["sh", "-c", says]))
+    assert child.wait() == 1
+    assert "'driver' ended with exit code 3: Bad: a file line 3  it has no end\n" in child.stderr
+
+
 def test_a_program_starts_when_what_it_is_after_is_ready(up):
     child = up(
         table("program", name="late", run=["echo", "now"], after=["slow", "rrbot"])
         + table(
-            "program", name="slow", run=["sh", "-c", "echo not yet; echo it runs; sleep 60"], ready="it runs"
+            "program",
+            name="slow",
+            run=["sh", "-c", "echo not yet; echo it runs; exec sleep 60"],
+            ready="it runs",
         )
         + robot()
     )

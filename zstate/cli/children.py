@@ -17,6 +17,7 @@ from zstate.closing import Closing
 
 END_WITHIN_S = 0.8
 _PROGRAM_ENDS_WITHIN_S = 3.0
+_LONGEST_ERROR = 500
 
 # Linux ends the program with whoever started it, however that ended. The rest of POSIX does not offer it.
 _TIED = """
@@ -35,7 +36,7 @@ class ChildCommand(Closing):
 
     With ``is_program`` ARGUMENTS are a command of the user's own instead, in ``folder``. Each line it says
     goes to ``on_line``, with whether it came on standard error, from a thread; ``on_end`` is called once it
-    is gone and all its lines are heard. ``last_error`` is what it said last on its standard error.
+    is gone and all its lines are heard. ``last_error`` is its last error, in one line.
     """
 
     def __init__(
@@ -120,7 +121,9 @@ class ChildCommand(Closing):
     def _follow_errors(self) -> None:
         for line in _lines(self._process.stderr):
             if line.strip():
-                self.last_error = text_in(line.strip())
+                # What is indented goes on with what was said before it, as findings and Python's errors do.
+                goes_on = line[0].isspace() and len(self.last_error) < _LONGEST_ERROR
+                self.last_error = f"{self.last_error} {line.strip()}".strip() if goes_on else text_in(line)
                 self._on_line(line, True)
 
 
