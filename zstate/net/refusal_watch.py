@@ -17,6 +17,7 @@ from contextlib import suppress
 import zenoh
 
 from zstate.closing import Closing
+from zstate.net.rendezvous import JOIN_WITHIN_S
 from zstate.net.security import Credentials
 
 _LOG = logging.getLogger("zstate")
@@ -54,12 +55,15 @@ class RefusalWatch(Closing):
         self._seeks = json.loads(config.get_json("scouting/multicast/enabled")) is True
         self._settled: set[str] = set()
         self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="zstate refusals", daemon=True)
         if endpoints or self._seeks:
-            threading.Thread(target=self._run, name="zstate refusals", daemon=True).start()
+            self._thread.start()
 
     def close(self) -> None:
         """Look no more. A second call does nothing."""
         self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join(JOIN_WITHIN_S)
 
     def _run(self) -> None:
         period_s = FIRST_LOOK_S

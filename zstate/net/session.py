@@ -238,9 +238,13 @@ class Session(Closing):
             self._closed = True
         _run_bounded(self._leave)
 
-    def _leave(self) -> None:
-        if self._companion is not None:
+    def stop_companion(self) -> None:
+        """End what runs beside the session to keep it connected."""
+        if self._companion is not None and os.getpid() == self._pid:
             self._companion.close()
+
+    def _leave(self) -> None:
+        self.stop_companion()
         self._raw.close()
 
 
@@ -248,10 +252,10 @@ _OPEN: weakref.WeakSet[Session] = weakref.WeakSet()
 
 
 @atexit.register
-def _close_all() -> None:
+def _end_threads() -> None:
     # A thread that is inside Zenoh as Python shuts down aborts the process.
     for session in tuple(_OPEN):
-        session.close()
+        session.stop_companion()
 
 
 def _run_bounded(action: Callable[[], None]) -> None:
