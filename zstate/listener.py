@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Literal
@@ -19,6 +18,7 @@ from zstate.following.off_clock import OffClock
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
 from zstate.following.writer_clocks import WriterClocks
+from zstate.locks import new_lock
 from zstate.net.history import PastReader
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
@@ -81,7 +81,7 @@ class TransformListener(Closing):
         self._departed: set[int] = set()
         self._overflowed: set[Follower] = set()
         # A model makes room for its links before it is added: no static edge may come between.
-        self._rebuilding = threading.Lock()
+        self._rebuilding = new_lock()
         self._past: PastReader | None = None
         self._heard: tuple[Stream, ...] = ("robot_description", "tf_static", follow)
         with ExitStack() as opening:

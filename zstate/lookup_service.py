@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import AmbiguousFrame, ZStateError
+from zstate.locks import new_lock
 from zstate.model.robot import RobotModel
 from zstate.net.history import Memory
 from zstate.net.service import Answer, Service
@@ -77,7 +77,7 @@ class RecentBuffer:
         self._track = self._buffer.add_robot(model, robot)
         self._memory = memory
         self._next_seq = 0
-        self._lock = threading.Lock()
+        self._lock = new_lock()
 
     def filled(self) -> TransformBuffer:
         """The buffer, with every sample until now."""

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.locks import new_lock, outlive_fork
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.robot import RobotModel
 from zstate.moving_edges import MovingEdges
 from zstate.net.claims import Claim
 from zstate.net.clock_offset import ClockService
-from zstate.net.forked import new_lock
 from zstate.net.history import Memory, answer_past
 from zstate.net.outlets import Outlets, StreamOutlet
 from zstate.net.presence import writer_here
@@ -81,7 +81,7 @@ class StatePublisher(Closing):
         self.robot = check_robot(robot or model.name)
         self._clock: Clock = clock or SystemClock()
         self._lock = new_lock()
-        self._stop = threading.Event()
+        self._stop = outlive_fork(threading.Event())
         self._opened = ExitStack()
         self._edges = MovingEdges(model, self.robot)
         self._session_id = secrets.randbits(32)

@@ -10,8 +10,8 @@ from urllib.parse import quote
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.locks import new_lock
 from zstate.net.claims import Claim
-from zstate.net.forked import new_lock
 from zstate.net.outlets import Outlets
 from zstate.net.placing import placing
 from zstate.net.presence import writer_here

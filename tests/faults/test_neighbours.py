@@ -77,7 +77,7 @@ def test_a_slow_reader_loses_samples_and_the_fast_one_beside_it_none_nor_time(st
     fast = start("reader", session=client(endpoint))
     assert fast.ask("after", "r1", 0)
     alone = statistics.median(fast.ask("latencies", "r1", 1000))
-    slow = start("reader", session=client(endpoint), busy_ms=10.0)
+    slow = start("reader", session=client(endpoint), robot="r1", busy_ms=10.0)
     beside = statistics.median(fast.ask("latencies", "r1", 1000))
     until(lambda: slow.ask("stats")["dropped"] > 0)
     publisher.ask("pause")

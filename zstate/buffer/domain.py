@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+from zstate.locks import new_lock
 
 
 class Domain:
@@ -15,7 +15,7 @@ class Domain:
     def __init__(self, given: str | None = None) -> None:
         self._given = given
         self._kept: dict[str, str] = {}
-        self._lock = threading.Lock()
+        self._lock = new_lock()
 
     @property
     def name(self) -> str | None:

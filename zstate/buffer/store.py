@@ -21,6 +21,7 @@ from zstate.buffer.tree import Tree
 from zstate.buffer.waiting import WaitingRoom
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import InsertRefused, InvalidInput
+from zstate.locks import outlive_fork
 from zstate.model.robot import RobotModel
 from zstate.transform import QUATERNION_TOLERANCE, Transform
 
@@ -45,7 +46,7 @@ class Store:
         self.ignored = 0
         """How many samples were older than the history reaches."""
         self._span_ns = round(history_s * 1e9)
-        self._lock = threading.RLock()
+        self._lock = outlive_fork(threading.RLock())
         self._writes = 0
         self._tree = Tree()
         self._room = WaitingRoom(self._tree)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
@@ -11,6 +10,7 @@ from typing import NamedTuple, TypeAlias
 from zstate.buffer.footing import Footing
 from zstate.buffer.tracks import Track
 from zstate.buffer.tree import Tree
+from zstate.locks import new_lock
 
 Marks: TypeAlias = Mapping[Track, int | None]
 """How new each track has to be [ns]; None is reached by any sample at all."""
@@ -70,7 +70,7 @@ class WaitingRoom:
 
     def __init__(self, tree: Tree) -> None:
         self.tree = tree
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         # Tuples that are replaced, never changed: ``notify`` takes no lock.
         self._waiters: tuple[Waiter, ...] = ()
         self._by_track: dict[Track, tuple[Waiter, ...]] = {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 
@@ -11,6 +10,7 @@ from zstate import se3
 from zstate.buffer.waiting import Waiter, WaitingRoom
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, LookupFailed
+from zstate.locks import new_lock
 from zstate.transform import Transform
 
 Look = Callable[[Waiter], Transform | LookupFailed]
@@ -43,7 +43,7 @@ class Watch(Closing):
         self._thresholds = (translation_m, rotation_rad)
         self._last: Transform | None = None
         self._pending = False
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._seat = ExitStack()
         self._waiter = self._seat.enter_context(room.seat(self._look))
         self._look()

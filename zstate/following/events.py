@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
@@ -15,6 +14,7 @@ from zstate.following.bounded import remember
 from zstate.following.placements import Placements
 from zstate.following.teller import Teller
 from zstate.following.vigil import Vigil
+from zstate.locks import new_lock
 from zstate.wire.keys import Stream
 from zstate.wire.writer import Announced, Writer
 
@@ -76,7 +76,7 @@ class Events(Closing):
         self._gone: dict[tuple[_Place, int], None] = {}
         self._fought: dict[tuple[str, str, int, str], None] = {}
         self._placements = Placements()
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._vigil = Vigil()
         self._teller = None if on_event is None else Teller(on_event, self._look)
 

@@ -13,6 +13,7 @@ from zstate.errors import InsertRefused, InvalidInput, MessageError
 from zstate.following.absent import Absent
 from zstate.following.bounded import remember
 from zstate.following.tally import Tally
+from zstate.locks import outlive_fork
 from zstate.wire.messages import RobotDescription, Sample
 
 # So many samples are kept that arrive before the robot is described, which takes milliseconds.
@@ -42,7 +43,7 @@ class Follower(ABC):
         self._objection = ""
         self._is_simulated = False
         self._newest: int | None = None
-        self._lock = threading.RLock()
+        self._lock = outlive_fork(threading.RLock())
         buffer.name_robot(robot)
 
     @property

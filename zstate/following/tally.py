@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections import Counter
 from dataclasses import dataclass
+
+from zstate.locks import new_lock
 
 _LOG = logging.getLogger("zstate")
 
@@ -33,7 +34,7 @@ class Tally:
     """The counters behind ``Stats``. Any thread may count."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._counts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
         self._first: dict[str, str] = {}

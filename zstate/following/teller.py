@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from zstate.closing import Closing
+from zstate.locks import outlive_fork
 
 T = TypeVar("T")
 
@@ -32,7 +33,7 @@ class Teller(Closing, Generic[T]):
         self._callback = callback
         self._look = look
         self._waiting: deque[T] = deque(maxlen=WAITING)
-        self._wake = threading.Condition()
+        self._wake = outlive_fork(threading.Condition())
         self._is_open = True
         self._thread = threading.Thread(target=self._run, name="zstate events", daemon=True)
         self._thread.start()

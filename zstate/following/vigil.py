@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
+
+from zstate.locks import new_lock
 
 Source = tuple[str, int]
 """A robot, and the session of one of its writers."""
@@ -39,7 +40,7 @@ class Vigil:
 
     def __init__(self) -> None:
         self._pulses: dict[Source, _Pulse] = {}
-        self._lock = threading.Lock()
+        self._lock = new_lock()
 
     def begin(self, writer: Source) -> None:
         """It is announced, with one more stream."""

@@ -15,7 +15,7 @@ import zenoh
 
 from zstate.closing import Closing
 from zstate.errors import SecondWriter, duration_text
-from zstate.net.forked import new_lock
+from zstate.locks import new_lock
 from zstate.net.presence import tokens_now
 from zstate.net.receiver import Ring
 from zstate.net.session import Session

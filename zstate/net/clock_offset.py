@@ -23,6 +23,7 @@ from zstate.buffer.tracks import Offset
 from zstate.clock import Clock, SystemClock
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.locks import new_lock
 from zstate.net.service import Answer, Service
 from zstate.net.session import Session
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
@@ -139,7 +140,7 @@ class OffsetMeter(Closing):
         self._session = session
         self._clock = clock
         self._wanted: deque[_Measured] = deque()
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._is_running = False
         self._is_open = True
 

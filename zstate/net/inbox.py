@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from typing import NamedTuple
 
 from zstate.closing import Closing
+from zstate.locks import outlive_fork
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
@@ -39,7 +40,7 @@ class Inbox(Closing):
         self._session = session
         self._heard: list[Heard] = []
         self._waiting = 0
-        self._has_room = threading.Condition()
+        self._has_room = outlive_fork(threading.Condition())
         self._is_open = True
         self._opened = ExitStack()
 

@@ -20,7 +20,7 @@ from contextlib import suppress
 import zenoh
 
 from zstate.errors import ConfigError
-from zstate.net.forked import new_lock
+from zstate.locks import new_lock
 from zstate.net.lobby import Lobby
 from zstate.net.membership import Membership
 

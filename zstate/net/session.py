@@ -19,6 +19,7 @@ import zenoh
 
 from zstate.closing import Closing
 from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
+from zstate.locks import new_lock
 from zstate.net.config import (
     CONFIG_VARIABLE,
     ConfigSource,
@@ -29,7 +30,7 @@ from zstate.net.config import (
     given_config,
     our_config,
 )
-from zstate.net.forked import keep_for_ever, new_lock
+from zstate.net.forked import keep_for_ever
 from zstate.net.modes import (
     check_credentials,
     check_mode,

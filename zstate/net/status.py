@@ -11,6 +11,7 @@ import zenoh
 
 from zstate.closing import Closing
 from zstate.errors import Closed, MessageError
+from zstate.locks import outlive_fork
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber
 from zstate.wire.keys import robot_of, status_expression, status_key
@@ -31,7 +32,7 @@ class StatusPublisher(Closing):
     def __init__(self, session: Session, robot: str, identity: str, status: Callable[[], Status]) -> None:
         self._session = session
         self._status = status
-        self._stop = threading.Event()
+        self._stop = outlive_fork(threading.Event())
         self._publisher = StreamPublisher(session, status_key(robot, identity), ENCODINGS[Status])
         self._thread = threading.Thread(target=self._run, name="zstate status", daemon=True)
         self._thread.start()
