@@ -162,4 +162,4 @@ def machine() -> str:
     """Cores, processor and kernel."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     cpu = next((line.partition(":")[2].strip() for line in lines if "model name" in line), platform.machine())
-    return f"{os.cpu_count()} x {cpu}, Linux {platform.release()}"
+    return f"{os.cpu_count()} x {cpu}, Linux {platform.release().partition('-')[0]}"

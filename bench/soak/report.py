@@ -27,7 +27,7 @@ def result_of(
     sent = sum(report.get("sent", 0) for report in ended.values())
     return {
         "command": " ".join(["python -m bench.soak", *task.options]),
-        "machine": f"{os.cpu_count()} x {cpu or platform.machine()}, Linux {platform.release()}",
+        "machine": f"{os.cpu_count()} x {cpu or platform.machine()}, Linux {platform.release().partition('-')[0]}",
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in ("zstate", "eclipse-zenoh")},
