@@ -25,9 +25,10 @@ def result_of(
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpu = next((line.partition(":")[2].strip() for line in lines if "model name" in line), "")
     sent = sum(report.get("sent", 0) for report in ended.values())
+    kernel = platform.release().partition("-")[0]
     return {
         "command": " ".join(["python -m bench.soak", *task.options]),
-        "machine": f"{os.cpu_count()} x {cpu or platform.machine()}, Linux {platform.release().partition('-')[0]}",
+        "machine": f"{os.cpu_count()} x {cpu or platform.machine()}, Linux {kernel}",
         "versions": {
             "python": platform.python_version(),
             **{name: version(name) for name in ("zstate", "eclipse-zenoh")},
