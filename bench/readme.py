@@ -44,7 +44,7 @@ def _cells(one: Outcome) -> list[str]:
         f"{one.rate_hz:.1f} Hz",
         f"{p50} / {p99} us",
         f"{cpu['writer']:.1f} + {cpu['reader']:.1f} %",
-        f"{others:.1f} %" if others else "",
+        f"{others:.1f} %" if others > 0.05 else "",
         number(one.bytes_per_sample),
     ]
 
