@@ -136,7 +136,7 @@ def test_history_and_clock_are_those_of_the_listeners_own_buffer(sessions):
 
 def test_what_cannot_be_followed_is_refused(sessions):
     with pytest.raises(InvalidInput, match="follow is 'joint_states' or 'tf', not 'joints'"):
-        TransformListener(sessions[0], "r1", follow="joints")  # type: ignore[arg-type]
+        TransformListener(sessions[0], "r1", follow="joints")
     with pytest.raises(InvalidInput, match="no wire 'dds'"):
         TransformListener(sessions[0], "r1", wire="dds")
     with pytest.raises(InvalidInput, match="robot name 'a/b'"):

@@ -119,7 +119,7 @@ def named(path: str) -> object:
 
 def signature_of(path: str) -> str:
     """Parameters with their kinds and defaults, without ``self`` and annotations."""
-    given = inspect.signature(named(path))  # type: ignore[arg-type]
+    given = inspect.signature(named(path))
     parameters = [
         parameter.replace(annotation=inspect.Parameter.empty)
         for parameter in given.parameters.values()

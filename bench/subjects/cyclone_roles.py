@@ -13,12 +13,11 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from bench.job import Job
-from bench.subjects.awakening import Awakening
 from bench.subjects.cyclone import DOMAIN_VARIABLE
 from bench.subjects.cyclone_idl import Header, JointState, TFMessage, Time
-from bench.subjects.edges import Pose
 from bench.subjects.subject import Answered
-from bench.subjects.tf_messages import TfBytes, TfHistory
+from bench.subjects.tf_messages import TfBytes
+from bench.subjects.tf_reader import TfReader
 
 MOST_TAKEN = 100
 
@@ -94,13 +93,11 @@ class Taking(Listener):
             self._take(message)
 
 
-class Reader:
-    """Keeps the transforms of each message."""
+class Reader(TfReader):
+    """Hears the messages of one domain."""
 
     def __init__(self, job: Job, answered: Answered) -> None:
-        self._answered = answered
-        self._history = TfHistory(job)
-        self._awakening = Awakening(job, self._answer)
+        super().__init__(job, answered)
         self._participant = participant()
         self._readers = [
             self._reader("rt/tf_static", LATCHED, self._history.add_statics),
@@ -110,22 +107,3 @@ class Reader:
     def _reader(self, topic: str, of: Qos, take: Any) -> Any:
         into = Topic(self._participant, topic, TFMessage)
         return DataReader(self._participant, into, qos=of, listener=Taking(take))
-
-    def _on_transforms(self, message: Any) -> None:
-        self._awakening.heard(self._history.add(message))
-
-    def _answer(self, stamp: int) -> None:
-        if self._history.answers(stamp):
-            self._answered(stamp)
-
-    def pose(self, stamp: int, robot: int = 0) -> Pose:
-        """From what was kept."""
-        return self._history.pose(stamp)
-
-    def has_tree(self) -> bool:
-        """Whether every link was heard of."""
-        return self._history.has_tree()
-
-    def close(self) -> None:
-        """The process's end closes the domain."""
-        self._awakening.close()

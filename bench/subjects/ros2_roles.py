@@ -14,10 +14,9 @@ from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
 from bench.job import Job
-from bench.subjects.awakening import Awakening
-from bench.subjects.edges import Pose
 from bench.subjects.subject import Answered
-from bench.subjects.tf_messages import TfBytes, TfHistory
+from bench.subjects.tf_messages import TfBytes
+from bench.subjects.tf_reader import TfReader
 
 JOINTS = QoSProfile(depth=10)
 TF = QoSProfile(depth=100)
@@ -52,13 +51,11 @@ class Writer:
         rclpy.shutdown()
 
 
-class Reader:
-    """Keeps the transforms of each message."""
+class Reader(TfReader):
+    """Hears the messages of one domain."""
 
     def __init__(self, job: Job, answered: Answered) -> None:
-        self._answered = answered
-        self._history = TfHistory(job)
-        self._awakening = Awakening(job, self._answer)
+        super().__init__(job, answered)
         rclpy.init()
         node = rclpy.create_node("bench_reader")
         self._subscriptions = [
@@ -72,23 +69,8 @@ class Reader:
         with suppress(ExternalShutdownException):
             rclpy.spin(node)
 
-    def _on_transforms(self, message: Any) -> None:
-        self._awakening.heard(self._history.add(message))
-
-    def _answer(self, stamp: int) -> None:
-        if self._history.answers(stamp):
-            self._answered(stamp)
-
-    def pose(self, stamp: int, robot: int = 0) -> Pose:
-        """From what was kept."""
-        return self._history.pose(stamp)
-
-    def has_tree(self) -> bool:
-        """Whether every link was heard of."""
-        return self._history.has_tree()
-
     def close(self) -> None:
         """Leave the domain."""
-        self._awakening.close()
+        super().close()
         rclpy.shutdown()
         self._thread.join()

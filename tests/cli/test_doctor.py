@@ -47,22 +47,32 @@ def warnings(*arguments: str) -> dict[str, str]:
 
 
 @contextmanager
-def stamping(stamp: Callable[[], int], streams: tuple[Stream, ...] = EVERYTHING) -> Iterator[None]:
-    """rrbot, a hundred times a second, with stamps as ``stamp`` says."""
+def again_and_again(action: Callable[[], object]) -> Iterator[None]:
+    """Meanwhile ``action`` is done a hundred times a second."""
     stop = threading.Event()
 
-    def publish() -> None:
+    def repeat() -> None:
         while not stop.wait(0.01):
-            publisher.publish([0.0, 0.0], stamp=stamp())
+            action()
 
-    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=streams) as publisher:
-        thread = threading.Thread(target=publish)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@contextmanager
+def stamping(stamp: Callable[[], int], streams: tuple[Stream, ...] = EVERYTHING) -> Iterator[None]:
+    """rrbot, a hundred times a second, with stamps as ``stamp`` says."""
+    with (
+        connect() as session,
+        StatePublisher(session, load_model(RRBOT), streams=streams) as publisher,
+        again_and_again(lambda: publisher.publish([0.0, 0.0], stamp=stamp())),
+    ):
+        yield
 
 
 def test_of_a_robot_that_is_well_every_link_is_ok(monkeypatch: pytest.MonkeyPatch):
@@ -203,45 +213,33 @@ def test_a_clock_that_is_ahead_is_broken_before_the_stamps_it_makes():
         def now(self) -> int:
             return super().now() + 10 * SECOND
 
-    with connect() as session, StatePublisher(session, load_model(RRBOT), clock=Ahead()) as publisher:
-        stop = threading.Event()
-        thread = threading.Thread(
-            target=lambda: [publisher.publish([0.0, 0.0]) for _ in iter(lambda: stop.wait(0.01), True)]
-        )
-        thread.start()
+    with (
+        connect() as session,
+        StatePublisher(session, load_model(RRBOT), clock=Ahead()) as publisher,
+        again_and_again(lambda: publisher.publish([0.0, 0.0])),
+    ):
         found = broken_link("rrbot")
-        stop.set()
-        thread.join()
     assert found["name"] == "clocks"
     assert "10.0 s ahead of this one" in found["text"]
 
 
 def test_simulated_time_that_nobody_tells_is_missed():
     clock = ManualClock(5 * SECOND, "sim")
-    with connect() as session, StatePublisher(session, load_model(RRBOT), clock=clock) as publisher:
-        stop = threading.Event()
-        thread = threading.Thread(
-            target=lambda: [publisher.publish([0.0, 0.0]) for _ in iter(lambda: stop.wait(0.01), True)]
-        )
-        thread.start()
+    with (
+        connect() as session,
+        StatePublisher(session, load_model(RRBOT), clock=clock) as publisher,
+        again_and_again(lambda: publisher.publish([0.0, 0.0])),
+    ):
         found = broken_link("rrbot")
-        stop.set()
-        thread.join()
     assert found["name"] == "stamps"
     assert "nobody has told the time on 'zstate/clock'" in found["text"]
 
 
 def test_a_writer_of_a_newer_version_is_named_as_such():
     with standing(), connect() as session:
-        stop = threading.Event()
         newer = session.zenoh.declare_publisher("zstate/rrbot/joint_states", encoding="zstate/JointState;v=2")
-        thread = threading.Thread(
-            target=lambda: [newer.put(b"\x90") for _ in iter(lambda: stop.wait(0.05), True)]
-        )
-        thread.start()
-        found = broken_link("rrbot")
-        stop.set()
-        thread.join()
+        with again_and_again(lambda: newer.put(b"\x90")):
+            found = broken_link("rrbot")
     assert (found["name"], found["next"]) == ("version", "pip install -U zstate")
     assert "version 2" in found["text"]
 

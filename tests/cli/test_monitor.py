@@ -25,7 +25,7 @@ CLOCK = ManualClock(1_789_000_000_000_000_000)
 
 
 def frame(name: str, parent: str | None, kind: str = "joint", writer: str = DRIVER) -> FrameInfo:
-    return FrameInfo(name, parent, kind, writer, None, None, None, 0)  # type: ignore[arg-type]
+    return FrameInfo(name, parent, kind, writer, None, None, None, 0)
 
 
 TREE = (

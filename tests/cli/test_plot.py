@@ -39,7 +39,7 @@ def texts(file: Path) -> str:
 
 
 def test_positions_become_curves_in_the_order_of_time_with_the_units_of_their_joints():
-    curves = joint_curves(DOCUMENTS, load_model(MODEL))  # type: ignore[arg-type]
+    curves = joint_curves(DOCUMENTS, load_model(MODEL))
     assert curves.names == ("slide", "turn", "flight.0", "flight.1")
     assert curves.units == ("m", "rad", "", "")
     assert curves.seconds.tolist() == [0.0, 1.0]
@@ -49,7 +49,7 @@ def test_positions_become_curves_in_the_order_of_time_with_the_units_of_their_jo
 
 
 def test_a_joint_that_there_is_not_is_refused_with_those_that_there_are():
-    curves = joint_curves(DOCUMENTS, None)  # type: ignore[arg-type]
+    curves = joint_curves(DOCUMENTS, None)
     with pytest.raises(InvalidInput, match=r"did you mean 'slide'.*joints: slide, turn"):
         curves.chosen(["slid"])
 

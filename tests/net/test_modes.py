@@ -44,7 +44,7 @@ LAN_PEER = """
 def test_loopback_refuses_what_leaves_this_host(endpoint: str):
     for use in ({"endpoints": ["tcp/127.0.0.1:1", endpoint]}, {"listen": endpoint}):
         with pytest.raises(InvalidInput) as caught:
-            connect(mode="loopback", **use)  # type: ignore[arg-type]
+            connect(mode="loopback", **use)
         assert f"{endpoint!r} leaves this host" in str(caught.value)
 
 

@@ -83,7 +83,7 @@ def test_only_of_those_who_refuse_something_is_said_and_once(fleet: Fleet, caplo
     nobody, refusing = f"tcp/127.0.0.1:{a_free_port()}", fleet.tcp("users")
     # Each calls the other, of which one link remains.
     ours = {"endpoints": [nobody, second, fleet.tcp("open"), refusing], "listen": first}
-    with connect(endpoints=first, listen=second), connect(**ours) as session:  # type: ignore[arg-type]
+    with connect(endpoints=first, listen=second), connect(**ours) as session:
         until(lambda: len(session.zenoh.info.transports()) >= 2)
         until(lambda: refusals(caplog))
         with connect(endpoints=fleet.tcp("users"), listen=own_listener(None)):

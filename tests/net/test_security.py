@@ -23,7 +23,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def refusal(credentials: Credentials, **arguments: object) -> str:
     with pytest.raises(ConfigError) as caught:
-        connect(credentials=credentials, **{"mode": "client", "endpoints": HERE, **arguments})  # type: ignore[arg-type]
+        connect(credentials=credentials, **{"mode": "client", "endpoints": HERE, **arguments})
     return str(caught.value)
 
 

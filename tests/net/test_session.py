@@ -37,7 +37,7 @@ ROUTER = """
 def test_an_endpoint_in_the_wrong_form_is_refused_with_the_right_one(endpoint: str, advice: str):
     for use in ({"endpoints": [endpoint]}, {"listen": [endpoint]}, {"endpoints": endpoint}):
         with pytest.raises(InvalidInput) as caught:
-            connect(mode="client", **use)  # type: ignore[arg-type]
+            connect(mode="client", **use)
         assert advice in str(caught.value)
         assert repr(endpoint) in str(caught.value)
 

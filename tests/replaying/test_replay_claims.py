@@ -36,7 +36,7 @@ def cart(tmp_path: Path) -> Path:
 
 
 def replay(session, path: Path, **options: object) -> int:
-    with Replayer(session, path, rate=math.inf, **options) as replayer:  # type: ignore[arg-type]
+    with Replayer(session, path, rate=math.inf, **options) as replayer:
         return replayer.run().samples
 
 

@@ -145,6 +145,19 @@ metrics_option = click.option(
 )
 
 
+def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Command]:
+    """``--timeout``, in seconds; ``what`` says what for."""
+    return click.option(
+        "--timeout",
+        type=float,
+        callback=checked_seconds,
+        default=default_s,
+        metavar="S",
+        show_default=True,
+        help=what,
+    )
+
+
 def named_robot(robot: str | None, wire: str) -> str:
     """The robot that a command was given, or the only one that ``wire`` can mean."""
     from zstate.cli.words import is_ros, words_of

@@ -84,6 +84,8 @@ class Claim(Closing):
         if self._first is None:
             self._session.check()
             self._follow()
+            if not self._rivals:
+                return
             earlier = {rival for rival in self._rivals if self._is_before_us(rival)}
             # Zenoh now and then goes on telling of a token that is gone, in the session that followed it.
             there = earlier.intersection(self._rivals_now()) if earlier else earlier

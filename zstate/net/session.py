@@ -239,24 +239,24 @@ class Session(Closing):
             self._closed = True
         _run_bounded(self._leave)
 
-    def stop_companion(self) -> None:
+    def _stop_companion(self) -> None:
         """End what runs beside the session to keep it connected."""
         if self._companion is not None and os.getpid() == self._pid:
             self._companion.close()
 
     def _leave(self) -> None:
-        self.stop_companion()
+        self._stop_companion()
         self._raw.close()
+
+    @staticmethod
+    @atexit.register
+    def _stop_companions() -> None:
+        # A thread that is inside Zenoh as Python shuts down aborts the process.
+        for session in tuple(_OPEN):
+            session._stop_companion()
 
 
 _OPEN: weakref.WeakSet[Session] = weakref.WeakSet()
-
-
-@atexit.register
-def _end_threads() -> None:
-    # A thread that is inside Zenoh as Python shuts down aborts the process.
-    for session in tuple(_OPEN):
-        session.stop_companion()
 
 
 def _run_bounded(action: Callable[[], None]) -> None:

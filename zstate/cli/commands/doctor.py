@@ -10,7 +10,7 @@ import click
 
 from zstate.cli.console import say, say_json
 from zstate.cli.network import Network
-from zstate.cli.options import checked_seconds, session_options, wire_option
+from zstate.cli.options import session_options, timeout_option, wire_option
 
 if TYPE_CHECKING:
     from zstate.cli.doctor.check import Check
@@ -18,15 +18,7 @@ if TYPE_CHECKING:
 
 @click.command("doctor")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@click.option(
-    "--timeout",
-    type=float,
-    callback=checked_seconds,
-    default=3.0,
-    show_default=True,
-    metavar="S",
-    help="How long to wait for what is announced and slow.",
-)
+@timeout_option("How long to wait for what is announced and slow.", 3.0)
 @click.option(
     "--all", "in_full", is_flag=True, help="Every link of every robot, also of those that are sound."
 )

@@ -10,7 +10,7 @@ import click
 
 from zstate.cli.console import say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_seconds, named_robot, session_options, wire_option
+from zstate.cli.options import named_robot, session_options, timeout_option, wire_option
 
 if TYPE_CHECKING:
     from zstate.cli.document_text import Changes
@@ -25,15 +25,7 @@ def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> flo
 @click.command("echo")
 @click.argument("robot", required=False)
 @click.option("--once", is_flag=True, help="Print one; give up after --timeout with the reason.")
-@click.option(
-    "--timeout",
-    type=float,
-    callback=checked_seconds,
-    default=10.0,
-    metavar="S",
-    show_default=True,
-    help="How long --once waits.",
-)
+@timeout_option("How long --once waits.")
 @click.option("--field", metavar="NAME", help="Only this: stamp, positions, positions.JOINT, or just JOINT.")
 @click.option("--changed", is_flag=True, help="Only what differs from what was printed last, stamps aside.")
 @click.option(

@@ -12,10 +12,10 @@ from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
-    checked_seconds,
     seconds_option,
     session_options,
     takeover_option,
+    timeout_option,
     wire_option,
     wires_option,
 )
@@ -38,15 +38,7 @@ def snapshot_command() -> None:
 @click.argument("file", metavar="FILE")
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
 @click.option("--force", is_flag=True, help="Also where there is such a file already.")
-@click.option(
-    "--timeout",
-    type=float,
-    callback=checked_seconds,
-    default=3.0,
-    show_default=True,
-    metavar="S",
-    help="How long to wait for what is announced.",
-)
+@timeout_option("How long to wait for what is announced.", 3.0)
 @wire_option
 @session_options
 def save_command(

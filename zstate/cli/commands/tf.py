@@ -13,9 +13,9 @@ from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
-    checked_seconds,
     reading_clock_option,
     session_options,
+    timeout_option,
     wire_option,
 )
 from zstate.cli.roster import Roster
@@ -58,14 +58,7 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
 @click.argument("source", metavar="B")
 @click.option("--once", is_flag=True, help="Print one answer; give up after --timeout with the reason.")
 @click.option("--at", callback=_stamp, metavar="STAMP", help="One answer, for this instant.")
-@click.option(
-    "--timeout",
-    type=float,
-    callback=checked_seconds,
-    default=10.0,
-    metavar="S",
-    help="With --once and --at; default 10.",
-)
+@timeout_option("How long --once and --at wait.")
 @click.option(
     "--rate",
     type=float,

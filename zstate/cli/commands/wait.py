@@ -9,7 +9,7 @@ import click
 
 from zstate.cli.console import count_text, fail, note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_seconds, session_options, wire_option
+from zstate.cli.options import session_options, timeout_option, wire_option
 from zstate.errors import Unreachable, ZStateError
 
 _GRACE_S = 0.5
@@ -18,15 +18,7 @@ _GRACE_S = 0.5
 @click.command("wait")
 @click.argument("what", type=click.Choice(["robot", "frame", "router"]), metavar="robot|frame|router")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
-@click.option(
-    "--timeout",
-    type=float,
-    callback=checked_seconds,
-    default=30.0,
-    show_default=True,
-    metavar="S",
-    help="Give up after so long, with the reason.",
-)
+@timeout_option("Give up after so long, with the reason.", 30.0)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object, also after the timeout.")
 @wire_option
 @session_options
