@@ -246,6 +246,8 @@ class TransformListener(Closing):
             self._names.pop(session, None)
         if announced.stream == "tf_static" and announced.stream in self._wire.shared:
             self._note_static_writer(session, alive=alive)
+        if announced.stream == "robot_description" and self._follow == "joint_states" and alive:
+            self._follower(announced.robot, session).name_writer(session, self._names[session])
         if announced.stream != self._follow:
             return
         if self._clocks is not None:

@@ -110,6 +110,16 @@ def test_each_edge_has_its_rate_latency_writer_and_clock():
 
 
 @pytest.mark.processes
+def test_fixed_edges_stand_under_the_writer_of_the_model(spawn: Spawn):
+    model = started(spawn, "publish", "rrbot")
+    model.line()
+    with standing(streams=("joint_states",)):
+        report = json.loads(zstate("monitor", "world", "tool", "--once", "--json").stdout)
+    pids = {(edge["kind"], int(edge["writer"].rpartition(" ")[2])) for edge in report["edges"]}
+    assert pids == {("joint", os.getpid()), ("static", model.process.pid)}
+
+
+@pytest.mark.processes
 def test_it_goes_on_and_names_who_has_gone_silent(spawn: Spawn):
     command = started(spawn, "monitor", "base", "tool")
     until(lambda: "waiting: " in command.stderr)

@@ -301,3 +301,16 @@ def test_a_restart_leaves_what_a_static_writer_took_over():
     )
     following.follower.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
     assert following.buffer.lookup("r1/upper", "r1/lower").translation[0] == 1.0
+
+
+def test_fixed_edges_are_those_of_whoever_writes_the_model_and_moving_ones_of_the_driver():
+    following = Following(JointFollower)
+    following.follower.describe(description())
+    following.take(following.sample(0, [0, 0]))
+    following.follower.name_writer(7, "driver")
+    assert {frame.writer for frame in following.buffer.frames() if frame.kind == "static"} == {
+        "the model of 'rrbot'"
+    }
+    following.follower.name_writer(1, "publisher")
+    writers = {(frame.kind, frame.writer) for frame in following.buffer.frames() if frame.parent}
+    assert writers == {("static", "publisher"), ("joint", "driver")}

@@ -37,5 +37,6 @@ class Edge:
     def writer(self) -> str | None:
         """Who gives this edge, as far as anybody said."""
         if self.robot is not None:
-            return self.robot.writer or f"the model of {self.robot.model.name!r}"
+            said_by = self.robot.model_writer if self.kind == "static" else self.robot.writer
+            return said_by or f"the model of {self.robot.model.name!r}"
         return self.track.writer if self.track is not None else self.own_writer

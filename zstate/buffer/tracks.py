@@ -34,7 +34,8 @@ class JointTrack:
     """The joint positions of one robot, and velocities from the first sample on that has them.
 
     A row is the positions in the order of ``model.joint_names``, then the velocities; velocities
-    that were not published are NaN. ``prefix`` stands before the names of all links.
+    that were not published are NaN. ``prefix`` stands before the names of all links. ``writer`` is who
+    publishes the positions and ``model_writer`` who publishes the model, where that is known.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class JointTrack:
         self.forms = self._table.forms
         self.interpolation = interpolation
         self.writer: str | None = None
+        self.model_writer: str | None = None
         self.clock_offsets: ClockOffsets = {}
         self.history = History(model.position_count, span_ns)
         # Quaternions of floating joints have to be looked at and normalised.

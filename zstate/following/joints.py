@@ -31,11 +31,15 @@ class JointFollower(Follower):
     def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally) -> None:
         super().__init__(robot, buffer, tally)
         self._digest = ""
+        self._describer: int | None = None
         self._track: JointTrack | None = None
         self._order = JointOrder(())
 
     def describe(self, description: RobotDescription) -> None:
         self.heard = True
+        with self._lock:
+            self._describer = description.session
+            self._writer_changed()
         if not self._keeps_our_time(description) or description.digest == self._digest:
             return
         with self._lock:
@@ -95,3 +99,4 @@ class JointFollower(Follower):
     def _writer_changed(self) -> None:
         if self._track is not None:
             self._track.writer = self.writer
+            self._track.model_writer = self._writers.get(self._describer or 0)

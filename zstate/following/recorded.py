@@ -117,6 +117,7 @@ class RecordedRobots:
         elif isinstance(message, StaticTransforms):
             self._take_statics(speaker, message)
         elif isinstance(message, RobotDescription) and speaker.robot in self._joints:
+            self._name(self._joints[speaker.robot], speaker)
             self._joints[speaker.robot].describe(message)
 
     def _take_joints(self, speaker: Speaker, state: JointState) -> None:
