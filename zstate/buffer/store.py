@@ -15,6 +15,7 @@ from zstate.buffer.feeds import EdgeNames, Feed, Feeds, TooOld, second_writer
 from zstate.buffer.frames import FrameInfo, frame_info
 from zstate.buffer.history import View, thin
 from zstate.buffer.kernel import insert_together
+from zstate.buffer.layout import Layout
 from zstate.buffer.path import TrackUse
 from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack, Track
 from zstate.buffer.tree import Tree
@@ -249,6 +250,17 @@ class Store:
         """Every frame ever named, in the order of their first mention."""
         with self._lock:
             return tuple(frame_info(name, edge) for name, edge in self._tree.frames.items())
+
+    @property
+    def version(self) -> int:
+        """Grows whenever a frame becomes known, or what places one changes."""
+        return self._tree.version
+
+    def layout(self) -> Layout:
+        """What places every frame now, for those who read all of them at once."""
+        with self._lock:
+            robots = {name: track for name, track in self._tree.robots.items() if track is not None}
+            return Layout(self._tree.version, dict(self._tree.frames), robots)
 
     def _take_views(self, uses: Sequence[TrackUse]) -> list[View]:
         """The views of several tracks at one moment between writes."""

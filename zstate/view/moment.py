@@ -1,0 +1,110 @@
+"""Moment: where every frame was at one instant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate import se3
+from zstate.errors import UnknownFrame
+
+Poses: TypeAlias = NDArray[np.float64]
+Rows: TypeAlias = NDArray[np.intp]
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Which frame is placed on which. Frame i is called ``names[i]``; parents stand before children.
+
+    ``parents[i]`` is the row of its parent, -1 for a root. ``kinds`` are those of ``FrameInfo``: joint,
+    pose, static or root; ``writers`` say who gives each edge, as far as that is known.
+    """
+
+    names: tuple[str, ...]
+    parents: Rows
+    kinds: tuple[str, ...]
+    writers: tuple[str | None, ...]
+
+    @cached_property
+    def index(self) -> Mapping[str, int]:
+        """The row of each frame."""
+        return {name: row for row, name in enumerate(self.names)}
+
+    @cached_property
+    def roots(self) -> Rows:
+        """The row of the frame above each frame that has no parent."""
+        roots = np.arange(len(self.names))
+        for row, parent in enumerate(self.parents.tolist()):
+            if parent >= 0:
+                roots[row] = roots[parent]
+        return roots
+
+    def row(self, name: str) -> int:
+        """The row of a frame. Raises UnknownFrame."""
+        try:
+            return self.index[name]
+        except KeyError:
+            near = get_close_matches(name, self.names, n=3)
+            raise UnknownFrame(name, name, name=name, near_misses=near, frame_count=len(self.names)) from None
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The pose of every frame in its parent, at one instant.
+
+    ``poses[i]`` is ``parent_from_child`` of frame i of ``tree``: (N, 7), x y z [m], qx qy qz qw; the
+    identity for roots and where ``known[i]`` is False. Why a pose is not known stands in ``reasons[i]``.
+    ``stamp`` is the instant [ns]; of what is newest, the newest of all, and None when nothing moves.
+    """
+
+    stamp: int | None
+    tree: Tree
+    poses: Poses
+    known: Mask
+    reasons: Mapping[int, str] = field(default_factory=dict[int, str])
+
+    def placed(self, fixed: str) -> Poses:
+        """The pose of every frame in ``fixed``: (N, 7), NaN where no known edges join the two.
+
+        Row i is ``fixed_from_frame``; the array is the caller's to read only. Raises UnknownFrame.
+        """
+        done = self._placed.get(fixed)
+        if done is None:
+            done = self._placed[fixed] = self._place(self.tree.row(fixed))
+        return done
+
+    def _place(self, fixed: int) -> Poses:
+        tops, top_from_frame = self._from_top
+        pose = tuple(top_from_frame[fixed].tolist())
+        fixed_from_top = se3.invert(pose)
+        placed = np.stack(
+            np.broadcast_arrays(*se3.compose(fixed_from_top, se3.columns(top_from_frame))), axis=-1
+        )
+        placed[tops != tops[fixed]] = np.nan
+        placed.flags.writeable = False
+        return placed
+
+    @cached_property
+    def _placed(self) -> dict[str, Poses]:
+        return {}
+
+    @cached_property
+    def _from_top(self) -> tuple[Rows, Poses]:
+        """The highest frame that known edges lead up to, and ``top_from_frame``.
+
+        Each round doubles how far up every frame has come, so that a deep tree needs few of them.
+        """
+        rows = np.arange(len(self.tree.names))
+        up = np.where(self.known & (self.tree.parents >= 0), self.tree.parents, rows)
+        poses = np.where((up == rows)[:, None], se3.IDENTITY, self.poses)
+        while not np.array_equal(above := up[up], up):
+            both = se3.compose(se3.columns(poses[up]), se3.columns(poses))
+            poses, up = np.stack(both, axis=-1), above
+        return up, poses
