@@ -2,6 +2,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from zstate.errors import InvalidInput
 from zstate.wire.keys import full_name
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
@@ -42,6 +43,15 @@ def test_a_full_name_of_the_robots_own_is_written_as_its_bare_name():
 def test_without_a_prefix_a_bare_name_is_the_robots_own():
     assert names().to_zstate("map") == "map"
     assert names().to_ros("ros/map") == "map"
+
+
+@pytest.mark.parametrize("prefix", ["", "r1/", "left_"])
+def test_the_slash_that_old_programs_put_before_a_frame_is_dropped_once_as_tf2_does(prefix: str):
+    for ros in ("hand", "r1/hand", "left_hand", "fleet/map"):
+        assert names(prefix).to_zstate(f"/{ros}") == names(prefix).to_zstate(ros)
+    for no_name in ("/", "//hand"):
+        with pytest.raises(InvalidInput, match="has a slash at its end|begins with a slash|is empty"):
+            full_name(ROBOT, names(prefix).to_zstate(no_name))
 
 
 def test_the_robot_of_the_root_namespace_keeps_its_own_frames_apart_from_nobodys():

@@ -30,6 +30,8 @@ class FrameNames:
     robot's own, and an own link with a slash in it as somebody else's. A name of somebody else, or of
     nobody, that begins with the prefix is read as the robot's own. And a ROS frame whose name without
     the prefix is ``r1/...`` or ``ros/...`` is written as a frame of the robot, or of nobody.
+
+    The slash that programs of old put before a frame is no part of its name in tf2, and is dropped.
     """
 
     def __init__(self, options: Ros2Options, robot: str) -> None:
@@ -51,6 +53,7 @@ class FrameNames:
 
     def to_zstate(self, name: str) -> str:
         """What this robot calls the frame that a ROS node calls ``name``."""
+        name = name.removeprefix("/")
         if not self._prefix:
             return name
         own = name.removeprefix(self._prefix)
