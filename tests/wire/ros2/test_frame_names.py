@@ -50,7 +50,7 @@ def test_the_slash_that_old_programs_put_before_a_frame_is_dropped_once_as_tf2_d
     for ros in ("hand", "r1/hand", "left_hand", "fleet/map"):
         assert names(prefix).to_zstate(f"/{ros}") == names(prefix).to_zstate(ros)
     for no_name in ("/", "//hand"):
-        with pytest.raises(InvalidInput, match="has a slash at its end|begins with a slash|is empty"):
+        with pytest.raises(InvalidInput, match="has a slash at its end"):
             full_name(ROBOT, names(prefix).to_zstate(no_name))
 
 
