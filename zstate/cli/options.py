@@ -145,6 +145,23 @@ metrics_option = click.option(
 )
 
 
+def json_option(what: str = "One JSON object a line.") -> Callable[[Command], Command]:
+    """``--json``, as ``as_json``; ``what`` says what is printed."""
+    return click.option("--json", "as_json", is_flag=True, help=what)
+
+
+def form_options(json: str, svg: str) -> Callable[[Command], Command]:
+    """``--json`` and the forms of a picture, as ``form``: None for text. The texts say what is printed."""
+
+    def with_forms(command: Command) -> Command:
+        helps = {"json": json, "svg": svg, "dot": "For Graphviz.", "mermaid": "For Markdown."}
+        for form, text in reversed(helps.items()):
+            command = click.option(f"--{form}", "form", flag_value=form, help=text)(command)
+        return command
+
+    return with_forms
+
+
 def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Command]:
     """``--timeout``, in seconds; ``what`` says what for."""
     return click.option(
@@ -230,6 +247,9 @@ rate_option = click.option(
 )
 seconds_option = click.option(
     "--seconds", type=float, callback=checked_seconds, metavar="N", help="End after so long [s]."
+)
+heard_robot_option = click.option(
+    "--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them."
 )
 name_option = click.option(
     "--name", metavar="NAME", help="The robot's name on the network; default: as it is called here."

@@ -12,6 +12,7 @@ import click
 
 from zstate.cli.console import count_text, say, say_json
 from zstate.cli.layout import in_columns, tree_lines
+from zstate.cli.options import json_option
 from zstate.errors import Found, ModelError
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "vel
 @click.argument("file")
 @click.option("--fix-hints", is_flag=True, help="Below each finding, what to write instead.")
 @click.option("--joints", "joint_table", is_flag=True, help="The joints as a table, instead of the tree.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object.")
+@json_option("One JSON object.")
 def check_command(file: str, fix_hints: bool, joint_table: bool, as_json: bool) -> None:
     """Say what is right and wrong with the robot model in FILE.
 

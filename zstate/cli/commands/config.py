@@ -8,12 +8,12 @@ import click
 
 from zstate.cli.console import note, say, say_json
 from zstate.cli.layout import in_columns
-from zstate.cli.options import plain_session_options, reading_clock_option, wire_option
+from zstate.cli.options import json_option, plain_session_options, reading_clock_option, wire_option
 
 
 @click.command("config")
 @click.option("--zenoh", "as_zenoh", is_flag=True, help="What Zenoh is told, beyond its own defaults.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object.")
+@json_option("One JSON object.")
 @wire_option
 @reading_clock_option
 @plain_session_options

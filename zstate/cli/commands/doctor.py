@@ -10,7 +10,7 @@ import click
 
 from zstate.cli.console import say, say_json
 from zstate.cli.network import Network
-from zstate.cli.options import session_options, timeout_option, wire_option
+from zstate.cli.options import json_option, session_options, timeout_option, wire_option
 
 if TYPE_CHECKING:
     from zstate.cli.doctor.check import Check
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.option(
     "--all", "in_full", is_flag=True, help="Every link of every robot, also of those that are sound."
 )
-@click.option("--json", "as_json", is_flag=True, help="One JSON object.")
+@json_option("One JSON object.")
 @wire_option
 @session_options
 def doctor_command(

@@ -10,7 +10,7 @@ import click
 
 from zstate.cli.console import fail, note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options, wire_option
+from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -19,10 +19,7 @@ if TYPE_CHECKING:
 
 @click.command("graph")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@click.option("--json", "form", flag_value="json", help="One JSON object: programs and streams.")
-@click.option("--svg", "form", flag_value="svg", help="A picture, from left to right.")
-@click.option("--dot", "form", flag_value="dot", help="For Graphviz.")
-@click.option("--mermaid", "form", flag_value="mermaid", help="For Markdown.")
+@form_options("One JSON object: programs and streams.", "A picture, from left to right.")
 @wire_option
 @session_options
 def graph_command(network: Network, robot: str, form: str | None, wire: str) -> None:

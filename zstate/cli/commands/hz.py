@@ -10,7 +10,7 @@ import click
 
 from zstate.cli.console import fail, note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import named_robot, session_options, timeout_option, wire_option
+from zstate.cli.options import json_option, named_robot, session_options, timeout_option, wire_option
 from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ _SETTLING_S = 0.1
 )
 @click.option("--once", is_flag=True, help="Print one measurement, of the first second.")
 @timeout_option("How long --once waits for the first sample.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@json_option()
 @wire_option
 @session_options
 def hz_command(

@@ -10,6 +10,7 @@ import click
 
 from zstate.cli.console import count_text, rate_text, say, say_json
 from zstate.cli.layout import in_columns
+from zstate.cli.options import json_option
 
 if TYPE_CHECKING:
     from zstate.cli.recording_facts import RecordedRobot
@@ -21,7 +22,7 @@ _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of w
 
 @click.command("info")
 @click.argument("file")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object.")
+@json_option("One JSON object.")
 def info_command(file: str, as_json: bool) -> None:
     """Say what is in the recording FILE: its robots, their streams and models, when, how much.
 

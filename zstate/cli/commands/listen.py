@@ -13,7 +13,7 @@ import click
 from zstate.cli.console import note, say, say_json
 from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import metrics_option, reading_clock_option, session_options, wire_option
+from zstate.cli.options import json_option, metrics_option, reading_clock_option, session_options, wire_option
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
@@ -34,7 +34,7 @@ _MEETING_S = 0.3
 
 @click.command("listen")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@json_option()
 @wire_option
 @reading_clock_option
 @metrics_option

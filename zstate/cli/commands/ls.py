@@ -10,7 +10,7 @@ import click
 
 from zstate.cli.console import is_terminal, note, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options, wire_option
+from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _MEETING_S = 0.5
 
 @click.command("ls")
 @click.option("--watch", is_flag=True, help="Keep the list up to date, until Ctrl-C.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON array; on ROS's side one object.")
+@json_option("One JSON array; on ROS's side one object.")
 @wire_option
 @session_options
 def ls_command(network: Network, *, watch: bool, as_json: bool, wire: str) -> None:

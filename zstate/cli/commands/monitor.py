@@ -9,7 +9,14 @@ import click
 
 from zstate.cli.console import is_terminal, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import reading_clock_option, session_options, timeout_option, wire_option
+from zstate.cli.options import (
+    heard_robot_option,
+    json_option,
+    reading_clock_option,
+    session_options,
+    timeout_option,
+    wire_option,
+)
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed
 from zstate.errors import duration_text
@@ -29,8 +36,8 @@ _FIRST_AFTER_S = 1.0
 @click.argument("source", metavar="B")
 @click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
 @timeout_option("How long --once waits for the pose.")
-@click.option("--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@heard_robot_option
+@json_option()
 @wire_option
 @reading_clock_option
 @session_options

@@ -13,6 +13,8 @@ from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
+    heard_robot_option,
+    json_option,
     reading_clock_option,
     session_options,
     timeout_option,
@@ -76,8 +78,8 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
     show_default=True,
     help="Digits behind the point; JSON has them all.",
 )
-@click.option("--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+@heard_robot_option
+@json_option()
 @wire_option
 @reading_clock_option
 @session_options

@@ -11,7 +11,7 @@ import click
 
 from zstate.cli.console import is_terminal, note, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options, wire_option
+from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -23,10 +23,7 @@ _NO_FRAMES = "announced, but without any frame: who publishes the model? `zstate
 
 @click.command("tree")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@click.option("--json", "form", flag_value="json", help="One JSON array of frames.")
-@click.option("--svg", "form", flag_value="svg", help="A picture, from the top down.")
-@click.option("--dot", "form", flag_value="dot", help="For Graphviz.")
-@click.option("--mermaid", "form", flag_value="mermaid", help="For Markdown.")
+@form_options("One JSON array of frames.", "A picture, from the top down.")
 @wire_option
 @session_options
 def tree_command(network: Network, robot: str, form: str | None, wire: str) -> None:

@@ -9,7 +9,7 @@ import click
 
 from zstate.cli.console import count_text, fail, note, say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import session_options, timeout_option, wire_option
+from zstate.cli.options import json_option, session_options, timeout_option, wire_option
 from zstate.errors import Unreachable, ZStateError
 
 _GRACE_S = 0.5
@@ -19,7 +19,7 @@ _GRACE_S = 0.5
 @click.argument("what", type=click.Choice(["robot", "frame", "router"]), metavar="robot|frame|router")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @timeout_option("Give up after so long, with the reason.", 30.0)
-@click.option("--json", "as_json", is_flag=True, help="One JSON object, also after the timeout.")
+@json_option("One JSON object, also after the timeout.")
 @wire_option
 @session_options
 def wait_command(
