@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 import time
 from collections.abc import AsyncIterable, Callable
@@ -156,6 +155,8 @@ class TransformBuffer(Questions):
         self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0
     ) -> Transform:
         """``wait`` for asyncio: nothing blocks, and cancelling the task ends it."""
+        import asyncio  # noqa: PLC0415  # who calls this has it already, and others do not need it
+
         question = self._question(target, source, at)
         loop, event = asyncio.get_running_loop(), asyncio.Event()
         deadline = loop.time() + seconds("timeout_s", timeout_s)

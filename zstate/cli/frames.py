@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from zstate.cli.console import note
 from zstate.cli.roster import announced_robots
+from zstate.cli.worker import Worker
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 _MODELS_WITHIN_S = 3.0
 _SAMPLES_WITHIN_S = 1.0
+# A rate that two samples tell may be far off.
+_RATE_OVER_NS = 100_000_000
 _QUIET_S = 0.15
 _LOOK_EVERY_S = 0.02
 
@@ -26,29 +29,40 @@ def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     Says on standard error what is announced but does not arrive. Fails when no such robot is
     announced.
     """
+    # Models and statics come while those who write them are asked for, which is mostly waiting.
+    asked = Worker("zstate announced", lambda: announced_robots(session, robot))
     from zstate.listener import TransformListener
 
-    # Models and statics come while those who write them are asked for.
     with TransformListener(session, robot) as listener:
-        robots = announced_robots(session, robot)
+        robots = asked.result()
         _wait_for_models(listener, robots)
         _wait_for_samples(listener, robots)
         return listener.buffer.frames()
 
 
 def _wait_for_models(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> None:
-    """Until all robots are described and nothing more has come for a moment: statics are many messages."""
+    """Until all that is announced is there, or all robots are described and nothing came for a moment."""
     deadline = time.monotonic() + _MODELS_WITHIN_S
     count, changed = 0, time.monotonic()
     while (now := time.monotonic()) < deadline:
         frames = listener.buffer.frames()
         if len(frames) != count:
             count, changed = len(frames), now
-        if now - changed > _QUIET_S and not _missing(listener, robots):
+        is_quiet = now - changed > _QUIET_S
+        if (is_quiet or _has_statics(frames, robots)) and not _missing(listener, robots):
             break
         time.sleep(_LOOK_EVERY_S)
     for text in _missing(listener, robots):
         note(text)
+
+
+def _has_statics(frames: tuple[FrameInfo, ...], robots: tuple[RobotInfo, ...]) -> bool:
+    """Whether every writer of static edges is known to have placed a frame."""
+    from zstate.wire.keys import MODEL_WRITER
+
+    names = [name for robot in robots for name, _ in robot.static_names if name != MODEL_WRITER]
+    heard = {frame.writer for frame in frames if frame.kind == "static"}
+    return len(names) == len(heard.intersection(names))  # not where two robots have one of the same name
 
 
 def _missing(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> list[str]:
@@ -65,15 +79,19 @@ def _missing(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> list
 
 
 def _wait_for_samples(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> None:
-    """Until there are two samples of whatever is written, or it is clear that they are slow."""
+    """Until there are enough samples of whatever is written, or it is clear that they are slow."""
     written = {robot.name for robot in robots if "joint_states" in _streams(robot)}
     deadline = time.monotonic() + _SAMPLES_WITHIN_S
     while time.monotonic() < deadline and any(
-        frame.kind == "joint" and frame.count < 2
+        frame.kind == "joint" and not _tells_its_rate(frame)
         for frame in listener.buffer.frames()
         if frame.name.partition("/")[0] in written
     ):
         time.sleep(_LOOK_EVERY_S)
+
+
+def _tells_its_rate(frame: FrameInfo) -> bool:
+    return frame.count > 1 and (frame.newest or 0) - (frame.oldest or 0) >= _RATE_OVER_NS
 
 
 def _streams(robot: RobotInfo) -> set[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -160,6 +161,8 @@ def _leave(code: str | int | None) -> NoReturn:
             with suppress(OSError, ValueError):
                 stream.flush()
         os._exit(code)
+    # Python looks for garbage as it ends, a tenth of a second long where it has heard a fleet.
+    gc.freeze()
     sys.exit(code)
 
 

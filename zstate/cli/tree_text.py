@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import age_text, rate_text
+from zstate.cli.frame_tree import below, roots, short_name
 from zstate.cli.layout import in_columns, tree_lines
-from zstate.cli.pictures.frames import below, roots, short_name
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import age_text, count_text, rate_text
+from zstate.cli.frame_tree import below, roots, short_name
 from zstate.cli.pictures.cards import BELOW, Card, cards
 from zstate.cli.pictures.svg import ALARM, LINE, MUTED, WRITERS, Svg, text_width
 
@@ -20,26 +21,6 @@ _PAD = 12.0
 
 # Who is silent for so long is worth a colour.
 _OLD_NS = 1_000_000_000
-
-
-def short_name(frame: FrameInfo) -> str:
-    """The name without the robot's, where the parent belongs to the same robot."""
-    robot, slash, bare = frame.name.partition("/")
-    return bare if slash and (frame.parent or "").startswith(f"{robot}/") else frame.name
-
-
-def roots(frames: Sequence[FrameInfo]) -> list[str]:
-    """The names of the frames without a parent, sorted."""
-    return sorted(frame.name for frame in frames if frame.parent is None)
-
-
-def below(frames: Sequence[FrameInfo]) -> dict[str, list[str]]:
-    """The names of each frame's children."""
-    children: dict[str, list[str]] = {}
-    for frame in frames:
-        if frame.parent is not None:
-            children.setdefault(frame.parent, []).append(frame.name)
-    return children
 
 
 def svg(frames: Sequence[FrameInfo], now: int, *, in_full: bool, title: str) -> str:
