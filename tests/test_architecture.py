@@ -70,6 +70,9 @@ HOMES = {
     "tf2_msgs": "ros1",
     "prometheus_client": "metrics",
     "viser": "view",
+    "websockets": "view",  # what viser's server is made of
+    "trimesh": "view",
+    "collada": "view",
     "click": "cli",
     "matplotlib": "cli",  # `zstate plot`
     "rich": "cli",

@@ -1,0 +1,109 @@
+"""The page is where it says, and shows itself through its door only."""
+
+from __future__ import annotations
+
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+
+import pytest
+
+pytest.importorskip("viser")
+
+import viser
+from support import a_free_port, until
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from zstate.errors import InvalidInput
+from zstate.view.page import Page
+
+PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
+
+
+def status(url: str, headers: Mapping[str, str] | None = None) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=dict(headers or {}))) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def listens(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((host, port)) == 0
+
+
+def another_address() -> str | None:
+    """One of this machine that is not loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return None
+        return probe.getsockname()[0]
+
+
+def test_it_is_on_loopback_unless_somebody_says_otherwise():
+    with Page(port=0) as page:
+        assert page.url == f"http://127.0.0.1:{page.port}"
+        assert status(page.url) == 200
+        assert status(page.url, {"Host": "evil.example"}) == 403
+        address = another_address()
+        assert address is None or not listens(address, page.port)
+    assert not listens("127.0.0.1", page.port)
+
+
+def test_a_websocket_comes_through_the_same_door():
+    with Page(port=0) as page:
+        address = f"ws://127.0.0.1:{page.port}"
+        with connect(address, subprotocols=PROTOCOL, compression=None) as socket:
+            assert socket.recv(timeout=10)
+        with pytest.raises(InvalidStatus) as caught:
+            connect(address, subprotocols=PROTOCOL, origin="https://evil.example")  # type: ignore[arg-type]
+        assert caught.value.response.status_code == 403
+
+
+def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
+    with Page("0.0.0.0", 0) as page:
+        here = f"127.0.0.1:{page.port}"
+        assert page.door.token is not None
+        assert page.url.endswith(f":{page.port}/?token={page.door.token}")
+        assert status(f"http://{here}") == 401
+        assert status(f"http://{here}/?token={page.door.token}") == 200
+        with pytest.raises(InvalidStatus) as caught:
+            connect(f"ws://{here}", subprotocols=PROTOCOL)
+        assert caught.value.response.status_code == 401
+        cookie = {"Cookie": f"zstate_view_{page.port}={page.door.token}"}
+        with connect(f"ws://{here}", subprotocols=PROTOCOL, additional_headers=cookie) as socket:
+            assert socket.recv(timeout=10)
+
+
+def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
+    with Page(port=a_free_port()) as first:
+        with pytest.raises(InvalidInput, match=f"port {first.port} is taken"):
+            Page(port=first.port)
+        with Page() as second, Page() as third:
+            assert len({first.port, second.port, third.port}) == 3
+            assert [status(page.url) for page in (second, third)] == [200, 200]
+
+
+@pytest.mark.parametrize(("host", "port"), [("nowhere.invalid", 0), ("127.0.0.1", 99999)])
+def test_what_cannot_be_listened_at_is_an_error_of_the_user(host: str, port: int):
+    with pytest.raises(InvalidInput, match="nobody can listen"):
+        Page(host, port)
+
+
+def test_nobody_is_shown_the_way_to_the_internet():
+    with Page(port=0) as page:
+        assert page.server.request_share_url() is None
+
+
+def test_it_prints_nothing(capsys: pytest.CaptureFixture[str]):
+    with Page(port=0) as page:
+        until(lambda: listens("127.0.0.1", page.port))
+    said = capsys.readouterr()
+    assert "viser" not in said.out + said.err
