@@ -6,6 +6,16 @@ import click
 
 from zstate.cli.console import say
 
+# What click's functions lack. In zsh, who has not asked for completion yet has no compdef; in fish, all of
+# a help after its first comma would be lost.
+_MENDED = {
+    "zsh": (
+        "#compdef zstate\n",
+        "#compdef zstate\n\n(( $+functions[compdef] )) || { autoload -Uz compinit && compinit -i }\n",
+    ),
+    "fish": ('string split "," $completion', 'string split --max 1 "," $completion'),
+}
+
 
 @click.command("completion")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
@@ -23,4 +33,5 @@ def completion_command(shell: str) -> None:
 
     kind = get_completion_class(shell)
     assert kind is not None
-    say(kind(group, {}, "zstate", COMPLETION_VARIABLE).source().strip("\n"))
+    source = kind(group, {}, "zstate", COMPLETION_VARIABLE).source().strip("\n")
+    say(source.replace(*_MENDED[shell]) if shell in _MENDED else source)
