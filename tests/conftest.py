@@ -20,7 +20,8 @@ def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
     """Each test, with the processes it starts, meets nobody else."""
     address = f"127.0.0.1:{a_free_port()}"
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", address)
-    monkeypatch.delenv("ZENOH_CONFIG", raising=False)
+    for variable in ("ZENOH_CONFIG", "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG"):
+        monkeypatch.delenv(variable, raising=False)
     return address
 
 

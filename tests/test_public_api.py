@@ -36,7 +36,7 @@ NAMES = [
 
 SIGNATURES = {
     "load_model": "(source, *, xacro_args=None)",
-    "connect": ("(config=None, *, mode='peer', endpoints=(), listen=(), timeout_s=5.0, credentials=None)"),
+    "connect": ("(config=None, *, mode=None, endpoints=(), listen=(), timeout_s=5.0, credentials=None)"),
     "discover": "(session, timeout_s=1.0, *, wire='native')",
     "Kinematics": "(model)",
     "Kinematics.edge_poses": "(positions, out=None)",

@@ -68,6 +68,23 @@ def test_robots_and_statics_of_one_file_run_until_ctrl_c(up):
     interrupted(child)
 
 
+def test_a_program_of_plain_python_comes_to_the_router_of_the_file(up, free_port: int):
+    program = "\n".join(
+        [
+            "import zstate",
+            "with zstate.connect() as session, zstate.TransformListener(session, 'left') as listener:",
+            "    print('heard', listener.buffer.wait('base', 'lower', timeout_s=10.0).source)",
+        ]
+    )
+    child = up(
+        f'[router]\nlisten = ["tcp/127.0.0.1:{free_port}"]\n'
+        + robot(name="left")
+        + table("program", name="mine", run=["python", "-c", program], after=["left"])
+    )
+    assert any(line.startswith("mine") for line in lines_until(child, "heard lower"))
+    interrupted(child)
+
+
 def test_a_loop_starts_a_robot_for_each_name_with_its_own_static_edges(up):
     child = up(
         "[parameters]\nrate = 100.0\n"

@@ -5,12 +5,9 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-
-from zstate.errors import ConfigError
 
 if TYPE_CHECKING:
     from zstate.net.security import Credentials
@@ -126,13 +123,6 @@ def _password(user: str, file: str | None) -> str:
                 f"the password of {user!r} is missing; put it into {PASSWORD_VARIABLE} or a --password-file"
             )
         return password
-    from zstate.net.credential_files import check_private
+    from zstate.net.credential_files import password_in
 
-    check_private(file)
-    try:
-        lines = Path(file).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the password file {file!r} cannot be read: {error}", path=file) from None
-    if not lines or not lines[0]:
-        raise ConfigError(f"the password file {file!r} has nothing in its first line", path=file)
-    return lines[0]
+    return password_in(file)

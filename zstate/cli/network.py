@@ -45,8 +45,9 @@ class Network:
     @property
     def joins_as(self) -> str:
         """The mode, or what the other options mean without one."""
-        # Whoever only says where to connect means a router, and peers do not pass on what others say.
-        return self.mode or ("client" if self.connect and not self.listen and not self.config else "peer")
+        from zstate.net.environment import implied_mode
+
+        return self.mode or implied_mode(self.connect, self.listen, self.config)
 
 
 @contextmanager

@@ -51,6 +51,21 @@ def check_private(file: File) -> None:
         )
 
 
+def password_in(file: File) -> str:
+    """The first line of a file that only its owner may read. Raises ConfigError."""
+    _check_readable(file)
+    check_private(file)
+    try:
+        lines = Path(file).read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"the password file {str(file)!r} cannot be read: {error}", path=str(file)
+        ) from None
+    if not lines or not lines[0]:
+        raise ConfigError(f"the password file {str(file)!r} has nothing in its first line", path=str(file))
+    return lines[0]
+
+
 def _load_pair(context: ssl.SSLContext, certificate: File, key: File | None) -> None:
     try:
         # A password is asked for on the terminal unless one is given.

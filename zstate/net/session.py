@@ -30,6 +30,7 @@ from zstate.net.config import (
     given_config,
     our_config,
 )
+from zstate.net.environment import naming_the_variable, said_in_environment
 from zstate.net.forked import keep_for_ever
 from zstate.net.modes import (
     check_credentials,
@@ -50,7 +51,7 @@ CLOSE_WITHIN_S = 0.8
 def connect(
     config: ConfigSource | None = None,
     *,
-    mode: str = "peer",
+    mode: str | None = None,
     endpoints: str | Sequence[str] = (),
     listen: str | Sequence[str] = (),
     timeout_s: float = 5.0,
@@ -59,7 +60,7 @@ def connect(
     """Join the network.
 
     Without arguments: meet every process of this host that does the same, and nobody else. Nothing
-    leaves the host. Otherwise ``mode`` is one of
+    leaves the host. Otherwise ``mode``, "peer" unless given, is one of
 
     - ``"peer"``: a direct link to each of ``endpoints``, kept up for ever whether or not somebody
       answers yet, and to whoever comes to ``listen``. Peers do not pass on what others say: two of them
@@ -80,10 +81,29 @@ def connect(
     without one, the file named by the environment variable ``ZENOH_CONFIG``. ``endpoints``, ``listen``,
     ``credentials`` and a ``mode`` other than "peer" then replace what it says.
 
+    Where ``config``, ``mode``, ``endpoints`` and ``listen`` say nothing, the environment is asked, as by
+    zstate's commands: ``ZSTATE_MODE``, ``ZSTATE_CONNECT`` and ``ZSTATE_LISTEN`` (endpoints with blanks
+    between them; a client, if only they say where to connect), ``ZSTATE_CONFIG``, and who this is:
+    ``ZSTATE_CERTS`` with ``ZSTATE_IDENTITY``, ``ZSTATE_USER`` with ``ZSTATE_PASSWORD`` or
+    ``ZSTATE_PASSWORD_FILE``. So the programs that `zstate up` starts are on its network.
+
     Raises InvalidInput or ConfigError for what cannot be used, Unreachable where nobody answers,
     AccessDenied where all who do refuse, PortBusy, NetworkError. The other modes go on trying; who refuses
     them, and why, is logged as a warning.
     """
+    if config is None and mode is None and not endpoints and not listen:
+        said = said_in_environment()
+        if said is not None:
+            with naming_the_variable():
+                return connect(
+                    said.config,
+                    mode=said.mode,
+                    endpoints=said.endpoints,
+                    listen=said.listen,
+                    timeout_s=timeout_s,
+                    credentials=credentials or said.credentials,
+                )
+    mode = mode or "peer"
     checked = _check(mode, endpoints, listen, timeout_s)
     if credentials is not None:
         _check_credentials(credentials, checked[1], checked[2])

@@ -34,8 +34,8 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     zstate up cell.toml rate=500 robots="left right third"
     zstate up cell.toml --check
 
-    With a [router] the rest starts when that is ready, and comes to it unless [network] says otherwise.
-    Paths are beside FILE, which is TOML:
+    With a [router] the rest starts when that is ready, and comes to it unless [network] says otherwise: so
+    does a program's zstate.connect() that is given nothing. Paths are beside FILE, which is TOML:
 
     \b
     include = ["network.toml"]        # more such files
