@@ -71,6 +71,14 @@ def find(name: str) -> CatalogEntry:
     raise _unknown(name, wanted)
 
 
+def package_folders() -> tuple[Path, ...]:
+    """The folders in and below which the collections keep packages, whose meshes their robots name."""
+    folders = [folder.parents[1] for folder in _example_folders()] + list(_example_folders())
+    if util.find_spec("robot_descriptions") is not None:
+        folders.append(_cloned())
+    return tuple(folder for folder in folders if folder.is_dir())
+
+
 def _unknown(name: str, wanted: str) -> UnknownModel:
     entries = catalog()
     near = get_close_matches(wanted[:100], [entry.name for entry in entries], n=3)
@@ -121,9 +129,12 @@ def _robot_descriptions() -> dict[str, Path]:
     # Its modules clone repositories when imported, so only its cache is looked at.
     if util.find_spec("robot_descriptions") is None:
         return {}
+    return _by_stem(_cloned().rglob("*.urdf"))
+
+
+def _cloned() -> Path:
     default = "~/.cache/robot_descriptions"
-    folder = Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", default)).expanduser()
-    return _by_stem(folder.rglob("*.urdf"))
+    return Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", default)).expanduser()
 
 
 _COLLECTIONS: dict[str, Callable[[], dict[str, Path]]] = {

@@ -1,0 +1,295 @@
+"""Meshes: shapes as binary glTF, in the colours of the URDF and of the files, each file read once."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+trimesh = pytest.importorskip("trimesh")
+
+from zstate import load_model  # noqa: E402
+from zstate.model.shapes import Box, Cylinder, MeshFile, Shape, Sphere, shapes_of  # noqa: E402
+from zstate.se3 import IDENTITY  # noqa: E402
+from zstate.view.geometry.paths import MeshPaths, Missing  # noqa: E402
+from zstate.view.geometry.smoothing import smooth  # noqa: E402
+from zstate.view.meshes import Drawing, Meshes  # noqa: E402
+
+TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n{}f 1/1 2/2 3/3\n"
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+  <asset><unit meter="{unit}" name="unit"/><up_axis>{up}</up_axis></asset>
+  <library_effects><effect id="e"><profile_COMMON><technique sid="common"><lambert>
+    <diffuse><color>1 0 0 1</color></diffuse></lambert></technique></profile_COMMON></effect>
+  </library_effects>
+  <library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+  <library_geometries><geometry id="g"><mesh>
+    <source id="p"><float_array id="pa" count="9">0 0 0 10 0 0 0 20 30</float_array><technique_common>
+      <accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+      <param name="Z" type="float"/></accessor></technique_common></source>
+    <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+    <triangles material="s" count="1"><input semantic="VERTEX" source="#v" offset="0"/>
+      <p>0 1 2</p></triangles>
+  </mesh></geometry></library_geometries>
+  <library_visual_scenes><visual_scene id="S"><node><instance_geometry url="#g"><bind_material>
+    <technique_common><instance_material symbol="s" target="#m"/></technique_common></bind_material>
+    </instance_geometry></node></visual_scene></library_visual_scenes>
+  <scene><instance_visual_scene url="#S"/></scene>
+</COLLADA>"""
+
+
+def shape(geometry: object, color: tuple[float, ...] | None = None, texture: str | None = None) -> Shape:
+    return Shape("base", "visual", IDENTITY, geometry, color, texture)  # type: ignore[arg-type]
+
+
+def drawn(one: Shape, meshes: Meshes | None = None, **options: object) -> Drawing:
+    drawing = (meshes or Meshes()).draw(one, **options)  # type: ignore[arg-type]
+    assert isinstance(drawing, Drawing), str(drawing)
+    return drawing
+
+
+def read(drawing: Drawing):
+    """The meshes of a glTF file, as another program reads them."""
+    scene = trimesh.load_scene(io.BytesIO(drawing.glb), file_type="glb", process=False)
+    return list(scene.geometry.values())
+
+
+def the_mesh(drawing: Drawing):
+    (mesh,) = read(drawing)
+    return mesh
+
+
+def linear(channel: float) -> float:
+    """sRGB to linear light, as the standard writes it."""
+    return channel / 12.92 if channel <= 0.04045 else ((channel + 0.055) / 1.055) ** 2.4
+
+
+def color_of(drawing: Drawing) -> list[int]:
+    return the_mesh(drawing).visual.material.baseColorFactor.tolist()
+
+
+def as_read(color: tuple[float, float, float, float]) -> list[int]:
+    """What a reader of glTF makes of an sRGB colour: linear, in 255 steps."""
+    return [*(round(linear(channel) * 255) for channel in color[:3]), round(color[3] * 255)]
+
+
+def picture(path: Path, mode: str = "RGB", size: tuple[int, int] = (8, 4)) -> Path:
+    Image.new(mode, size, (10, 200, 30, 128)[: len(mode)]).save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("geometry", "size", "volume"),
+    [
+        (Box((1.0, 2.0, 3.0)), (1.0, 2.0, 3.0), 6.0),
+        (Cylinder(0.5, 2.0), (1.0, 1.0, 2.0), 2.0 * np.pi * 0.25),
+        (Sphere(0.5), (1.0, 1.0, 1.0), np.pi / 6.0),
+    ],
+)
+def test_a_primitive_has_its_size_about_its_middle_and_faces_outwards(geometry, size, volume):
+    mesh = the_mesh(drawn(shape(geometry)))
+    assert mesh.bounds == pytest.approx(np.array([-0.5, 0.5])[:, None] * size, abs=1e-6)
+    mesh.merge_vertices(merge_norm=True)
+    assert mesh.is_watertight
+    # Positive only where the triangles are seen counterclockwise from outside; 32 sides are not quite round.
+    assert mesh.volume == pytest.approx(volume, rel=0.05)
+
+
+def test_a_box_has_sharp_edges_and_a_sphere_none():
+    # Each corner of a box is three points, one for each side that meets there.
+    assert len(the_mesh(drawn(shape(Box((1, 1, 1))))).vertices) == 24
+    ball = the_mesh(drawn(shape(Sphere(2.0))))
+    assert ball.vertex_normals == pytest.approx(ball.vertices / 2.0, abs=0.05)
+
+
+def test_faces_that_bend_little_share_their_points_and_others_do_not():
+    def fold(degrees: float) -> int:
+        """How many points two triangles have that meet in the y axis at that angle."""
+        x, z = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        points = np.array([(0, 0, 0), (0, 1, 0), (-1, 0, 0), (x, 0, z)])
+        return len(smooth(points, np.array([(0, 1, 2), (0, 3, 1)])).points)
+
+    assert (fold(0), fold(30), fold(40), fold(90)) == (4, 4, 6, 6)
+
+
+def test_triangles_without_area_are_left_out():
+    points = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (np.nan, 0, 0)])
+    surface = smooth(points, np.array([(0, 1, 2), (0, 1, 1), (0, 1, 3)]))
+    assert surface.points[surface.triangles].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
+
+
+def test_the_colour_of_the_urdf_arrives_as_linear_light():
+    color = (0.9, 0.5, 0.01, 0.25)
+    assert color_of(drawn(shape(Box((1, 1, 1)), color))) == as_read(color)
+
+
+def test_what_has_no_colour_is_light_grey():
+    red, green, blue, opacity = color_of(drawn(shape(Sphere(1.0))))
+    assert max(red, green, blue) - min(red, green, blue) < 15
+    assert opacity == 255
+
+
+def test_one_colour_may_be_laid_over_everything():
+    over = (1.0, 0.0, 0.0, 0.5)
+    assert color_of(drawn(shape(Sphere(1.0), (0, 1, 0, 1)), over=over)) == as_read(over)
+
+
+def test_a_mesh_of_a_file_without_colours_takes_that_of_the_urdf(tmp_path):
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    color = (0.0, 0.0, 1.0, 1.0)
+    one = shape(MeshFile(str(tmp_path / "box.stl"), (1, -1, 2)), color)
+    assert color_of(drawn(one)) == as_read(color)
+    assert drawn(one).scale == (1, -1, 2)
+
+
+def test_the_colours_of_a_file_win_over_that_of_the_urdf(tmp_path):
+    (tmp_path / "red.dae").write_text(DAE.format(unit=1, up="Z_UP"))
+    one = shape(MeshFile(str(tmp_path / "red.dae")), (0, 0, 1, 1))
+    assert color_of(drawn(one)) == as_read((1, 0, 0, 1))
+
+
+@pytest.mark.parametrize("up", ["Y_UP", "Z_UP"])
+def test_collada_is_read_in_its_unit_and_its_up_axis_is_not_heeded_as_in_rviz(tmp_path, up):
+    (tmp_path / "cm.dae").write_text(DAE.format(unit=0.01, up=up))
+    mesh = the_mesh(drawn(shape(MeshFile(str(tmp_path / "cm.dae")))))
+    assert mesh.bounds == pytest.approx(np.array([(0, 0, 0), (0.1, 0.2, 0.3)]))
+
+
+def test_the_materials_beside_an_obj_file_are_read_with_their_images(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "textures").mkdir()
+    picture(tmp_path / "textures" / "green.png")
+    (tmp_path / "meshes" / "a.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd ../textures/green.png\n")
+    obj = tmp_path / "meshes" / "a.obj"
+    obj.write_text(TRIANGLE_OBJ.format("mtllib a.mtl\nusemtl skin\n"))
+    mesh = the_mesh(drawn(shape(MeshFile(str(obj)))))
+    assert mesh.visual.material.baseColorTexture.size == (8, 4)
+    placed = {tuple(point[:2]): tuple(uv) for point, uv in zip(mesh.vertices, mesh.visual.uv, strict=True)}
+    assert placed == {(0, 0): (0, 0), (1, 0): (1, 0), (0, 1): (0, 1)}
+
+
+def test_the_image_of_the_urdf_is_laid_over_a_mesh_without_a_material(tmp_path):
+    (tmp_path / "a.obj").write_text(TRIANGLE_OBJ.format(""))
+    image = picture(tmp_path / "see through.png", "RGBA")
+    one = shape(MeshFile(str(tmp_path / "a.obj")), None, image.as_uri())
+    assert the_mesh(drawn(one)).visual.material.baseColorTexture.mode == "RGBA"
+
+
+def test_an_image_goes_over_a_primitive_too_and_a_missing_one_is_told(tmp_path):
+    image = picture(tmp_path / "wood.png")
+    assert the_mesh(drawn(shape(Box((1, 1, 1)), None, str(image)))).visual.material.baseColorTexture
+    gone = shape(Box((1, 1, 1)), (1, 0, 0, 1), str(tmp_path / "gone.png"))
+    assert color_of(drawn(gone)) == as_read((1, 0, 0, 1))
+    missing = Meshes().missing_texture(gone)
+    assert missing is not None
+    assert missing.looked == (str(tmp_path),)
+
+
+def test_large_images_are_made_smaller(tmp_path):
+    image = picture(tmp_path / "wide.png", size=(5000, 1000))
+    mesh = the_mesh(drawn(shape(Box((1, 1, 1)), None, str(image))))
+    assert max(mesh.visual.material.baseColorTexture.size) == 2048
+
+
+def test_equal_shapes_are_one_object_and_each_file_is_read_once(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box().export(path)
+    meshes = Meshes()
+    first = drawn(shape(MeshFile(str(path))), meshes)
+    grey = drawn(shape(MeshFile(str(path))), meshes, over=(0.5, 0.5, 0.5, 0.5))
+    path.unlink()
+    path.write_bytes(b"nothing")
+    again = drawn(shape(MeshFile(str(path), (2, 2, 2))), meshes)
+    assert again.glb is first.glb
+    assert grey.glb is not first.glb
+
+
+@pytest.mark.parametrize("ending", ["dae", "obj", "stl", "ply", "glb"])
+@pytest.mark.parametrize("content", [b"", b"solid nothing", bytes(200), b"<COLLADA/>"])
+def test_a_file_that_is_no_mesh_is_missing_and_not_an_error(tmp_path, ending, content):
+    path = tmp_path / f"bad.{ending}"
+    path.write_bytes(content)
+    missing = Meshes().draw(shape(MeshFile(str(path))))
+    assert isinstance(missing, Missing)
+    assert missing.reason
+
+
+def test_a_format_nobody_reads_says_which_are_read(tmp_path):
+    (tmp_path / "old.mesh").write_bytes(b"ogre")
+    missing = Meshes().draw(shape(MeshFile(str(tmp_path / "old.mesh"))))
+    assert isinstance(missing, Missing)
+    assert "'.mesh' are not read; .dae, .glb" in missing.reason
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package ``arm`` two folders below the only one that is looked in, with one file."""
+    for name in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    mesh = tmp_path / "src" / "repository" / "arm" / "meshes" / "a b.stl"
+    mesh.parent.mkdir(parents=True)
+    mesh.touch()
+    return tmp_path / "src" / "repository" / "arm"
+
+
+def test_packages_are_found_below_ros_package_path(package, monkeypatch):
+    monkeypatch.setenv("ROS_PACKAGE_PATH", f"/nowhere:{package.parents[1]}")
+    expected = package / "meshes" / "a b.stl"
+    assert MeshPaths().find("package://arm/meshes/a b.stl") == expected
+    assert MeshPaths().find("package:///arm/meshes/a%20b.stl") == expected
+
+
+def test_packages_are_found_in_what_ros_2_has_installed(package, monkeypatch):
+    share = package.parents[2] / "install" / "share"
+    share.mkdir(parents=True)
+    package.rename(share / "arm")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(share.parent))
+    assert MeshPaths().find("package://arm/meshes/a b.stl") == share / "arm" / "meshes" / "a b.stl"
+
+
+def test_packages_are_found_around_the_urdf(package):
+    found = MeshPaths(package / "urdf").find("package://arm/meshes/a b.stl")
+    assert found == package / "meshes" / "a b.stl"
+
+
+def test_a_relative_name_starts_at_the_urdf(package):
+    assert MeshPaths(package).find("meshes/a b.stl") == package / "meshes" / "a b.stl"
+    missing = MeshPaths().find("meshes/a b.stl")
+    assert isinstance(missing, Missing)
+    assert "means nothing without the folder of its URDF" in missing.reason
+
+
+def test_a_file_is_found_by_its_uri_and_by_its_path(package):
+    file = package / "meshes" / "a b.stl"
+    assert MeshPaths().find(file.as_uri()) == file
+    assert MeshPaths().find(f"file://{file}") == file
+    assert MeshPaths().find(str(file)) == file
+
+
+def test_nothing_is_fetched_from_elsewhere():
+    missing = MeshPaths().find("https://example.org/arm.stl")
+    assert isinstance(missing, Missing)
+    assert missing.reason.startswith("https:// is not fetched")
+
+
+def test_what_is_missing_says_where_it_was_looked_for(package, monkeypatch):
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
+    missing = MeshPaths().find("package://arm/meshes/c.stl")
+    assert isinstance(missing, Missing)
+    assert (missing.reason, missing.looked) == ("the package 'arm' has no such file", (str(package),))
+    unknown = MeshPaths().find("package://leg/meshes/c.stl")
+    assert isinstance(unknown, Missing)
+    assert "there is no package 'leg'; put the folder" in unknown.reason
+    assert str(package.parent) in unknown.looked
+
+
+@pytest.mark.robots
+@pytest.mark.parametrize("name", ["panda", "talos", "ur5", "anymal_c"])
+def test_nothing_of_a_known_robot_is_missing(name):
+    meshes = Meshes()
+    for one in shapes_of(load_model(name)):
+        assert not isinstance(meshes.draw(one), Missing)
+        assert meshes.missing_texture(one) is None

@@ -1,0 +1,143 @@
+"""MeshPaths: the files that robots name as package://, file:// or plain paths. Never the network."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from zstate.model.known import package_folders
+
+_DEEPEST = 4  # repositories hold packages in folders of folders
+_NOT_PACKAGES = {"meshes", "urdf"}  # inside one, and large
+_IN_PACKAGES = {"package", "model"}
+_HOW = "put the folder of the package into ROS_PACKAGE_PATH"
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """A file that a robot names and that cannot be drawn: why, and where it was looked for."""
+
+    uri: str
+    reason: str
+    looked: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        where = f"; looked in {', '.join(self.looked)}" if self.looked else ""
+        return f"{self.uri}: {self.reason}{where}"
+
+
+class MeshPaths:
+    """Finds files as they are named in a URDF.
+
+    ``package://NAME/PATH`` and ``package:///NAME/PATH`` are looked for in, by turns: the folders around
+    ``base``, the folder of the URDF where that is known; ROS_PACKAGE_PATH; AMENT_PREFIX_PATH; and what
+    example-robot-data and robot_descriptions have installed. A relative path starts at ``base``.
+    """
+
+    def __init__(self, base: Path | None = None) -> None:
+        self._base = base
+
+    def find(self, uri: str) -> Path | Missing:
+        """The file of that name, or why there is none."""
+        scheme, separator, rest = uri.partition("://")
+        if not separator:
+            return self._plain(uri, Path(uri))
+        if scheme in _IN_PACKAGES:
+            return self._in_package(uri, unquote(rest).lstrip("/"))
+        if scheme == "file":
+            return self._plain(uri, Path("/" + unquote(urlsplit(uri).path).lstrip("/")))
+        return Missing(uri, f"{scheme}:// is not fetched; name it as package://NAME/PATH or file:///PATH")
+
+    def _plain(self, uri: str, path: Path) -> Path | Missing:
+        if path.is_absolute():
+            return path if _is_file(path) else Missing(uri, "there is no such file", (str(path.parent),))
+        if self._base is None:
+            reason = "a relative path means nothing without the folder of its URDF; write package://NAME/PATH"
+            return Missing(uri, reason)
+        found = self._base / path
+        return found if _is_file(found) else Missing(uri, "there is no such file", (str(self._base),))
+
+    def _in_package(self, uri: str, path: str) -> Path | Missing:
+        package, _, rest = path.partition("/")
+        folders = list(dict.fromkeys(self._packages(package)))
+        for folder in folders:
+            if _is_file(folder / rest):
+                return folder / rest
+        if folders:
+            return Missing(uri, f"the package {package!r} has no such file", tuple(map(str, folders)))
+        looked = tuple(str(folder) for folder in (*self._around, *self._shares, *self._forests))
+        return Missing(uri, f"there is no package {package!r}; {_HOW}", looked)
+
+    def _packages(self, name: str) -> Iterator[Path]:
+        for folder in self._around:
+            if folder.name == name:
+                yield folder
+        for folder in (*self._around, *self._shares):
+            if _is_folder(folder / name):
+                yield folder / name
+        yield from self._grown.get(name, ())
+
+    @cached_property
+    def _around(self) -> Sequence[Path]:
+        return () if self._base is None else (self._base, *self._base.parents)
+
+    @cached_property
+    def _shares(self) -> Sequence[Path]:
+        """Folders that have packages directly in them."""
+        return [prefix / "share" for prefix in _listed("AMENT_PREFIX_PATH")]
+
+    @cached_property
+    def _forests(self) -> Sequence[Path]:
+        """Folders that have packages somewhere below them, or are one."""
+        return [*_listed("ROS_PACKAGE_PATH"), *package_folders()]
+
+    @cached_property
+    def _grown(self) -> dict[str, list[Path]]:
+        """Every folder of the forests by its name, the shallow ones first."""
+        found: dict[str, list[Path]] = {}
+        for forest in self._forests:
+            for folder in _walk(forest):
+                found.setdefault(folder.name, []).append(folder)
+        return found
+
+
+def _walk(top: Path) -> Iterator[Path]:
+    level = [top]
+    for _ in range(_DEEPEST + 1):
+        yield from level
+        level = [below for folder in level for below in _folders_in(folder)]
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(Path(one) for one in entries if _may_be_package(one))
+    except OSError:
+        return []
+
+
+def _may_be_package(entry: os.DirEntry[str]) -> bool:
+    return entry.name not in _NOT_PACKAGES and not entry.name.startswith(".") and entry.is_dir()
+
+
+def _listed(variable: str) -> list[Path]:
+    parts = os.environ.get(variable, "").split(os.pathsep)
+    return [Path(part) for part in parts if part]
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
