@@ -1,0 +1,95 @@
+"""Board: all panels of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Protocol
+
+import viser
+
+from zstate.closing import Closing
+from zstate.view.fixed_frame import FixedFrame
+from zstate.view.frame_facts import FrameFacts
+from zstate.view.graph_watch import GraphWatch
+from zstate.view.moment import Moment
+from zstate.view.panels.between_panel import BetweenPanel
+from zstate.view.panels.display_panel import DisplayPanel, Switches
+from zstate.view.panels.frames_panel import FramesPanel, Trails
+from zstate.view.panels.graph_panel import GraphPanel
+from zstate.view.panels.look import Look, Panel
+from zstate.view.panels.plots_panel import PlotsPanel
+from zstate.view.panels.replay_panel import ReplayPanel
+from zstate.view.panels.robots_panel import Painter, RobotsPanel
+from zstate.view.panels.sliders_panel import SlidersPanel
+from zstate.view.replay_clock import ReplayClock
+from zstate.view.sliders import Sliders
+from zstate.view.world import World
+
+
+class Shown(Switches, Painter, Trails, Protocol):
+    """What the panels want of a scene."""
+
+
+class Board(Closing):
+    """Puts the panels on the page of ``server``; ``sliders`` are of the robots that are moved here.
+
+    Whoever draws asks for each picture ``stamp``, the instant to show, and ``fixed``, the frame to see it
+    from; and tells it the moment that is shown, with ``update``, a few times a second. One thread does all
+    of this; closing is for the end.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, world: World, scene: Shown, sliders: Sequence[Sliders] = ()
+    ) -> None:
+        gui = server.gui
+        self._world = world
+        self._facts = FrameFacts(world.buffer)
+        self._fixed = FixedFrame()
+        self._opened = ExitStack()
+        self.clock = ReplayClock(live=world.session is not None)
+        tabs = gui.add_tab_group()
+        self._panels: list[Panel] = []
+        with tabs.add_tab("View"):
+            self._panels += [DisplayPanel(gui, scene, self._fixed), RobotsPanel(gui, world, scene)]
+        with tabs.add_tab("Frames"):
+            self._panels.append(FramesPanel(gui, world, scene))
+            with gui.add_folder("Between two frames"):
+                self._panels.append(BetweenPanel(gui, world))
+        with tabs.add_tab("Joints"):
+            self._add_joints(gui, sliders)
+        with tabs.add_tab("Time"):
+            self._panels.append(ReplayPanel(gui, self.clock))
+        if world.session is not None:
+            with tabs.add_tab("Graph"):
+                watch = self._opened.enter_context(GraphWatch(world.session))
+                self._panels.append(GraphPanel(gui, watch))
+
+    def _add_joints(self, gui: viser.GuiApi, sliders: Sequence[Sliders]) -> None:
+        for one in sliders:
+            with gui.add_folder(f"Move {one.robot}"):
+                self._panels.append(SlidersPanel(gui, one))
+        with gui.add_folder("Plot"):
+            self._panels.append(PlotsPanel(gui, self._world))
+
+    @property
+    def stamp(self) -> int | None:
+        """The instant to show [ns]; None for the newest of everything."""
+        return self.clock.stamp(self._facts.span())
+
+    def fixed(self, moment: Moment) -> str:
+        """The frame to see ``moment`` from; empty where there is none."""
+        return self._fixed.of(moment.tree)
+
+    def update(self, moment: Moment) -> None:
+        """Do what was chosen on the page since the last time, and tell there what is new."""
+        is_live = self.clock.live and self.clock.is_present
+        buffer = self._world.buffer
+        now = buffer.clock.now() if is_live else None
+        for panel in self._panels:
+            # The panel of the fixed frame stands first: what was chosen there holds for the others.
+            panel.update(Look(moment, self.fixed(moment), self._facts, now, buffer.domain.name))
+
+    def close(self) -> None:
+        """Look no more at who writes what. A second call does nothing."""
+        self._opened.close()

@@ -1,0 +1,60 @@
+"""What is drawn, and seen from where."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import viser
+
+from zstate.view.fixed_frame import FixedFrame
+from zstate.view.moment import Tree
+from zstate.view.panels.choice import FrameChoice
+from zstate.view.panels.look import Look
+
+_NO_FRAME = "(no frame yet)"
+
+
+class Switches(Protocol):
+    """What of a scene is shown."""
+
+    visuals: bool
+    collisions: bool
+    axes: bool
+    names: bool
+    parent_lines: bool
+
+
+class DisplayPanel:
+    """The fixed frame, chosen from a list, and a box to tick for each thing that may be shown."""
+
+    def __init__(self, gui: viser.GuiApi, scene: Switches, fixed: FixedFrame) -> None:
+        self._scene = scene
+        self._fixed = fixed
+        self._tree: Tree | None = None
+        hint = "Everything is seen from this frame. Click and type to search."
+        self._frames = FrameChoice(gui, "Fixed frame", _NO_FRAME, hint)
+        self._visuals = gui.add_checkbox("Visuals", scene.visuals)
+        self._collisions = gui.add_checkbox("Collisions", scene.collisions)
+        self._axes = gui.add_checkbox("Axes", scene.axes)
+        self._names = gui.add_checkbox("Names", scene.names)
+        self._parent_lines = gui.add_checkbox("Parent lines", scene.parent_lines)
+
+    def update(self, look: Look) -> None:
+        tree = look.moment.tree
+        chosen = self._frames.taken()
+        if chosen is not None:
+            self._fixed.chosen = chosen
+        fixed = self._fixed.of(tree)
+        if tree is not self._tree:
+            self._tree = tree
+            self._frames.offer(tree.names, fixed or None)
+        elif fixed:
+            self._frames.show(fixed)
+        self._switch(self._scene)
+
+    def _switch(self, scene: Switches) -> None:
+        scene.visuals = self._visuals.value
+        scene.collisions = self._collisions.value
+        scene.axes = self._axes.value
+        scene.names = self._names.value
+        scene.parent_lines = self._parent_lines.value

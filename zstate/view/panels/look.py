@@ -1,0 +1,38 @@
+"""Look: what the panels are told each time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from zstate.errors import duration_text
+from zstate.view.frame_facts import FrameFacts
+from zstate.view.moment import Moment
+
+
+class Look(NamedTuple):
+    """A moment as it is drawn: seen from the frame ``fixed``; ``now`` [ns] tells how old things are.
+
+    ``now`` is None where that means nothing: in the past, and in a recording. ``domain`` says whose time the
+    stamps are, as far as that is known.
+    """
+
+    moment: Moment
+    fixed: str
+    facts: FrameFacts
+    now: int | None
+    domain: str | None = None
+
+    @property
+    def at(self) -> int | None:
+        """The stamp to ask a buffer about: None for the present."""
+        return self.moment.stamp if self.now is None else None
+
+    def age_text(self, stamp: int | None) -> str:
+        """How long ago an instant was."""
+        return "-" if stamp is None or self.now is None else duration_text(self.now - stamp)
+
+
+class Panel(Protocol):
+    """A part of the page. Its callbacks note what is wanted; ``update`` does it, and tells the news."""
+
+    def update(self, look: Look) -> None: ...

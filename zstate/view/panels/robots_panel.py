@@ -1,0 +1,93 @@
+"""Which robots there are, whether they say anything, and what cannot be drawn of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import viser
+
+from zstate.view.moment import Moment
+from zstate.view.panels import html
+from zstate.view.panels.look import Look
+from zstate.view.staleness import is_silent, silence_text
+from zstate.view.world import World
+
+_MOST_LINES = 12
+
+
+class Painter(Protocol):
+    """What a scene does with robots."""
+
+    def grey(self, robot: str, since: str | None) -> None: ...
+    def missing_meshes(self, robot: str) -> Sequence[tuple[str, str]]: ...
+
+
+class RobotsPanel:
+    """A line for each robot. One that is silent is drawn grey, with the time since when."""
+
+    def __init__(self, gui: viser.GuiApi, world: World, scene: Painter) -> None:
+        self._world = world
+        self._scene = scene
+        self._robots = gui.add_html("")
+        self._missing = gui.add_html("")
+
+    def update(self, look: Look) -> None:
+        robots = self._world.robots()
+        silences = {robot: self._silence(robot, look) for robot in robots}
+        for robot, silence in silences.items():
+            self._scene.grey(robot, silence)
+        self._robots.content = self._table(look, silences)
+        self._missing.content = unplaced_html(look.moment) + self._meshes(robots)
+
+    def _silence(self, robot: str, look: Look) -> str | None:
+        silent_s = self._world.silent_s(robot)
+        if silent_s is None or not is_silent(silent_s, look.facts.rate_hz(robot)):
+            return None
+        return silence_text(silent_s)
+
+    def _table(self, look: Look, silences: Mapping[str, str | None]) -> str:
+        if not silences:
+            text = "No robot is announced. Start one, for instance with: zstate publish panda --source sine"
+            return html.paragraph(text, muted=True)
+        rows = [(robot, silence or self._state(robot, look)) for robot, silence in silences.items()]
+        colors = [html.ALARM if silence else "" for silence in silences.values()]
+        return html.table(("Robot", "State"), rows, colors)
+
+    def _state(self, robot: str, look: Look) -> str:
+        rate_hz = look.facts.rate_hz(robot)
+        if rate_hz is None:
+            return "no sample yet" if look.facts.track(robot) else "no model yet"
+        return f"{'live' if self._world.session else 'recorded'}, {rate_hz:.1f} Hz"
+
+    def _meshes(self, robots: Sequence[str]) -> str:
+        lines = [
+            f"{uri}\n    {where}" for robot in robots for uri, where in self._scene.missing_meshes(robot)
+        ]
+        return _listing("meshes are missing", "mesh is missing", lines)
+
+
+def unplaced_html(moment: Moment) -> str:
+    """The frames that have no pose, with the reason; those together that have the same."""
+    frames: dict[str, list[str]] = {}
+    for row, reason in moment.reasons.items():
+        frames.setdefault(reason, []).append(moment.tree.names[row])
+    lines = [f"{_enumerated(names)}: {reason}" for reason, names in frames.items()]
+    count = len(moment.reasons)
+    return _listing("frames have no pose", "frame has no pose", lines, count)
+
+
+def _enumerated(names: Sequence[str]) -> str:
+    if len(names) <= 3:
+        return ", ".join(names)
+    return f"{names[0]}, {names[1]} and {len(names) - 2} more"
+
+
+def _listing(several: str, one: str, lines: Sequence[str], count: int | None = None) -> str:
+    if not lines:
+        return ""
+    count = len(lines) if count is None else count
+    more = len(lines) - _MOST_LINES
+    shown = [*lines[:_MOST_LINES], *([f"... and {more} more"] if more > 0 else [])]
+    head = f"{count} {one if count == 1 else several}"
+    return html.paragraph(head, color=html.ALARM) + html.paragraph("\n".join(shown))
