@@ -12,7 +12,6 @@ from zstate.net.session import Session
 
 _DISTURBS_NS = 20_000_000
 _BREAKS_NS = 1_000_000_000
-_DAY_NS = 86_400_000_000_000
 
 _SET_CLOCKS = "timedatectl  # on both machines: is each synchronized?"
 _STAMPS = "date +%s.%N  # is it this time where the writer runs? It is to stamp with time.time_ns()"
@@ -51,7 +50,7 @@ def _far_check(ear: Ear) -> Check | None:
     least, stamp = ear.samples.delays[0], ear.samples.last_stamp or 0
     if abs(least) <= FAR_NS:
         return None
-    size = f"{_size(least)} {'before' if least > 0 else 'after'}"
+    size = f"{duration_text(abs(least))} {'before' if least > 0 else 'after'}"
     text = (
         f"{ear.samples_writer} stamps samples {size} the time here ({stamp_text(stamp)}): "
         f"{likely_cause(stamp, stamp + least)}"
@@ -105,8 +104,3 @@ def _simulated_check(domain: str, session: Session) -> Check:
 
 def _delay_text(nanoseconds: int) -> str:
     return duration_text(max(nanoseconds, 0))
-
-
-def _size(nanoseconds: int) -> str:
-    size = abs(nanoseconds)
-    return f"{size / _DAY_NS:.1f} days" if size >= 2 * _DAY_NS else duration_text(size)

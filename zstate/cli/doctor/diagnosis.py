@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,11 @@ from zstate.cli.doctor.network_checks import (
     refused_check,
     with_options,
 )
+from zstate.cli.doctor.next_command import looking_there
 from zstate.cli.network import Network, open_session
+from zstate.cli.words import RosWords, is_ros, words_of
 from zstate.errors import ModelError, ZStateError
+from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
@@ -47,11 +51,16 @@ def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iter
         yield from _behind(session, network, robot, wire, timeout_s)
 
 
+def joined(network: Network, wire: str) -> Network:
+    """How ``open_session`` joins, where ``network`` may say nothing."""
+    return Network("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_given else network
+
+
 def _behind(session: Session, network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
     from zstate.net.presence import discover
 
     robots = discover(session, wire=wire)
-    check = network_check(session, network)  # later than the others, whom it counts
+    check = network_check(session, joined(network, wire))  # later than the others, whom it counts
     yield check
     if check.state == "broken":
         return
@@ -59,20 +68,32 @@ def _behind(session: Session, network: Network, robot: str, wire: str, timeout_s
     if access is not None:
         yield access
     wanted = [info for info in robots if robot in (ANY, info.name)]
+    if is_ros(wire) and words_of(wire).robot:
+        wanted = list(robots)  # there is one at most, and ROS has no name for it
     if not wanted:
         yield _absent_check(session, network, robot, robots, wire)
         return
-    yield ok("robots", f"{', '.join(repr(info.name) for info in robots)} announced")
-    yield from _of_robots(session, wanted, robots, wire, timeout_s)
+    names = ", ".join(repr(info.name) for info in robots)
+    yield ok("robots", words_of(wire).announced(robots) if is_ros(wire) else f"{names} announced")
+    for found in _of_robots(session, wanted, robots, wire, timeout_s, called=robot):
+        yield replace(found, next=looking_there(found.next, network, wire)) if found.next else found
 
 
 def _of_robots(
-    session: Session, wanted: Sequence[RobotInfo], robots: Sequence[RobotInfo], wire: str, timeout_s: float
+    session: Session,
+    wanted: Sequence[RobotInfo],
+    robots: Sequence[RobotInfo],
+    wire: str,
+    timeout_s: float,
+    *,
+    called: str,
 ) -> Iterator[Check]:
     from zstate.cli.doctor.ear import Ear, listen
     from zstate.cli.doctor.robot_checks import robot_checks
+    from zstate.cli.doctor.ros_checks import ros_checks
     from zstate.net.clock_offset import measure_offsets
 
+    words = words_of(wire)
     with ExitStack() as listening:
         ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in wanted]
         if wire == "native":
@@ -82,7 +103,11 @@ def _of_robots(
                 ear.ask()
         listen(ears, timeout_s)
         for ear in ears:
-            for check in robot_checks(ear, session):
+            if isinstance(words, RosWords):
+                checks = ros_checks(ear, session, words, called)
+            else:
+                checks = robot_checks(ear, session)
+            for check in checks:
                 yield check.of(ear.info.name)
 
 
@@ -92,9 +117,14 @@ def _absent_check(
     names = [info.name for info in robots]
     near = get_close_matches(robot, names, n=1)
     what = "no robot is announced" if robot == ANY else f"nobody announces the robot {robot!r}"
+    if is_ros(wire) and not names:
+        text = words_of(wire).announced(robots).partition(";")[0]
+        then = f"zstate ls --wire {wire}{_connecting(network)}  # are the domain and the router right?"
+        return broken("robots", text, then)
     if names:
         text = f"{what}; announced: {', '.join(map(repr, names))}"
-        return broken("robots", text, f"zstate doctor {(near or names)[0]}{_connecting(network)}")
+        then = f"zstate doctor {(near or names)[0]}"
+        return broken("robots", text, looking_there(then, network, wire))
     for options, others in elsewhere(network) if wire == "native" else ():
         found = next((name for name in others if name == robot), others[0])
         text = f"{what} here; {with_options(options)}: {', '.join(map(repr, others))}"
@@ -105,7 +135,7 @@ def _absent_check(
     if session.twin is not None:
         what += f", or the router shows none to {session.twin.identity}"
     text = f"{what}: its publisher is not running" if robot != ANY else what
-    return broken("robots", text, f"{_start(robot, wire)}{_connecting(network)}")
+    return broken("robots", text, f"{_start(robot)}{_connecting(network)}")
 
 
 def _has_ros(session: Session) -> bool:
@@ -114,12 +144,10 @@ def _has_ros(session: Session) -> bool:
     return bool(discover(session, 0.3, wire="ros2"))
 
 
-def _start(robot: str, wire: str) -> str:
+def _start(robot: str) -> str:
     """What would put ``robot`` there."""
     from zstate.model.known import find
 
-    if wire != "native":
-        return f"zstate ls --wire {wire}"
     if robot == ANY:
         return "zstate publish panda --source sine"
     try:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable
 from contextlib import ExitStack
 
+from zstate.cli.doctor.node_samples import NodeSamples
 from zstate.cli.doctor.samples import Samples
 from zstate.closing import Closing
 from zstate.errors import MessageError
@@ -26,6 +27,7 @@ AT_LEAST_S = 1.2
 """Writers say once a second how they do."""
 
 _LOOK_EVERY_S = 0.02
+_OF_NODES: tuple[Stream, ...] = ("joint_states", "tf")
 _ANSWERS_WITHIN_S = 0.4
 
 
@@ -52,8 +54,14 @@ class Ear(Closing):
             key = self._wire.expression(info.name, "robot_description")
             opening.enter_context(LatchedSubscriber(session, key, self._take_description))
             self.samples = opening.enter_context(Samples(session, info.name, self.followed, self._wire))
+            self.nodes: dict[Stream, NodeSamples] = {}
+            """By stream, what each node says, on ROS's side."""
             if is_native:
                 opening.enter_context(watch_status(session, info.name, self._take_status))
+            else:
+                for stream in _OF_NODES:
+                    nodes = NodeSamples(session, info.name, stream, self._wire)
+                    self.nodes[stream] = opening.enter_context(nodes)
             self.listener = opening.enter_context(
                 TransformListener(
                     session,

@@ -38,13 +38,13 @@ def robot_checks(ear: Ear, session: Session) -> Iterator[Check]:
     versions = _version_check(ear)
     if versions is not None:
         yield versions
-    model, check = _model_check(ear)
+    model, check = model_check(ear)
     yield check
     yield _samples_check(ear)
     yield clocks_check(ear)
     yield stamps_check(ear, session)
-    yield _statics_check(ear)
-    yield _poses_check(ear, model)
+    yield statics_check(ear)
+    yield poses_check(ear, model)
 
 
 def _writers_check(ear: Ear) -> Check:
@@ -101,7 +101,8 @@ def _version_check(ear: Ear) -> Check | None:
     return None
 
 
-def _model_check(ear: Ear) -> tuple[RobotModel | None, Check]:
+def model_check(ear: Ear) -> tuple[RobotModel | None, Check]:
+    """What the robot says it is, where that can be used, and whether it can."""
     robot = ear.info.name
     if ear.description is None:
         return None, _no_model_check(ear)
@@ -142,7 +143,7 @@ def _samples_check(ear: Ear) -> Check:
         return broken(
             stream, f"{who} is there, but no sample comes: {_idle_text(ear)}", f"zstate echo {robot}"
         )
-    refused = _refused_check(ear)
+    refused = refused_check(ear)
     if refused is not None:
         return refused
     rate_hz = samples.rate_hz
@@ -180,7 +181,8 @@ def _idle_text(ear: Ear) -> str:
     return f"it runs, but {status.text or 'publishes nothing'}"
 
 
-def _refused_check(ear: Ear) -> Check | None:
+def refused_check(ear: Ear) -> Check | None:
+    """Why samples that came cannot be used; None where all can."""
     refused, texts = ear.listener.stats.refused, ear.listener.refusals
     reasons = [
         reason
@@ -209,7 +211,8 @@ def _rate_check(ear: Ear, rate_hz: float, who: str) -> Check:
     return ok(stream, f"{text}, newest {duration_text(ear.samples.silent_ns)} ago")
 
 
-def _statics_check(ear: Ear) -> Check:
+def statics_check(ear: Ear) -> Check:
+    """Whether all who announce fixed edges place some."""
     frames = ear.listener.buffer.frames()
     owned = [frame for frame in frames if frame.kind == "static"]
     heard = {frame.writer for frame in owned}
@@ -224,7 +227,8 @@ def _statics_check(ear: Ear) -> Check:
     return ok("tf_static", f"{count_text(len(owned), 'fixed edge')}")
 
 
-def _poses_check(ear: Ear, model: RobotModel | None) -> Check:
+def poses_check(ear: Ear, model: RobotModel | None) -> Check:
+    """Whether the frames hang together, and a pose of the outermost is known."""
     frames, robot = ear.listener.buffer.frames(), ear.info.name
     if not frames:
         return skipped("poses", "no frame is known")
