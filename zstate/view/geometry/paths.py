@@ -25,9 +25,13 @@ class Missing:
     reason: str
     looked: tuple[str, ...] = ()
 
+    @property
+    def why(self) -> str:
+        """The reason, and where it was looked for."""
+        return f"{self.reason}; looked in {', '.join(self.looked)}" if self.looked else self.reason
+
     def __str__(self) -> str:
-        where = f"; looked in {', '.join(self.looked)}" if self.looked else ""
-        return f"{self.uri}: {self.reason}{where}"
+        return f"{self.uri}: {self.why}"
 
 
 class MeshPaths:

@@ -1,0 +1,1 @@
+"""What is drawn of the robots: their bodies, axes, names, lines and trails."""

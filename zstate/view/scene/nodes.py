@@ -1,0 +1,123 @@
+"""Nodes: the tree of frames as a tree of viser's, so that only poses that change are sent.
+
+A joint that turns is one message, whatever hangs on its link; another fixed frame moves the root alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TypeVar
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from zstate.se3 import IDENTITY
+from zstate.view.moment import Mask, Moment, Poses, Tree
+
+_Float = TypeVar("_Float", np.float32, np.float64)
+
+_TOP = "/frames"
+# What nobody sees is not sent: noise of encoders, and what is left when poses are multiplied.
+_UNSEEN_M = 1e-6
+_UNSEEN_TURN = 1e-6
+
+
+class Nodes:
+    """A node for each frame. ``paths`` are their names in viser, for what hangs on them.
+
+    ``shown`` says by row of ``tree`` which frames have a place in the fixed one. ``version`` grows when
+    a frame has got another path, or a place, or has lost it.
+    """
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        scene.add_frame(_TOP, show_axes=False)
+        self._ids: dict[str, int] = {}
+        self._handles: dict[str, viser.FrameHandle] = {}
+        self._rows: list[viser.FrameHandle] = []
+        self._poses: Poses = np.empty((0, 7))
+        self.tree: Tree | None = None
+        self.paths: dict[str, str] = {}
+        self.shown: Mask = np.empty(0, dtype=np.bool_)
+        self.version = 0
+
+    def show(self, moment: Moment, fixed: str) -> Poses:
+        """Move every frame to its place; returns these, as ``moment.placed(fixed)``."""
+        if moment.tree is not self.tree:
+            self._grow(moment.tree)
+        placed = moment.placed(fixed)
+        shown = np.isfinite(placed[:, 0])
+        if not np.array_equal(shown, self.shown):
+            self._reveal(moment.tree, shown)
+        self._move(_on_parents(moment, placed, shown))
+        return placed
+
+    def is_shown(self, frame: str) -> bool:
+        """Whether the frame has a place in the fixed one."""
+        return self.tree is not None and frame in self.paths and bool(self.shown[self.tree.row(frame)])
+
+    def _grow(self, tree: Tree) -> None:
+        paths = self._paths(tree)
+        for path in self._outermost_without(set(paths.values())):
+            self._handles[path].remove()
+            for below in [one for one in self._handles if one == path or one.startswith(f"{path}/")]:
+                del self._handles[below]
+        for path in paths.values():
+            if path not in self._handles:
+                self._handles[path] = self._scene.add_frame(path, show_axes=False)
+        self._rows = [self._handles[path] for path in paths.values()]
+        self._poses = np.full((len(paths), 7), np.nan)
+        self.shown = np.ones(len(paths), dtype=np.bool_)
+        self.tree, self.paths = tree, paths
+        self.version += 1
+
+    def _paths(self, tree: Tree) -> dict[str, str]:
+        """Short ones, because every message has one; a frame keeps its number for good."""
+        paths: list[str] = []
+        for row, name in enumerate(tree.names):
+            parent = int(tree.parents[row])
+            above = _TOP if parent < 0 else paths[parent]
+            paths.append(f"{above}/{self._ids.setdefault(name, len(self._ids))}")
+        return dict(zip(tree.names, paths, strict=True))
+
+    def _outermost_without(self, kept: set[str]) -> Iterator[str]:
+        """The nodes to remove; what is below one goes with it."""
+        gone = self._handles.keys() - kept
+        return (path for path in gone if path.rpartition("/")[0] not in gone)
+
+    def _reveal(self, tree: Tree, shown: Mask) -> None:
+        """A node without a place is hidden, unless a frame below it has one: then it is only passed."""
+        passed = shown.copy()
+        for row in range(len(shown) - 1, -1, -1):
+            parent = int(tree.parents[row])
+            if passed[row] and parent >= 0:
+                passed[parent] = True
+        for handle, visible in zip(self._rows, passed.tolist(), strict=True):
+            handle.visible = visible
+        self.shown = shown
+        self.version += 1
+
+    def _move(self, poses: Poses) -> None:
+        with np.errstate(invalid="ignore"):
+            still = np.abs(poses - self._poses) <= (*(_UNSEEN_M,) * 3, *(_UNSEEN_TURN,) * 4)
+        moved, turned = ~still[:, :3].all(axis=1), ~still[:, 3:].all(axis=1)
+        for row in np.flatnonzero(moved).tolist():
+            self._rows[row].position = poses[row, :3]
+        for row, wxyz in zip(np.flatnonzero(turned).tolist(), wxyzs(poses[turned]), strict=True):
+            self._rows[row].wxyz = wxyz
+        self._poses[moved, :3] = poses[moved, :3]
+        self._poses[turned, 3:] = poses[turned, 3:]
+
+
+def wxyzs(poses: NDArray[_Float]) -> NDArray[_Float]:
+    """The quaternions of poses (..., 7) in viser's order (..., 4)."""
+    return poses[..., [6, 3, 4, 5]]
+
+
+def _on_parents(moment: Moment, placed: Poses, shown: Mask) -> Poses:
+    """Each frame on the node of its parent, which stands at the fixed frame while it has no place."""
+    parents = moment.tree.parents
+    on_shown = (parents >= 0) & shown[parents]
+    on_top = np.where(shown[:, None], placed, IDENTITY)
+    return np.where((shown & on_shown)[:, None], moment.poses, on_top)

@@ -1,0 +1,109 @@
+"""Scene: what is drawn in the page, apart from its panels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import viser
+
+from zstate.model.robot import RobotModel
+from zstate.model.shapes import Shape, read_shapes
+from zstate.view.geometry.paths import Missing
+from zstate.view.meshes import Meshes
+from zstate.view.moment import Moment
+from zstate.view.scene.axes import Axes
+from zstate.view.scene.body import Body, Dress
+from zstate.view.scene.lines import Lines
+from zstate.view.scene.names import Names
+from zstate.view.scene.nodes import Nodes
+from zstate.view.scene.silences import Silences
+from zstate.view.scene.trails import Trails
+from zstate.view.scene.workshop import Workshop
+
+
+class Scene:
+    """Robots, and frames, as they are at the moments that are shown.
+
+    The attributes say what is drawn from the next ``show`` on: ``visuals`` and ``collisions`` of robots
+    (the latter see-through), and ``axes``, ``names`` and ``parent_lines`` of frames. Files are read beside
+    the drawing; ``busy`` while some of what is to be drawn is not there yet. To be used by one thread.
+    """
+
+    def __init__(self, server: viser.ViserServer, meshes: Meshes | None = None) -> None:
+        self.visuals = True
+        self.collisions = False
+        self.axes = True
+        self.names = False
+        self.parent_lines = False
+        self._scene = server.scene
+        self._workshop = Workshop(meshes or Meshes())
+        self._bodies: dict[str, Body] = {}
+        self._nodes = Nodes(server.scene)
+        self._axes = Axes(server.scene)
+        self._names = Names(server.scene)
+        self._lines = Lines(server.scene)
+        self._trails = Trails(server.scene)
+        self._silences = Silences(server.scene)
+
+    @property
+    def busy(self) -> bool:
+        """Whether files are still being read for what is to be drawn."""
+        return self._workshop.busy
+
+    def set_robot(self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None) -> None:
+        """Draw a robot, in place of an earlier one of that name; its links are the frames ``name/link``.
+
+        ``shapes`` are those of its model when they are not given.
+        """
+        self.remove_robot(name)
+        faults: list[Missing] = []
+        if shapes is None:
+            shapes, findings = read_shapes(model)
+            faults = [Missing(f"{name}, line {one.line}", one.message) for one in findings]
+        self._bodies[name] = Body(self._scene, self._workshop, name, shapes, faults)
+
+    def remove_robot(self, name: str) -> None:
+        """Draw a robot no more; without one of that name, do nothing."""
+        body = self._bodies.pop(name, None)
+        if body is not None:
+            body.remove(self._nodes)
+        self._silences.set(name, None)
+
+    def grey(self, robot: str, since: str | None) -> None:
+        """Draw a robot in see-through grey, with the text ``since`` at its root; None: as it is again."""
+        self._silences.set(robot, since)
+
+    def trail(self, frame: str, on: bool) -> None:
+        """Draw where a frame has been from now on, or draw that no more."""
+        self._trails.switch(frame, on)
+
+    def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
+        """What cannot be drawn of a robot: the name of each file in the URDF, and why it cannot."""
+        body = self._bodies.get(robot)
+        return () if body is None else tuple((one.uri, one.why) for one in body.missing)
+
+    def show(self, moment: Moment, fixed: str) -> None:
+        """Draw everything as it was at a moment, seen from the frame ``fixed``. Raises UnknownFrame."""
+        placed = self._nodes.show(moment, fixed)
+        shown = self._nodes.shown
+        self._show_bodies()
+        self._axes.show(self.axes, placed, shown)
+        self._lines.show(self.parent_lines, placed, shown, moment.tree.parents)
+        self._names.show(self.names, self._nodes)
+        self._trails.show(moment, fixed, placed)
+        self._silences.show(self._nodes)
+
+    def _show_bodies(self) -> None:
+        for made in self._workshop.fetch():
+            for body in self._bodies.values():
+                if body.take(made):
+                    break
+        for name, body in self._bodies.items():
+            body.wear(self._dresses(name))
+            body.hang(self._nodes)
+
+    def _dresses(self, robot: str) -> set[Dress]:
+        dresses: set[Dress] = {"collision"} if self.collisions else set()
+        if self.visuals:
+            dresses.add("grey" if self._silences.is_silent(robot) else "visual")
+        return dresses

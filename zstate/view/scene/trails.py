@@ -1,0 +1,96 @@
+"""Trails: where frames have been, as lines that fade."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from zstate.view.moment import Moment, Poses
+
+_SEGMENTS = 400
+_SHORTEST_M = 0.002
+_PERIOD_NS = 50_000_000
+_LONGEST_GAP_NS = 1_000_000_000
+_WIDTH_PX = 3.0
+_PAPER = np.array([244.0, 244.0, 246.0])
+_COLORS = ((214, 39, 120), (31, 119, 180), (44, 140, 60), (230, 120, 20), (120, 80, 190), (20, 150, 150))
+
+
+class Trail:
+    """The last places of one frame, as many segments as fit; they begin all in one point."""
+
+    def __init__(self, handle: viser.LineSegmentsHandle, place: NDArray[np.float64], stamp: int) -> None:
+        self.handle = handle
+        self._points = np.broadcast_to(place, (_SEGMENTS, 2, 3)).astype(np.float32)
+        self._stamp = stamp
+
+    def goes_on(self, stamp: int) -> bool:
+        """Whether a place at that stamp belongs to the same trail: time has not jumped."""
+        return 0 <= stamp - self._stamp < _LONGEST_GAP_NS
+
+    def add(self, place: NDArray[np.float64], stamp: int) -> None:
+        """Go on to a place, unless that is too soon or too near to be seen."""
+        last = self._points[-1, 1]
+        near = float(np.linalg.norm(place - last)) < _SHORTEST_M
+        if near or stamp - self._stamp < _PERIOD_NS:
+            self._stamp = stamp if near else self._stamp
+            return
+        self._points = np.roll(self._points, -1, axis=0)
+        self._points[-1] = (last, place)
+        self._stamp = stamp
+        self.handle.points = self._points
+
+
+class Trails:
+    """Draws those that are on. A trail begins anew when time jumps, or the fixed frame is another."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._trails: dict[str, Trail | None] = {}
+        self._colors: dict[str, int] = {}
+        self._fixed = ""
+
+    def switch(self, frame: str, on: bool) -> None:
+        """Draw the trail of a frame from now on, or draw it no more."""
+        if on:
+            self._trails.setdefault(frame, None)
+        elif frame in self._trails:
+            self._forget(frame)
+            del self._trails[frame]
+
+    def show(self, moment: Moment, fixed: str, placed: Poses) -> None:
+        """Go on to where the frames are."""
+        if fixed != self._fixed:
+            self._fixed = fixed
+            for frame in self._trails:
+                self._forget(frame)
+        for frame in self._trails:
+            row = moment.tree.index.get(frame)
+            if row is not None and moment.stamp is not None and np.isfinite(placed[row, 0]):
+                self._add(frame, placed[row, :3], moment.stamp)
+
+    def _add(self, frame: str, place: NDArray[np.float64], stamp: int) -> None:
+        trail = self._trails[frame]
+        if trail is not None and trail.goes_on(stamp):
+            trail.add(place, stamp)
+            return
+        self._trails[frame] = Trail(self._line(frame, place), place, stamp)
+
+    def _line(self, frame: str, place: NDArray[np.float64]) -> viser.LineSegmentsHandle:
+        number = self._colors.setdefault(frame, len(self._colors))
+        fade = np.linspace(0.0, 1.0, 2 * _SEGMENTS)[:, None]
+        colors = (1.0 - fade) * _PAPER + fade * np.array(_COLORS[number % len(_COLORS)])
+        return self._scene.add_line_segments(
+            f"/trails/{number}",
+            np.broadcast_to(place, (_SEGMENTS, 2, 3)).astype(np.float32),
+            colors.reshape(_SEGMENTS, 2, 3).astype(np.uint8),
+            thickness=_WIDTH_PX,
+            thickness_units="screen",
+        )
+
+    def _forget(self, frame: str) -> None:
+        trail = self._trails[frame]
+        if trail is not None:
+            trail.handle.remove()
+        self._trails[frame] = None
