@@ -45,6 +45,8 @@ def test_bad_input_is_a_value_error_and_a_failed_question_is_not() -> None:
         (1_500, "1.5 us"),
         (12_000_000, "12.0 ms"),
         (4_200_000_000, "4.2 s"),
+        (172_799 * S, "172799.0 s"),
+        (216_000 * S, "2.5 days"),
         (-3_000_000, "-3.0 ms"),
     ],
 )
@@ -76,6 +78,59 @@ def test_in_past_says_how_far_before_and_how_long_the_history_is() -> None:
     error = InPast("map", "hand", edge=("map", "base"), requested=S, oldest=3 * S, newest=7 * S)
     assert "asked 2.0 s before the oldest sample of 'map' -> 'base'" in str(error)
     assert "the history there spans 4.0 s" in str(error)
+
+
+def test_a_single_sample_is_told_as_that() -> None:
+    before = InPast("map", "hand", edge=("map", "base"), requested=S, oldest=3 * S, newest=3 * S)
+    assert "asked 2.0 s before the only sample of 'map' -> 'base' so far; " in str(before)
+    assert "spans" not in str(before)
+    assert "zstate static" in str(before)
+    after = InFuture("map", "hand", edge=("map", "base"), requested=5 * S, oldest=3 * S, newest=3 * S)
+    assert "asked 2.0 s after the only sample of 'map' -> 'base'; " in str(after)
+
+
+# 2024-01-05 10:17:57.278 UTC
+WALL = 1_704_449_877_278_544_000
+SIMULATED = 250_655_000_000
+
+
+def test_wall_clock_time_asked_of_a_simulation_is_told_in_words() -> None:
+    error = InFuture("a", "b", edge=("a", "b"), requested=WALL, oldest=S, newest=SIMULATED)
+    assert (
+        "that instant, 2024-01-05 10:17:57 UTC, is wall-clock time, and those samples keep simulated time, "
+        "or that of a machine whose clock was never set (the newest 250.655 s); ask in the time" in str(error)
+    )
+    assert error.is_of_another_time
+    assert "wait for it" not in str(error)
+    again = pickle.loads(pickle.dumps(timed_out(error, 1.0)))
+    assert str(again).endswith(str(error))
+
+
+def test_simulated_time_asked_of_a_wall_clock_is_told_in_words() -> None:
+    error = InPast("a", "b", edge=("a", "b"), requested=SIMULATED, oldest=WALL, newest=WALL + S)
+    assert (
+        "that instant, 250.655 s, is simulated time or one since a machine was switched on, and those "
+        "samples keep wall-clock time (the newest 2024-01-05 10:17:58 UTC)" in str(error)
+    )
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("seconds", S), ("milliseconds", 1_000_000), ("microseconds", 1_000)]
+)
+def test_a_mistaken_unit_is_told_on_either_side(unit: str, scale: int) -> None:
+    asked = InPast("a", "b", edge=("a", "b"), requested=WALL // scale, oldest=WALL, newest=WALL + S)
+    assert f"that instant, {WALL // scale}, looks like {unit}: stamps are nanoseconds" in str(asked)
+    stamped = InFuture("a", "b", edge=("a", "b"), requested=WALL, oldest=1, newest=WALL // scale)
+    assert f"their writer gives {unit} where nanoseconds are meant" in str(stamped)
+
+
+@pytest.mark.parametrize(
+    ("asked", "newest"), [(100_000 * S, 100 * S), (WALL, WALL - 90_000 * S), (S, 40_000 * S)]
+)
+def test_stamps_of_one_time_that_are_far_apart_are_only_that(asked: int, newest: int) -> None:
+    error = InFuture("a", "b", edge=("a", "b"), requested=asked, oldest=newest - S, newest=newest)
+    assert not error.is_of_another_time
+    assert "wait for it" in str(error)
 
 
 def test_an_unknown_frame_comes_with_near_misses_or_with_what_lists_the_frames() -> None:

@@ -139,9 +139,16 @@ def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
         assert answer["stamp"] == soon
         message = failure("tf", "base", "lower", "--at", str(soon - 3_600 * 10**9))
         other = failure("tf", "base", "lower", "--at", "250.655")
-    assert "before the oldest sample heard of 'rrbot/base' -> 'rrbot/upper'" in message
-    assert "asked for 250.655000000, and samples of 'rrbot/base' -> 'rrbot/upper' are stamped" in other
-    assert "another time" in other
+        late = failure("tf", "base", "lower", "--at", str(soon + 3_600 * 10**9), "--timeout", "1")
+        seconds = failure("tf", "base", "lower", "--at", str(soon // 10**9))
+    assert "before the oldest sample of 'rrbot/base' -> 'rrbot/upper'" in message
+    assert "leave --at out for the newest pose, or name an instant to come" in message
+    assert "that instant, 250.655 s, is simulated time or one since a machine was switched on, and" in other
+    assert "those samples keep wall-clock time" in other
+    assert "after the newest sample of 'rrbot/base' -> 'rrbot/upper'" in late
+    assert "wait longer (--timeout), or leave --at out" in late
+    assert "looks like seconds: stamps are nanoseconds" in seconds
+    assert not any(word in message + other + late + seconds for word in ("timeout_s", "at=None", "history_s"))
 
 
 @pytest.mark.parametrize("stamp", ["noon", "1.0000000001", "nan", "1e40"])

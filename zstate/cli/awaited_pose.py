@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from zstate.cli.console import fail, note
 from zstate.cli.roster import Roster
-from zstate.clock import stamp_text
-from zstate.errors import InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
+from zstate.errors import InFuture, InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
 
 if TYPE_CHECKING:
     from zstate.listener import TransformListener
@@ -17,8 +16,7 @@ if TYPE_CHECKING:
 # Whoever has answers usually gives the first one sooner; waiting is mentioned only afterwards.
 _GRACE_S = 0.5
 
-# Nobody asks for what was so long before a command began; stamps of two clocks are further apart.
-_ANOTHER_TIME_NS = 365 * 86_400 * 1_000_000_000
+_LEAVE_OUT = "leave --at out for the newest pose"
 
 
 class AwaitedPose:
@@ -81,28 +79,28 @@ class AwaitedPose:
             note(f"waiting: {self._explained(reason, hint)}")
 
     def _refuse_past(self, reason: InPast) -> NoReturn:
-        assert reason.requested is not None
-        assert reason.oldest is not None
-        assert reason.edge is not None
-        edge = self._words.explained(" -> ".join(map(repr, reason.edge)))
-        if reason.oldest - reason.requested > _ANOTHER_TIME_NS:
-            fail(
-                f"asked for {stamp_text(reason.requested)}, and samples of {edge} are stamped "
-                f"{stamp_text(reason.oldest)} and later: that is another time (of a simulation, or since a "
-                "machine was switched on), or another unit"
-            )
+        if reason.is_of_another_time:
+            fail(f"{self._words.explained(reason.happening)}; {_LEAVE_OUT}")
         fail(
-            f"asked {duration_text(reason.oldest - reason.requested)} before the oldest sample heard of "
-            f"{edge}; this command knows only what comes while it runs: "
-            "leave --at out, or name an instant to come"
+            f"{self._words.explained(reason.happening)}; this command knows only what comes while it runs: "
+            f"{_LEAVE_OUT}, or name an instant to come"
         )
 
     def _give_up(self, reason: WaitTimeout, timeout_s: float) -> NoReturn:
-        fail(f"gave up after {timeout_s:g} s: {self._explained(reason, self._hint(reason))}")
+        advice = ""
+        if isinstance(reason, InFuture):
+            advice = (
+                f"; {_LEAVE_OUT}"
+                if reason.is_of_another_time
+                else f"; wait longer (--timeout), or {_LEAVE_OUT}"
+            )
+        fail(f"gave up after {timeout_s:g} s: {self._explained(reason, self._hint(reason))}{advice}")
 
     def _explained(self, reason: LookupFailed, hint: str) -> str:
         if isinstance(reason, UnknownFrame) and not reason.frame_count:
             return hint  # no frame at all is known: that is not about this one
+        if isinstance(reason, InFuture):
+            return self._words.explained(reason.happening)  # what a program would do is of no use here
         return f"{self._words.explained(reason.explanation())}{f' ({hint})' if hint else ''}"
 
     def _hint(self, reason: LookupFailed) -> str:

@@ -63,9 +63,9 @@ from zstate.errors.lookup import (
     Stale,
     UnknownFrame,
     WaitTimeout,
-    duration_text,
     timed_out,
 )
+from zstate.errors.times import duration_text
 
 __all__ = [
     "AccessDenied",

@@ -7,16 +7,11 @@ from functools import cache, cached_property
 from typing import Any
 
 from zstate.errors.base import ZStateError
+from zstate.errors.times import difference_text, duration_text
 
-
-def duration_text(nanoseconds: int) -> str:
-    """A duration as a person says it: 85 ns, 12.0 us, 3.5 ms, 4.2 s."""
-    size = abs(nanoseconds)
-    for unit, scale in (("s", 1_000_000_000), ("ms", 1_000_000), ("us", 1_000)):
-        if size >= scale:
-            return f"{nanoseconds / scale:.1f} {unit}"
-    return f"{nanoseconds} ns"
-
+_IN_THEIR_TIME = (
+    "; ask in the time that they keep, or for the newest instant (at=None), and let all writers keep one time"
+)
 
 # An offset of clocks that is smaller than this does not explain why there is no answer.
 _WORTH_SAYING_NS = 1_000_000
@@ -180,25 +175,76 @@ class NoData(LookupFailed):
         return f"no sample of {self._edge_text()} has arrived yet; is its writer running (`zstate ls`)?"
 
 
-class InFuture(LookupFailed):
-    """The instant asked for lies after the newest sample of ``edge``."""
+class _OutsideHistory(LookupFailed):
+    """The instant asked for is not among those that samples tell of."""
+
+    @property
+    def happening(self) -> str:
+        """What happened, with which values, without advice."""
+        raise NotImplementedError
+
+    @property
+    def is_of_another_time(self) -> bool:
+        """Whether what was asked and the samples are stamped by clocks that say nothing of each other."""
+        return bool(self._difference)
+
+    @property
+    def _difference(self) -> str:
+        if self.requested is None or self.newest is None:
+            return ""
+        return difference_text(self.requested, self.newest)
+
+    @property
+    def _has_one_sample(self) -> bool:
+        return self.newest is not None and self.oldest == self.newest
+
+    def _told(self, what: str) -> str:
+        """``what``, and why the stamps are so far apart where that can be seen."""
+        return f"{what}: {self._difference}" if self._difference else what
 
     def explanation(self) -> str:
+        advice = _IN_THEIR_TIME if self._difference else self._advice()
+        return f"{self.happening}{advice}{_also(self._clock_text())}"
+
+    def _advice(self) -> str:
+        raise NotImplementedError
+
+
+class InFuture(_OutsideHistory):
+    """The instant asked for lies after the newest sample of ``edge``."""
+
+    @property
+    def happening(self) -> str:
+        which = "only" if self._has_one_sample else "newest"
+        return self._told(
+            f"asked {_span(self.requested, self.newest)} after the {which} sample of {self._edge_text()}"
+        )
+
+    def _advice(self) -> str:
         return (
-            f"asked {_span(self.requested, self.newest)} after the newest sample of {self._edge_text()}; "
-            "wait for it (timeout_s=...), ask for the newest instant (at=None), or predict (predict_s=...)"
-            f"{_also(self._clock_text())}"
+            "; wait for it (timeout_s=...), ask for the newest instant (at=None), or predict (predict_s=...)"
         )
 
 
-class InPast(LookupFailed):
+class InPast(_OutsideHistory):
     """The instant asked for lies before the oldest sample of ``edge``; waiting cannot mend it."""
 
-    def explanation(self) -> str:
+    @property
+    def happening(self) -> str:
+        which = "only" if self._has_one_sample else "oldest"
+        return self._told(
+            f"asked {_span(self.oldest, self.requested)} before the {which} sample of {self._edge_text()}"
+        )
+
+    def _advice(self) -> str:
+        if self._has_one_sample:
+            return (
+                " so far; ask for the newest instant (at=None), or start the listener earlier; what never "
+                "moves is published as static (`zstate static`)"
+            )
         return (
-            f"asked {_span(self.oldest, self.requested)} before the oldest sample of {self._edge_text()}; "
-            f"the history there spans {_span(self.newest, self.oldest)}: start the listener earlier or give "
-            f"the buffer more history_s{_also(self._clock_text())}"
+            f"; the history there spans {_span(self.newest, self.oldest)}: start the listener earlier or "
+            "give the buffer more history_s"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, stamp_text
-from zstate.errors import duration_text
+from zstate.errors.times import counts_from_start, duration_text, unit_mistaken
 from zstate.following.tally import Tally
 from zstate.wire.messages import Sample, TransformSample
 
@@ -12,8 +12,6 @@ FAR_NS = 60_000_000_000
 """A sample was not held up for so long by any network, and clocks that disagree so much were never set."""
 
 _HOUR_NS = 3_600_000_000_000
-_DAY_NS = 24 * _HOUR_NS
-_UNITS = (("seconds", 1_000_000_000), ("milliseconds", 1_000_000), ("microseconds", 1_000))
 _EVERYTHING = (-(2**63), 2**63)
 
 
@@ -57,17 +55,16 @@ class OffClock:
         now = self._buffer.clock.now()
         who = f", which {writer} writes," if writer else ""
         return (
-            f"samples of {robot!r}{who} are stamped {_size(stamp - now)} this machine's time "
+            f"samples of {robot!r}{who} are stamped {_apart(stamp - now)} this machine's time "
             f"({stamp_text(stamp)}): {likely_cause(stamp, now)}; they are used and counted in off_clock"
         )
 
 
 def likely_cause(stamp: int, now: int) -> str:
     """What makes writers stamp ``stamp`` when it is ``now`` [ns]."""
-    for unit, scale in _UNITS:
-        if abs(stamp * scale - now) < _DAY_NS:
-            return f"the writer gives {unit} where nanoseconds are meant"
-    if abs(stamp) < 3650 * _DAY_NS:
+    if unit := unit_mistaken(stamp, now):
+        return f"the writer gives {unit} where nanoseconds are meant"
+    if counts_from_start(stamp):
         return (
             "1970 and after: the writer stamps with the time since it was switched on, its machine has no "
             "clock that was set, or this is simulated time (then both sides need `--clock sim`)"
@@ -78,7 +75,5 @@ def likely_cause(stamp: int, now: int) -> str:
     return "the clock of one of the two machines was never set (NTP); or what comes is a recording"
 
 
-def _size(offset_ns: int) -> str:
-    size = abs(offset_ns)
-    said = f"{size / _DAY_NS:.1f} days" if size >= 2 * _DAY_NS else duration_text(size)
-    return f"{said} {'after' if offset_ns > 0 else 'before'}"
+def _apart(offset_ns: int) -> str:
+    return f"{duration_text(abs(offset_ns))} {'after' if offset_ns > 0 else 'before'}"
