@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import math
 import time
 
@@ -133,19 +134,21 @@ def test_a_robot_that_is_not_there_is_met_with_those_that_are():
 
 def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
     with standing():
-        soon = time.time_ns() + 2_000_000_000
+        soon = time.time_ns() + 6_000_000_000  # a busy machine takes its time to start a command
         as_printed = f"{soon // 10**9}.{soon % 10**9:09d}"
-        answer = json.loads(zstate("tf", "base", "lower", "--at", as_printed, "--json").stdout)
+        answer = json.loads(
+            zstate("tf", "base", "lower", "--at", as_printed, "--timeout", "20", "--json").stdout
+        )
         assert answer["stamp"] == soon
         message = failure("tf", "base", "lower", "--at", str(soon - 3_600 * 10**9))
         other = failure("tf", "base", "lower", "--at", "250.655")
         late = failure("tf", "base", "lower", "--at", str(soon + 3_600 * 10**9), "--timeout", "1")
         seconds = failure("tf", "base", "lower", "--at", str(soon // 10**9))
-    assert "before the oldest sample of 'rrbot/base' -> 'rrbot/upper'" in message
+    assert re.search("before the (oldest|only) sample of 'rrbot/base' -> 'rrbot/upper'", message)
     assert "leave --at out for the newest pose, or name an instant to come" in message
     assert "that instant, 250.655 s, is simulated time or one since a machine was switched on, and" in other
     assert "those samples keep wall-clock time" in other
-    assert "after the newest sample of 'rrbot/base' -> 'rrbot/upper'" in late
+    assert re.search("after the (newest|only) sample of 'rrbot/base' -> 'rrbot/upper'", late)
     assert "wait longer (--timeout), or leave --at out" in late
     assert "looks like seconds: stamps are nanoseconds" in seconds
     assert not any(word in message + other + late + seconds for word in ("timeout_s", "at=None", "history_s"))
