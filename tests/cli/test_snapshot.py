@@ -8,6 +8,7 @@ from looking import ELBOW, RRBOT, SHOULDER, Spawn, failure, interrupted, standin
 from support import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect, discover, load_model
+from zstate.cli.network import Network
 from zstate.cli.snapshot.snapshot import Configuration, RobotShot, Snapshot, StaticShot, read_snapshot
 from zstate.cli.snapshot.text import json_text, toml_text
 
@@ -80,6 +81,49 @@ def test_a_robot_stands_again_as_it_stood(spawn: Spawn, tmp_path: Path, suffix: 
         assert "calibration" in {name for name, _ in info.static_names}
         count = listener.stats.received
         until(lambda: listener.stats.received > count)
+    interrupted(child)
+
+
+@pytest.mark.parametrize(
+    ("saved", "options", "network"),
+    [
+        (HERE, "", Network()),
+        (Configuration("1", "h", "peer", "ros2"), "--wire ros2", Network()),
+        (
+            Configuration("1", "h", "client", connect=("tcp/a:1",)),
+            "--mode client --connect tcp/a:1",
+            Network("client", ("tcp/a:1",)),
+        ),
+        (
+            Configuration("1", "h", "peer", "native", ("tcp/a:1",), ("tcp/b:1",), "my file"),
+            "--mode peer --connect tcp/a:1 --listen tcp/b:1 --config 'my file'",
+            Network("peer", ("tcp/a:1",), ("tcp/b:1",), "my file"),
+        ),
+    ],
+)
+def test_who_saved_it_can_be_followed_onto_the_network(saved, options: str, network: Network):
+    assert saved.options() == options
+    assert saved.is_plain == (not options)
+    assert saved.network(Network()) == network
+    elsewhere = saved.network(Network(connect=("tcp/c:1",)))
+    assert (elsewhere.connect, elsewhere.listen) == (("tcp/c:1",), network.listen)
+
+
+@pytest.mark.processes
+def test_a_snapshot_is_loaded_here_unless_it_is_asked_for_where_it_was_taken(
+    spawn: Spawn, tmp_path: Path, free_port: int
+):
+    file, router = tmp_path / "cell.toml", f"tcp/127.0.0.1:{free_port}"
+    started(spawn, "router", "--listen", router).line()
+    with standing(router=router):
+        assert zstate("snapshot", "save", str(file), "--connect", router).returncode == 0
+    here = zstate("snapshot", "load", str(file), "--seconds", "0.1").stderr.decode()
+    assert f"with --mode client --connect {router}; --as-saved does the same here" in here
+    child = started(spawn, "snapshot", "load", str(file), "--as-saved")
+    child.line()
+    with connect(mode="client", endpoints=router) as session:
+        until(lambda: [info.name for info in discover(session)] == ["rrbot"])
+    assert f": --mode client --connect {router}" in child.stderr
     interrupted(child)
 
 

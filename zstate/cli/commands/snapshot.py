@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from zstate.cli import logs
 from zstate.cli.console import count_text, fail, note, say
@@ -19,6 +21,9 @@ from zstate.cli.options import (
     wire_option,
     wires_option,
 )
+
+if TYPE_CHECKING:
+    from zstate.cli.snapshot.snapshot import Configuration
 
 _RATE_HZ = 10.0
 
@@ -85,6 +90,11 @@ def save_command(
     metavar="HZ",
     help="How often the joints are said.",
 )
+@click.option(
+    "--as-saved",
+    is_flag=True,
+    help="Join the network, and speak the wire, as whoever saved FILE; the options below come first.",
+)
 @seconds_option
 @takeover_option
 @wires_option
@@ -94,6 +104,7 @@ def load_command(
     file: str,
     robots: tuple[str, ...],
     rate: float,
+    as_saved: bool,
     seconds: float | None,
     takeover: bool,
     wires: tuple[str, ...],
@@ -101,24 +112,41 @@ def load_command(
 ) -> None:
     """Publish the robots of FILE, or the named ones, until Ctrl-C: they stand as they stood.
 
-    Their joints are stamped with the time it is now. The configuration in FILE is for you to read: this
-    command joins the network as its options say.
+    Their joints are stamped with the time it is now. Nothing leaves this host, wherever the robots of FILE
+    were, unless options or --as-saved say so. Passwords and certificates are not in FILE.
 
     \b
     zstate snapshot load cell.toml
+    zstate snapshot load cell.toml --as-saved          # back to where it was taken
     zstate snapshot load cell.toml panda --wire ros2
     """
     from zstate.cli.snapshot.loading import Standing, chosen
     from zstate.cli.snapshot.snapshot import read_snapshot
 
-    shots, statics = chosen(read_snapshot(Path(file)), robots)
+    snapshot = read_snapshot(Path(file))
+    shots, statics = chosen(snapshot, robots)
     if not shots and not statics:
         fail(f"{file!r} has no robot in it")
+    network, wires = _joining(snapshot.configuration, network, wires, as_saved=as_saved)
     with (
         open_session(network, wires) as session,
         Standing(session, shots, statics, wires, takeover=takeover) as standing,
     ):
         standing.run(rate, seconds)
+
+
+def _joining(
+    saved: Configuration, network: Network, wires: tuple[str, ...], *, as_saved: bool
+) -> tuple[Network, tuple[str, ...]]:
+    """How to join the network, and what to speak; says where that is not as it was saved, or is as saved."""
+    is_wire_said = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
+    if as_saved:
+        if not saved.is_plain:
+            note(f"as saved on {saved.host!r}: {saved.options()}")
+        return saved.network(network), wires if is_wire_said else (saved.wire,)
+    if not (saved.is_plain or network.is_given or is_wire_said):
+        note(f"it was saved on {saved.host!r} with {saved.options()}; --as-saved does the same here")
+    return network, wires
 
 
 for command in snapshot_command.commands.values():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from zstate.cli.network import Network
 from zstate.cli.up.toml_file import TomlFile
 from zstate.errors import ConfigError, InvalidInput
 from zstate.model.robot import RobotModel
@@ -34,6 +36,38 @@ class Configuration(_Part, frozen=True):
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
     config: str | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether a command without any option would be on the network just so."""
+        return not self._names_places and self.mode == "peer" and self.wire == "native"
+
+    @property
+    def _names_places(self) -> bool:
+        return bool(self.connect or self.listen or self.config)
+
+    def options(self) -> str:
+        """What to say to a command for the same."""
+        said = [
+            *(("--mode", self.mode) if self.mode != "peer" or self._names_places else ()),
+            *(word for endpoint in self.connect for word in ("--connect", endpoint)),
+            *(word for endpoint in self.listen for word in ("--listen", endpoint)),
+            *(("--config", self.config) if self.config else ()),
+            *(("--wire", self.wire) if self.wire != "native" else ()),
+        ]
+        return shlex.join(said)
+
+    def network(self, said: Network) -> Network:
+        """The same way to join the network; what is ``said`` now comes first."""
+        # Whoever named no place at all was wherever commands of that wire are by themselves.
+        mode = self.mode if self.mode != "peer" or self._names_places else None
+        return Network(
+            said.mode or mode,
+            said.connect or self.connect,
+            said.listen or self.listen,
+            said.config or self.config,
+            said.credentials,
+        )
 
 
 class RobotShot(_Part, frozen=True, kw_only=True):
