@@ -73,6 +73,7 @@ HOMES = {
     "websockets": "view",  # what viser's server is made of
     "trimesh": "view",
     "collada": "view",
+    "imageio": "view",  # comes with viser
     "PIL": "view",
     "click": "cli",
     "matplotlib": "cli",  # `zstate plot`

@@ -38,6 +38,7 @@ _COMMANDS = {
     "doctor": ("Look", "What is wrong, and what to do next."),
     "wait": ("Look", "Wait until a robot, a pose or a router is there."),
     "config": ("Look", "What commands go by here, and who said so."),
+    "view": ("Look", "The robots, drawn in a browser, and moved from there."),
     "plot": ("Look", "Joint positions, or the path of a frame, over time."),
     "check": ("Look", "What is right and wrong with a robot model."),
     "record": ("Record", "What robots say, into MCAP files."),

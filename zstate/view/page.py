@@ -6,6 +6,7 @@ import contextlib
 import errno
 import functools
 import io
+import logging
 import socket
 import threading
 from collections.abc import Generator
@@ -21,6 +22,11 @@ from zstate.view.door import Door, is_websocket
 
 PORT = 8080
 _PORTS_TRIED = 100
+
+# It tells of every browser that opens a connection and thinks better of it, with a traceback.
+_SILENT = logging.getLogger("zstate.view.http")
+_SILENT.addHandler(logging.NullHandler())
+_SILENT.propagate = False
 
 # While one server opens, websockets' function that opens servers is not what it is for others.
 _opening = threading.Lock()
@@ -63,6 +69,8 @@ class Page(Closing):
     def _open(self, title: str) -> viser.ViserServer:
         with _opening, _quiet(), self._opens_here() as opened:
             server = _Server(self.host, self.port, title, verbose=False)
+            server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
+            server.gui.main_panel.dock_right()
             if not opened:
                 server.stop()
                 raise RuntimeError("this version of viser opens its server in a way that is not guarded")
@@ -86,7 +94,7 @@ class Page(Closing):
         ) -> websockets.asyncio.server.serve:
             opened.append(port)
             guarded = functools.partial(self._answer, process_request)
-            return opens(handler, sock=self._listening, process_request=guarded, **options)
+            return opens(handler, sock=self._listening, process_request=guarded, logger=_SILENT, **options)
 
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
         try:

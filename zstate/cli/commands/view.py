@@ -1,0 +1,105 @@
+"""zstate view: the robots, drawn in a browser."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from zstate.cli.network import Network, open_session
+from zstate.cli.options import checked_rate, session_options
+
+if TYPE_CHECKING:
+    from zstate.view.sliders import Sliders
+
+
+def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) -> Path | None:
+    if file is not None and Path(file).suffix.lower() != ".png":
+        raise click.BadParameter(f"{file!r} does not end with .png")
+    return None if file is None else Path(file)
+
+
+@click.command("view")
+@click.argument("robots", nargs=-1, metavar="[ROBOT...]")
+@click.option("--sliders", is_flag=True, help="Move the robots from the page, and publish what they do.")
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Where to listen; 0.0.0.0 is everywhere."
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    help="0 is any that is free; default: the first free one from 8080 on.",
+)
+@click.option(
+    "--rate",
+    type=float,
+    default=30.0,
+    show_default=True,
+    callback=checked_rate,
+    help="Pictures a second [Hz].",
+)
+@click.option("--snapshot", callback=_checked_picture, metavar="FILE.png", help="Write one picture, and end.")
+@click.option("--size", nargs=2, type=click.IntRange(16, 8192), default=(1280, 800), help="Of that picture.")
+@session_options
+def view_command(
+    *,
+    network: Network,
+    robots: tuple[str, ...],
+    sliders: bool,
+    host: str,
+    port: int | None,
+    rate: float,
+    snapshot: Path | None,
+    size: tuple[int, int],
+) -> None:
+    """Draw the announced robots, or those that are named, in a browser.
+
+    Prints the address to open. It is for this machine only; from another one, forward its port:
+    ssh -L 8080:127.0.0.1:8080 HOST. With --host others may open it too, who have the token in the
+    address that is printed; what they see travels in the clear.
+
+    With --sliders each ROBOT is moved from the page. It is a robot that is announced, or a name or URDF
+    file as `zstate publish` takes it, and nobody else may write its joints. A ROBOT may also be a
+    recording. --snapshot draws with an installed Chromium, without a screen.
+    Needs viser: pip install 'zstate[view]'.
+
+    \b
+    zstate view
+    zstate view panda --sliders
+    zstate view run.mcap
+    zstate view panda --snapshot panda.png
+    zstate view --host 0.0.0.0 --port 9000
+    """
+    import_module("zstate.view.library")  # told before anything is heard when it is missing
+
+    from zstate.cli.viewing import chosen_sliders, recording_among, running, show_address, take_snapshot
+    from zstate.view.page import Page
+    from zstate.view.view import View
+    from zstate.view.world import World
+
+    said, recording = robots, recording_among(robots)
+    if recording is not None and sliders:
+        raise click.UsageError("--sliders moves robots that are here, not those of a recording")
+    with ExitStack() as opened:
+        moved: list[Sliders] = []
+        if recording is None:
+            session = opened.enter_context(open_session(network))
+            if sliders:
+                moved = [opened.enter_context(one) for one in chosen_sliders(session, robots)]
+            robots = tuple(one.robot for one in moved) or robots
+            world = opened.enter_context(World(session, robots))
+        else:
+            robots = ()
+            world = opened.enter_context(World.of_recording(recording))
+        page = opened.enter_context(Page(port=0) if snapshot else Page(host, port))
+        folder = next((Path(one).parent for one in said if Path(one).is_file()), None)
+        view = opened.enter_context(View(world, page, sliders=moved, rate_hz=rate, folder=folder))
+        with running(view) as worker:
+            if snapshot is None:
+                show_address(page)
+                worker.result()
+            else:
+                take_snapshot(world, view, page, robots, path=snapshot, size=size)

@@ -1,0 +1,110 @@
+"""What `zstate view` does around the view itself: whom it shows, whom it moves, and where."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import click
+
+from zstate.cli.console import fail, note, say
+from zstate.cli.options import load_robot
+from zstate.cli.worker import Worker
+from zstate.model.robot import RobotModel
+from zstate.net.presence import discover
+from zstate.net.session import Session
+from zstate.view.door import is_loopback
+from zstate.view.page import Page
+from zstate.view.picture import take_picture
+from zstate.view.sliders import Sliders
+from zstate.view.view import View
+from zstate.view.world import World
+
+_RECORDINGS = (".mcap", ".db3")
+_MEETING_S = 0.5
+_ANNOUNCED_WITHIN_S = 5.0
+# Several robots are rarely announced at once.
+_OTHERS_WITHIN_S = 0.5
+_ENDS_WITHIN_S = 0.8
+
+
+def recording_among(robots: Sequence[str]) -> Path | None:
+    """The recording that is meant instead of robots."""
+    files = [Path(one) for one in robots if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
+    if files and len(robots) > 1:
+        raise click.UsageError(f"a recording is viewed alone; got {', '.join(robots)}")
+    return files[0] if files else None
+
+
+def chosen_sliders(session: Session, robots: Sequence[str]) -> Iterator[Sliders]:
+    """Sliders of each robot that is named, or of all that are announced."""
+    announced = [info.name for info in discover(session, _MEETING_S if robots else _ANNOUNCED_WITHIN_S)]
+    if not robots and not announced:
+        fail("no robot is announced that could be moved; name one, as in `zstate view panda --sliders`")
+    for one in robots or announced:
+        model, name = _announced_model(session, one) if one in announced else load_robot(one, None)
+        sliders = Sliders(session, model, name)
+        if sliders.refusal:
+            note(f"{name!r} is not moved: {sliders.refusal}", robot=name)
+        yield sliders
+
+
+def _announced_model(session: Session, robot: str) -> tuple[RobotModel, str]:
+    with World(session, (robot,)) as world:
+        if not _until(lambda: robot in world.models, _ANNOUNCED_WITHIN_S):
+            fail(f"{robot!r} is announced, but not what it looks like; `zstate doctor {robot}` says more")
+        return world.models[robot], robot
+
+
+@contextmanager
+def running(view: View) -> Generator[Worker[None]]:
+    """The view at work, until this is left."""
+    stop = threading.Event()
+    worker = Worker("zstate view", lambda: view.run(stop))
+    try:
+        yield worker
+    finally:
+        stop.set()
+        with suppress(TimeoutError):
+            worker.result(_ENDS_WITHIN_S)
+
+
+def show_address(page: Page) -> None:
+    """Say what to open, and how that is reached from elsewhere."""
+    say(f"the view is at {page.url}")
+    if not is_loopback(page.host):
+        note("whoever has this address may look, and move what has sliders; it travels in the clear")
+    elif os.environ.get("SSH_CONNECTION"):
+        note(f"from your own machine: ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}")
+
+
+def take_snapshot(
+    world: World, view: View, page: Page, robots: Sequence[str], *, path: Path, size: tuple[int, int]
+) -> None:
+    """Write one picture, once the robots are there."""
+    if not _until(lambda: _is_there(world, robots), _ANNOUNCED_WITHIN_S):
+        there = ", ".join(map(repr, world.robots())) or "none"
+        whom = " and ".join(map(repr, robots)) or "any robot"
+        fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {whom}; robots that were heard: {there}")
+    if not robots and world.session is not None:
+        time.sleep(_OTHERS_WITHIN_S)
+    take_picture(page, path, width=size[0], height=size[1], is_ready=lambda: not view.scene.busy)
+    say(f"wrote {path}: {', '.join(world.models)}, {size[0]} x {size[1]} pixels")
+
+
+def _is_there(world: World, robots: Sequence[str]) -> bool:
+    models = world.models
+    return all(robot in models for robot in robots) if robots else bool(models)
+
+
+def _until(condition: Callable[[], bool], timeout_s: float) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True

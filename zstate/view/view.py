@@ -1,0 +1,127 @@
+"""View: draws a world on a page, again and again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from zstate.clock import SystemClock
+from zstate.closing import Closing
+from zstate.model.robot import RobotModel
+from zstate.rate import Rate
+from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of
+from zstate.view.meshes import Meshes
+from zstate.view.moment import Moment
+from zstate.view.page import Page
+from zstate.view.panels.board import Board
+from zstate.view.scene.scene import Scene
+from zstate.view.sliders import Sliders
+from zstate.view.world import World
+
+# Numbers that change faster cannot be read, and cost more than the picture.
+_PANELS_PERIOD_S = 0.1
+_IDLE_S = 0.5
+
+
+class View(Closing):
+    """Draws ``world`` on ``page`` at most ``rate_hz`` times a second, while a browser shows that.
+
+    ``sliders`` are of robots that are moved from the page; they and the world are the caller's to close.
+    ``folder`` is where the relative paths of meshes begin, which only those know who have the URDF's file.
+    One thread calls ``run`` or ``draw``.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        page: Page,
+        *,
+        sliders: Sequence[Sliders] = (),
+        rate_hz: float = 30.0,
+        folder: Path | None = None,
+    ) -> None:
+        self._world = world
+        self._page = page
+        self._rate_hz = rate_hz
+        self.scene = Scene(page.server, Meshes(folder))
+        self._board = Board(page.server, world, self.scene, sliders)
+        self._version = -1
+        self._drawn: dict[str, RobotModel] = {}
+        self._framed: tuple[str, tuple[str, ...]] | None = None
+        self._panels_due_s = 0.0
+        server = page.server
+        server.initial_camera.fov = FIELD_OF_VIEW
+        # Without a graphics card shadows cost four times as much as all else.
+        server.scene.configure_default_lights(cast_shadow=False)
+        self._floor = server.scene.add_grid(
+            "/floor",
+            cell_color=(226, 228, 232),
+            cell_size=0.2,
+            section_color=(190, 194, 200),
+            infinite_grid=True,
+            fade_distance=14.0,
+            shadow_opacity=0.0,
+        )
+
+    def run(self, stop: threading.Event) -> None:
+        """Draw until ``stop`` is set."""
+        while not stop.is_set():
+            if not self._page.connected.wait(_IDLE_S):
+                self._world.look()
+                continue
+            for _ in Rate(self._rate_hz, SystemClock(), stop):
+                self.draw()
+                if not self._page.connected.is_set():
+                    break
+
+    def draw(self) -> Moment:
+        """Show the world as it is now, or at the instant that was chosen on the page."""
+        if self._version != self._world.version:
+            self._version = self._world.version
+            self._renew_robots()
+        moment = self._world.moment(self._board.stamp)
+        fixed = self._board.fixed(moment)
+        with self._page.server.atomic():
+            if fixed:
+                self.scene.show(moment, fixed)
+                self._frame(moment, fixed)
+            if time.monotonic() >= self._panels_due_s:
+                self._board.update(moment)
+                self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
+        return moment
+
+    def close(self) -> None:
+        """Draw no more. A second call does nothing."""
+        self._board.close()
+
+    def _renew_robots(self) -> None:
+        models = self._world.models
+        for name in self._drawn.keys() - models.keys():
+            self.scene.remove_robot(name)
+            del self._drawn[name]
+        for name, model in models.items():
+            known = self._drawn.get(name)
+            if known is None or known.digest != model.digest:
+                self.scene.set_robot(name, model)
+                self._drawn[name] = model
+
+    def _frame(self, moment: Moment, fixed: str) -> None:
+        """Look at all robots when there are others than before, or they are seen from another frame."""
+        subject = fixed, tuple(self._drawn)
+        if subject == self._framed or not self._drawn:
+            return
+        framing = framing_of(moment, moment.placed(fixed))
+        if framing is not None:
+            self._framed = subject
+            self._aim(framing)
+
+    def _aim(self, framing: Framing) -> None:
+        server = self._page.server
+        self._floor.position = (0.0, 0.0, framing.floor)
+        server.initial_camera.position = framing.position
+        server.initial_camera.look_at = framing.look_at
+        for client in server.get_clients().values():
+            client.camera.position = framing.position
+            client.camera.look_at = framing.look_at
