@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from datetime import datetime
 from difflib import get_close_matches
 
 import numpy as np
@@ -13,7 +14,6 @@ from zstate.closing import Closing
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.locks import new_lock
 from zstate.model.robot import RobotModel
-from zstate.net.claims import who_text
 from zstate.net.session import Session
 from zstate.publisher import STREAMS, StatePublisher
 from zstate.rate import check_rate
@@ -21,7 +21,6 @@ from zstate.sources.sine import SineSource
 from zstate.sources.source import JointReading
 from zstate.view.dials import Dials, Values
 from zstate.wire.keys import Stream
-from zstate.wire.writer import Writer
 
 _JOIN_WITHIN_S = 1.0
 
@@ -234,5 +233,6 @@ class _Readings:
 
 def _refusal(error: SecondWriter) -> str:
     first = error.first
-    who = who_text(first) if isinstance(first, Writer) else f"{first.program!r}"
-    return f"{who} writes {error.stream} of {error.robot!r} already; end that first, then try again"
+    since = datetime.fromtimestamp(first.since // 1_000_000_000).astimezone()
+    who, what = f"{first.program}@{first.host} pid {first.pid}", f"{error.stream} of {error.robot!r}"
+    return f"{who} writes {what} since {since:%Y-%m-%d %H:%M:%S}; end that first, then try again"

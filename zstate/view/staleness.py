@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from datetime import datetime
 
-from zstate.errors import duration_text
-
 _SILENT_AFTER_S = 1.0
 _SILENT_PERIODS = 10.0
 
@@ -27,8 +25,8 @@ def silence_text(silent_s: float, now_s: float | None = None) -> str:
 
 
 def _lasting(seconds: float) -> str:
-    if seconds < 60.0:
-        return duration_text(round(seconds * 1e9))
-    minutes, seconds = divmod(round(seconds), 60)
+    minutes, seconds = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {seconds} s"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"

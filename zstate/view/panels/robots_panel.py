@@ -41,7 +41,8 @@ class RobotsPanel:
         self._missing.content = unplaced_html(look.moment) + self._meshes(robots)
 
     def _silence(self, robot: str, look: Look) -> str | None:
-        silent_s = self._world.silent_s(robot)
+        # Who is silent now was not when what is shown happened.
+        silent_s = None if look.now is None else self._world.silent_s(robot)
         if silent_s is None or not is_silent(silent_s, look.facts.rate_hz(robot)):
             return None
         return silence_text(silent_s)
@@ -58,7 +59,7 @@ class RobotsPanel:
         rate_hz = look.facts.rate_hz(robot)
         if rate_hz is None:
             return "no sample yet" if look.facts.track(robot) else "no model yet"
-        return f"{'live' if self._world.session else 'recorded'}, {rate_hz:.1f} Hz"
+        return f"{'in the past' if look.now is None else 'live'}, {rate_hz:.1f} Hz"
 
     def _meshes(self, robots: Sequence[str]) -> str:
         lines = [

@@ -68,7 +68,7 @@ class SlidersPanel:
                 knob.remove()
             self._knobs = self._new_knobs()
         for knob, value in zip(self._knobs, self._sliders.values.tolist(), strict=True):
-            knob.show(value)
+            knob.show(value, held=bool(self._sliders.refusal))
         self._state.content = self._state_html()
         self._again.visible = bool(self._sliders.refusal)
         self._mimics.content = html.pairs(self._mimic_rows()) if self._sliders.mimics else ""
@@ -125,8 +125,9 @@ class _Knob:
             limited = float(np.clip(value / self._scale, self._dial.lower, self._dial.upper))
             self._sliders.set(self._dial.name, limited)
 
-    def show(self, value: float) -> None:
-        """Stand where the sliders stand, unless a person has just moved this one."""
+    def show(self, value: float, *, held: bool) -> None:
+        """Stand where the sliders stand, unless a person has just moved this one; ``held``: let nobody."""
+        self._slider.disabled = held
         if self._choice.taken() is None:
             self._choice.show(min(max(self._shown(value), self._slider.min), self._slider.max))
 
