@@ -94,7 +94,7 @@ def test_of_several_robots_one_line_is_enough_for_those_that_are_well():
     (left,) = [line for line in lines if "left" in line and "announced" not in line]
     assert left.split()[:2] == ["ok", "left"]
     assert lines[-2] == "first broken link: joint_states of 'right'"
-    assert lines[-1].startswith("next: zstate joints right")
+    assert lines[-1].startswith("next: zstate joints FILE --name right")
 
 
 def test_where_nobody_is_it_says_how_to_begin():
@@ -147,7 +147,7 @@ def test_a_driver_that_calls_the_robot_otherwise_is_found():
 def test_joint_states_without_a_model_lack_the_model():
     with standing(streams=("joint_states",)):
         found = broken_link("rrbot")
-    assert (found["name"], found["next"]) == ("model", "zstate publish FILE --name rrbot")
+    assert (found["name"], found["next"]) == ("model", "zstate publish rrbot")
 
 
 def test_joints_of_another_model_are_refused_with_the_reason(tmp_path: Path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from zstate.cli.console import count_text
@@ -23,6 +24,18 @@ def is_ros(wire: str) -> bool:
 def followed(wire: str) -> Literal["joint_states", "tf"]:
     """The stream that tells where frames are: what everybody writes, and needs no model on ROS's side."""
     return "tf" if is_ros(wire) else "joint_states"
+
+
+@lru_cache(maxsize=64)
+def writing(command: str, robot: str) -> str:
+    """`zstate publish` or `zstate joints` for ``robot``: by its name where that is a known model's too."""
+    from zstate.errors import ModelError
+    from zstate.model.known import find
+
+    try:
+        return f"zstate {command} {find(robot).name}"
+    except ModelError:
+        return f"zstate {command} FILE --name {robot}"
 
 
 def words_of(wire: str) -> Words:
@@ -94,7 +107,7 @@ class NativeWords:
             what = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample comes"
             return f"{what}; `zstate doctor {robot}` says why"
         command = "joints" if stream == "joint_states" else "publish"
-        return f"nobody writes {stream} of {robot!r}{' any more' * ended}; `zstate {command} {robot}` would"
+        return f"nobody writes {stream} of {robot!r}{' any more' * ended}; `{writing(command, robot)}` would"
 
     def lacking(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, heard: bool) -> str:
         wanted = [info for info in robots if robot in ("*", info.name)]

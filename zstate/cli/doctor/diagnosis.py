@@ -21,8 +21,8 @@ from zstate.cli.doctor.network_checks import (
 )
 from zstate.cli.doctor.next_command import looking_there
 from zstate.cli.network import Network, open_session
-from zstate.cli.words import RosWords, is_ros, words_of
-from zstate.errors import ModelError, ZStateError
+from zstate.cli.words import RosWords, is_ros, words_of, writing
+from zstate.errors import ZStateError
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import ANY
 
@@ -146,14 +146,10 @@ def _has_ros(session: Session) -> bool:
 
 def _start(robot: str) -> str:
     """What would put ``robot`` there."""
-    from zstate.model.known import find
-
     if robot == ANY:
         return "zstate publish panda --source sine"
-    try:
-        return f"zstate publish {find(robot).name} --source sine"
-    except ModelError:
-        return f"zstate publish FILE --name {robot}"
+    command = writing("publish", robot)
+    return command if "FILE" in command else f"{command} --source sine"
 
 
 def _connecting(network: Network) -> str:

@@ -9,6 +9,7 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
 from zstate.cli.doctor.ear import Ear
 from zstate.cli.telling_links import telling_links
+from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -130,7 +131,7 @@ def _no_model_check(ear: Ear) -> Check:
         return broken("model", text, f"zstate doctor {robot} --timeout 10")
     if ear.followed == "tf":
         return ok("model", "nobody publishes one, and none is needed: poses come ready made on tf")
-    return broken("model", f"nobody publishes the model of {robot!r}", f"zstate publish FILE --name {robot}")
+    return broken("model", f"nobody publishes the model of {robot!r}", writing("publish", robot))
 
 
 def _samples_check(ear: Ear) -> Check:
@@ -159,14 +160,14 @@ def _nobody_check(ear: Ear) -> Check:
     robot, waiting = ear.info.name, ear.writers("tf")
     if "robot_description" not in ear.streams and not waiting:
         text = f"nobody writes joint_states of {robot!r}, nor tf: it stands still"
-        return warning("joint_states", text, f"zstate joints {robot}  # moves it, for a try")
+        return warning("joint_states", text, f"{writing('joints', robot)}  # moves it, for a try")
     waits = f", for which {waiting[-1]} waits" if waiting else ""
     text = f"nobody writes joint_states of {robot!r}{waits}: its driver is not running (any more)"
     others = [info.name for info in ear.neighbours if _streams(info) == {"joint_states"}]
     if others:
         text += f", or calls the robot {others[0]!r}, of which there are joint_states and no model"
-        return broken("joint_states", text, f"zstate publish FILE --name {others[0]}")
-    return broken("joint_states", text, f"zstate joints {robot}  # moves it, until the driver runs")
+        return broken("joint_states", text, writing("publish", others[0]))
+    return broken("joint_states", text, f"{writing('joints', robot)}  # moves it, until the driver runs")
 
 
 def _streams(info: RobotInfo) -> set[str]:
