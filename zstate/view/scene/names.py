@@ -2,48 +2,68 @@
 
 from __future__ import annotations
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
+from zstate.view.moment import Mask, Moment
 from zstate.view.scene.nodes import Nodes
 
 _SIZE = 0.85
+_SAME_PLACE_M = 0.004
 
 
 class Names:
-    """Draws them while they are ``on``: without the robot's name where only one robot is there."""
+    """Draws them while they are on, without the robot's name where only one robot is there.
+
+    Frames in one place, such as the axes of a wrist, have one label with a line for each: labels over
+    each other cannot be read.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         self._labels: dict[str, tuple[str, viser.LabelHandle]] = {}
-        self._drawn = (False, -1)
+        self._drawn: tuple[bool, int, bytes] | None = None
 
-    def show(self, on: bool, nodes: Nodes) -> None:
+    def show(self, on: bool, moment: Moment, nodes: Nodes) -> None:
         """Put one at each frame that has a place."""
-        if self._drawn == (on, nodes.version):
+        joined = _joined(moment, nodes.shown) if on else np.zeros(0, dtype=np.bool_)
+        drawn = (on, nodes.version, joined.tobytes())
+        if drawn == self._drawn:
             return
-        self._drawn = (on, nodes.version)
-        texts = _texts(list(nodes.paths))
+        self._drawn = drawn
+        texts = _texts(moment, nodes.shown, joined) if on else {}
         for frame in self._labels.keys() - nodes.paths.keys():
             del self._labels[frame]
         for frame, path in nodes.paths.items():
-            self._show(frame, path, texts[frame], on and nodes.is_shown(frame))
+            self._show(frame, path, texts.get(frame))
 
-    def _show(self, frame: str, path: str, text: str, visible: bool) -> None:
+    def _show(self, frame: str, path: str, text: str | None) -> None:
         there, label = self._labels.get(frame, ("", None))
-        if label is None or there != path:
-            if visible:
-                label = self._scene.add_label(
-                    f"{path}/name", text, font_screen_scale=_SIZE, anchor="bottom-left"
-                )
-                self._labels[frame] = (path, label)
-            return
-        label.visible = visible
-        label.text = text
+        if label is not None and there == path:
+            label.visible = text is not None
+            label.text = label.text if text is None else text
+        elif text is not None:
+            label = self._scene.add_label(f"{path}/name", text, font_screen_scale=_SIZE, anchor="bottom-left")
+            self._labels[frame] = (path, label)
 
 
-def _texts(frames: list[str]) -> dict[str, str]:
-    """What each is called on the picture."""
-    robots = {frame.partition("/")[0] for frame in frames if "/" in frame}
-    if len(robots) > 1:
-        return {frame: frame for frame in frames}
-    return {frame: frame.partition("/")[2] or frame for frame in frames}
+def _joined(moment: Moment, shown: Mask) -> Mask:
+    """Which frames are where their parents are."""
+    parents = moment.tree.parents
+    near: NDArray[np.bool_] = np.linalg.norm(moment.poses[:, :3], axis=1) < _SAME_PLACE_M
+    return near & moment.known & (parents >= 0) & shown & shown[parents]
+
+
+def _texts(moment: Moment, shown: Mask, joined: Mask) -> dict[str, str]:
+    """The label of each frame that has one."""
+    names = moment.tree.names
+    robots = {name.partition("/")[0] for name in names if "/" in name}
+    lines: dict[int, list[str]] = {}
+    hosts: list[int] = []
+    for row, name in enumerate(names):
+        hosts.append(hosts[int(moment.tree.parents[row])] if joined[row] else row)
+        if shown[row]:
+            called = name if len(robots) > 1 else name.partition("/")[2] or name
+            lines.setdefault(hosts[row], []).append(called)
+    return {names[row]: "\n".join(called) for row, called in lines.items()}

@@ -89,7 +89,7 @@ class Scene:
         self._show_bodies()
         self._axes.show(self.axes, placed, shown)
         self._lines.show(self.parent_lines, placed, shown, moment.tree.parents)
-        self._names.show(self.names, self._nodes)
+        self._names.show(self.names, moment, self._nodes)
         self._trails.show(moment, fixed, placed)
         self._silences.show(self._nodes)
 

@@ -79,7 +79,7 @@ class Trails:
 
     def _line(self, frame: str, place: NDArray[np.float64]) -> viser.LineSegmentsHandle:
         number = self._colors.setdefault(frame, len(self._colors))
-        fade = np.linspace(0.0, 1.0, 2 * _SEGMENTS)[:, None]
+        fade = np.linspace(0.0, 1.0, 2 * _SEGMENTS)[:, None] ** 0.5
         colors = (1.0 - fade) * _PAPER + fade * np.array(_COLORS[number % len(_COLORS)])
         return self._scene.add_line_segments(
             f"/trails/{number}",

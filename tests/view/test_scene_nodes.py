@@ -1,0 +1,149 @@
+"""Nodes: viser is told of the poses that changed, and of no others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import pi
+
+import numpy as np
+import pytest
+
+viser = pytest.importorskip("viser")
+
+from drawing import at, in_fixed, is_seen, moment, told, tree  # noqa: E402
+
+from zstate import se3  # noqa: E402
+from zstate.view.page import Page  # noqa: E402
+from zstate.view.scene.nodes import Nodes  # noqa: E402
+
+ARM = tree({"map": None, "arm/base": "map", "arm/upper": "arm/base", "arm/tool": "arm/upper"})
+POSES = {"arm/base": at(1, 2, 0, pi / 2), "arm/upper": at(0, 0, 0.5, 0.3), "arm/tool": at(0.4, 0, 0)}
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    with Page(port=0) as opened:
+        yield opened
+
+
+@pytest.fixture
+def server(page):
+    page.server.scene.reset()
+    return page.server
+
+
+def assert_placed(server, nodes: Nodes, shown, fixed: str) -> None:
+    """Every frame that has a place is at it, as viser has been told."""
+    for name, expected in zip(shown.tree.names, shown.placed(fixed), strict=True):
+        path = nodes.paths[name]
+        assert nodes.is_shown(name) == bool(np.isfinite(expected[0]))
+        if nodes.is_shown(name):
+            assert is_seen(server, path)
+            found = in_fixed(server, path)
+            apart = se3.compose(se3.invert(found), tuple(expected.tolist()))
+            assert apart[:3] == pytest.approx((0, 0, 0), abs=1e-5)
+            assert abs(apart[6]) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("fixed", ARM.names)
+def test_every_frame_is_where_it_is_in_the_fixed_one(server, fixed):
+    nodes = Nodes(server.scene)
+    shown = moment(ARM, POSES)
+    nodes.show(shown, fixed)
+    assert_placed(server, nodes, shown, fixed)
+
+
+def test_what_stands_still_is_not_sent(server):
+    nodes = Nodes(server.scene)
+    nodes.show(moment(ARM, POSES), "map")
+    with told(server) as messages:
+        nodes.show(moment(ARM, POSES, stamp=1), "map")
+    assert messages == []
+
+
+def test_a_joint_that_turns_is_one_message_whatever_hangs_on_it(server):
+    nodes = Nodes(server.scene)
+    nodes.show(moment(ARM, POSES), "map")
+    turned = moment(ARM, POSES | {"arm/upper": at(0, 0, 0.5, 0.8)})
+    with told(server) as messages:
+        nodes.show(turned, "map")
+    assert [type(message).__name__ for message in messages] == ["SetOrientationMessage"]
+    assert_placed(server, nodes, turned, "map")
+
+
+def test_another_fixed_frame_moves_the_root_alone(server):
+    nodes = Nodes(server.scene)
+    shown = moment(ARM, POSES)
+    nodes.show(shown, "map")
+    with told(server) as messages:
+        nodes.show(shown, "arm/tool")
+    assert {message.name for message in messages} == {nodes.paths["map"]}
+    assert_placed(server, nodes, shown, "arm/tool")
+
+
+def test_noise_that_nobody_sees_is_not_sent_until_it_adds_up(server):
+    nodes = Nodes(server.scene)
+    nodes.show(moment(ARM, POSES), "map")
+    with told(server) as messages:
+        for k in range(1, 5):
+            nodes.show(moment(ARM, POSES | {"arm/tool": at(0.4 + k * 2e-7)}), "map")
+        assert messages == []
+        nodes.show(moment(ARM, POSES | {"arm/tool": at(0.4 + 2e-5)}), "map")
+        assert len(messages) == 1
+
+
+def test_frames_without_a_place_are_hidden_with_all_below_them(server):
+    nodes = Nodes(server.scene)
+    shown = moment(ARM, POSES, unknown=["arm/upper"])
+    nodes.show(shown, "map")
+    assert_placed(server, nodes, shown, "map")
+    assert [is_seen(server, nodes.paths[name]) for name in ARM.names] == [True, True, False, False]
+    again = moment(ARM, POSES)
+    nodes.show(again, "map")
+    assert_placed(server, nodes, again, "map")
+
+
+def test_what_is_below_a_missing_pose_is_seen_from_there(server):
+    nodes = Nodes(server.scene)
+    shown = moment(ARM, POSES, unknown=["arm/upper"])
+    nodes.show(shown, "arm/tool")
+    assert [nodes.is_shown(name) for name in ARM.names] == [False, False, True, True]
+    assert_placed(server, nodes, shown, "arm/tool")
+
+
+def test_a_frame_that_comes_leaves_the_others_as_they_are(server):
+    nodes = Nodes(server.scene)
+    nodes.show(moment(ARM, POSES), "map")
+    before = dict(nodes.paths)
+    more = tree(
+        {"map": None, "arm/base": "map", "cup": "map", "arm/upper": "arm/base", "arm/tool": "arm/upper"}
+    )
+    with told(server) as messages:
+        nodes.show(moment(more, POSES), "map")
+    assert {name: nodes.paths[name] for name in before} == before
+    assert not any("Remove" in type(message).__name__ for message in messages)
+    created = [message.name for message in messages if type(message).__name__ == "FrameMessage"]
+    assert created == [nodes.paths["cup"]]
+
+
+def test_a_frame_that_changes_its_parent_takes_along_what_hangs_on_it(server):
+    nodes = Nodes(server.scene)
+    nodes.show(moment(ARM, POSES), "map")
+    version = nodes.version
+    grasped = tree({"map": None, "arm/base": "map", "arm/tool": "arm/base", "arm/upper": "arm/tool"})
+    shown = moment(grasped, {"arm/tool": at(1, 0, 0), "arm/upper": at(0, 2, 0)})
+    nodes.show(shown, "map")
+    assert nodes.version > version
+    assert_placed(server, nodes, shown, "map")
+    back = moment(ARM, POSES)
+    nodes.show(back, "map")
+    assert_placed(server, nodes, back, "map")
+
+
+def test_a_frame_that_goes_is_removed(server):
+    nodes = Nodes(server.scene)
+    nodes.show(moment(ARM, POSES), "map")
+    tool = nodes.paths["arm/tool"]
+    nodes.show(moment(tree({"map": None, "arm/base": "map"}), POSES), "map")
+    assert "arm/tool" not in nodes.paths
+    assert server.scene.get_handle_by_name(tool) is None
