@@ -74,12 +74,15 @@ class Follower(ABC):
             if self._objection:
                 self._tally.refuse("clock domain", self._objection)
                 return
-            if not self._follow_session(sample):
+            if sample.session != self._session and not self._follow_session(sample):
                 self._tally.refuse(
                     "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
                 )
                 return
-            self._count_gap(sample.seq, overflowed)
+            if sample.seq == self._next_seq:
+                self._next_seq += 1
+            else:
+                self._count_gap(sample.seq, overflowed)
             if self._can_read(sample):
                 self._insert_counted(sample)
             else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from typing import TypeAlias
 
 import zenoh
 
@@ -26,6 +27,8 @@ Not more, because a sample that waits holds the memory it was received in, 10 to
 """
 
 _MOST_KEYS = 4096
+
+_Statuses: TypeAlias = "zenoh.handlers.Handler[zenoh.MatchingStatus]"
 
 
 def capacity_for(keyexpr: str) -> int:
@@ -57,12 +60,20 @@ class StreamPublisher(Closing):
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=False,
         )
+        self._has_readers = False
+        self._changes: zenoh.MatchingListener[_Statuses] | None = None
 
     @property
     def has_readers(self) -> bool:
         """Whether anybody subscribes to this key now. Cheap enough to ask before each sample."""
-        # the stub says bool, but it is an object and always true
-        return bool(self._publisher.matching_status.matching)  # pyright: ignore
+        if self._changes is None:
+            # Zenoh tells of each change, beginning with a first reader; the last one it told is what holds.
+            ring: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
+            self._changes = self._publisher.declare_matching_listener(ring)
+        change = self._changes.handler.try_recv()
+        if change is not None:
+            self._has_readers = change.matching
+        return self._has_readers
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Hand one sample to the network, with what goes beside it. Raises Closed."""
@@ -74,6 +85,8 @@ class StreamPublisher(Closing):
 
     def close(self) -> None:
         """Withdraw from the key. A second call does nothing."""
+        if self._changes is not None:
+            self._session.release(self._changes)
         self._session.release(self._publisher)
 
 

@@ -42,6 +42,8 @@ class JointOrder:
 
     def read(self, state: JointState) -> JointNumbers:
         """The numbers of ``state`` in our order. Raises MessageError when they are not all there."""
+        if state.order == self.digest and state.names is state.velocities is state.efforts is None:
+            return JointNumbers(from_block(state.positions), None, None)  # nearly always
         pick = None if state.order == self.digest else self._pick(state.names)
         numbers = JointNumbers(
             from_block(state.positions), _numbers(state.velocities), _numbers(state.efforts)

@@ -26,21 +26,22 @@ Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
 Level = Literal["ok", "warn", "error", "stale"]
 
 POSE_BYTES = 7 * 8
+_FLOAT64 = np.dtype("<f8")
 
 
 def to_block(values: ArrayLike) -> bytes:
     """Numbers of any shape as a block, row by row."""
-    return np.asarray(values, dtype="<f8").tobytes()
+    return np.asarray(values, dtype=_FLOAT64).tobytes()
 
 
 def from_block(block: bytes) -> NDArray[np.float64]:
     """The numbers of a block: (n,), read-only, sharing the block's memory."""
-    return np.frombuffer(block, dtype="<f8")
+    return np.frombuffer(block, dtype=_FLOAT64)
 
 
 def poses_from_block(block: bytes) -> NDArray[np.float64]:
     """The poses of a block: (n, 7), x y z [m], qx qy qz qw; read-only, sharing its memory."""
-    return np.frombuffer(block, dtype="<f8").reshape(-1, 7)  # pyright: ignore[reportUnknownMemberType]
+    return np.frombuffer(block, dtype=_FLOAT64).reshape(-1, 7)
 
 
 def order_digest(order: Sequence[str] | Sequence[tuple[str, str]]) -> bytes:
@@ -87,7 +88,8 @@ class JointState(Sample, frozen=True, array_like=True, gc=False):
     names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        _check_numbers(self.positions, self.velocities, self.efforts)
+        if len(self.positions) % 8 or self.velocities is not None or self.efforts is not None:
+            _check_numbers(self.positions, self.velocities, self.efforts)
         if self.names is not None:
             _check_names(self)
 
