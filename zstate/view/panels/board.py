@@ -83,12 +83,12 @@ class Board(Closing):
 
     def update(self, moment: Moment) -> None:
         """Do what was chosen on the page since the last time, and tell there what is new."""
-        is_live = self.clock.live and self.clock.is_present
-        buffer = self._world.buffer
-        now = buffer.clock.now() if is_live else None
+        buffer, is_present = self._world.buffer, self.clock.is_present
+        domain = buffer.domain.name
+        now = buffer.clock.now() if is_present and domain in (None, buffer.clock.domain) else None
         for panel in self._panels:
             # The panel of the fixed frame stands first: what was chosen there holds for the others.
-            panel.update(Look(moment, self.fixed(moment), self._facts, now, buffer.domain.name))
+            panel.update(Look(moment, self.fixed(moment), self._facts, is_present, now, domain))
 
     def close(self) -> None:
         """Look no more at who writes what. A second call does nothing."""

@@ -10,22 +10,23 @@ from zstate.view.moment import Moment
 
 
 class Look(NamedTuple):
-    """A moment as it is drawn: seen from the frame ``fixed``; ``now`` [ns] tells how old things are.
+    """A moment as it is drawn: seen from the frame ``fixed``, and the newest of everything or not.
 
-    ``now`` is None where that means nothing: in the past, and in a recording. ``domain`` says whose time the
-    stamps are, as far as that is known.
+    ``now`` [ns] tells how old things are; it is None where that means nothing: in the past, and where
+    stamps are not of the time that the buffer's clock tells. ``domain`` says whose time they are.
     """
 
     moment: Moment
     fixed: str
     facts: FrameFacts
+    is_present: bool
     now: int | None
-    domain: str | None = None
+    domain: str | None
 
     @property
     def at(self) -> int | None:
         """The stamp to ask a buffer about: None for the present."""
-        return self.moment.stamp if self.now is None else None
+        return None if self.is_present else self.moment.stamp
 
     def age_text(self, stamp: int | None) -> str:
         """How long ago an instant was."""

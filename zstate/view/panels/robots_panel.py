@@ -42,7 +42,7 @@ class RobotsPanel:
 
     def _silence(self, robot: str, look: Look) -> str | None:
         # Who is silent now was not when what is shown happened.
-        silent_s = None if look.now is None else self._world.silent_s(robot)
+        silent_s = self._world.silent_s(robot) if look.is_present else None
         if silent_s is None or not is_silent(silent_s, look.facts.rate_hz(robot)):
             return None
         return silence_text(silent_s)
@@ -59,7 +59,7 @@ class RobotsPanel:
         rate_hz = look.facts.rate_hz(robot)
         if rate_hz is None:
             return "no sample yet" if look.facts.track(robot) else "no model yet"
-        return f"{'in the past' if look.now is None else 'live'}, {rate_hz:.1f} Hz"
+        return f"{'live' if look.is_present else 'in the past'}, {rate_hz:.1f} Hz"
 
     def _meshes(self, robots: Sequence[str]) -> str:
         lines = [

@@ -1,0 +1,86 @@
+"""The board without a browser: what a person chose is done once, and what is drawn follows."""
+
+from __future__ import annotations
+
+import pytest
+from live import RRBOT, SECOND
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import ManualClock
+from zstate.transform import Transform
+from zstate.view.page import Page
+from zstate.view.panels.board import Board
+from zstate.view.panels.choice import Choice, FrameChoice
+from zstate.view.scene.scene import Scene
+from zstate.view.world import World
+
+
+@pytest.fixture(scope="module")
+def page():
+    with Page(port=0) as page:
+        yield page
+
+
+@pytest.fixture
+def buffer() -> TransformBuffer:
+    """rrbot for ten seconds, ten samples in each."""
+    buffer = TransformBuffer(60.0, ManualClock(10 * SECOND))
+    track = buffer.add_robot(RRBOT, "r1")
+    for tick in range(101):
+        buffer.insert_joints(track, tick * SECOND // 10, [tick / 10, 0.0])
+    return buffer
+
+
+def test_what_a_person_chose_is_taken_once(page):
+    box = page.server.gui.add_checkbox("box", False)
+    choice = Choice[bool](box)
+    assert choice.taken() is None
+    box.value = True
+    assert choice.taken() is True
+    assert choice.taken() is None
+
+
+def test_what_a_person_chose_is_not_overwritten_by_what_was_shown_before(page):
+    number = page.server.gui.add_number("number", 1.0)
+    choice = Choice[float](number)
+    number.value = 2.0
+    choice.show(1.0)
+    assert choice.taken() == 2.0
+    choice.show(3.0)
+    assert number.value == 3.0
+    assert choice.taken() is None
+
+
+def test_a_frame_stays_chosen_while_others_come(page):
+    choice = FrameChoice(page.server.gui, "frame", "(none)")
+    assert choice.frame is None
+    choice.offer(("a", "b"), "b")
+    choice.offer(("c", "a", "b"), "b")
+    assert choice.frame == "b"
+    choice.offer(("c", "a"), None)
+    assert choice.frame is None
+    assert choice.taken() is None
+
+
+def test_a_board_of_nothing_waits_for_the_first_robot(page):
+    buffer = TransformBuffer()
+    with World(None, buffer=buffer) as world, Board(page.server, world, Scene(page.server)) as board:
+        moment = world.moment(board.stamp)
+        board.update(moment)
+        assert board.fixed(moment) == ""
+        buffer.insert_static(Transform("map", "camera", [1, 0, 0], [0, 0, 0, 1]))
+        moment = world.moment(board.stamp)
+        board.update(moment)
+        assert board.fixed(moment) == "map"
+
+
+def test_a_recording_is_shown_at_an_instant_of_its_own_and_not_at_its_end(page, buffer):
+    with World(None, buffer=buffer) as world, Board(page.server, world, Scene(page.server)) as board:
+        board.clock.pause()
+        assert board.stamp == 0
+        board.clock.seek(4 * SECOND)
+        stamp = board.stamp
+        assert stamp == 4 * SECOND
+        moment = world.moment(stamp)
+        board.update(moment)
+        assert board.stamp == 4 * SECOND
