@@ -80,7 +80,7 @@ class Follower(ABC):
                 )
                 return
             if sample.seq == self._next_seq:
-                self._next_seq += 1
+                self._next_seq = sample.seq + 1
             else:
                 self._count_gap(sample.seq, overflowed)
             if self._can_read(sample):

@@ -15,8 +15,8 @@ RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 # wakes a thread to wake another. With one runtime for the three, a reader's sample costs 30 us less CPU.
 #
 # Zenoh sets SO_LINGER to 10 s: closing the socket of a neighbour who was cut off blocks the thread that
-# does it for so long (eclipse-zenoh/zenoh#1101), and with all of them blocked nobody can connect: that
-# takes more threads than one. "tx" keeps its single one: it closes nothing, and a second one is woken in vain.
+# does it for so long (eclipse-zenoh/zenoh#1101), and with all of them blocked nobody can connect: so there
+# are more threads than one. "tx" closes nothing and keeps its single one: a second is woken in vain.
 _THREADS = 4
 _THREADS_OF_A_ROUTER = 128
 
