@@ -95,7 +95,7 @@ def look(browser: Browser) -> Iterator[Callable[..., Looker]]:
     """``look(url)`` opens it; at the end no page has had an error, or asked for anything outside."""
     lookers: list[Looker] = []
 
-    def opened(url: str, width: int = 900, height: int = 560) -> Looker:
+    def opened(url: str, width: int = 800, height: int = 500) -> Looker:
         tab = browser.new_page(viewport={"width": width, "height": height})
         looker = Looker(tab)
         lookers.append(looker)
@@ -105,6 +105,8 @@ def look(browser: Browser) -> Iterator[Callable[..., Looker]]:
         tab.on("websocket", lambda socket: looker.asked.append(socket.url))
         tab.goto(url, timeout=SLOWLY_MS)
         tab.locator("canvas").first.wait_for(timeout=SLOWLY_MS)
+        # It lies over the picture, and says that there is no graphics card.
+        tab.locator(".mantine-Notification-closeButton").first.click(timeout=SLOWLY_MS)
         return looker
 
     yield opened
