@@ -14,43 +14,12 @@ from typing import Any
 import pytest
 from looking import Spawn, failure, started, zstate
 from support import Child
+from tutorial import FILES, FOLDER, blocks, masked, terminal, told
 
 pytestmark = pytest.mark.processes
 
-ARM = """\
-<robot name="arm">
-  <link name="base"/>
-  <link name="upper"/>
-  <link name="lower"/>
-  <joint name="shoulder" type="revolute">
-    <parent link="base"/><child link="upper"/>
-    <origin xyz="0 0 0.5"/><axis xyz="0 1 0"/>
-    <limit lower="-2" upper="2" effort="10" velocity="3"/>
-  </joint>
-  <joint name="elbow" type="continuous">
-    <parent link="upper"/><child link="lower"/>
-    <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
-  </joint>
-</robot>
-"""
-
-SWING = """\
-import math
-import time
-
-from zstate import StatePublisher, connect, load_model
-
-model = load_model("arm.urdf")
-with connect() as session, StatePublisher(session, model, streams=("joint_states",)) as arm:
-    while True:
-        angle = 1.2 * math.sin(time.time())
-        arm.publish({"shoulder": angle, "elbow": -angle})
-        time.sleep(0.02)
-"""
-"""The driver: joint states, and nothing else."""
-
-CELL = '[[robot]]\nmodel = "./arm.urdf"\n'
-"""What makes poses of them."""
+ARM, SWING, CELL = ((FOLDER / name).read_text() for name in ("arm.urdf", "swing.py", "cell.toml"))
+"""A robot; the driver, which says joint states and nothing else; and what makes poses of them."""
 
 XACRO = """\
 <robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -102,6 +71,15 @@ def ready(child: Child, text: str) -> None:
         pass
 
 
+@pytest.fixture
+def without_xacro(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where nobody has installed the expander."""
+    (folder / ".without").mkdir()
+    for name in ("xacro", "xacrodoc"):
+        (folder / ".without" / f"{name}.py").write_text("raise ImportError")
+    monkeypatch.setenv("PYTHONPATH", str(folder / ".without"), prepend=os.pathsep)
+
+
 def stamped(stamp: str) -> None:
     """Have the driver stamp its samples so."""
     Path("swing.py").write_text(SWING.replace("-angle})", f"-angle}}, stamp={stamp})"))
@@ -115,6 +93,18 @@ def doctor(*arguments: str, code: int) -> dict[str, Any]:
 
 def test_the_driver_is_a_dozen_lines():
     assert len(SWING.splitlines()) <= 12
+
+
+def test_the_document_shows_the_files_beside_it():
+    for language, name in FILES.items():
+        assert blocks(language) == [(FOLDER / name).read_text()]
+
+
+def test_the_documents_terminal_says_what_stands_there(folder: Path, without_xacro: None):
+    with terminal(folder) as shell:
+        for one in told():
+            said, expected = masked(shell.does(one)), masked(one.lines)
+            assert said == expected or (one.goes_on and sorted(said) == sorted(expected)), one.command
 
 
 def test_the_robot_runs_and_can_be_looked_at(cell: Child, driver):
@@ -209,13 +199,8 @@ def test_4_stamps_of_the_future_and_of_1970_are_used_and_named(cell: Child, driv
     assert [check["state"] for check in said["checks"] if check["name"] == "poses"] == ["ok"]
 
 
-def test_5_a_xacro_that_nobody_has_expanded_is_recognised(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_5_a_xacro_that_nobody_has_expanded_is_recognised(folder: Path, without_xacro: None):
     Path("arm.urdf").write_text(XACRO)
-    # As where nobody has installed the expander.
-    (folder / "without").mkdir()
-    for name in ("xacro", "xacrodoc"):
-        (folder / "without" / f"{name}.py").write_text("raise ImportError")
-    monkeypatch.setenv("PYTHONPATH", str(folder / "without"), prepend=os.pathsep)
     told = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
     assert told in zstate("check", "arm.urdf").stdout.decode()
     assert told in failure("publish", "arm.urdf")
