@@ -84,3 +84,19 @@ def test_a_recording_is_shown_at_an_instant_of_its_own_and_not_at_its_end(page, 
         moment = world.moment(stamp)
         board.update(moment)
         assert board.stamp == 4 * SECOND
+
+
+def test_where_nothing_is_new_nothing_is_sent(page, buffer, monkeypatch):
+    sent: list[object] = []
+    with World(None, buffer=buffer) as world, Board(page.server, world, Scene(page.server)) as board:
+        board.clock.pause()
+        board.update(world.moment(board.stamp))
+        pipe = page.server.gui._websock_interface
+        queue = pipe.queue_message
+        monkeypatch.setattr(pipe, "queue_message", lambda message: (sent.append(message), queue(message)))
+        board.update(world.moment(board.stamp))
+        board.update(world.moment(board.stamp))
+        assert sent == []
+        board.clock.seek(2 * SECOND)
+        board.update(world.moment(board.stamp))
+        assert sent
