@@ -14,7 +14,8 @@ OPENING = """
 
     def threads():
         names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
-        return {pool: sum(name.startswith(pool + "-") for name in names) for pool in ("net", "tx", "rx", "acc")}
+        pools = ("net", "tx", "rx", "acc")
+        return {pool: sum(name.startswith(pool + "-") for name in names) for pool in pools}
 
     options = json.loads(sys.argv[1])
     with connect(**options) as first, connect(mode="client", endpoints=sys.argv[2]) as second:
