@@ -40,7 +40,8 @@ def test_a_router_has_threads_for_many_who_vanish_and_the_environment_stays_as_i
 def test_whoever_has_few_neighbours_has_few_threads_more(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     threads, _ = opened(spawn, json.dumps({"mode": "peer", "listen": endpoint}), endpoint)
-    assert threads == {"net": 4, "tx": 1, "rx": 0, "acc": 0}
+    assert 4 <= threads.pop("net") < 20  # where one waits for another it is replaced meanwhile
+    assert threads == {"tx": 1, "rx": 0, "acc": 0}
 
 
 def test_what_the_environment_says_of_zenohs_threads_is_kept(
