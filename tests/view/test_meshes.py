@@ -158,6 +158,14 @@ def test_collada_is_read_in_its_unit_and_its_up_axis_is_not_heeded_as_in_rviz(tm
     assert mesh.bounds == pytest.approx(np.array([(0, 0, 0), (0.1, 0.2, 0.3)]))
 
 
+def test_a_collada_file_that_lost_a_material_is_drawn_in_the_colour_of_the_urdf(tmp_path):
+    lost = DAE.format(unit=1, up="Z_UP").replace('<effect id="e">', '<effect id="other">')
+    (tmp_path / "lost.dae").write_text(lost)
+    one = shape(MeshFile(str(tmp_path / "lost.dae")), (0, 0, 1, 1))
+    assert the_mesh(drawn(one)).bounds.tolist() == [[0, 0, 0], [10, 20, 30]]
+    assert color_of(drawn(one)) == as_read((0, 0, 1, 1))
+
+
 def test_the_materials_beside_an_obj_file_are_read_with_their_images(tmp_path):
     (tmp_path / "meshes").mkdir()
     (tmp_path / "textures").mkdir()

@@ -14,6 +14,7 @@ from PIL import Image
 from trimesh.resolvers import FilePathResolver
 from trimesh.units import unit_conversion
 
+from zstate.view.geometry.mending import without_lost_materials
 from zstate.view.geometry.smoothing import smooth
 from zstate.view.geometry.surface import Look, Surface
 
@@ -36,11 +37,9 @@ def read_mesh(path: Path) -> tuple[Surface, ...]:
     """
     _check(path, FORMATS)
     try:
-        resolver = FilePathResolver(str(path), allow_anywhere=True)
-        scene: Any = _load(path, resolver=resolver, process=path.suffix.lower() == ".stl")
-        surfaces = tuple(_surfaces(scene))
-    except UnreadableFile:
-        raise
+        surfaces = _loaded(path, path)
+        if not surfaces and path.suffix.lower() == ".dae":
+            surfaces = _loaded(path, without_lost_materials(path))
     except Exception as error:  # readers of six formats raise whatever they stumble over
         raise UnreadableFile(f"it cannot be read: {str(error)[:200] or type(error).__name__}") from None
     if not any(len(surface.triangles) for surface in surfaces):
@@ -64,6 +63,14 @@ def _check(path: Path, formats: set[str]) -> None:
         raise UnreadableFile(f"files of the kind '{path.suffix}' are not read; {known} are")
     if (size := path.stat().st_size) > MAX_BYTES:
         raise UnreadableFile(f"it has {size} bytes; the limit is {MAX_BYTES}")
+
+
+def _loaded(path: Path, data: Path | io.BytesIO) -> tuple[Surface, ...]:
+    """The surfaces of a file whose contents are ``data``; images are found from where it is."""
+    kind = path.suffix.lower().removeprefix(".")
+    resolver = FilePathResolver(str(path), allow_anywhere=True)
+    scene: Any = _load(data, file_type=kind, resolver=resolver, process=kind == "stl")
+    return tuple(_surfaces(scene))
 
 
 def _surfaces(scene: Any) -> Iterator[Surface]:

@@ -23,7 +23,7 @@ GREY: Color = (0.74, 0.75, 0.77, 1.0)
 
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
-_COMPONENTS = {"float32": 5126, "uint32": 5125, "uint8": 5121}
+_COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123}
 _VERTICES, _INDICES = 34962, 34963
 _ROUGHNESS = 0.65
 
@@ -95,7 +95,9 @@ class Glb:
         if surface.colors is not None:
             attributes["COLOR_0"] = self._array(_linear_colors(surface.colors), _VERTICES)
         self._corner_count += surface.triangles.size
-        rows = self._array(surface.triangles.reshape(-1, 1), _INDICES)
+        # The largest number of a kind means something else.
+        narrow = np.uint16 if len(surface.points) < 0xFFFF else np.uint32
+        rows = self._array(surface.triangles.reshape(-1, 1).astype(narrow), _INDICES)
         self._primitives.append({"attributes": attributes, "indices": rows, "material": len(self._looks)})
         self._looks.append((surface.look, surface.uv is not None))
 
