@@ -81,7 +81,7 @@ SIGNATURES = {
     "TransformBuffer.latest": "(target, source)",
     "TransformBuffer.wait": "(target, source, at=None, timeout_s=1.0)",
     "TransformBuffer.wait_async": "(target, source, at=None, timeout_s=1.0)",
-    "TransformBuffer.frames": "()",
+    "TransformBuffer.frames": "(among=None)",
     "TransformBuffer.from_recording": "(path, robot=None, *, clock=None)",
     "Recording": "(path, robot=None)",
     "Recording.buffer": "()",

@@ -269,3 +269,11 @@ def test_at_exactly_half_a_turn_the_quaternion_is_taken_as_given() -> None:
         buffer = filled(moving("a", "b", 0), end)
         yaw = buffer.lookup("a", "b", S // 2).rpy[2]
         assert yaw == pytest.approx(sign * math.pi / 2)
+
+
+def test_of_many_frames_only_those_asked_for_are_told_of():
+    buffer = TransformBuffer()
+    for child in ("a", "b", "c"):
+        buffer.insert_static(Transform.from_pose7("world", child, (0, 0, 0, 0, 0, 0, 1)))
+    assert [frame.name for frame in buffer.frames(among=("c", "nowhere", "a"))] == ["c", "a"]
+    assert [frame.name for frame in buffer.frames()] == ["world", "a", "b", "c"]

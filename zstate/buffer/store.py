@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -246,10 +246,12 @@ class Store:
             for track in self._tree.tracks():
                 thin(track.history, stamps)
 
-    def frames(self) -> tuple[FrameInfo, ...]:
-        """Every frame ever named, in the order of their first mention."""
+    def frames(self, among: Iterable[str] | None = None) -> tuple[FrameInfo, ...]:
+        """Every frame ever named, in the order of their first mention; or those ``among`` full names."""
         with self._lock:
-            return tuple(frame_info(name, edge) for name, edge in self._tree.frames.items())
+            known = self._tree.frames
+            names = known if among is None else [name for name in among if name in known]
+            return tuple(frame_info(name, known[name]) for name in names)
 
     @property
     def version(self) -> int:

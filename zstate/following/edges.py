@@ -76,8 +76,8 @@ class EdgeFollower(Follower):
         """Edges that this writer has not said before: what one said of them that is gone is another epoch."""
         if children:
             others = self._others()
-            for frame in self._buffer.frames():
-                if frame.kind == "pose" and frame.name in children and frame.writer not in others:
+            for frame in self._buffer.frames(children):
+                if frame.kind == "pose" and frame.writer not in others:
                     self._buffer.withdraw(frame.name)
             self._undescribed |= children
 
@@ -97,7 +97,7 @@ class EdgeFollower(Follower):
 
     def _placed(self, children: set[str]) -> list[FrameInfo]:
         """Their edges, without those that a model or a static writer places by now."""
-        return [frame for frame in self._buffer.frames() if frame.kind == "pose" and frame.name in children]
+        return [frame for frame in self._buffer.frames(children) if frame.kind == "pose"]
 
     def _writer_changed(self) -> None:
         pass  # each sample is inserted under its writer's name

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM
-from zstate.errors import InsertRefused, InvalidInput, MessageError
+from zstate.errors import InsertRefused, InvalidInput, MessageError, duration_text
 from zstate.following.absent import Absent
 from zstate.following.bounded import remember
 from zstate.following.tally import Tally
@@ -188,12 +188,21 @@ class Follower(ABC):
             return False
         if not self._may_begin_again():
             return False
+        size = self._step_back(before.stamp)
         self._last_late, self._newest = None, sample.stamp
         self._restart()
         self._tally.note(
-            f"{self.robot} back", f"the clock of {self.robot!r} went back: its history begins anew"
+            f"{self.robot} back",
+            f"the clock of {self.robot!r} went back{size}: its history begins anew, that of others stays",
         )
         return self._insert(sample)
+
+    def _step_back(self, stamp: int) -> str:
+        """By how much ``stamp`` is before what is kept of the robot, in words; empty where nothing is kept."""
+        frames = self._buffer.frames()
+        own = (frame.newest for frame in frames if frame.name.startswith(f"{self.robot}/"))
+        newest = max((one for one in own if one is not None), default=None)
+        return "" if newest is None else f" by {duration_text(newest - stamp)}"
 
     def _follow_session(self, sample: Sample) -> bool:
         """Whether samples of this session count: those of the newest writer to appear."""

@@ -64,8 +64,8 @@ class JointFollower(Follower):
     def _make_room(self, model: RobotModel) -> None:
         # The robot's own model knows best: whoever else placed one of its links gives way.
         joints = {f"{self.robot}/{joint.child}": joint for joint in model.joints}
-        for frame in self._buffer.frames():
-            if frame.name in joints and frame.parent is not None:
+        for frame in self._buffer.frames(joints):
+            if frame.parent is not None:
                 if not self._says_the_same(frame, joints[frame.name]):
                     self._tally.refuse(
                         "second writer", f"{frame.writer!r} placed {frame.name!r}, a link of the model"

@@ -117,16 +117,12 @@ class StaticFollower:
         return known is not None and known.kind == "static" and are_same(known, transform)
 
     def _withdraw(self, children: list[str]) -> None:
-        if not children:
-            return  # the usual case; looking at all frames of a fleet takes milliseconds
         for child in children:
             del self._edges[child]
-        for child in self._still_ours().intersection(children):
-            self._buffer.withdraw(child)
-
-    def _still_ours(self) -> set[str]:
-        # A model or another writer may have taken an edge over meanwhile: then it is theirs.
-        return {frame.name for frame in self._buffer.frames() if frame.writer == self._writer}
+        for frame in self._buffer.frames(children):
+            # A model or another writer may have taken an edge over meanwhile: then it is theirs.
+            if frame.writer == self._writer:
+                self._buffer.withdraw(frame.name)
 
     def _refuse(self, reason: str, error: InvalidInput) -> None:
         self._tally.refuse(reason, f"static edge of {self._writer!r}: {error}")
