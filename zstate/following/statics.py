@@ -50,9 +50,9 @@ class StaticFollower:
 
     def name_writer(self, writer: str) -> None:
         """Who the writer is, if that is learned later than what it says."""
-        ours = self._still_ours()
+        ours = self._still_ours(self._edges)
         self._writer = writer
-        for child in ours & self._edges.keys():
+        for child in ours:
             self._buffer.insert_static(self._edges[child], writer=writer)
 
     def replace(self, statics: StaticTransforms) -> None:
@@ -119,10 +119,12 @@ class StaticFollower:
     def _withdraw(self, children: list[str]) -> None:
         for child in children:
             del self._edges[child]
-        for frame in self._buffer.frames(children):
-            # A model or another writer may have taken an edge over meanwhile: then it is theirs.
-            if frame.writer == self._writer:
-                self._buffer.withdraw(frame.name)
+        for child in self._still_ours(children):
+            self._buffer.withdraw(child)
+
+    def _still_ours(self, children: Iterable[str]) -> list[str]:
+        # A model or another writer may have taken an edge over meanwhile: then it is theirs.
+        return [frame.name for frame in self._buffer.frames(children) if frame.writer == self._writer]
 
     def _refuse(self, reason: str, error: InvalidInput) -> None:
         self._tally.refuse(reason, f"static edge of {self._writer!r}: {error}")
