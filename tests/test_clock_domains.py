@@ -199,7 +199,7 @@ def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot
         assert buffer.latest("r2/world", "r2/tool") == NOW
     assert caplog.text.count("3600.0 s after this machine's time") == 1
     assert "whole hours: the writer takes its local time for UTC" in caplog.text
-    assert caplog.text.count("the clock of 'r1' went back") == 1
+    assert caplog.text.count("the clock of 'r1' went back by 3600.0 s: its history") == 1
     assert "'r2'" not in caplog.text
 
 

@@ -155,7 +155,8 @@ def _stranger(encoding: str, kind: type[Message]) -> MessageError:
     match = _ENCODING.fullmatch(encoding)
     if match and match[1] == kind.__name__ and int(match[2]) > VERSION:
         return MessageError(
-            f"{kind.__name__} of version {match[2]}, but this zstate reads version {VERSION}: upgrade it",
+            f"{kind.__name__} of version {match[2]}, but this zstate reads version {VERSION}: "
+            "`pip install -U zstate`",
             reason="newer version",
         )
     return MessageError(

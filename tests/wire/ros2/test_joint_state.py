@@ -200,7 +200,10 @@ def test_counts_that_do_not_agree_are_malformed_and_said(counts: tuple[int, int,
 
 
 def test_joints_without_positions_have_a_reason_of_their_own():
-    assert reason(cdr(joint_state(0, "", ["a"], [], [1.0], [2.0]))) == "no positions"
+    payload = cdr(joint_state(0, "", ["left", "right"], [], [1.0, 2.0], []))
+    assert reason(payload) == "no positions"
+    with pytest.raises(MessageError, match="without positions of 'left', 'right': velocities alone place"):
+        JointStateDecoder().decode(payload)
 
 
 def test_a_joint_that_comes_twice_is_malformed_and_named():

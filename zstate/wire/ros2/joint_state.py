@@ -114,16 +114,24 @@ def _read(reader: Reader) -> RosJointState:
     stamp, frame_id = reader.stamp(), reader.text()
     names = tuple(reader.text() for _ in range(reader.count()))
     positions, velocities, efforts = reader.sequence(), reader.sequence(), reader.sequence()
+    if names and not positions:
+        raise _without_positions(names)
     _check_counts(reader, len(names), len(positions) // 8, len(velocities) // 8, len(efforts) // 8)
     if len(set(names)) != len(names):
         raise reader.malformed(_twice(names))
     return RosJointState(stamp, frame_id, names, positions, velocities or None, efforts or None)
 
 
+def _without_positions(names: Sequence[str]) -> MessageError:
+    return MessageError(
+        f"a {JOINT_STATE.name} without positions of {', '.join(map(repr, names))}: velocities alone place no "
+        "link; let its writer tell positions, or leave those joints out",
+        reason="no positions",
+    )
+
+
 def _check_counts(reader: Reader, names: int, positions: int, velocities: int, efforts: int) -> None:
     counts = f"{names} names, {positions} positions, {velocities} velocities, {efforts} efforts"
-    if names != positions and not positions:
-        raise MessageError(f"a {JOINT_STATE.name} without positions: {counts}", reason="no positions")
     if names != positions or velocities not in (0, names) or efforts not in (0, names):
         raise reader.malformed(f"its counts do not agree: {counts}")
 
