@@ -11,12 +11,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate import se3
 from zstate.errors import UnknownFrame
+from zstate.view.chains import Duals, compose, duals_of, invert, poses_of
 
 Poses: TypeAlias = NDArray[np.float64]
 Rows: TypeAlias = NDArray[np.intp]
 Mask: TypeAlias = NDArray[np.bool_]
+
+_STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -82,11 +84,8 @@ class Moment:
 
     def _place(self, fixed: int) -> Poses:
         tops, top_from_frame = self._from_top
-        pose = tuple(top_from_frame[fixed].tolist())
-        fixed_from_top = se3.invert(pose)
-        placed = np.stack(
-            np.broadcast_arrays(*se3.compose(fixed_from_top, se3.columns(top_from_frame))), axis=-1
-        )
+        fixed_from_top = invert(top_from_frame[fixed : fixed + 1])
+        placed = poses_of(compose(fixed_from_top, top_from_frame))
         placed[tops != tops[fixed]] = np.nan
         placed.flags.writeable = False
         return placed
@@ -96,15 +95,15 @@ class Moment:
         return {}
 
     @cached_property
-    def _from_top(self) -> tuple[Rows, Poses]:
+    def _from_top(self) -> tuple[Rows, Duals]:
         """The highest frame that known edges lead up to, and ``top_from_frame``.
 
         Each round doubles how far up every frame has come, so that a deep tree needs few of them.
         """
         rows = np.arange(len(self.tree.names))
         up = np.where(self.known & (self.tree.parents >= 0), self.tree.parents, rows)
-        poses = np.where((up == rows)[:, None], se3.IDENTITY, self.poses)
-        while not np.array_equal(above := up[up], up):
-            both = se3.compose(se3.columns(poses[up]), se3.columns(poses))
-            poses, up = np.stack(both, axis=-1), above
-        return up, poses
+        duals = duals_of(self.poses)
+        duals[up == rows] = _STILL
+        while (up[up] != up).any():
+            duals, up = compose(duals[up], duals), up[up]
+        return up, duals

@@ -21,7 +21,7 @@ from zstate.view.sliders import Sliders
 from zstate.view.world import World
 
 # Numbers that change faster cannot be read, and cost more than the picture.
-_PANELS_PERIOD_S = 0.1
+_PANELS_PERIOD_S = 0.2
 _IDLE_S = 0.5
 
 
