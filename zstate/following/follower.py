@@ -198,7 +198,7 @@ class Follower(ABC):
         return self._insert(sample)
 
     def _step_back(self, stamp: int) -> str:
-        """By how much ``stamp`` is before what is kept of the robot, in words; empty where nothing is kept."""
+        """By how much ``stamp`` is before what is kept of the robot; empty where nothing is."""
         frames = self._buffer.frames()
         own = (frame.newest for frame in frames if frame.name.startswith(f"{self.robot}/"))
         newest = max((one for one in own if one is not None), default=None)
