@@ -4,13 +4,14 @@ import json
 import os
 
 import pytest
-from looking import Spawn, failure, interrupted, standing, started, zstate
+from looking import RRBOT, Spawn, failure, interrupted, standing, started, zstate
 from support import until
 
-from zstate import StaticPublisher, Transform, connect
+from zstate import StaticPublisher, Transform, connect, load_model
 from zstate.buffer.frames import FrameInfo
 from zstate.buffer.tracks import Offset
 from zstate.cli.monitor.meter import Measure, PathMeter
+from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
 from zstate.clock import ManualClock
@@ -19,6 +20,9 @@ from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 DRIVER = "driver@jetson pid 412"
+
+MODEL = load_model(RRBOT)
+FIXED = str(len(MODEL.links) - 1 - len(MODEL.joint_names))
 
 
 CLOCK = ManualClock(1_789_000_000_000_000_000)
@@ -161,3 +165,56 @@ def test_on_ros_side_each_edge_is_measured(ros_router: str):
         report = json.loads(zstate("monitor", "base", "tool", "--once", "--json").stdout)
     assert [edge["kind"] for edge in report["edges"]] == ["pose", "pose", "static"]
     assert all(edge["rate_hz"] > 20.0 for edge in report["edges"][:2])
+
+
+def test_of_all_edges_the_joints_of_a_robot_are_one_line_and_its_fixed_edges_another():
+    frames = (*TREE[1:], frame("r2/odom", "map", "pose", "odometry"), frame("r2/laser", "r2/odom", "static"))
+    heard = [Row(one.name, one, MEASURE if one.kind != "static" else None, None) for one in frames]
+    assert overview_text(heard).splitlines() == [
+        "frame    edge      rate      latency   max     jitter    missed  clock  writer",
+        f"r1/*     3 joints  100.0 Hz  400.0 us  2.1 ms  110.0 us  3              {DRIVER}",
+        f"r1/*     1 static                                                       {DRIVER}",
+        "r2/odom  pose      100.0 Hz  400.0 us  2.1 ms  110.0 us  3              odometry",
+        f"r2/*     1 static                                                       {DRIVER}",
+    ]
+    narrow = overview_text(heard, width=52).splitlines()
+    assert max(map(len, narrow)) <= 52
+    assert narrow[0].split()[:2] == ["frame", "edge"]
+    assert narrow[-2:] == [f"a: {DRIVER}", "b: odometry"]
+
+
+@pytest.mark.processes
+def test_without_frames_it_monitors_all_that_is_heard():
+    with standing("left"), standing("right"):
+        lines = zstate("monitor", "--once").stdout.decode().splitlines()
+        edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
+        (only,) = zstate("monitor", "--robot", "left", "--once").stdout.decode().splitlines()[1:2]
+    assert [line.split()[:3] for line in lines[1:5]] == [
+        ["left/*", "2", "joints"],
+        ["left/*", FIXED, "static"],
+        ["right/*", "2", "joints"],
+        ["right/*", FIXED, "static"],
+    ]
+    assert f"pid {os.getpid()}" in lines[1]
+    assert only.startswith("left/*")
+    assert {edge["child"] for edge in edges} == {
+        f"{robot}/{link}" for robot in ("left", "right") for link in MODEL.links if link != MODEL.root
+    }
+    assert all(edge["rate_hz"] > 20.0 for edge in edges if edge["kind"] == "joint")
+
+
+@pytest.mark.processes
+def test_without_frames_it_says_that_nobody_is_there():
+    message = failure("monitor", "--once", "--timeout", "0.7")
+    assert "gave up after 0.7 s: no robot is announced" in message
+
+
+def test_one_frame_is_not_enough():
+    assert "'base' is one frame; give two of them, or none" in failure("monitor", "base", code=2)
+
+
+@pytest.mark.processes
+def test_all_edges_on_ros_side_have_their_ros_names(ros_router: str):
+    with standing(wire="ros2", router=ros_router):
+        lines = zstate("monitor", "--once").stdout.decode().splitlines()
+    assert [line.split()[:2] for line in lines[1:4]] == [["lower", "pose"], ["upper", "pose"], ["*", FIXED]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 _HEADINGS = ("frame", "edge", "rate", "latency", "max", "jitter", "missed", "clock", "writer")
 # What a narrow terminal does without, in this order.
-_DISPENSABLE = tuple(map(_HEADINGS.index, ("max", "clock", "edge", "jitter")))
+_DISPENSABLE = ("max", "clock", "edge", "jitter")
+
+NO_NUMBERS = ("",) * (len(_HEADINGS) - 3)
+"""The cells of an edge whose samples are not its own, or that has none."""
 
 _SILENT_S, _SILENT_PERIODS = 1.0, 10
 _OFFSET_NS = 1_000_000
@@ -48,19 +51,37 @@ class Row:
         }
 
 
+Cells = list[tuple[str, ...]]
+
+
 def report_text(rows: Sequence[Row], *, width: int | None = None) -> str:
-    """The table; where it is wider than ``width``, writers are letters and some columns are left out."""
-    lines = in_columns([_HEADINGS, *_cells(rows, {})])
+    """The table of a path, from its first frame to its last."""
+    return table_text(rows, lambda letters: _cells(rows, letters), width=width)
+
+
+def table_text(
+    rows: Sequence[Row],
+    cells: Callable[[Mapping[str, str]], Cells],
+    *,
+    width: int | None = None,
+    dispensable: Sequence[str] = _DISPENSABLE,
+) -> str:
+    """The table of ``cells`` and what is to be said of clocks; ``cells`` is given other names for writers.
+
+    Where it is wider than ``width``, writers are letters and ``dispensable`` columns are left out.
+    """
+    lines = in_columns([_HEADINGS, *cells({})])
     if width is not None and max(map(len, lines)) > width:
         letters = _letters(rows)
-        lines = narrowed([_HEADINGS, *_cells(rows, letters)], width, _DISPENSABLE)
+        columns = [_HEADINGS.index(heading) for heading in dispensable]
+        lines = narrowed([_HEADINGS, *cells(letters)], width, columns)
         lines += [f"{letter}: {writer}" for writer, letter in letters.items()]
     return "\n".join([*lines, *_clock_notes(rows)])
 
 
-def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> list[tuple[str, ...]]:
+def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> Cells:
     """Edges whose samples are those of the edge above have only their kind: one robot's joints, mostly."""
-    cells: list[tuple[str, ...]] = []
+    cells: Cells = []
     said: set[str] = set()
     for frame, row in zip(_names(rows), rows, strict=True):
         edge = row.edge
@@ -69,10 +90,10 @@ def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> list[tuple[str, .
             continue
         writer = letters.get(edge.writer or "", edge.writer or "")
         if edge.kind == "static":
-            cells.append((frame, edge.kind, *[""] * (len(_HEADINGS) - 3), writer))
+            cells.append((frame, edge.kind, *NO_NUMBERS, writer))
             continue
         source = PathMeter.source(edge)
-        numbers = [""] * (len(_HEADINGS) - 3) if source in said else _numbers(row.measure, row.offset)
+        numbers = NO_NUMBERS if source in said else measured_cells(row.measure, row.offset)
         cells.append((frame, edge.kind, *numbers, writer if source not in said else ""))
         said.add(source)
     return cells
@@ -85,15 +106,16 @@ def _names(rows: Sequence[Row]) -> list[str]:
     return [name.partition("/")[2] or name for name in full] if len(robots) == 1 else full
 
 
-def _numbers(measure: Measure | None, offset: Offset | None) -> list[str]:
+def measured_cells(measure: Measure | None, offset: Offset | None) -> tuple[str, ...]:
+    """What was measured, from rate to clock."""
     if measure is None:
-        return ["no sample", "", "", "", "", ""]
-    return [
+        return ("no sample", *NO_NUMBERS[1:])
+    return (
         _rate_text(measure),
         *(_time_text(seconds) for seconds in (measure.latency_s, measure.latency_max_s, measure.jitter_s)),
         str(measure.missed),
         "" if offset is None else _ahead_text(offset),
-    ]
+    )
 
 
 def _rate_text(measure: Measure) -> str:
