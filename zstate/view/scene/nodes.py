@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from zstate.se3 import IDENTITY
 from zstate.view.moment import Mask, Moment, Poses, Tree
+from zstate.view.scene.posing import move, turn
 
 _Float = TypeVar("_Float", np.float32, np.float64)
 
 _TOP = "/frames"
-# What nobody sees is not sent: noise of encoders, and what is left when poses are multiplied.
-_UNSEEN_M = 1e-6
-_UNSEEN_TURN = 1e-6
+# What nobody sees is not sent [m, and parts of a quaternion]: what is left when poses are multiplied.
+_UNSEEN = 1e-6
 
 
 class Nodes:
@@ -100,12 +100,14 @@ class Nodes:
 
     def _move(self, poses: Poses) -> None:
         with np.errstate(invalid="ignore"):
-            still = np.abs(poses - self._poses) <= (*(_UNSEEN_M,) * 3, *(_UNSEEN_TURN,) * 4)
-        moved, turned = ~still[:, :3].all(axis=1), ~still[:, 3:].all(axis=1)
+            changed = ~(np.abs(poses - self._poses) <= _UNSEEN)
+        moved, turned = changed[:, :3].any(axis=1), changed[:, 3:].any(axis=1)
         for row in np.flatnonzero(moved).tolist():
-            self._rows[row].position = poses[row, :3]
-        for row, wxyz in zip(np.flatnonzero(turned).tolist(), wxyzs(poses[turned]), strict=True):
-            self._rows[row].wxyz = wxyz
+            x, y, z = poses[row, :3].tolist()
+            move(self._rows[row], (x, y, z))
+        for row in np.flatnonzero(turned).tolist():
+            qx, qy, qz, qw = poses[row, 3:].tolist()
+            turn(self._rows[row], (qw, qx, qy, qz))
         self._poses[moved, :3] = poses[moved, :3]
         self._poses[turned, 3:] = poses[turned, 3:]
 
