@@ -22,6 +22,13 @@ def say(text: str = "") -> None:
     click.echo(text)
 
 
+def say_fitted(text: str) -> None:
+    """Lines of the result, which a terminal that is too narrow for them gets folded between words."""
+    from zstate.cli.layout import fitted
+
+    say(fitted(text, terminal_width()) if is_terminal() else text)
+
+
 def say_json(value: Any) -> None:
     """One JSON document on one line."""
     click.echo(json.dumps(value))

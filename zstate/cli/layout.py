@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+Guides = Callable[[str, Mapping[str, Sequence[str]]], Iterator[tuple[str, str]]]
+"""What draws a tree: ``tree_lines`` or ``chain_lines``."""
+
+_WIDE_ENOUGH = 20
+"""So many letters are a column that text can be folded in."""
 
 
 def tree_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
@@ -19,6 +26,22 @@ def tree_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tup
             is_last = position == len(below) - 1
             fork, rail = ("└── ", "    ") if is_last else ("├── ", "│   ")
             stack.append((below[position], guide_below + fork, guide_below + rail))
+
+
+def chain_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
+    """As ``tree_lines``, but two columns deep, and only where the tree forks."""
+    stack = [(root, "", "")]
+    while stack:
+        name, guide, rail = stack.pop()
+        yield guide, name
+        children_here = children.get(name, ())
+        if len(children_here) == 1:
+            stack.append((children_here[0], f"{rail}↓ ", rail))
+            continue
+        for position in reversed(range(len(children_here))):
+            is_last = position == len(children_here) - 1
+            fork, below_it = ("└ ", "  ") if is_last else ("├ ", "│ ")
+            stack.append((children_here[position], rail + fork, rail + below_it))
 
 
 def in_columns(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -42,3 +65,39 @@ def narrowed(rows: Sequence[Sequence[str]], width: int | None, dispensable: Sequ
         kept = [[cell for place, cell in enumerate(row) if place not in gone] for row in rows]
         lines = in_columns(kept)
     return lines
+
+
+def letters_for(names: Iterable[str]) -> dict[str, str]:
+    """Something shorter for each of ``names``, in their order: a to z, then numbers."""
+    return {name: _letter(number) for number, name in enumerate(dict.fromkeys(names))}
+
+
+def _letter(number: int) -> str:
+    return chr(ord("a") + number) if number < 26 else str(number + 1)
+
+
+def fitted(text: str, width: int) -> str:
+    """``text`` with lines longer than ``width`` folded between words.
+
+    What does not fit goes on below the line's last column where that is wide enough, else it is indented
+    by two. Words are not broken, so that a path or a key stays whole.
+    """
+    return "\n".join(part for line in text.split("\n") for part in _folded(line, width))
+
+
+def _folded(line: str, width: int) -> list[str]:
+    if len(line) <= width:
+        return [line]
+    import textwrap
+
+    columns = [gap.end() for gap in re.finditer(r"(?<=\S) {2,}(?=\S)", line)]
+    last = columns[-1] if columns else 0
+    indent = last if 0 < last <= width - _WIDE_ENOUGH else len(line) - len(line.lstrip()) + 2
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        replace_whitespace=False,
+    )

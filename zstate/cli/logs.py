@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import sys
 import threading
 import time
@@ -68,8 +69,16 @@ def write(text: str, *, level: str = "info", event: str = "note", **facts: objec
         known = {name: fact for name, fact in facts.items() if fact is not None}
         line = json.dumps({"time": _time_text(), "level": level, "event": event, **known, "text": text})
     else:
-        line = text if level == "info" else f"zstate: {text}"
+        line = _as_wide_as_seen(text if level == "info" else f"zstate: {text}")
     _write_line(line)
+
+
+def _as_wide_as_seen(text: str) -> str:
+    if not _standard_error().isatty():
+        return text
+    from zstate.cli.layout import fitted
+
+    return fitted(text, shutil.get_terminal_size().columns)
 
 
 def _write_line(line: str) -> None:

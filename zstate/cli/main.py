@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NoReturn
 import click
 
 from zstate.cli import logs
+from zstate.cli.help_text import HelpContext
 from zstate.errors import ZStateError
 
 if TYPE_CHECKING:
@@ -72,6 +73,8 @@ class Commands(click.Group):
             return None
         command = getattr(import_module(f"zstate.cli.commands.{cmd_name}"), f"{cmd_name}_command")
         assert isinstance(command, click.Command)
+        for one in (command, *(command.commands.values() if isinstance(command, click.Group) else ())):
+            one.context_class = HelpContext
         if logs.log_format_option not in command.params:
             command.params.append(logs.log_format_option)
         if COMPLETION_VARIABLE in os.environ:

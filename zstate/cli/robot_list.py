@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from zstate.cli.console import rate_text
-from zstate.cli.layout import narrowed
+from zstate.cli.layout import letters_for, narrowed
 from zstate.cli.sampling import Sampler, Source
 from zstate.errors import duration_text
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # So long without a sample is worth a word, rather than no number.
 _SILENT_NS = 2_000_000_000
 
-_AGE, _SINCE = 2, 4
+_AGE, _WRITER, _SINCE = 2, 3, 4
 
 
 def sources(robots: Sequence[RobotInfo]) -> list[Source]:
@@ -37,19 +37,25 @@ def sources(robots: Sequence[RobotInfo]) -> list[Source]:
 def robots_text(robots: Sequence[RobotInfo], sampler: Sampler, *, width: int | None = None) -> str:
     """Each robot, and below it each stream: rate, age of the newest sample, writer, since when.
 
-    Where that is wider than ``width``, the date is left out, then all of since when, then the age.
+    Where that is wider than ``width``, the date is left out, then all of since when, then the age; at last
+    writers become letters that are explained below.
     """
     rows = [_row(robot, stream, writer, sampler) for robot in robots for stream, writer in robot.writers]
-    lines = narrowed(rows, None)
+    lines, legend = narrowed(rows, None), list[str]()
     if width is not None and max(map(len, lines), default=0) > width:
         short = [(*row[:_SINCE], row[_SINCE].rpartition(", ")[2]) for row in rows]
         lines = narrowed(short, width, (_SINCE, _AGE))
+        if max(map(len, lines)) > width:
+            letters = letters_for(row[_WRITER] for row in rows)
+            named = [(*row[:_WRITER], letters[row[_WRITER]], *row[_SINCE:]) for row in short]
+            lines = narrowed(named, width, (_SINCE, _AGE))
+            legend = [f"{letter}: {writer}" for writer, letter in letters.items()]
     text: list[str] = []
     for robot in robots:
         count = len(robot.writers)
         text += [robot.name, *lines[:count]]
         lines = lines[count:]
-    return "\n".join(text)
+    return "\n".join([*text, *legend])
 
 
 def _row(robot: RobotInfo, stream: Stream, writer: Writer, sampler: Sampler) -> tuple[str, ...]:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import age_text, rate_text
 from zstate.cli.frame_tree import below, roots, short_name
-from zstate.cli.layout import in_columns, tree_lines
+from zstate.cli.layout import Guides, chain_lines, in_columns, letters_for, tree_lines
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
 
 _HEADINGS = ("frame", "edge", "rate", "age", "writer")
 
-Guides = Callable[[str, Mapping[str, Sequence[str]]], Iterator[tuple[str, str]]]
 Cells = Callable[["FrameInfo", int], tuple[str, ...]]
 
 
@@ -40,29 +39,13 @@ def tree_text(frames: Sequence[FrameInfo], now: int, *, in_full: bool, width: in
     lines = _lines(frames, now, in_full=in_full, guides=tree_lines)
     if width is None or _fits(lines, width):
         return "\n".join(lines)
-    letters = _letters(frames)
+    letters = letters_for(frame.writer for frame in frames if frame.writer)
     legend = [f"{letter}: {writer}" for writer, letter in letters.items()]
     for guides, cells in ((tree_lines, _cells), (chain_lines, _cells), (chain_lines, _fewer_cells)):
         lines = _lines(frames, now, in_full=in_full, guides=guides, cells=cells, names=letters)
         if _fits(lines, width):
             break
     return "\n".join([*lines, *legend])
-
-
-def chain_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
-    """As ``tree_lines``, but two columns deep, and only where the tree forks."""
-    stack = [(root, "", "")]
-    while stack:
-        name, guide, rail = stack.pop()
-        yield guide, name
-        children_here = children.get(name, ())
-        if len(children_here) == 1:
-            stack.append((children_here[0], f"{rail}↓ ", rail))
-            continue
-        for position in reversed(range(len(children_here))):
-            is_last = position == len(children_here) - 1
-            fork, below_it = ("└ ", "  ") if is_last else ("├ ", "│ ")
-            stack.append((children_here[position], rail + fork, rail + below_it))
 
 
 def _lines(
@@ -83,15 +66,6 @@ def _lines(
             shown = name if in_full else short_name(frame)
             rows.append((guide + shown, *cells(frame, now), names.get(writer, "") if names else writer))
     return in_columns(rows)
-
-
-def _letters(frames: Sequence[FrameInfo]) -> dict[str, str]:
-    writers = dict.fromkeys(frame.writer for frame in frames if frame.writer)
-    return {writer: _letter(number) for number, writer in enumerate(writers) if writer}
-
-
-def _letter(number: int) -> str:
-    return chr(ord("a") + number) if number < 26 else str(number + 1)
 
 
 def _fits(lines: Sequence[str], width: int) -> bool:

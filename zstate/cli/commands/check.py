@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, say, say_json
-from zstate.cli.layout import in_columns, tree_lines
+from zstate.cli.console import count_text, is_terminal, say_fitted, say_json, terminal_width
+from zstate.cli.layout import Guides, chain_lines, in_columns, narrowed, tree_lines
 from zstate.cli.options import json_option
 from zstate.errors import Found, ModelError
 
@@ -54,7 +54,7 @@ def check_command(file: str, fix_hints: bool, joint_table: bool, as_json: bool) 
     if as_json:
         say_json(_facts(name, model, findings))
     else:
-        say(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
+        say_fitted(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
     raise SystemExit(0 if model else 1)
 
 
@@ -68,7 +68,7 @@ def _report(
         if fix_hints and finding.fix:
             lines += [f"      fix: {finding.fix}"]
     if model is not None:
-        lines += in_columns(_joint_rows(model) if joint_table else _link_rows(model))
+        lines += _joint_lines(model) if joint_table else _link_lines(model)
     elif not fix_hints and any(finding.fix for finding in findings):
         lines += (
             [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
@@ -93,14 +93,29 @@ def _finding_row(finding: Found) -> tuple[str, str, str]:
     return where, finding.severity, finding.message
 
 
-def _link_rows(model: RobotModel) -> list[tuple[str, str, str, str]]:
+def _joint_lines(model: RobotModel) -> list[str]:
+    dispensable = ("axis", "effort", "velocity", "parent", "type")
+    return narrowed(_joint_rows(model), _width(), [_JOINT_HEADINGS.index(column) for column in dispensable])
+
+
+def _link_lines(model: RobotModel) -> list[str]:
+    lines, width = in_columns(_link_rows(model, tree_lines)), _width()
+    if width is None or max(map(len, lines)) <= width:
+        return lines
+    of_joint, of_type = 1, 2
+    return narrowed(_link_rows(model, chain_lines), width, (of_type, of_joint))
+
+
+def _width() -> int | None:
+    return terminal_width() if is_terminal() else None
+
+
+def _link_rows(model: RobotModel, guides: Guides) -> list[tuple[str, str, str, str]]:
     joints = {joint.child: joint for joint in model.joints}
     children: dict[str, list[str]] = {}
     for joint in model.joints:
         children.setdefault(joint.parent, []).append(joint.child)
-    return [
-        (guide + link, *_joint_cells(joints.get(link))) for guide, link in tree_lines(model.root, children)
-    ]
+    return [(guide + link, *_joint_cells(joints.get(link))) for guide, link in guides(model.root, children)]
 
 
 def _joint_rows(model: RobotModel) -> list[tuple[str, ...]]:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import click
 
-from zstate.cli.console import note, say, say_json
+from zstate.cli.console import note, say, say_fitted, say_json
 from zstate.cli.layout import in_columns
 from zstate.cli.options import json_option, plain_session_options, reading_clock_option, wire_option
 
@@ -43,7 +43,7 @@ def config_command(context: click.Context, /, *, as_zenoh: bool, as_json: bool, 
         say_json({"settings": [asdict(one) for one in settings(context)], "problems": wrong})
     else:
         rows = [(one.name, one.text, one.origin) for one in settings(context)]
-        say("\n".join(in_columns([("setting", "value", "from"), *rows])))
+        say_fitted("\n".join(in_columns([("setting", "value", "from"), *rows])))
     for text in wrong:
         note(f"zstate: {text}", event="problem")
     raise SystemExit(1 if wrong else 0)

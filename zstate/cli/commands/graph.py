@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, note, say, say_json
+from zstate.cli.console import fail, note, say, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
@@ -45,7 +45,7 @@ def graph_command(network: Network, robot: str, form: str | None, wire: str) -> 
         say_json(graph.facts())
     elif graph.streams:
         title = "Who writes and reads what" if robot == "*" else f"Who writes and reads what of {robot}"
-        say(_drawn(graph, form, title))
+        say_fitted(_drawn(graph, form, title)) if form is None else say(_drawn(graph, form, title))
     else:
         note(words_of(wire).announced(()))
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, rate_text, say, say_json
-from zstate.cli.layout import in_columns
+from zstate.cli.console import count_text, is_terminal, rate_text, say_fitted, say_json, terminal_width
+from zstate.cli.layout import in_columns, narrowed
 from zstate.cli.options import json_option
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def info_command(file: str, as_json: bool) -> None:
         say_json(_facts(info, robots))
         return
     lines = [*_head(info), *(line for robot in robots for line in ("", *_robot_lines(robot)))]
-    say("\n".join([*lines, *_other_lines(info)]))
+    say_fitted("\n".join([*lines, *_other_lines(info)]))
 
 
 def _head(info: RecordingInfo) -> Iterator[str]:
@@ -80,7 +80,8 @@ def _robot_lines(robot: RecordedRobot) -> list[str]:
         ("  " + said.stream, said.topic, said.type, str(said.count), rate_text(said.rate_hz), said.writer)
         for said in robot.streams
     ]
-    return [f"{robot.name}: {_model_text(robot)}", *in_columns(rows)]
+    width, of_topic, of_type = terminal_width() if is_terminal() else None, 1, 2
+    return [f"{robot.name}: {_model_text(robot)}", *narrowed(rows, width, (of_type, of_topic))]
 
 
 def _model_text(robot: RecordedRobot) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.console import is_terminal, note, say, say_json, terminal_width
+from zstate.cli.console import is_terminal, note, say, say_fitted, say_json, terminal_width
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
@@ -69,7 +69,7 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
     if as_json:
         say_json(graph_facts(graph, spoken))
     elif graph.nodes or graph.topics:
-        say(text(graph))
+        say_fitted(text(graph))
         hint = namespaces_hint(graph, spoken)
         if hint:
             note(hint)
@@ -91,7 +91,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
         if as_json:
             say_json(robots_facts(robots, sampler))
         elif robots:
-            say(robots_text(robots, sampler, width=terminal_width() if is_terminal() else None))
+            say_fitted(robots_text(robots, sampler, width=terminal_width() if is_terminal() else None))
         else:
             note(words_of("native").announced(robots))
 

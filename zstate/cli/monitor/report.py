@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from zstate.cli.console import rate_text
-from zstate.cli.layout import in_columns, narrowed
+from zstate.cli.layout import in_columns, letters_for, narrowed
 from zstate.cli.monitor.meter import Measure, PathMeter
 from zstate.errors import duration_text
 
@@ -72,7 +72,7 @@ def table_text(
     """
     lines = in_columns([_HEADINGS, *cells({})])
     if width is not None and max(map(len, lines)) > width:
-        letters = _letters(rows)
+        letters = letters_for(row.edge.writer for row in rows if row.edge is not None and row.edge.writer)
         columns = [_HEADINGS.index(heading) for heading in dispensable]
         lines = narrowed([_HEADINGS, *cells(letters)], width, columns)
         lines += [f"{letter}: {writer}" for writer, letter in letters.items()]
@@ -133,11 +133,6 @@ def _ahead_text(offset: Offset) -> str:
     if abs(offset.offset_ns) <= offset.uncertainty_ns:
         return "0"
     return f"{'+' if offset.offset_ns > 0 else ''}{duration_text(offset.offset_ns)}"
-
-
-def _letters(rows: Sequence[Row]) -> dict[str, str]:
-    writers = dict.fromkeys(row.edge.writer for row in rows if row.edge is not None and row.edge.writer)
-    return {writer: chr(ord("a") + number) for number, writer in enumerate(writers) if writer}
 
 
 def _clock_notes(rows: Sequence[Row]) -> list[str]:
