@@ -310,3 +310,18 @@ def test_a_trail_of_a_frame_that_nobody_knows_is_no_error(scene):
     scene.trail("ghost", True)
     scene.show(moved(0.0, 0.0), "map")
     scene.trail("ghost", False)
+
+
+def test_many_labels_are_as_large_as_things_are(scene, server):
+    def modes() -> set[str]:
+        labels = handles(server, viser.LabelHandle).items()
+        return {label.font_size_mode for path, label in labels if is_seen(server, path)}
+
+    scene.names = True
+    names = ["map", *(f"f{k}" for k in range(60))]
+    many = tree({name: None if name == "map" else "map" for name in names})
+    poses = {name: at(k) for k, name in enumerate(names)}
+    scene.show(moment(many, poses), "map")
+    assert modes() == {"scene"}
+    scene.show(moment(TREE, POSES), "map")
+    assert modes() == {"screen"}

@@ -124,27 +124,39 @@ class Glb:
 
 
 def _joined(surfaces: Iterable[Surface]) -> list[Surface]:
-    """One surface for each look: a browser draws few large ones faster than many small ones."""
-    alike: dict[object, list[Surface]] = {}
+    """One surface for each look: a browser draws few large ones faster than many small ones.
+
+    All of them have places in an image, and colours, where one has: viser draws instances of no others.
+    """
+    alike: dict[Look | None, list[Surface]] = {}
     for surface in surfaces:
         if len(surface.triangles):
-            has = (surface.look, surface.uv is None, surface.colors is None)
-            alike.setdefault(has, []).append(surface)
-    return [_join(group) for group in alike.values()]
+            alike.setdefault(surface.look, []).append(surface)
+    every = [surface for group in alike.values() for surface in group]
+    has_uv = any(one.uv is not None for one in every)
+    has_colors = any(one.colors is not None for one in every)
+    return [_join(group, has_uv, has_colors) for group in alike.values()]
 
 
-def _join(group: list[Surface]) -> Surface:
+def _join(group: list[Surface], has_uv: bool, has_colors: bool) -> Surface:
     starts = np.cumsum([0, *(len(one.points) for one in group[:-1])])
     rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
-    uvs = [one.uv for one in group if one.uv is not None]
-    colors = [one.colors for one in group if one.colors is not None]
     return Surface(
         np.concatenate([one.points for one in group]),
         np.concatenate(rows).astype(np.uint32),
         group[0].look,
-        np.concatenate(uvs) if uvs else None,
-        np.concatenate(colors) if colors else None,
+        np.concatenate([_uv(one) for one in group]) if has_uv else None,
+        np.concatenate([_colors(one) for one in group]) if has_colors else None,
     )
+
+
+def _uv(surface: Surface) -> NDArray[np.float32]:
+    return np.zeros((len(surface.points), 2), dtype=np.float32) if surface.uv is None else surface.uv
+
+
+def _colors(surface: Surface) -> NDArray[np.uint8]:
+    white = np.full((len(surface.points), 4), 255, dtype=np.uint8)
+    return white if surface.colors is None else surface.colors
 
 
 def _look(own: Look | None, has_uv: bool, paint: Paint) -> Look:

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import viser
 
-from zstate.model.shapes import Color, Shape
+from zstate.model.shapes import Shape
 from zstate.view.geometry.paths import Missing
 from zstate.view.meshes import Drawing
+from zstate.view.scene.dress import OVER, Dress, role_of
 from zstate.view.scene.nodes import Nodes
 from zstate.view.scene.workshop import Made, Order, Workshop
-
-Dress = Literal["visual", "collision", "grey"]
-
-_COLLISION: Color = (0.98, 0.55, 0.12, 0.42)
-_GREY: Color = (0.55, 0.57, 0.60, 0.38)
-_OVER: dict[Dress, Color | None] = {"visual": None, "collision": _COLLISION, "grey": _GREY}
 
 
 @dataclass
@@ -56,13 +50,7 @@ class Body:
     missing: list[Missing] = field(default_factory=list[Missing])
 
     def __post_init__(self) -> None:
-        visuals = [shape for shape in self.shapes if shape.role == "visual"]
-        collisions = [shape for shape in self.shapes if shape.role == "collision"]
-        self._wardrobes: dict[Dress, _Wardrobe] = {
-            "visual": self._wardrobe("v", visuals),
-            "collision": self._wardrobe("c", collisions),
-            "grey": self._wardrobe("g", visuals),
-        }
+        self._wardrobes: dict[Dress, _Wardrobe] = {dress: self._wardrobe(dress) for dress in OVER}
         self._orders: dict[Order, _Piece] = {}
         self._nodes_version = -1
 
@@ -108,13 +96,18 @@ class Body:
                     piece.handle.remove()
         self._orders.clear()
 
-    def _wardrobe(self, letter: str, shapes: Sequence[Shape]) -> _Wardrobe:
-        frames = [f"{self.robot}/{shape.link}" for shape in shapes]
-        named = enumerate(zip(shapes, frames, strict=True))
-        return _Wardrobe([_Piece(shape, frame, f"{letter}{k}") for k, (shape, frame) in named])
+    @property
+    def frames(self) -> set[str]:
+        """The frames on whose nodes something hangs, or will."""
+        return {f"{self.robot}/{shape.link}" for shape in self.shapes}
+
+    def _wardrobe(self, dress: Dress) -> _Wardrobe:
+        shapes = [shape for shape in self.shapes if shape.role == role_of(dress)]
+        named = [(shape, f"{self.robot}/{shape.link}") for shape in shapes]
+        return _Wardrobe([_Piece(shape, frame, f"{dress[0]}{k}") for k, (shape, frame) in enumerate(named)])
 
     def _order(self, dress: Dress, wardrobe: _Wardrobe) -> None:
-        orders = {Order(piece.shape, _OVER[dress]): piece for piece in wardrobe.pieces}
+        orders = {Order(piece.shape, OVER[dress]): piece for piece in wardrobe.pieces}
         self._orders |= orders
         self.workshop.order(list(orders))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -10,6 +12,9 @@ from zstate.view.moment import Mask, Moment
 from zstate.view.scene.nodes import Nodes
 
 _SIZE = 0.85
+# So many labels of one size on the screen hide all else: they are then as large as things are [m].
+_MANY = 40
+_HEIGHT_M = 0.028
 _SAME_PLACE_M = 0.004
 
 
@@ -33,18 +38,27 @@ class Names:
             return
         self._drawn = drawn
         texts = _texts(moment, nodes.shown, joined) if on else {}
+        size = "scene" if len(texts) > _MANY else "screen"
         for frame in self._labels.keys() - nodes.paths.keys():
             del self._labels[frame]
         for frame, path in nodes.paths.items():
-            self._show(frame, path, texts.get(frame))
+            self._show(frame, path, texts.get(frame), size)
 
-    def _show(self, frame: str, path: str, text: str | None) -> None:
+    def _show(self, frame: str, path: str, text: str | None, size: Literal["screen", "scene"]) -> None:
         there, label = self._labels.get(frame, ("", None))
         if label is not None and there == path:
             label.visible = text is not None
             label.text = label.text if text is None else text
+            label.font_size_mode = size
         elif text is not None:
-            label = self._scene.add_label(f"{path}/name", text, font_screen_scale=_SIZE, anchor="bottom-left")
+            label = self._scene.add_label(
+                f"{path}/name",
+                text,
+                font_size_mode=size,
+                font_screen_scale=_SIZE,
+                font_scene_height=_HEIGHT_M,
+                anchor="bottom-left",
+            )
             self._labels[frame] = (path, label)
 
 

@@ -13,7 +13,7 @@ import viser
 from numpy.typing import NDArray
 
 from zstate.se3 import IDENTITY
-from zstate.view.moment import Mask, Moment, Poses, Tree
+from zstate.view.moment import Mask, Moment, Poses, Rows, Tree
 from zstate.view.scene.posing import move, turn
 
 _Float = TypeVar("_Float", np.float32, np.float64)
@@ -24,10 +24,10 @@ _UNSEEN = 1e-6
 
 
 class Nodes:
-    """A node for each frame. ``paths`` are their names in viser, for what hangs on them.
+    """A node for each frame on which something hangs, and for those above it.
 
-    ``shown`` says by row of ``tree`` which frames have a place in the fixed one. ``version`` grows when
-    a frame has got another path, or a place, or has lost it.
+    ``paths`` are their names in viser. ``shown`` says by row of ``tree`` which frames have a place in the
+    fixed one. ``version`` grows when a frame has got another path, or a place, or has lost it.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
@@ -35,22 +35,28 @@ class Nodes:
         scene.add_frame(_TOP, show_axes=False)
         self._ids: dict[str, int] = {}
         self._handles: dict[str, viser.FrameHandle] = {}
-        self._rows: list[viser.FrameHandle] = []
+        self._rows: Rows = np.empty(0, dtype=np.intp)
+        self._hooks: list[viser.FrameHandle] = []
+        self._wanted: frozenset[str] = frozenset()
         self._poses: Poses = np.empty((0, 7))
         self.tree: Tree | None = None
         self.paths: dict[str, str] = {}
         self.shown: Mask = np.empty(0, dtype=np.bool_)
         self.version = 0
 
-    def show(self, moment: Moment, fixed: str) -> Poses:
-        """Move every frame to its place; returns these, as ``moment.placed(fixed)``."""
-        if moment.tree is not self.tree:
+    def show(self, moment: Moment, fixed: str, wanted: frozenset[str]) -> Poses:
+        """Move every frame to its place, with nodes for those that are ``wanted``.
+
+        Returns the places, as ``moment.placed(fixed)``.
+        """
+        if moment.tree is not self.tree or wanted != self._wanted:
+            self._wanted = wanted
             self._grow(moment.tree)
         placed = moment.placed(fixed)
         shown = np.isfinite(placed[:, 0])
         if not np.array_equal(shown, self.shown):
             self._reveal(moment.tree, shown)
-        self._move(_on_parents(moment, placed, shown))
+        self._move(_on_parents(moment, placed, shown)[self._rows])
         return placed
 
     def is_shown(self, frame: str) -> bool:
@@ -66,20 +72,24 @@ class Nodes:
         for path in paths.values():
             if path not in self._handles:
                 self._handles[path] = self._scene.add_frame(path, show_axes=False)
-        self._rows = [self._handles[path] for path in paths.values()]
+        self._rows = np.array([tree.row(name) for name in paths], dtype=np.intp)
+        self._hooks = [self._handles[path] for path in paths.values()]
         self._poses = np.full((len(paths), 7), np.nan)
-        self.shown = np.ones(len(paths), dtype=np.bool_)
+        self.shown = np.zeros(0, dtype=np.bool_)
         self.tree, self.paths = tree, paths
         self.version += 1
 
     def _paths(self, tree: Tree) -> dict[str, str]:
         """Short ones, because every message has one; a frame keeps its number for good."""
-        paths: list[str] = []
-        for row, name in enumerate(tree.names):
-            parent = int(tree.parents[row])
-            above = _TOP if parent < 0 else paths[parent]
-            paths.append(f"{above}/{self._ids.setdefault(name, len(self._ids))}")
-        return dict(zip(tree.names, paths, strict=True))
+        kept = np.array([name in self._wanted for name in tree.names], dtype=np.bool_)
+        for row in range(len(kept) - 1, -1, -1):
+            kept[tree.parents[row]] |= kept[row] and tree.parents[row] >= 0
+        paths: dict[str, str] = {}
+        for row in np.flatnonzero(kept).tolist():
+            name, parent = tree.names[row], int(tree.parents[row])
+            above = _TOP if parent < 0 else paths[tree.names[parent]]
+            paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
+        return paths
 
     def _outermost_without(self, kept: set[str]) -> Iterator[str]:
         """The nodes to remove; what is below one goes with it."""
@@ -93,7 +103,7 @@ class Nodes:
             parent = int(tree.parents[row])
             if passed[row] and parent >= 0:
                 passed[parent] = True
-        for handle, visible in zip(self._rows, passed.tolist(), strict=True):
+        for handle, visible in zip(self._hooks, passed[self._rows].tolist(), strict=True):
             handle.visible = visible
         self.shown = shown
         self.version += 1
@@ -104,10 +114,10 @@ class Nodes:
         moved, turned = changed[:, :3].any(axis=1), changed[:, 3:].any(axis=1)
         for row in np.flatnonzero(moved).tolist():
             x, y, z = poses[row, :3].tolist()
-            move(self._rows[row], (x, y, z))
+            move(self._hooks[row], (x, y, z))
         for row in np.flatnonzero(turned).tolist():
             qx, qy, qz, qw = poses[row, 3:].tolist()
-            turn(self._rows[row], (qw, qx, qy, qz))
+            turn(self._hooks[row], (qw, qx, qy, qz))
         self._poses[moved, :3] = poses[moved, :3]
         self._poses[turned, 3:] = poses[turned, 3:]
 

@@ -6,16 +6,17 @@ from collections.abc import Sequence
 
 import viser
 
+from zstate.model.findings import Finding
 from zstate.model.robot import RobotModel
 from zstate.model.shapes import Shape, read_shapes
-from zstate.view.geometry.paths import Missing
 from zstate.view.meshes import Meshes
-from zstate.view.moment import Moment
+from zstate.view.moment import Moment, Tree
 from zstate.view.scene.axes import Axes
-from zstate.view.scene.body import Body, Dress
+from zstate.view.scene.dress import Dress
 from zstate.view.scene.lines import Lines
 from zstate.view.scene.names import Names
 from zstate.view.scene.nodes import Nodes
+from zstate.view.scene.robots import Robots
 from zstate.view.scene.silences import Silences
 from zstate.view.scene.trails import Trails
 from zstate.view.scene.workshop import Workshop
@@ -37,7 +38,8 @@ class Scene:
         self.parent_lines = False
         self._scene = server.scene
         self._workshop = Workshop(meshes or Meshes())
-        self._bodies: dict[str, Body] = {}
+        self._robots = Robots(server.scene, self._workshop)
+        self._faults: dict[str, tuple[tuple[str, str], ...]] = {}
         self._nodes = Nodes(server.scene)
         self._axes = Axes(server.scene)
         self._names = Names(server.scene)
@@ -55,18 +57,16 @@ class Scene:
 
         ``shapes`` are those of its model when they are not given.
         """
-        self.remove_robot(name)
-        faults: list[Missing] = []
+        faults: tuple[Finding, ...] = ()
         if shapes is None:
-            shapes, findings = read_shapes(model)
-            faults = [Missing(f"{name}, line {one.line}", one.message) for one in findings]
-        self._bodies[name] = Body(self._scene, self._workshop, name, shapes, faults)
+            shapes, faults = read_shapes(model)
+        self._faults[name] = tuple((f"{name}, line {one.line}", one.message) for one in faults)
+        self._robots.set(name, tuple(shapes), self._nodes)
 
     def remove_robot(self, name: str) -> None:
         """Draw a robot no more; without one of that name, do nothing."""
-        body = self._bodies.pop(name, None)
-        if body is not None:
-            body.remove(self._nodes)
+        self._robots.remove(name, self._nodes)
+        self._faults.pop(name, None)
         self._silences.set(name, None)
 
     def grey(self, robot: str, since: str | None) -> None:
@@ -79,28 +79,23 @@ class Scene:
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
         """What cannot be drawn of a robot: the name of each file in the URDF, and why it cannot."""
-        body = self._bodies.get(robot)
-        return () if body is None else tuple((one.uri, one.why) for one in body.missing)
+        missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
+        return self._faults.get(robot, ()) + missing
 
     def show(self, moment: Moment, fixed: str) -> None:
         """Draw everything as it was at a moment, seen from the frame ``fixed``. Raises UnknownFrame."""
-        placed = self._nodes.show(moment, fixed)
+        placed = self._nodes.show(moment, fixed, self._wanted(moment.tree))
         shown = self._nodes.shown
-        self._show_bodies()
+        self._robots.show(self._nodes, moment.tree, placed, self._dresses)
         self._axes.show(self.axes, placed, shown)
         self._lines.show(self.parent_lines, placed, shown, moment.tree.parents)
         self._names.show(self.names, moment, self._nodes)
         self._trails.show(moment, fixed, placed)
         self._silences.show(self._nodes)
 
-    def _show_bodies(self) -> None:
-        for made in self._workshop.fetch():
-            for body in self._bodies.values():
-                if body.take(made):
-                    break
-        for name, body in self._bodies.items():
-            body.wear(self._dresses(name))
-            body.hang(self._nodes)
+    def _wanted(self, tree: Tree) -> frozenset[str]:
+        """The frames on which something hangs."""
+        return frozenset(tree.names) if self.names else self._robots.frames | self._silences.frames(tree)
 
     def _dresses(self, robot: str) -> set[Dress]:
         dresses: set[Dress] = {"collision"} if self.collisions else set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import viser
 
+from zstate.view.moment import Tree
 from zstate.view.scene.nodes import Nodes
 
 
@@ -14,6 +15,8 @@ class Silences:
         self._scene = scene
         self._texts: dict[str, str] = {}
         self._labels: dict[str, tuple[str, viser.LabelHandle]] = {}
+        self._tree: Tree | None = None
+        self._firsts: dict[str, str] = {}
 
     def set(self, robot: str, text: str | None) -> None:
         """A robot is silent, which ``text`` says, or is not: None."""
@@ -25,6 +28,14 @@ class Silences:
     def is_silent(self, robot: str) -> bool:
         """Whether that was said last."""
         return robot in self._texts
+
+    def frames(self, tree: Tree) -> frozenset[str]:
+        """The frame of each silent robot that its label hangs on: the first, for parents stand first."""
+        if tree is not self._tree:
+            self._tree, self._firsts = tree, {}
+            for name in tree.names:
+                self._firsts.setdefault(name.partition("/")[0], name)
+        return frozenset(self._firsts[robot] for robot in self._texts if robot in self._firsts)
 
     def show(self, nodes: Nodes) -> None:
         """Draw the labels at the first frame of each silent robot."""
@@ -46,6 +57,4 @@ class Silences:
             label.text = text
 
     def _path(self, robot: str, nodes: Nodes) -> str | None:
-        """Of the robot's frame that stands first: parents do."""
-        frames = (path for frame, path in nodes.paths.items() if frame.startswith(f"{robot}/"))
-        return next(frames, None)
+        return nodes.paths.get(self._firsts.get(robot, ""))

@@ -1,0 +1,182 @@
+"""Fleet: robots that look the same are instances of the same nodes, and stand where they would alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from support import until
+
+viser = pytest.importorskip("viser")
+
+from drawing import at, handles, moment, told, tree  # noqa: E402
+
+from zstate import se3  # noqa: E402
+from zstate.model.shapes import Box, MeshFile, Shape, Sphere  # noqa: E402
+from zstate.model.urdf import parse_urdf  # noqa: E402
+from zstate.view.page import Page  # noqa: E402
+from zstate.view.scene.scene import Scene  # noqa: E402
+
+CART = parse_urdf('<robot name="cart"><link name="base"/></robot>', "cart.urdf")
+ORIGIN = (0.1, 0.2, 0.3, *se3.quaternion_of_rpy(0.4, 0.5, 0.6))
+SHAPES = (Shape("base", "visual", ORIGIN, Box((1, 2, 3))), Shape("base", "collision", ORIGIN, Sphere(1.0)))
+NAMES = [f"r{k}" for k in range(5)]
+TREE = tree({"map": None} | {f"{name}/base": "map" for name in NAMES})
+POSES = {f"{name}/base": at(k, -k, 0, 0.3 * k) for k, name in enumerate(NAMES)}
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    with Page(port=0) as opened:
+        yield opened
+
+
+@pytest.fixture
+def server(page):
+    page.server.scene.reset()
+    return page.server
+
+
+def drawn(scene: Scene, shown) -> None:
+    """Show a moment until nothing is missing from the picture."""
+
+    def complete() -> bool:
+        scene.show(shown, "map")
+        return not scene.busy
+
+    until(complete)
+    scene.show(shown, "map")
+
+
+def fleet_of(server, names, shapes=SHAPES) -> Scene:
+    scene = Scene(server)
+    for name in names:
+        scene.set_robot(name, CART, shapes)
+    drawn(scene, moment(TREE, POSES))
+    return scene
+
+
+def nodes(server) -> list:
+    return [handle for handle in handles(server, viser.BatchedGlbHandle).values() if handle.visible]
+
+
+def seen(server) -> set[tuple[float, ...]]:
+    """The corner (1, 1, 1) of every instance that is seen, in the fixed frame, as the browser computes it."""
+    corners: set[tuple[float, ...]] = set()
+    for node in nodes(server):
+        poses = zip(node.batched_positions, node.batched_wxyzs, node.batched_scales, strict=True)
+        for position, (qw, qx, qy, qz), scale in poses:
+            if scale.any():
+                turned = se3.rotate((qx, qy, qz, qw), tuple(scale.tolist()))
+                corner = np.array(node.scale) * (position + turned)
+                corners.add(tuple(np.round(corner, 4).tolist()))
+    return corners
+
+
+def corners_of(names, scale=(1, 1, 1)) -> set[tuple[float, ...]]:
+    """Where those corners are by the definition of the poses."""
+    places = [se3.compose(POSES[f"{name}/base"], ORIGIN) for name in names]
+    corners = [se3.compose(place, (*scale, 0, 0, 0, 1))[:3] for place in places]
+    return {tuple(np.round(corner, 4).tolist()) for corner in corners}
+
+
+def test_few_robots_are_drawn_each_for_itself(server):
+    fleet_of(server, NAMES[:3])
+    assert nodes(server) == []
+    assert len(handles(server, viser.GlbHandle)) == 3
+
+
+def test_many_robots_are_one_node_for_each_shape(server):
+    fleet_of(server, NAMES)
+    assert len(nodes(server)) == 1
+    assert handles(server, viser.GlbHandle) == {}
+    assert seen(server) == corners_of(NAMES)
+
+
+def test_robots_that_look_different_are_no_fleet(server):
+    scene = fleet_of(server, NAMES[:3])
+    scene.set_robot("r3", CART, SHAPES[:1])
+    drawn(scene, moment(TREE, POSES))
+    assert nodes(server) == []
+
+
+def test_a_mirrored_mesh_is_mirrored_in_a_fleet_too(server, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    scale = (1.0, -2.0, 0.5)
+    fleet_of(server, NAMES, (Shape("base", "visual", ORIGIN, MeshFile(str(tmp_path / "box.stl"), scale)),))
+    assert seen(server) == corners_of(NAMES, scale)
+
+
+def test_two_messages_move_a_shape_of_all_robots(server):
+    scene = fleet_of(server, NAMES)
+    scene.axes = False
+    scene.show(moment(TREE, POSES), "map")
+    with told(server) as messages:
+        scene.show(moment(TREE, POSES), "map")
+        assert messages == []
+        scene.show(moment(TREE, POSES | {f"{name}/base": at(5, 5, 5, 1) for name in NAMES}), "map")
+    assert len(messages) == 2
+
+
+def test_robots_come_to_a_fleet_and_leave_it(server):
+    scene = fleet_of(server, NAMES[:4])
+    scene.set_robot("r4", CART, SHAPES)
+    drawn(scene, moment(TREE, POSES))
+    assert seen(server) == corners_of(NAMES)
+    for name in NAMES[:4]:
+        scene.remove_robot(name)
+    drawn(scene, moment(TREE, POSES))
+    assert seen(server) == corners_of(["r4"])
+    scene.remove_robot("r4")
+    scene.show(moment(TREE, POSES), "map")
+    assert nodes(server) == []
+
+
+def test_a_silent_robot_of_a_fleet_is_drawn_in_grey(server):
+    scene = fleet_of(server, NAMES)
+    (own,) = nodes(server)
+    scene.grey("r2", "silent for 3 s")
+    drawn(scene, moment(TREE, POSES))
+    assert np.count_nonzero(own.batched_scales.any(axis=1)) == 4
+    assert seen(server) == corners_of(NAMES)
+    assert [label.text for label in handles(server, viser.LabelHandle).values()] == ["r2: silent for 3 s"]
+    scene.grey("r2", None)
+    scene.show(moment(TREE, POSES), "map")
+    assert np.count_nonzero(own.batched_scales.any(axis=1)) == 5
+
+
+def test_a_robot_without_a_place_is_not_drawn(server):
+    scene = fleet_of(server, NAMES)
+    scene.show(moment(TREE, POSES, unknown=["r1/base"]), "map")
+    assert seen(server) == corners_of([name for name in NAMES if name != "r1"])
+
+
+def test_a_robot_whose_frames_are_not_there_yet_is_not_drawn(server):
+    scene = fleet_of(server, NAMES)
+    few = tree({"map": None, "r0/base": "map"})
+    scene.show(moment(few, POSES), "map")
+    assert seen(server) == corners_of(["r0"])
+    scene.show(moment(TREE, POSES), "map")
+    assert seen(server) == corners_of(NAMES)
+
+
+def test_collisions_of_a_fleet_are_drawn_when_they_are_asked_for(server):
+    scene = fleet_of(server, NAMES)
+    scene.visuals, scene.collisions = False, True
+    drawn(scene, moment(TREE, POSES))
+    assert len(nodes(server)) == 2
+    assert seen(server) == corners_of(NAMES)
+    scene.collisions = False
+    scene.show(moment(TREE, POSES), "map")
+    assert seen(server) == set()
+
+
+def test_what_is_missing_is_listed_for_each_robot_of_a_fleet(server):
+    lost = (*SHAPES, Shape("base", "visual", ORIGIN, MeshFile("package://nowhere/a.stl")))
+    scene = fleet_of(server, NAMES, lost)
+    for name in NAMES:
+        ((uri, why),) = scene.missing_meshes(name)
+        assert uri == "package://nowhere/a.stl"
+        assert "no package 'nowhere'" in why
