@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from math import degrees
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.console import count_text, duration_or_dash, is_terminal, say
+from zstate.cli.console import count_text, duration_or_dash, is_terminal, say, terminal_width
 from zstate.cli.metered_buffer import Measure, MeteredBuffer
 from zstate.clock import wait_in_slices
 from zstate.errors import LookupFailed, duration_text
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _REFRESH_S = 0.1
 # The rate shown is that of so many refreshes.
 _WINDOW = 10
+# So many columns are enough for angles, too.
+_WITH_ANGLES = 72
 
 
 class Row(NamedTuple):
@@ -103,12 +105,14 @@ class DemoTable:
             caption_justify="left",
         )
         table.add_column(f"pose in {self._root}", style="bold", overflow="fold")
-        for title in (r"x       y       z \[m]", r"roll   pitch  yaw \[deg]", "age"):
+        with_angles = terminal_width() >= _WITH_ANGLES
+        angles = (r"roll   pitch  yaw \[deg]",) if with_angles else ()
+        for title in (r"x       y       z \[m]", *angles, "age"):
             table.add_column(title, justify="right", no_wrap=True)
         for row in self.rows():
             xyz = " ".join(f"{value:7.3f}" for value in row.transform.translation)
-            rpy = " ".join(f"{degrees(angle):6.1f}" for angle in row.transform.rpy)
-            table.add_row(_link(row), xyz, rpy, duration_text(row.age))
+            rpy = (" ".join(f"{degrees(angle):6.1f}" for angle in row.transform.rpy),) if with_angles else ()
+            table.add_row(_link(row), xyz, *rpy, duration_text(row.age))
         return table
 
     def line(self) -> str:

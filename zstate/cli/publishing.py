@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
-from zstate.cli.console import report_text, say
+from zstate.cli.console import report_text, say_fitted
 from zstate.cli.worker import Worker
 from zstate.lookup_service import LookupService, RecentBuffer
 from zstate.net.session import Session
@@ -22,9 +22,9 @@ def run(publisher: StatePublisher, source: JointSource, rate_hz: float, seconds:
         report = worker.result()
     except SystemExit:
         publisher.close()
-        say(report_text(worker.result(1.0)))
+        say_fitted(report_text(worker.result(1.0)))
         raise
-    say(report_text(report))
+    say_fitted(report_text(report))
 
 
 def answering_lookups(session: Session, *publishers: StatePublisher) -> ExitStack:

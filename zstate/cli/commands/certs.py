@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from zstate.cli.console import note, say
+from zstate.cli.console import note, say_fitted
 
 
 @click.command("certs")
@@ -39,7 +39,7 @@ def certs_command(folder: str, identities: tuple[str, ...], hosts: tuple[str, ..
 
     authority = CertificateFiles.of(folder, AUTHORITY)
     for name, files in issue_identities(folder, identities, hosts=hosts, days=days).items():
-        say(f"{name}: {files.certificate} and {files.key}, for {days} days")
+        say_fitted(f"{name}: {files.certificate} and {files.key}, for {days} days")
     note(
         f"These are for tests: whoever has {authority.key} can be anybody. In production keep it off every "
         "robot and router, or better, let your own authority sign (common name = identity, for TLS servers "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say
+from zstate.cli.console import count_text, fail, note, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import load_robot, rate_option, seconds_option
 from zstate.errors import UnknownModel
@@ -57,7 +57,9 @@ def demo_command(robot: str | None, robot_option: str | None, rate: float, secon
         "publisher", [*arguments, "--connect", endpoint], on_end=lambda _: ended.set()
     ) as publisher:
         size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"
-        say(f"{called} ({size}): process {publisher.pid} publishes it at {rate:g} Hz, this one looks it up")
+        say_fitted(
+            f"{called} ({size}): process {publisher.pid} publishes it at {rate:g} Hz, this one looks it up"
+        )
         _look(endpoint, model, called, ended, seconds)
         if ended.is_set():
             fail(f"the publisher ended with exit code {publisher.exit_code}: {publisher.last_error}")
@@ -102,7 +104,7 @@ def _look(
         try:
             table.show(ended, seconds)
         finally:
-            say(table.summary())
+            say_fitted(table.summary())
 
 
 def _has_begun(meter: Meter, ended: threading.Event) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from zstate.cli.console import fail, note, say, say_json
+from zstate.cli.console import fail, note, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, named_robot, session_options, timeout_option, wire_option
 from zstate.cli.words import is_ros
@@ -119,9 +119,9 @@ def _show(measured: Intervals, *, as_json: bool) -> None:
     if as_json:
         say_json(asdict(measured))
         return
-    say(f"average rate: {measured.rate_hz:.3f}")
+    say_fitted(f"average rate: {measured.rate_hz:.3f}")
     missed = f" missed: {measured.missed}" if measured.missed else ""
-    say(
+    say_fitted(
         f"\tmin: {measured.min_s:.3f}s max: {measured.max_s:.3f}s "
         f"std dev: {measured.std_dev_s:.5f}s window: {measured.window}{missed}"
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, say
+from zstate.cli.console import count_text, say_fitted
 from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
@@ -73,5 +73,5 @@ def joints_command(
     ):
         joints = count_text(len(model.joint_names), "joint")
         place = words_of(wire).place(called, ("joint_states",))
-        say(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
+        say_fitted(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
         run(publisher, SineSource(model), rate, seconds)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import note, say, say_json
+from zstate.cli.console import note, say_fitted, say_json
 from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, metrics_option, reading_clock_option, session_options, wire_option
@@ -150,7 +150,7 @@ def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:
     if as_json:
         say_json({"robot": robot, **asdict(measure), **asdict(stats)})
         return
-    say(
+    say_fitted(
         f"{robot}  {measure.rate_hz:.1f} Hz  age {_time_text(measure.age_s)}  "
         f"latency {_time_text(measure.latency_s)}  received {stats.received}  dropped {stats.dropped}  "
         f"missed {stats.missed}  late {stats.late}  refused {_refused_text(stats.refused)}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say
+from zstate.cli.console import count_text, fail, note, say_fitted
 from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
@@ -136,7 +136,7 @@ def publish_command(
 def _introduce(publisher: StatePublisher, places: list[str]) -> None:
     model = publisher.model
     size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
-    say(f"publishing {publisher.robot!r} ({size}) on {' and on '.join(places)}")
+    say_fitted(f"publishing {publisher.robot!r} ({size}) on {' and on '.join(places)}")
     _mention_warnings(model)
 
 
@@ -193,4 +193,4 @@ def _publish_every_sample(publisher: StatePublisher, source: HeardSource, second
             publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
     finally:
         if source.count:
-            say(f"{count_text(source.count, 'sample')} published, {source.rate_hz:.2f} Hz")
+            say_fitted(f"{count_text(source.count, 'sample')} published, {source.rate_hz:.2f} Hz")

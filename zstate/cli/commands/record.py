@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, is_terminal, note, say
+from zstate.cli.console import fail, is_terminal, note, say_fitted
 from zstate.cli.metrics import of_recorder, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
@@ -109,7 +109,7 @@ def _run(recorder: Recorder, roster: Roster, robots: tuple[str, ...], duration: 
         _show(recorder, progress, duration)
     finally:
         recorder.close()
-        say(progress.summary())
+        say_fitted(progress.summary())
     if recorder.failure is not None:
         raise recorder.failure
     if not recorder.stats.messages:
@@ -123,7 +123,7 @@ def _show(recorder: Recorder, progress: Progress, duration: float | None) -> Non
         while not _is_over(recorder, until, _LINE_S):
             for news in progress.news():
                 note(news)
-            say(progress.line())
+            say_fitted(progress.line())
         return
     from rich.live import Live
     from rich.text import Text

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, is_terminal, note, say
+from zstate.cli.console import fail, is_terminal, note, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
 from zstate.errors import InvalidInput
@@ -97,7 +97,7 @@ def replay_command(
         live = live_writers(session, replayer.robots, wires)
         if live and not takeover:
             fail(f"there is {'; '.join(live)} on the network already; end that first, or use --takeover")
-        say(introduction(replayer, file))
+        say_fitted(introduction(replayer, file))
         _run(replayer)
 
 
@@ -110,9 +110,9 @@ def _run(replayer: Replayer) -> None:
         report = _show(replayer, worker)
     except SystemExit:
         replayer.close()
-        say(report_text(replayer.report()))
+        say_fitted(report_text(replayer.report()))
         raise
-    say(report_text(report))
+    say_fitted(report_text(report))
     if not report.samples:
         fail("no sample was published; `zstate info` shows what the file holds")
 

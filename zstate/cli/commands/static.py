@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, note, say
+from zstate.cli.console import fail, note, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import session_options, takeover_option, wire_option
 from zstate.cli.words import is_ros, words_of
@@ -97,7 +97,7 @@ def static_command(
             )
             for edge in owned:
                 publisher.set(edge)
-                say(_sentence(edge, publisher, wires))
+                say_fitted(_sentence(edge, publisher, wires))
         wait_in_slices(threading.Event())
 
 
