@@ -109,7 +109,7 @@ def test_a_mirrored_mesh_is_mirrored_in_a_fleet_too(server, tmp_path):
     assert seen(server) == corners_of(NAMES, scale)
 
 
-def test_two_messages_move_a_shape_of_all_robots(server):
+def test_one_message_moves_a_shape_of_all_robots(server):
     scene = fleet_of(server, NAMES)
     scene.axes = False
     scene.show(moment(TREE, POSES), "map")
@@ -117,7 +117,7 @@ def test_two_messages_move_a_shape_of_all_robots(server):
         scene.show(moment(TREE, POSES), "map")
         assert messages == []
         scene.show(moment(TREE, POSES | {f"{name}/base": at(5, 5, 5, 1) for name in NAMES}), "map")
-    assert len(messages) == 2
+    assert len(messages) == 1
 
 
 def test_robots_come_to_a_fleet_and_leave_it(server):

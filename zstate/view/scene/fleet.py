@@ -1,6 +1,6 @@
 """Fleet: robots that look the same, each shape of theirs one node with an instance for each robot.
 
-A browser is sent each mesh once, and two messages move a shape of all robots. For few robots the tree of
+A browser is sent each mesh once, and one message moves a shape of all robots. For few robots the tree of
 nodes is cheaper, because there most shapes need no message at all.
 """
 
@@ -19,6 +19,7 @@ from zstate.view.geometry.paths import Missing
 from zstate.view.meshes import Drawing
 from zstate.view.moment import Mask, Poses, Rows, Tree
 from zstate.view.scene.dress import OVER, Dress, role_of
+from zstate.view.scene.posing import place
 from zstate.view.scene.workshop import Made, Order, Workshop
 
 _UNSEEN = 1e-5  # what a browser draws with has not more digits
@@ -136,8 +137,8 @@ class Fleet:
         turned = _in_mirror(poses, mirrored).astype(np.float32)
         if batch.sent is None or np.abs(turned - batch.sent).max() > _UNSEEN:
             batch.sent = turned
-            batch.handle.batched_positions = self._all(turned[:, :3], (0.0, 0.0, 0.0))
-            batch.handle.batched_wxyzs = self._all(turned[:, [6, 3, 4, 5]], (1.0, 0.0, 0.0, 0.0))
+            wxyzs = self._all(turned[:, [6, 3, 4, 5]], (1.0, 0.0, 0.0, 0.0))
+            place(batch.handle, self._all(turned[:, :3], (0.0, 0.0, 0.0)), wxyzs)
 
     def _draw(self, batch: _Batch, drawing: Drawing, count: int) -> None:
         """Begin with nothing to be seen; ``_move`` goes on."""
