@@ -54,6 +54,13 @@ def test_the_floor_is_where_a_robot_stands_that_is_placed_by_its_hip():
     assert [framing.floor for framing in framings if framing] == [-1.0, 0.0]
 
 
+def test_the_floor_goes_beyond_every_robot():
+    moment = moment_of(("a/root", (0.0, 0.0, 0.0)), ("b/root", (0.0, -7.5, 0.0)))
+    framing = framing_of(moment, moment.placed("a/root"))
+    assert framing is not None
+    assert framing.reach > 8
+
+
 def test_a_map_that_begins_far_away_does_not_make_the_robot_small():
     frames = (("a/root", (100.0, 0.0, 0.0)), ("a/tip", (100.0, 0.0, 1.0)))
     far = moment_of(("map", (0.0, 0.0, 0.0)), *frames)

@@ -25,7 +25,7 @@ from zstate.view.view import View
 from zstate.view.world import World
 
 _RECORDINGS = (".mcap", ".db3")
-_MEETING_S = 0.5
+_MEETING_S = 0.3
 _ANNOUNCED_WITHIN_S = 5.0
 # Several robots are rarely announced at once.
 _OTHERS_WITHIN_S = 0.5

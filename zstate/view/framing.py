@@ -18,16 +18,22 @@ _DIRECTION = np.array([1.0, 0.75, 0.45]) / np.linalg.norm([1.0, 0.75, 0.45])
 # Frames are where links begin; how far their meshes go beyond, nobody asked yet.
 _FLESH_M = 0.12
 _NEAREST_M = 0.6
+_SMALLEST_FLOOR = 3
 # What is cut off by a hair looks like a mistake.
 _ROOM = 1.08
 
 
 class Framing(NamedTuple):
-    """Where a camera stands and where it looks, and how high the floor lies, in the fixed frame [m]."""
+    """Where a camera stands and where it looks, in the fixed frame [m].
+
+    ``floor`` is how high the floor lies, and ``reach`` how far it goes around the fixed frame's origin, a
+    whole number of metres.
+    """
 
     position: tuple[float, float, float]
     look_at: tuple[float, float, float]
     floor: float
+    reach: int
 
 
 def framing_of(moment: Moment, placed: Poses) -> Framing | None:
@@ -46,7 +52,8 @@ def framing_of(moment: Moment, placed: Poses) -> Framing | None:
     away = float(np.max(nearer + aside / math.tan(0.5 * FIELD_OF_VIEW), initial=_NEAREST_M))
     # Whoever is placed by its hip stands lower than that.
     floor = min(0.0, float(points[:, 2].min()))
-    return Framing(_vector(middle + _ROOM * away * _DIRECTION), _vector(middle), floor)
+    reach = _SMALLEST_FLOOR + math.ceil(float(np.abs(points[:, :2]).max()))
+    return Framing(_vector(middle + _ROOM * away * _DIRECTION), _vector(middle), floor, reach)
 
 
 def _robots(moment: Moment) -> NDArray[np.bool_]:
