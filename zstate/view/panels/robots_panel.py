@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
+import numpy as np
 import viser
 
-from zstate.view.moment import Moment
+from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.look import Look
 from zstate.view.staleness import is_silent, silence_text
@@ -38,7 +39,8 @@ class RobotsPanel:
         for robot, silence in silences.items():
             self._scene.grey(robot, silence)
         self._robots.content = self._table(look, silences)
-        self._missing.content = unplaced_html(look.moment) + self._meshes(robots)
+        apart = apart_html(look.moment.tree, look.fixed)
+        self._missing.content = apart + unplaced_html(look.moment) + self._meshes(robots)
 
     def _silence(self, robot: str, look: Look) -> str | None:
         # Who is silent now was not when what is shown happened.
@@ -66,6 +68,23 @@ class RobotsPanel:
             f"{uri}\n    {where}" for robot in robots for uri, where in self._scene.missing_meshes(robot)
         ]
         return _listing("meshes are missing", "mesh is missing", lines)
+
+
+def apart_html(tree: Tree, fixed: str) -> str:
+    """The roots that nothing joins to the fixed frame, so that nothing on them is drawn."""
+    if fixed not in tree.index:
+        return ""
+    root = int(tree.roots[tree.index[fixed]])
+    counts = np.bincount(tree.roots, minlength=len(tree.names)).tolist()
+    apart = [(tree.names[row], count - 1) for row, count in enumerate(counts) if count and row != root]
+    if not apart:
+        return ""
+    lines = [f"{name}{f', and {below} below it' * bool(below)}" for name, below in apart]
+    advice = f"zstate static {tree.names[root]} {apart[0][0]} --xyz 1 0 0"
+    listing = _listing(
+        "frames are not joined to the fixed frame", "frame is not joined to the fixed frame", lines
+    )
+    return listing + html.paragraph(f"Join them, for instance with: {advice}", muted=True)
 
 
 def unplaced_html(moment: Moment) -> str:
