@@ -52,7 +52,7 @@ def wheel(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_the_code_the_robots_and_nothing_else(wheel: Path):
     code = {path.relative_to(ROOT).as_posix() for path in (ROOT / "zstate").rglob("*.py")}
-    robots = {f"zstate/models/{path.name}" for path in (ROOT / "models").iterdir()}
+    robots = {f"zstate/models/{path.name}" for path in (ROOT / "models").iterdir() if path.is_file()}
     shipped = {name for name in names_in(wheel) if ".dist-info/" not in name and name not in extension(wheel)}
     assert shipped == code | robots | {"zstate/py.typed", "zstate/_kernel.pyi"}
 
