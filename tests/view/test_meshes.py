@@ -225,6 +225,13 @@ def test_a_file_that_is_no_mesh_is_missing_and_not_an_error(tmp_path, ending, co
     assert missing.reason
 
 
+@pytest.mark.parametrize("geometry", [Box((0, 0, 0)), Cylinder(0, 1), Sphere(0), Box((1e300, 1, 1))])
+def test_a_primitive_that_nobody_can_see_is_missing(geometry):
+    missing = Meshes().draw(shape(geometry))
+    assert isinstance(missing, Missing)
+    assert missing.uri.endswith("of link 'base'")
+
+
 def test_a_format_nobody_reads_says_which_are_read(tmp_path):
     (tmp_path / "old.mesh").write_bytes(b"ogre")
     missing = Meshes().draw(shape(MeshFile(str(tmp_path / "old.mesh"))))

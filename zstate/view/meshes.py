@@ -41,7 +41,11 @@ class Meshes:
         """The shape in its own colours, or all ``over`` in one; or why it cannot be drawn."""
         geometry = shape.geometry
         if not isinstance(geometry, MeshFile):
-            return Drawing(self._paint((geometry, shape.texture is not None), shape, over))
+            source = (geometry, shape.texture is not None)
+            if self._pack(source).triangle_count:
+                return Drawing(self._paint(source, shape, over))
+            name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
+            return Missing(name, "there is nothing to see: it has no size, or one beyond all measure")
         found = self._paths.find(geometry.uri)
         if isinstance(found, Missing):
             return found

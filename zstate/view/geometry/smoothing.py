@@ -35,6 +35,8 @@ def smooth(
     exporter that made every triangle flat say nothing. Triangles that are none (of no area, or not
     finite) are left out.
     """
+    with np.errstate(over="ignore"):
+        points = points.astype(np.float32).astype(np.float64)  # as they will be drawn
     triangles = triangles[_proper(points, triangles)]
     rows = triangles.ravel()
     areas = _areas(points, triangles)
@@ -56,7 +58,7 @@ def smooth(
 
 
 def _proper(points: Corners, triangles: NDArray[np.intp]) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore"):
         area = np.linalg.norm(_areas(points, triangles)[::3], axis=-1)
     return np.isfinite(area) & (area > 0.0)
 
