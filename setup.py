@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: the package holds the robots of models/, and the C extension is optional."""
+"""What pyproject.toml cannot say: the package has the robots of models/, and the C extension is optional."""
 
 import sys
 from pathlib import Path
