@@ -168,6 +168,7 @@ def test_a_writer_that_is_stopped_is_told_from_one_that_is_gone(spawn: Spawn, fr
     started(spawn, "router", "--listen", endpoint).line()
     child = started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint)
     child.line()
+    assert zstate("wait", "robot", "rrbot", "--connect", endpoint).returncode == 0
     os.kill(child.process.pid, signal.SIGSTOP)
     found = broken_link("rrbot", "--connect", endpoint)
     assert found["name"] == "writers"
