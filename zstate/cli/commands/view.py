@@ -42,7 +42,15 @@ def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) ->
     help="Pictures a second [Hz].",
 )
 @click.option("--snapshot", callback=_checked_picture, metavar="FILE.png", help="Write one picture, and end.")
-@click.option("--size", nargs=2, type=click.IntRange(16, 8192), default=(1280, 800), help="Of that picture.")
+@click.option(
+    "--size",
+    nargs=2,
+    type=click.IntRange(16, 8192),
+    default=(1280, 800),
+    show_default=True,
+    metavar="WIDTH HEIGHT",
+    help="Of that picture, in pixels.",
+)
 @session_options
 def view_command(
     *,
