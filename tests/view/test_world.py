@@ -149,3 +149,14 @@ def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
         assert world.robots() == ("r1",)
         assert world.moment().known.all()
         assert world.silent_s("r1") is None
+
+
+def test_robots_that_speak_ros_are_seen_like_others(sessions):
+    with (
+        StatePublisher(sessions[0], MODEL, wires="ros2") as publisher,
+        World(sessions[1], wire="ros2") as world,
+    ):
+        publisher.publish([0.5, -0.5])
+        until(lambda: world.moment().stamp is not None)
+        assert [model.digest for model in world.models.values()] == [MODEL.digest]
+        assert world.moment().known.all()

@@ -40,21 +40,22 @@ def recording_among(robots: Sequence[str]) -> Path | None:
     return files[0] if files else None
 
 
-def chosen_sliders(session: Session, robots: Sequence[str]) -> Iterator[Sliders]:
+def chosen_sliders(session: Session, robots: Sequence[str], wire: str) -> Iterator[Sliders]:
     """Sliders of each robot that is named, or of all that are announced."""
-    announced = [info.name for info in discover(session, _MEETING_S if robots else _ANNOUNCED_WITHIN_S)]
+    within_s = _MEETING_S if robots else _ANNOUNCED_WITHIN_S
+    announced = [info.name for info in discover(session, within_s, wire=wire)]
     if not robots and not announced:
         fail("no robot is announced that could be moved; name one, as in `zstate view panda --sliders`")
     for one in robots or announced:
-        model, name = _announced_model(session, one) if one in announced else load_robot(one, None)
-        sliders = Sliders(session, model, name)
+        model, name = _announced_model(session, one, wire) if one in announced else load_robot(one, None)
+        sliders = Sliders(session, model, name, wires=(wire,))
         if sliders.refusal:
             note(f"{name!r} is not moved: {sliders.refusal}", robot=name)
         yield sliders
 
 
-def _announced_model(session: Session, robot: str) -> tuple[RobotModel, str]:
-    with World(session, (robot,)) as world:
+def _announced_model(session: Session, robot: str, wire: str) -> tuple[RobotModel, str]:
+    with World(session, (robot,), wire=wire) as world:
         if not _until(lambda: robot in world.models, _ANNOUNCED_WITHIN_S):
             fail(f"{robot!r} is announced, but not what it looks like; `zstate doctor {robot}` says more")
         return world.models[robot], robot

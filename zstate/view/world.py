@@ -22,7 +22,8 @@ class World(Closing):
     """Every robot that is announced, or those of ``robots``, with what is known of them.
 
     Where the ``session`` is None nothing is followed and ``buffer`` is all there is: a recording, see
-    ``of_recording``. Otherwise it is filled by ``listener``. Methods may be called from any thread.
+    ``of_recording``. Otherwise it is filled by ``listener``, which hears ``wire``. Methods may be called
+    from any thread.
     """
 
     def __init__(
@@ -30,6 +31,7 @@ class World(Closing):
         session: Session | None,
         robots: Sequence[str] = (),
         *,
+        wire: str = "native",
         buffer: TransformBuffer | None = None,
         history_s: float = 30.0,
     ) -> None:
@@ -38,7 +40,7 @@ class World(Closing):
         self.listener: TransformListener | None = None
         if session is not None:
             followed = robots[0] if len(robots) == 1 else ANY
-            self.listener = TransformListener(session, followed, self.buffer)
+            self.listener = TransformListener(session, followed, self.buffer, wire)
         self._shown = frozenset(robots)
         self._version = 0
         self._models: Mapping[str, RobotModel] = {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_rate, session_options
+from zstate.cli.options import checked_rate, session_options, wire_option
 
 if TYPE_CHECKING:
     from zstate.view.sliders import Sliders
@@ -51,6 +51,7 @@ def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) ->
     metavar="WIDTH HEIGHT",
     help="Of that picture, in pixels.",
 )
+@wire_option
 @session_options
 def view_command(
     *,
@@ -62,6 +63,7 @@ def view_command(
     rate: float,
     snapshot: Path | None,
     size: tuple[int, int],
+    wire: str,
 ) -> None:
     """Draw the announced robots, or those that are named, in a browser.
 
@@ -78,6 +80,7 @@ def view_command(
     zstate view
     zstate view panda --sliders
     zstate view run.mcap
+    zstate view --wire ros2                 # robots of ROS 2 nodes that run rmw_zenoh
     zstate view panda --snapshot panda.png
     zstate view --host 0.0.0.0 --port 9000
     """
@@ -94,11 +97,11 @@ def view_command(
     with ExitStack() as opened:
         moved: list[Sliders] = []
         if recording is None:
-            session = opened.enter_context(open_session(network))
+            session = opened.enter_context(open_session(network, (wire,)))
             if sliders:
-                moved = [opened.enter_context(one) for one in chosen_sliders(session, robots)]
+                moved = [opened.enter_context(one) for one in chosen_sliders(session, robots, wire)]
             robots = tuple(one.robot for one in moved) or robots
-            world = opened.enter_context(World(session, robots))
+            world = opened.enter_context(World(session, robots, wire=wire))
         else:
             robots = ()
             world = opened.enter_context(World.of_recording(recording))
