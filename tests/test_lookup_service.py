@@ -175,7 +175,7 @@ def test_a_stranger_in_another_process_asks_through_a_router(spawn: Callable[...
         assert (is_answer, error["error"], error["near_misses"]) == (False, "UnknownFrame", ["tool"])
         is_answer, error = said(f"target=world;source=tool;at={STAMP + 12_000_000}")
         assert (is_answer, error["error"]) == (False, "InFuture")
-        assert "12.0 ms after the newest sample" in str(error["message"])
+        assert "12.0 ms after the only sample" in str(error["message"])
         is_answer, error = said("target=world;source=tool;when=now")
         assert (is_answer, error["error"]) == (False, "InvalidInput")
         assert "no parameter 'when'" in str(error["message"])

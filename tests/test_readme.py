@@ -18,16 +18,17 @@ README = Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+def blocks(language: str, text: str = TEXT) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 PROGRAMS = {block.split("\n", 1)[0].removeprefix("# "): block for block in blocks("python")}
 
 
-def commands() -> list[list[str]]:
-    """Every ``$ zstate ...`` line, without its comment."""
-    lines = [line for block in blocks("console") for line in block.splitlines()]
+def commands(section: str) -> list[list[str]]:
+    """Every ``$ zstate ...`` line of a section, without its comment."""
+    text = TEXT.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    lines = [line for block in blocks("console", text) for line in block.splitlines()]
     return [line.split("#")[0].split()[1:] for line in lines]
 
 
@@ -82,7 +83,7 @@ def test_the_buffer_answers_without_a_network(spawn: Callable[..., Child]) -> No
 
 @pytest.mark.robots
 def test_the_three_terminals_show_the_hand(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
-    joints, publish, tf = commands()[:3]
+    joints, publish, tf = commands("Three terminals")
     first, second, third = start(joints), start(publish), start(tf)
     lines: list[str] = []
     assert third.stdout
@@ -98,12 +99,19 @@ def test_the_three_terminals_show_the_hand(start: Callable[[list[str]], subproce
 
 
 @pytest.mark.robots
+def test_the_view_with_sliders_tells_its_address(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
+    _, sliders, _ = commands("See it")
+    view = start([*sliders, "--port", "0"])
+    assert view.stdout is not None
+    assert view.stdout.readline().startswith("the view is at http://127.0.0.1:")
+
+
 def test_the_commands_for_routers_work_with_this_host_in_place_of_another(
     start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
 ) -> None:
     router, publish, tf = (
         [re.sub(r"tcp/[\d.]+:\d+", f"tcp/127.0.0.1:{free_port}", word) for word in command]
-        for command in commands()[3:6]
+        for command in commands("Behind routers")[:3]
     )
     running = start(router)
     assert running.stdout
@@ -120,7 +128,7 @@ def test_the_commands_for_ros_work_at_any_router(
     start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    router, publish, tf = commands()[6:9]
+    router, publish, tf = commands("With ROS 2, without ROS")[:3]
     running = start([*router, "--listen", endpoint])
     assert running.stdout
     assert str(free_port) in running.stdout.readline()
@@ -139,7 +147,7 @@ def test_a_recording_is_made_described_asked_and_played_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    record, info, replay = commands()[9:12]
+    record, info, replay = commands("Recordings")[:3]
     robot = start(["zstate", "publish", "panda", "--source", "sine"])
     recorder = start(record)
     assert recorder.wait(DEADLINE_S) == 0, recorder.communicate()[1]

@@ -70,6 +70,7 @@ def test_a_robot_that_cannot_move_has_no_dials():
     assert dials.positions(np.empty(0)).shape == (0,)
 
 
+@pytest.mark.robots
 def test_pandas_dials_are_its_joints():
     panda = load_model("panda")
     assert tuple(dial.name for dial in Dials(panda).dials) == panda.joint_names
