@@ -233,9 +233,9 @@ def poses_check(ear: Ear, model: RobotModel | None) -> Check:
     frames, robot = ear.listener.buffer.frames(), ear.info.name
     if not frames:
         return skipped("poses", "no frame is known")
-    roots = [frame.name for frame in frames if frame.parent is None]
+    roots = sorted(frame.name for frame in frames if frame.parent is None)
     if len(roots) > 1:
-        text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(sorted(roots))}"
+        text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(roots)}"
         return warning("poses", text, f"zstate static {roots[0]} {roots[1]} --xyz 0 0 0  # joins two of them")
     ends = telling_links(model, 1) if model is not None else ()
     target, source = roots[0], f"{robot}/{ends[0]}" if ends else frames[-1].name
