@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -265,3 +266,32 @@ def test_every_wait_of_many_threads_is_woken() -> None:
         waiter.join(10.0)
     assert sorted(answer.stamp for answer in answers) == stamps
     assert time.monotonic() - begin < 10.0
+
+
+def test_a_sample_that_comes_while_one_who_waits_leaves_wakes_the_others() -> None:
+    buffer = TransformBuffer()
+    buffer.insert(moving("a", "b", NOW))
+    stamps = itertools.count(NOW + 1)
+
+    class Interrupted(dict[Any, Any]):
+        """Whenever it is changed, a sample comes first."""
+
+        def pop(self, *arguments: Any) -> Any:
+            found = super().pop(*arguments)
+            buffer.insert(moving("a", "b", next(stamps)))
+            return found
+
+        def __setitem__(self, key: Any, value: Any) -> None:
+            buffer.insert(moving("a", "b", next(stamps)))
+            super().__setitem__(key, value)
+
+        def __delitem__(self, key: Any) -> None:
+            buffer.insert(moving("a", "b", next(stamps)))
+            super().__delitem__(key)
+
+    heard: list[int | None] = []
+    with buffer.watch("a", "b", lambda news: heard.append(news.stamp)):
+        leaving = buffer.watch("a", "b", lambda _: None)
+        buffer._room._by_track = Interrupted(buffer._room._by_track)
+        leaving.close()
+        assert heard[-1] == next(stamps) - 1 > NOW

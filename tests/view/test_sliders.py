@@ -109,6 +109,7 @@ def test_where_somebody_else_writes_the_joints_nothing_is_published_and_it_is_sa
     with StatePublisher(sessions[1], RRBOT, "r1", program="driver") as driver:
         driver.publish([0.0, 0.0])
         with Sliders(sessions[0], RRBOT, "r1") as sliders:
+            until(lambda: sliders.refusal)
             assert sliders.achieved_hz is None
             assert f"pid {os.getpid()}" in sliders.refusal
             assert "driver@" in sliders.refusal

@@ -101,9 +101,12 @@ class WaitingRoom:
         for track in marks.keys() - before:
             self._by_track[track] = (*self._by_track.get(track, ()), waiter)
         for track in before - marks.keys():
-            left = _without(self._by_track.pop(track), waiter)
+            left = _without(self._by_track[track], waiter)
+            # In one step: whoever notifies meanwhile finds those who stay.
             if left:
                 self._by_track[track] = left
+            else:
+                del self._by_track[track]
 
     def notify(self, *tracks: Track) -> None:
         """Wake those whose data is there: samples of ``tracks`` have come, or the tree has changed."""
