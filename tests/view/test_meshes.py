@@ -42,11 +42,11 @@ DAE = """<?xml version="1.0"?>
 
 
 def shape(geometry: object, color: tuple[float, ...] | None = None, texture: str | None = None) -> Shape:
-    return Shape("base", "visual", IDENTITY, geometry, color, texture)  # type: ignore[arg-type]
+    return Shape("base", "visual", IDENTITY, geometry, color, texture)
 
 
 def drawn(one: Shape, meshes: Meshes | None = None, **options: object) -> Drawing:
-    drawing = (meshes or Meshes()).draw(one, **options)  # type: ignore[arg-type]
+    drawing = (meshes or Meshes()).draw(one, **options)
     assert isinstance(drawing, Drawing), str(drawing)
     return drawing
 

@@ -63,7 +63,7 @@ def test_a_websocket_comes_through_the_same_door():
         with connect(address, subprotocols=PROTOCOL, compression=None) as socket:
             assert socket.recv(timeout=10)
         with pytest.raises(InvalidStatus) as caught:
-            connect(address, subprotocols=PROTOCOL, origin="https://evil.example")  # type: ignore[arg-type]
+            connect(address, subprotocols=PROTOCOL, origin="https://evil.example")
         assert caught.value.response.status_code == 403
 
 

@@ -114,7 +114,7 @@ class WaitingRoom:
             self._shown = self.tree.version
             self._show_tree()
         elif self._by_track:
-            for waiter in self._by_track.get(tracks[0], ()) if len(tracks) == 1 else self._at(tracks):
+            for waiter in self._at(tracks):
                 if waiter.expected.has_come():
                     waiter.wake()
 
@@ -130,6 +130,8 @@ class WaitingRoom:
             waiter.wake()
 
     def _at(self, tracks: Sequence[Track]) -> Iterable[Waiter]:
+        if len(tracks) == 1:
+            return self._by_track.get(tracks[0], ())
         # Once each, though many wait for several of them.
         return dict.fromkeys(waiter for track in tracks for waiter in self._by_track.get(track, ()))
 

@@ -53,18 +53,9 @@ from zstate.errors.base import (
     Who,
     ZStateError,
 )
-from zstate.errors.lookup import (
-    AmbiguousFrame,
-    Disconnected,
-    InFuture,
-    InPast,
-    LookupFailed,
-    NoData,
-    Stale,
-    UnknownFrame,
-    WaitTimeout,
-    timed_out,
-)
+from zstate.errors.instants import InFuture, InPast, NoData, Stale
+from zstate.errors.lookup import AmbiguousFrame, Disconnected, LookupFailed, UnknownFrame
+from zstate.errors.timeouts import WaitTimeout, timed_out
 from zstate.errors.times import duration_text
 
 __all__ = [

@@ -1,17 +1,13 @@
-"""Errors about questions that a buffer cannot answer."""
+"""Errors about questions that a buffer cannot answer: what all of them tell, and those about frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 from zstate.errors.base import ZStateError
-from zstate.errors.times import difference_text, duration_text
-
-_IN_THEIR_TIME = (
-    "; ask in the time that they keep, or for the newest instant (at=None), and let all writers keep one time"
-)
+from zstate.errors.times import duration_text
 
 # An offset of clocks that is smaller than this does not explain why there is no answer.
 _WORTH_SAYING_NS = 1_000_000
@@ -162,169 +158,6 @@ class Disconnected(LookupFailed):
             f"root {source_root!r}; missing is an edge whose child is {source_root!r} or {target_root!r} "
             f"(for instance `zstate static {target_root} {source_root} --xyz ...`)"
         )
-
-
-class NoData(LookupFailed):
-    """An edge of the path has no sample at all, or ``latest`` was asked of static edges only."""
-
-    def explanation(self) -> str:
-        if self.edge is None:
-            return "every edge of the path is static, so there is no newest instant; ask `lookup` instead"
-        if self.newest is not None:
-            return f"too little is known of {self._edge_text()}"
-        return f"no sample of {self._edge_text()} has arrived yet; is its writer running (`zstate ls`)?"
-
-
-class _OutsideHistory(LookupFailed):
-    """The instant asked for is not among those that samples tell of."""
-
-    @property
-    def happening(self) -> str:
-        """What happened, with which values, without advice."""
-        raise NotImplementedError
-
-    @property
-    def is_of_another_time(self) -> bool:
-        """Whether what was asked and the samples are stamped by clocks that say nothing of each other."""
-        return bool(self._difference)
-
-    @property
-    def _difference(self) -> str:
-        if self.requested is None or self.newest is None:
-            return ""
-        return difference_text(self.requested, self.newest)
-
-    @property
-    def _has_one_sample(self) -> bool:
-        return self.newest is not None and self.oldest == self.newest
-
-    def _told(self, what: str) -> str:
-        """``what``, and why the stamps are so far apart where that can be seen."""
-        return f"{what}: {self._difference}" if self._difference else what
-
-    def explanation(self) -> str:
-        advice = _IN_THEIR_TIME if self._difference else self._advice()
-        return f"{self.happening}{advice}{_also(self._clock_text())}"
-
-    def _advice(self) -> str:
-        raise NotImplementedError
-
-
-class InFuture(_OutsideHistory):
-    """The instant asked for lies after the newest sample of ``edge``."""
-
-    @property
-    def happening(self) -> str:
-        which = "only" if self._has_one_sample else "newest"
-        return self._told(
-            f"asked {_span(self.requested, self.newest)} after the {which} sample of {self._edge_text()}"
-        )
-
-    def _advice(self) -> str:
-        return (
-            "; wait for it (timeout_s=...), ask for the newest instant (at=None), or predict (predict_s=...)"
-        )
-
-
-class InPast(_OutsideHistory):
-    """The instant asked for lies before the oldest sample of ``edge``; waiting cannot mend it."""
-
-    @property
-    def happening(self) -> str:
-        which = "only" if self._has_one_sample else "oldest"
-        return self._told(
-            f"asked {_span(self.oldest, self.requested)} before the {which} sample of {self._edge_text()}"
-        )
-
-    def _advice(self) -> str:
-        if self._has_one_sample:
-            return (
-                " so far; ask for the newest instant (at=None), or start the listener earlier; what never "
-                "moves is published as static (`zstate static`)"
-            )
-        return (
-            f"; the history there spans {_span(self.newest, self.oldest)}: start the listener earlier or "
-            "give the buffer more history_s"
-        )
-
-
-class Stale(LookupFailed):
-    """The answer is older than ``max_age_s`` allows."""
-
-    def __init__(
-        self,
-        target: str,
-        source: str,
-        *,
-        age_s: float,
-        max_age_s: float,
-        edge: tuple[str, str] | None = None,
-        requested: int | None = None,
-        oldest: int | None = None,
-        newest: int | None = None,
-        rate_hz: float | None = None,
-        writer: str | None = None,
-    ) -> None:
-        super().__init__(
-            target,
-            source,
-            edge=edge,
-            requested=requested,
-            oldest=oldest,
-            newest=newest,
-            rate_hz=rate_hz,
-            writer=writer,
-        )
-        self.age_s = age_s
-        self.max_age_s = max_age_s
-
-    def explanation(self) -> str:
-        if self.clock_offset_ns is None:
-            clocks = ", and do the clocks of both machines agree?"
-        else:
-            clocks = f"? {self._clock_text()}".rstrip()
-        return (
-            f"the newest answer is {duration_text(round(self.age_s * 1e9))} old, {self.max_age_s:g} s are "
-            f"allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`){clocks}"
-        )
-
-
-class WaitTimeout(LookupFailed, TimeoutError):
-    """A wait that ran out. Always raised as a subclass of the reason it still waited for."""
-
-    reason: type[LookupFailed] = LookupFailed
-    waited_s: float = 0.0
-
-    def __str__(self) -> str:
-        return f"after waiting {self.waited_s:g} s, {super().__str__()}"
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restored_timeout, (self.reason, self.facts())
-
-
-@cache
-def _timeout_class(reason: type[LookupFailed]) -> type[WaitTimeout]:
-    facts = {"reason": reason, "__doc__": WaitTimeout.__doc__}
-    return type(f"{reason.__name__}Timeout", (WaitTimeout, reason), facts)
-
-
-def _restored_timeout(reason: type[LookupFailed], facts: dict[str, Any]) -> WaitTimeout:
-    error = _timeout_class(reason).__new__(_timeout_class(reason))
-    error.__dict__.update(facts)
-    return error
-
-
-def timed_out(reason: LookupFailed, waited_s: float) -> WaitTimeout:
-    """The same facts as ``reason``, as an error that is also a TimeoutError."""
-    return _restored_timeout(type(reason), {**reason.__dict__, "waited_s": waited_s})
-
-
-def _span(later: int | None, earlier: int | None) -> str:
-    return "some time" if later is None or earlier is None else duration_text(later - earlier)
-
-
-def _also(text: str) -> str:
-    return f"; {text}" if text else ""
 
 
 def _any_of(names: Sequence[str]) -> str:
