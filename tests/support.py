@@ -9,7 +9,8 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 DEADLINE_S = 15.0
 SOON_S = 3.0
@@ -28,6 +29,24 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
     while not condition():
         assert time.monotonic() < deadline, f"not so within {timeout_s} s"
         time.sleep(0.002)
+
+
+@contextmanager
+def again_and_again(action: Callable[[], object]) -> Iterator[None]:
+    """Meanwhile ``action`` is done a hundred times a second."""
+    stop = threading.Event()
+
+    def repeat() -> None:
+        while not stop.wait(0.01):
+            action()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 class Stepping:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 from looking import RRBOT, Spawn, failure, interrupted, standing, started, zstate
-from support import until
+from support import again_and_again, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.clock import ManualClock
@@ -25,21 +25,14 @@ SECOND = 1_000_000_000
 @contextmanager
 def simulation(start: int = 5 * SECOND, speed: float = 10.0) -> Iterator[None]:
     """A time that goes ``speed`` times as fast as the system's, and is told a hundred times a second."""
-    stop = threading.Event()
-
-    def tell() -> None:
+    with connect() as session, ClockPublisher(session) as publisher:
         began = time.monotonic_ns()
-        while not stop.wait(0.01):
+
+        def tell() -> None:
             publisher.publish(start + round(speed * (time.monotonic_ns() - began)))
 
-    with connect() as session, ClockPublisher(session) as publisher:
-        thread = threading.Thread(target=tell)
-        thread.start()
-        try:
+        with again_and_again(tell):
             yield
-        finally:
-            stop.set()
-            thread.join()
 
 
 def test_publish_stamps_and_paces_by_the_simulated_time():

@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import Any
 
 import pytest
 from looking import EVERYTHING, RRBOT, Spawn, failure, standing, started, zstate
-from support import a_free_port
+from support import a_free_port, again_and_again
 
 from zstate import StatePublisher, connect, load_model
 from zstate.clock import ManualClock, SystemClock
@@ -44,24 +43,6 @@ def warnings(*arguments: str) -> dict[str, str]:
     """What is said of the links that might not hold, while none is broken."""
     checks = diagnosed(*arguments, code=0)["checks"]
     return {check["name"]: check["text"] for check in checks if check["state"] == "warning"}
-
-
-@contextmanager
-def again_and_again(action: Callable[[], object]) -> Iterator[None]:
-    """Meanwhile ``action`` is done a hundred times a second."""
-    stop = threading.Event()
-
-    def repeat() -> None:
-        while not stop.wait(0.01):
-            action()
-
-    thread = threading.Thread(target=repeat)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 @contextmanager

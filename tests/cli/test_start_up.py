@@ -12,27 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from bench.micro.startup import BARE
 from zstate.cli.main import group
 
 pytestmark = pytest.mark.processes
 
 ROUNDS = 5
 AT_MOST = 2.5
-
-BARE = """
-import click
-
-@click.group()
-def group():
-    "A program."
-
-@group.command()
-@click.option("--number", type=int)
-def command(number):
-    "A command."
-
-group()
-"""
 
 
 def processor_s(*command: str) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from playwright.sync_api import Browser, Locator
     from playwright.sync_api import Page as Tab
+    from viser import ViserServer
 
     from zstate.net.session import Session
     from zstate.view.page import Page
@@ -77,6 +79,25 @@ class Looker:
             for part, url in parts
             if part.scheme not in ("data", "blob") and part.hostname not in LOOPBACK
         ]
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    """A page that no browser shows."""
+    pytest.importorskip("viser")
+    from zstate.view.page import Page
+
+    with Page(port=0) as opened:
+        yield opened
+
+
+@pytest.fixture
+def server(page: Page) -> Iterator[ViserServer]:
+    """The server of that page, with nothing on it."""
+    page.server.scene.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # viser warns of nodes that are removed twice
+        yield page.server
 
 
 @pytest.fixture(scope="session")

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import viser
+from support import until
 
 from zstate import se3
 from zstate.view.moment import Moment, Tree
+from zstate.view.scene.scene import Scene
 
 Pose = Sequence[float]
 HERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -33,6 +35,17 @@ def moment(of: Tree, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequenc
     rows = np.array([poses.get(name, HERE) for name in of.names])
     known = np.array([name not in unknown for name in of.names])
     return Moment(stamp, of, rows, known)
+
+
+def drawn(scene: Scene, shown) -> None:
+    """Show a moment until nothing is missing from the picture."""
+
+    def complete() -> bool:
+        scene.show(shown, "map")
+        return not scene.busy
+
+    until(complete)
+    scene.show(shown, "map")
 
 
 def handles(server: viser.ViserServer, kind: type[Any]) -> dict[str, Any]:

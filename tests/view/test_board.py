@@ -8,17 +8,10 @@ from live import RRBOT, SECOND
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
 from zstate.transform import Transform
-from zstate.view.page import Page
 from zstate.view.panels.board import Board
 from zstate.view.panels.choice import Choice, FrameChoice
 from zstate.view.scene.scene import Scene
 from zstate.view.world import World
-
-
-@pytest.fixture(scope="module")
-def page():
-    with Page(port=0) as page:
-        yield page
 
 
 @pytest.fixture

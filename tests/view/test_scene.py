@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
-from support import until
 
 viser = pytest.importorskip("viser")
 
-from drawing import at, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
+from drawing import at, drawn, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
 
 from zstate.model.urdf import parse_urdf  # noqa: E402
-from zstate.view.page import Page  # noqa: E402
 from zstate.view.scene.scene import Scene  # noqa: E402
 
 URDF = """<robot name="cart">
@@ -40,31 +35,6 @@ POSES = {
     "tug/base": at(0, 5, 0),
     "tug/wheel": at(0, 1, 0),
 }
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
-    with Page(port=0) as opened:
-        yield opened
-
-
-@pytest.fixture
-def server(page):
-    page.server.scene.reset()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # viser warns of nodes that are removed twice
-        yield page.server
-
-
-def drawn(scene: Scene, shown) -> None:
-    """Show a moment until nothing is missing from the picture."""
-
-    def complete() -> bool:
-        scene.show(shown, "map")
-        return not scene.busy
-
-    until(complete)
-    scene.show(shown, "map")
 
 
 def bodies(server) -> list[str]:

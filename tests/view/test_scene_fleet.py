@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
-from support import until
 
 viser = pytest.importorskip("viser")
 
-from drawing import at, handles, moment, told, tree  # noqa: E402
+from drawing import at, drawn, handles, moment, told, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
 from zstate.model.shapes import Box, MeshFile, Shape, Sphere  # noqa: E402
 from zstate.model.urdf import parse_urdf  # noqa: E402
-from zstate.view.page import Page  # noqa: E402
 from zstate.view.scene.scene import Scene  # noqa: E402
 
 CART = parse_urdf('<robot name="cart"><link name="base"/></robot>', "cart.urdf")
@@ -24,29 +20,6 @@ SHAPES = (Shape("base", "visual", ORIGIN, Box((1, 2, 3))), Shape("base", "collis
 NAMES = [f"r{k}" for k in range(5)]
 TREE = tree({"map": None} | {f"{name}/base": "map" for name in NAMES})
 POSES = {f"{name}/base": at(k, -k, 0, 0.3 * k) for k, name in enumerate(NAMES)}
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
-    with Page(port=0) as opened:
-        yield opened
-
-
-@pytest.fixture
-def server(page):
-    page.server.scene.reset()
-    return page.server
-
-
-def drawn(scene: Scene, shown) -> None:
-    """Show a moment until nothing is missing from the picture."""
-
-    def complete() -> bool:
-        scene.show(shown, "map")
-        return not scene.busy
-
-    until(complete)
-    scene.show(shown, "map")
 
 
 def fleet_of(server, names, shapes=SHAPES) -> Scene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from math import pi
 
 import numpy as np
@@ -13,24 +12,11 @@ viser = pytest.importorskip("viser")
 from drawing import at, in_fixed, is_seen, moment, told, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
-from zstate.view.page import Page  # noqa: E402
 from zstate.view.scene.nodes import Nodes  # noqa: E402
 
 ARM = tree({"map": None, "arm/base": "map", "arm/upper": "arm/base", "arm/tool": "arm/upper"})
 ALL = frozenset({*ARM.names, "cup"})
 POSES = {"arm/base": at(1, 2, 0, pi / 2), "arm/upper": at(0, 0, 0.5, 0.3), "arm/tool": at(0.4, 0, 0)}
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
-    with Page(port=0) as opened:
-        yield opened
-
-
-@pytest.fixture
-def server(page):
-    page.server.scene.reset()
-    return page.server
 
 
 def assert_placed(server, nodes: Nodes, shown, fixed: str) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
@@ -11,22 +9,9 @@ viser = pytest.importorskip("viser")
 
 from drawing import at, handles, moment, tree  # noqa: E402
 
-from zstate.view.page import Page  # noqa: E402
 from zstate.view.scene.scene import Scene  # noqa: E402
 
 TREE = tree({"map": None, "cart/base": "map", "cart/wheel": "cart/base"})
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
-    with Page(port=0) as opened:
-        yield opened
-
-
-@pytest.fixture
-def server(page):
-    page.server.scene.reset()
-    return page.server
 
 
 @pytest.fixture
