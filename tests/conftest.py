@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from support import Child, a_free_port
 
 from zstate.net.session import Session, connect
+
+# The harness is no part of the package, so it is found beside it; behind the rest: an installed zstate
+# stays the one that is tested.
+ROOT = str(Path(__file__).parents[1])
+if ROOT not in sys.path:
+    sys.path.append(ROOT)
 
 
 @pytest.fixture
