@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from math import fsum
 from statistics import median
 from typing import Any
 
@@ -83,7 +84,12 @@ class Outcome:
     @property
     def cpu_total(self) -> float:
         """CPU of all processes together [% of a core]."""
-        return sum(self.cpu_percent().values())
+        return fsum(self.cpu_percent().values())
+
+    @property
+    def cpu_between(self) -> float:
+        """CPU of those between writer and readers: a router, a master, a daemon [% of a core]."""
+        return fsum(used for role, used in self.cpu_percent().items() if role not in ("writer", "reader"))
 
     @property
     def bytes_per_s(self) -> float:

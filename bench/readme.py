@@ -38,13 +38,12 @@ def short_table(results: Results) -> str:
 
 def _cells(one: Outcome) -> list[str]:
     cpu = one.cpu_percent()
-    others = sum(cpu.values()) - cpu["writer"] - cpu["reader"]
     p50, p99 = (dash(one.latency_us(percent), number) for percent in (50, 99))
     return [
         f"{one.rate_hz:.1f} Hz",
         f"{p50} / {p99} us",
         f"{cpu['writer']:.1f} + {cpu['reader']:.1f} %",
-        f"{others:.1f} %" if others > 0.05 else "",
+        f"{one.cpu_between:.1f} %" if one.cpu_between > 0.05 else "",
         number(one.bytes_per_sample),
     ]
 
