@@ -133,6 +133,22 @@ def test_frames_in_two_trees_are_disconnected_with_both_roots() -> None:
     assert error.roots == ("a", "x")
 
 
+def test_a_connection_that_was_there_is_told_with_who_gave_it() -> None:
+    buffer = filled(static("x", "y"))
+    buffer.insert_static(static("a", "x"), writer="calibration")
+    buffer.withdraw("x")
+    error = failure(buffer, "a", "y")
+    assert isinstance(error, Disconnected)
+    assert (error.edge, error.writer) == (("a", "x"), "calibration")
+    assert error.gone_s is not None
+    assert error.gone_s >= 0.0
+    assert "'a' -> 'x' (writer calibration) was taken away just now" in str(error)
+    buffer.insert_static(static("b", "x"))
+    error = failure(buffer, "a", "y")
+    assert isinstance(error, Disconnected)
+    assert error.gone_s is None, "its root is 'b' now, which nothing ever placed"
+
+
 def test_a_missing_connection_is_blamed_before_a_bad_time() -> None:
     buffer = filled(moving("a", "b", 0), moving("x", "y", 0))
     for stamp in (-S, S):

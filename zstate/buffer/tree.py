@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import NamedTuple
 
 from zstate.buffer.edge import Edge
 from zstate.buffer.footing import Footing
 from zstate.buffer.names import Names
 from zstate.buffer.tracks import JointTrack, Track
 from zstate.errors import AmbiguousFrame, Disconnected, InsertRefused, UnknownFrame
+
+
+class _Gone(NamedTuple):
+    """An edge that was taken away, by whom it had been given, and when, by a monotonic clock [s]."""
+
+    edge: tuple[str, str]
+    writer: str | None
+    at_s: float
 
 
 class Tree:
@@ -25,6 +35,7 @@ class Tree:
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
         self.names = Names()
+        self._gone: dict[str, _Gone] = {}
         # What placed each frame before the context of untouched_on_error changed that; None outside of it.
         self._before: dict[str, Edge | None] | None = None
 
@@ -60,6 +71,9 @@ class Tree:
 
     def detach(self, child: str) -> None:
         """Take away what places ``child``; the frame stays known."""
+        edge = self.frames.get(child)
+        if edge is not None:
+            self._gone[child] = _Gone(edge.names, edge.writer, time.monotonic())
         self._place(child, None)
 
     def renew(self, track: JointTrack) -> None:
@@ -172,9 +186,16 @@ class Tree:
         source_frame = self.resolve(source, target, source)
         ways = self._ways(target_frame, source_frame)
         if ways is None:
-            roots = (self.root(target_frame), self.root(source_frame))
-            raise Disconnected(target, source, roots=roots)
+            raise self._disconnected(target, source, (self.root(target_frame), self.root(source_frame)))
         return ways
+
+    def _disconnected(self, target: str, source: str, roots: tuple[str, str]) -> Disconnected:
+        gone = [self._gone[root] for root in roots if root in self._gone]
+        if not gone:
+            return Disconnected(target, source, roots=roots)
+        last = max(gone, key=lambda one: one.at_s)
+        gone_s = time.monotonic() - last.at_s
+        return Disconnected(target, source, roots=roots, edge=last.edge, writer=last.writer, gone_s=gone_s)
 
     def _ways(self, target_frame: str, source_frame: str) -> tuple[list[Edge], list[Edge]] | None:
         above_target = list(self.upwards(target_frame))

@@ -21,7 +21,7 @@ ZStateError
 └── LookupFailed                       .target .source .edge .requested .oldest .newest .track .rate_hz ...
     ├── UnknownFrame                   never heard of it                          .name .near_misses
     ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
-    ├── Disconnected                   two trees                                  .roots
+    ├── Disconnected                   two trees                                  .roots .gone_s
     ├── NoData                         an edge without any sample
     ├── InFuture                       asked after the newest sample of an edge
     ├── InPast                         asked before the oldest sample of an edge

@@ -143,21 +143,40 @@ class AmbiguousFrame(LookupFailed):
 
 
 class Disconnected(LookupFailed):
-    """Both frames are known, but no chain of edges joins them. ``roots``: (target's, source's)."""
+    """Both frames are known, but no chain of edges joins them. ``roots``: (target's, source's).
+
+    Where one of these roots was placed before, ``edge`` and ``writer`` tell by what, and ``gone_s`` how
+    long ago [s] that was taken away.
+    """
 
     def __init__(
-        self, target: str, source: str, *, roots: tuple[str, str], requested: int | None = None
+        self,
+        target: str,
+        source: str,
+        *,
+        roots: tuple[str, str],
+        requested: int | None = None,
+        edge: tuple[str, str] | None = None,
+        writer: str | None = None,
+        gone_s: float | None = None,
     ) -> None:
-        super().__init__(target, source, requested=requested)
+        super().__init__(target, source, edge=edge, writer=writer, requested=requested)
         self.roots = roots
+        self.gone_s = gone_s
 
     def explanation(self) -> str:
         target_root, source_root = self.roots
         return (
             f"they are in two trees: {self.target!r} is under root {target_root!r}, {self.source!r} under "
             f"root {source_root!r}; missing is an edge whose child is {source_root!r} or {target_root!r} "
-            f"(for instance `zstate static {target_root} {source_root} --xyz ...`)"
+            f"(for instance `zstate static {target_root} {source_root} --xyz ...`){self._gone_text()}"
         )
+
+    def _gone_text(self) -> str:
+        if self.gone_s is None:
+            return ""
+        when = f"{int(self.gone_s)} s ago" if self.gone_s >= 1.0 else "just now"
+        return f"; {self._edge_text()} was taken away {when}"
 
 
 def _any_of(names: Sequence[str]) -> str:

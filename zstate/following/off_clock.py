@@ -5,6 +5,7 @@ from __future__ import annotations
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, stamp_text
 from zstate.errors.times import counts_from_start, duration_text, unit_mistaken
+from zstate.following.lag import LATE_NS, Lag
 from zstate.following.tally import Tally
 from zstate.wire.messages import Sample, TransformSample
 
@@ -18,6 +19,7 @@ _EVERYTHING = (-(2**63), 2**63)
 class OffClock:
     """Counts them in ``off_clock``, and logs the first of each start of a writer.
 
+    Those that are late, but not by so much, are given to a ``Lag``.
     ``is_described`` says that robots tell whose time they keep, so that one which has not yet may.
     """
 
@@ -26,6 +28,7 @@ class OffClock:
         self._tally = tally
         self._is_described = is_described
         self._reported: set[int] = set()
+        self._lag = Lag(tally)
 
     def look(self) -> tuple[int, int]:
         """The stamps [ns] between which nothing need be noted, as of now."""
@@ -33,16 +36,22 @@ class OffClock:
         if clock.domain != SYSTEM:
             return _EVERYTHING
         now = clock.now()
-        return now - FAR_NS, now + FAR_NS
+        return now - LATE_NS, now + FAR_NS
 
     def note(self, robot: str, writer: str | None, sample: Sample) -> None:
         """A sample outside of that."""
         if not self._keeps_system_time(robot, sample):
             return
+        now = self._buffer.clock.now()
+        who = f", which {writer} writes," if writer else ""
+        samples_of = f"samples of {robot!r}{who}"
+        if abs(sample.stamp - now) <= FAR_NS:
+            self._lag.note(samples_of, sample.session, now - sample.stamp, now)
+            return
         self._tally.count("off_clock")
         if sample.session not in self._reported:
             self._reported.add(sample.session)
-            self._tally.note(f"off clock {sample.session}", self._text(robot, writer, sample.stamp))
+            self._tally.note(f"off clock {sample.session}", _text(samples_of, sample.stamp, now))
 
     def _keeps_system_time(self, robot: str, sample: Sample) -> bool:
         kept = self._buffer.domain.of(robot)
@@ -50,14 +59,6 @@ class OffClock:
             # Whose time it is stands in the description, which is on its way, or will never come.
             return isinstance(sample, TransformSample) and sample.edges is not None
         return kept in (None, "", SYSTEM)
-
-    def _text(self, robot: str, writer: str | None, stamp: int) -> str:
-        now = self._buffer.clock.now()
-        who = f", which {writer} writes," if writer else ""
-        return (
-            f"samples of {robot!r}{who} are stamped {_apart(stamp - now)} this machine's time "
-            f"({stamp_text(stamp)}): {likely_cause(stamp, now)}; they are used and counted in off_clock"
-        )
 
 
 def likely_cause(stamp: int, now: int) -> str:
@@ -73,6 +74,13 @@ def likely_cause(stamp: int, now: int) -> str:
     if rest < 2 * FAR_NS and abs(hours) <= 28:
         return "whole hours: the writer takes its local time for UTC, or the other way round"
     return "the clock of one of the two machines was never set (NTP); or what comes is a recording"
+
+
+def _text(samples_of: str, stamp: int, now: int) -> str:
+    return (
+        f"{samples_of} are stamped {_apart(stamp - now)} this machine's time "
+        f"({stamp_text(stamp)}): {likely_cause(stamp, now)}; they are used and counted in off_clock"
+    )
 
 
 def _apart(offset_ns: int) -> str:

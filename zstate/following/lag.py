@@ -1,0 +1,52 @@
+"""Lag: samples that come later after their stamps than those before them. They are used, and named once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zstate.errors.times import duration_text
+from zstate.following.bounded import remember
+from zstate.following.tally import Tally
+
+LATE_NS = 1_000_000_000
+"""Younger samples are never looked at: what waits for less is no backlog."""
+
+_GROWN_NS = 1_000_000_000
+
+# After so long without a late one what comes is another backlog, such as that of another cut.
+_PAUSE_NS = 2_000_000_000
+
+
+@dataclass(slots=True)
+class _Backlog:
+    least_ns: int
+    last_ns: int
+
+
+class Lag:
+    """Logs, once for each start of a writer, that its samples fell behind by one second more than before.
+
+    The clocks of both sides may disagree: only what the age of samples at arrival grows by counts. A burst
+    after a cut begins with its oldest sample, so that it does not look like this.
+    """
+
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
+        self._backlogs: dict[int, _Backlog] = {}
+
+    def note(self, samples_of: str, session: int, age_ns: int, now_ns: int) -> None:
+        """A sample of ``session`` has come ``age_ns`` after its stamp, which is late."""
+        known = self._backlogs.get(session)
+        if known is None or now_ns - known.last_ns > _PAUSE_NS:
+            remember(self._backlogs, session, _Backlog(age_ns, now_ns))
+            return
+        known.last_ns = now_ns
+        known.least_ns = min(known.least_ns, age_ns)
+        if age_ns > known.least_ns + _GROWN_NS:
+            age, before = duration_text(age_ns), duration_text(known.least_ns)
+            self._tally.note(
+                f"lag {session}",
+                f"{samples_of} come {age} after their stamps, {before} shortly before: more is sent than the "
+                "network carries, or than this program takes; `zstate monitor` shows where it waits, and a "
+                "lower rate helps either way",
+            )
