@@ -128,7 +128,11 @@ class Fuzz:
             count = self.pick(history.width, history.width // 2, -1, 2**62, *ODD)
             size = count if isinstance(count, int) and 0 <= count < 100 else 3
             rates = self.pick(None, self.array(history.width - size))
-            history.take(self.stamp(), self.array(size), rates, count)
+            numbers = self.array(size)
+            if isinstance(numbers, np.ndarray) and self.random.random() < 0.4:
+                numbers = numbers.tobytes()[self.pick(0, 0, 0, 1, 8) :]
+            history.take(self.stamp(), numbers, rates, count)
+            self.kernel.block_of(numbers, count)
         history.reaches(self.stamp())
 
     def replace(self) -> None:

@@ -186,7 +186,8 @@ def test_a_killed_and_restarted_publisher_is_followed_and_the_other_robot_untouc
         again = started(spawn(PUBLISHER, "r1", PEER))
         # A new epoch for r1: nothing is kept that the old one said, though its history is 10 s.
         until(lambda: (lower("r1").oldest or 0) > killed_at, timeout_s=5.0)
-        assert lower("r2").oldest == oldest
+        # Of r2 all is kept; what it said before it was heard may have been learned since.
+        assert 0 < (lower("r2").oldest or 0) <= (oldest or 0)
         until(lambda: f"pid {again.process.pid}" in (lower("r1").writer or ""))
         stats = listener.stats
         assert (stats.late, stats.refused) == (0, {})

@@ -154,6 +154,7 @@ def test_several_robots_have_a_namespace_and_a_prefix_each(sessions, tmp_path: P
         left.publish([0.1, 0.2], stamp=STAMP)
         right.publish(SineSource(GRIPPER).read(STAMP).positions, stamp=STAMP)
         until(lambda: count(recorder, "left", "tf") == count(recorder, "right", "tf") == 1)
+        until(lambda: all(count(recorder, robot, "tf_static") for robot in ("left", "right")))
     (state,) = read(tmp_path / "run.mcap", "/left/joint_states")
     assert state.position.tolist() == [0.1, 0.2]
     assert len(read(tmp_path / "run.mcap", "/right/joint_states")) == 1
@@ -307,6 +308,7 @@ def test_what_ros_nodes_say_is_recorded_as_they_say_it(sessions, tmp_path: Path)
         StatePublisher(writer, RRBOT, "r1", wires=("ros2:domain=3",)) as publisher,
     ):
         until(lambda: count(recorder, "ros", "robot_description") == 1)
+        until(lambda: count(recorder, "ros", "tf_static") == 1)
         positions = [0.5, 0.25]
         until(lambda: publisher.publish(positions) or count(recorder, "ros", "tf") > 3)
     assert recorder.failure is None

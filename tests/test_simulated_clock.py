@@ -31,8 +31,10 @@ class Waiting:
     def __init__(self, clock: SimulatedClock, stamp: int) -> None:
         self.stop = threading.Event()
         self.reached: bool | None = None
+        waits = len(clock._waits)
         self._thread = threading.Thread(target=self._wait, args=(clock, stamp), daemon=True)
         self._thread.start()
+        until(lambda: len(clock._waits) != waits or self.is_over)
 
     def _wait(self, clock: SimulatedClock, stamp: int) -> None:
         self.reached = clock.wait_until(stamp, self.stop)
@@ -206,7 +208,7 @@ def test_a_rate_follows_a_time_that_goes_back_while_it_waits(sessions):
             target=lambda: ticks.extend(Rate(10.0, clock, threading.Event(), 0.5)), daemon=True
         )
         counting.start()
-        until(lambda: len(ticks) == 1)
+        until(lambda: len(ticks) == 1 and clock._waits)
         tell(40 * SECOND)
         until(lambda: len(ticks) == 2)
         tell(40 * SECOND + 300 * MS)
@@ -249,6 +251,7 @@ def test_a_publisher_and_a_listener_on_simulated_time_agree(sessions):
             target=lambda: robot.run(SineSource(RRBOT), 100.0, seconds=1.0), daemon=True
         )
         running.start()
+        until(lambda: robot.stats.sent)  # at the instant that was told last
         for n in range(1, 101):
             tell(SECOND + n * 10 * MS)
         running.join(10.0)

@@ -12,6 +12,8 @@ REVISION: int
 Description: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
 Blame: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
 
+def block_of(numbers: object, count: int, /) -> bytes | None: ...
+
 class Block(Buffer):
     @property
     def capacity(self) -> int: ...

@@ -12,7 +12,7 @@ from typing import Literal
 from zstate.errors import InvalidInput
 
 VARIABLE = "ZSTATE_KERNEL"
-REVISION = 3
+REVISION = 4
 """What the extension's own REVISION has to be; see there."""
 
 

@@ -71,6 +71,7 @@ class TransformListener(Closing):
             self.buffer.use_clock(clock)
         self._wire = wire_named(wire)
         self._follow: Follow = follow
+        self._is_shared = follow in self._wire.shared
         self._recalls = history_on_join
         self._tally = Tally()
         self._off_clock = OffClock(self.buffer, self._tally, is_described=not self._wire.shared)
@@ -139,8 +140,7 @@ class TransformListener(Closing):
         return self._wire.robot_of(key) if self.robot == ANY else self.robot
 
     def _follower(self, robot: str, session: int) -> Follower:
-        shared = self._follow in self._wire.shared
-        key = (robot, session if shared else 0)
+        key = (robot, session if self._is_shared else 0)
         follower = self._followers.get(key)
         if follower is None:
             if self._follow == "joint_states":
@@ -148,7 +148,7 @@ class TransformListener(Closing):
             else:
                 follower = EdgeFollower(robot, self.buffer, self._tally, self._names)
             follower = self._followers.setdefault(key, follower)
-            if shared and session in self._names:
+            if self._is_shared and session in self._names:
                 follower.name_writer(session, self._names[session])
         return follower
 
@@ -254,7 +254,7 @@ class TransformListener(Closing):
             self._clocks.note(announced, alive=alive)
         if alive and self._past is not None:
             self._past.ask(self._wire.expression(announced.robot, self._follow), session)
-        if self._follow not in self._wire.shared:
+        if not self._is_shared:
             self._note_writer(self._follower(announced.robot, session), session, alive=alive)
         elif (announced.robot, session) in self._followers:
             self._note_writer(self._followers[announced.robot, session], session, alive=alive)

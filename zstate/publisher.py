@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.closing import Closing
@@ -16,7 +15,7 @@ from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock, outlive_fork
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.robot import RobotModel
-from zstate.moving_edges import MovingEdges
+from zstate.moving_edges import MovingEdges, Positions
 from zstate.net.claims import Claim
 from zstate.net.clock_offset import ClockService
 from zstate.net.history import Memory, answer_past
@@ -33,7 +32,6 @@ from zstate.wire.messages import (
     JointState,
     RobotDescription,
     StaticTransforms,
-    from_block,
     order_digest,
     to_block,
 )
@@ -42,8 +40,6 @@ from zstate.wire.writer import Announced, Writer
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """What a robot's state consists of on the network."""
-
-Positions = ArrayLike | Mapping[str, float | Sequence[float]]
 
 
 class StatePublisher(Closing):
@@ -199,21 +195,17 @@ class StatePublisher(Closing):
         efforts: ArrayLike | None,
         stamp: int | None,
     ) -> None:
-        model = self.model
-        numbers = (
-            model.positions(positions) if isinstance(positions, Mapping) else model.check_positions(positions)
-        )
-        self._edges.check(numbers)
-        rates = None if velocities is None else to_block(model.check_velocities(velocities))
-        forces = None if efforts is None else to_block(model.check_efforts(efforts))
+        block = self._edges.block(positions)
+        rates = None if velocities is None else to_block(self.model.check_velocities(velocities))
+        forces = None if efforts is None else to_block(self.model.check_efforts(efforts))
         stamp = self._clock.now() if stamp is None else check_stamp(stamp)
         with self._lock:
             if self._stop.is_set():
                 raise Closed(f"the publisher of {self.robot!r} is closed")
             self._yield_to_the_first()
             head = (stamp, self._seq, self._session_id)
-            state = JointState(*head, self._joint_order, to_block(numbers), rates, forces)
-            said = [one for output in self._outputs for one in output.said(state, numbers)]
+            state = JointState(*head, self._joint_order, block, rates, forces)
+            said = [one for output in self._outputs for one in output.said(state)]
             self._seq += 1
             if self.memory is not None:
                 # First: who hears nothing of this sample yet can then be told of it.
@@ -265,19 +257,19 @@ class _Output:
         self._joints = self.outlets.get("joint_states")
         self._transforms = self.outlets.get("tf")
 
-    def said(self, state: JointState, positions: NDArray[np.float64]) -> Iterator[tuple[StreamOutlet, bytes]]:
+    def said(self, state: JointState) -> Iterator[tuple[StreamOutlet, bytes]]:
         """What this wire says of ``state``: the transforms only while somebody reads them."""
         if self._joints is not None:
             yield self._joints, self._joints.encode(state)
         if self._transforms is not None and self._transforms.has_readers:
-            yield self._transforms, self._transforms.encode(self._edges.sample(state, positions))
+            yield self._transforms, self._transforms.encode(self._edges.sample(state))
 
     @property
     def sayings(self) -> dict[Stream, Callable[[JointState], bytes]]:
         """How this wire says of a state again what it said when that was new."""
 
         def say_transforms(state: JointState) -> bytes:
-            return self.outlets["tf"].encode(self._edges.sample(state, from_block(state.positions)))
+            return self.outlets["tf"].encode(self._edges.sample(state))
 
         says: dict[Stream, Callable[[JointState], bytes]] = {"tf": say_transforms}
         return says if self._joints is None else {**says, "joint_states": self._joints.encode}

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from worlds import NOW, S, every_joint, failure, pose_of_every
+from worlds import EVERY_JOINT, NOW, S, every_joint, failure, pose_of_every
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
@@ -148,6 +148,21 @@ def test_a_floating_joints_quaternion_within_a_thousandth_is_normalised() -> Non
     buffer.insert_joints(track, 0, pose_of_every(track, free=(0, 0, 0, 0, 0, 0, 1.0009), lift=5.0))
     # The origin lifts by 1 m and the joint by 5 m, which a stretched quaternion would scale.
     np.testing.assert_allclose(buffer.lookup("root", "lift").translation, (0, 0, 6), atol=1e-14)
+
+
+@pytest.mark.parametrize("model", [load_model("rrbot"), load_model(EVERY_JOINT)], ids=["plain", "floating"])
+def test_a_block_is_inserted_as_the_numbers_in_it_are(model) -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(model, "r")
+    numbers = model.neutral + 1e-4
+    buffer.insert_joints(track, 0, numbers)
+    buffer.insert_joints(track, S, numbers.tobytes())
+    ends = f"r/{model.root}", f"r/{model.links[-1]}"
+    assert buffer.lookup(*ends, 0).pose7.tolist() == buffer.lookup(*ends, S).pose7.tolist()
+    for broken in (numbers.tobytes()[8:], numbers.tobytes()[1:], (numbers * np.nan).tobytes(), b""):
+        with pytest.raises(InvalidInput):
+            buffer.insert_joints(track, 2 * S, broken)
+    assert buffer.latest(*ends) == S
 
 
 def test_velocities_may_come_later_and_be_missing_again() -> None:

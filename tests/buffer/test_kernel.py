@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+from array import array
 from collections.abc import Callable
 
 import numpy as np
@@ -22,8 +23,10 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
 from zstate.extension import kernel
 from zstate.model.catalog import load_model
+from zstate.moving_edges import block_of
 from zstate.se3 import ARRAYS, columns, conjugate, multiply
 from zstate.transform import Transform
+from zstate.wire.messages import to_block
 
 pytestmark = pytest.mark.skipif(kernel != "c", reason=f"runs on the reference: {kernel.reason}")
 
@@ -197,9 +200,28 @@ def test_unusual_input_is_left_to_the_reference() -> None:
         "abc",
     ):
         assert history.take(1, numbers, None, 3) is None
+    for block in (b"", b"x" * 24 + b"y", row.tobytes()[8:], (row * np.nan).tobytes(), bytearray(24)):
+        assert history.take(1, block, None, 3) is None
     assert history.take(1, row, None, 3) is True
+    assert history.take(2, row.tobytes(), None, 3) is True
     assert history.take(-(2**63), row, None, 3) is False
-    assert len(history.view.kept_rows()) == 1
+    assert len(history.view.kept_rows()) == 2
+
+
+def test_a_block_is_made_of_plain_numbers_at_once_and_of_nothing_else() -> None:
+    row = np.array([0.5, -1.0, 3.0])
+    for numbers in (row, memoryview(row), array("d", row)):
+        assert block_of(numbers, 3) == to_block(row)
+    for numbers in (
+        row[:2],
+        row[::-1],
+        row.astype("f4"),
+        row[None],
+        row * np.inf,
+        row.tolist(),
+        to_block(row),
+    ):
+        assert block_of(numbers, 3) is None
 
 
 def test_views_cannot_be_written_to_and_outlive_their_history() -> None:

@@ -9,7 +9,7 @@ from math import nan
 from pathlib import Path
 
 import pytest
-from live import Tap
+from live import Tap, await_reader
 from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
 from support import DEADLINE_S, until
 
@@ -173,6 +173,7 @@ def test_messages_that_are_not_ours_are_told_once_and_the_stream_goes_on(spawn: 
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     with standing(), connect() as stranger:
         command.line()
+        await_reader(stranger, "zstate/rrbot/joint_states")
         for _ in range(3):
             stranger.zenoh.put("zstate/rrbot/joint_states", b"hello", encoding="text/plain")
         until(lambda: "text/plain" in command.stderr)

@@ -116,7 +116,9 @@ def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
         def all_heard() -> bool:
             for publisher in (one, two):
                 publisher.publish([0.0, 0.0])
-            return listener.robots() == ("r1", "r2") and listener.buffer.can_lookup("r2/base", "r2/lower")
+            return listener.robots() == ("r1", "r2") and all(
+                listener.buffer.can_lookup(f"{robot}/base", f"{robot}/lower") for robot in ("r1", "r2")
+            )
 
         until(all_heard)
         rows = collected(ListenerMetrics(lambda: [listener]))

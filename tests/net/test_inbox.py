@@ -3,7 +3,7 @@ from __future__ import annotations
 import time
 from contextlib import closing
 
-from live import Tap
+from live import Tap, await_reader
 from support import SOON_S, until
 
 from zstate.net.inbox import ROOM, Heard, Inbox
@@ -27,6 +27,7 @@ def test_what_several_subscriptions_hear_comes_in_one_queue_with_its_time(sessio
         inbox.hear("joint_states", "a/samples", "r1")
         inbox.hear_latched("robot_description", "a/*", None)
         until(lambda: samples.has_readers)
+        await_reader(writer, "a/value")
         before = time.time_ns()
         for number in range(5):
             samples.put(b"%d" % number)

@@ -18,10 +18,9 @@ NODE = """
     heard = set()
 
     def hear(samples):
-        for _, payload, *_ in samples:
-            if payload.decode() not in heard:
-                heard.add(payload.decode())
-                print(payload.decode())
+        for said in {sample.payload.decode() for sample in samples} - heard:
+            heard.add(said)
+            print(said)
 
     stop = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.readline(), stop.set()), daemon=True).start()

@@ -8,7 +8,7 @@ from support import Child
 pytestmark = pytest.mark.processes
 
 OPENING = """
-    import json, os, sys
+    import json, os, sys, time
     from pathlib import Path
     from zstate.net.session import connect
 
@@ -19,6 +19,9 @@ OPENING = """
 
     options = json.loads(sys.argv[1])
     with connect(**options) as first, connect(mode="client", endpoints=sys.argv[2]) as second:
+        deadline = time.monotonic() + 15.0
+        while not threads()["tx"] and time.monotonic() < deadline:  # it may only just be starting
+            time.sleep(0.001)
         print(json.dumps([threads(), os.environ.get("ZENOH_RUNTIME")]))
 """
 

@@ -90,7 +90,9 @@ def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
     heard: list[bytes] = []
     with (
         StreamPublisher(reader, "zstate/r1/tf", "") as stream,
-        StreamSubscriber(writer, "zstate/r1/tf", lambda arrivals: heard.extend(one[1] for one in arrivals)),
+        StreamSubscriber(
+            writer, "zstate/r1/tf", lambda arrivals: heard.extend(one.payload for one in arrivals)
+        ),
         Service(writer, KEY, answer, capacity=4) as service,
     ):
         until(lambda: stream.has_readers)

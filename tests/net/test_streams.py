@@ -44,7 +44,7 @@ def test_readers_of_many_keys_and_writers_of_a_session_go_on_when_one_of_its_rea
             mine.put(payload)
             other.put(payload)
             said = {(ours, payload), (theirs, payload)}
-            return all(said <= {arrival[:2] for arrival in ear} for ear in heard.values())
+            return all(said <= {(arrival.key, arrival.payload) for arrival in ear} for ear in heard.values())
 
         with StreamSubscriber(here, many, gone.extend):
             until(lambda: all_say(b"while both are there"))  # the sessions may just be meeting
@@ -107,7 +107,7 @@ def test_a_reader_that_raises_is_counted_reported_once_and_goes_on(sessions, mon
     monkeypatch.setattr(threading, "excepthook", lambda arguments: reported.append(arguments.exc_value))
 
     def raises(samples: list[Arrival]) -> None:
-        raise RuntimeError(str(samples[0][1]))
+        raise RuntimeError(str(samples[0].payload))
 
     with (
         StreamPublisher(sessions[0], KEY, ENCODING) as publisher,

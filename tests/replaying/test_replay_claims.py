@@ -42,6 +42,7 @@ def replay(session, path: Path, **options: object) -> int:
 
 def test_samples_that_somebody_writes_are_not_replayed_but_with_takeover(sessions, cart: Path):
     with StatePublisher(sessions[0], RRBOT, "cart", streams=["tf"], program="driver"):
+        until(lambda: tokens_now(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], cart)
         assert (raised.value.stream, raised.value.first.program) == ("tf", "driver")

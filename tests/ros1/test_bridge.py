@@ -233,7 +233,8 @@ def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
     assert (names, numbers) == (list(JOINTS), [[0.25, -1.5], [0.5, 1.0], [7.0, -8.0]])
     edges = {(parent, child) for parent, child, _ in hearing.edges}
     assert edges == {("left_base", "left_upper"), ("left_upper", "left_lower")}
-    assert hearing.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text()
+    # It is set by the thread that hears of the model, not by the one that carries samples.
+    until(lambda: hearing.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
 
 
 def test_what_cannot_be_used_is_counted_and_said_once(bridge: Bridge, peer: Callable[..., Peer]):

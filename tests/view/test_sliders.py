@@ -108,6 +108,7 @@ def test_another_rate_is_kept_from_then_on(arm):
 def test_where_somebody_else_writes_the_joints_nothing_is_published_and_it_is_said_who(sessions):
     with StatePublisher(sessions[1], RRBOT, "r1", program="driver") as driver:
         driver.publish([0.0, 0.0])
+        until(lambda: discover(sessions[0], 0.2))
         with Sliders(sessions[0], RRBOT, "r1") as sliders:
             until(lambda: sliders.refusal)
             assert sliders.achieved_hz is None
@@ -123,15 +124,14 @@ def test_where_somebody_else_writes_the_joints_nothing_is_published_and_it_is_sa
 
 def test_they_move_the_joints_of_a_robot_whose_model_another_program_tells(sessions):
     streams = ("robot_description", "tf_static", "tf")
-    with (
-        StatePublisher(sessions[1], RRBOT, "r1", streams=streams, program="model"),
-        Sliders(sessions[0], RRBOT, "r1") as sliders,
-    ):
-        assert sliders.refusal == ""
-        (robot,) = discover(sessions[1])
-        writers = {(stream, writer.program) for stream, writer in robot.writers}
-        mine = {stream for stream, program in writers if program != "model"}
-        assert mine == {"joint_states"}
+    with StatePublisher(sessions[1], RRBOT, "r1", streams=streams, program="model"):
+        until(lambda: discover(sessions[0], 0.2))
+        with Sliders(sessions[0], RRBOT, "r1") as sliders:
+            assert sliders.refusal == ""
+            (robot,) = discover(sessions[1])
+            writers = {(stream, writer.program) for stream, writer in robot.writers}
+            mine = {stream for stream, program in writers if program != "model"}
+            assert mine == {"joint_states"}
 
 
 def test_closed_sliders_are_gone_from_the_network_and_do_not_open_again(sessions):

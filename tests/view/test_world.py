@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from live import await_reader, settle
 from support import until
+from wire.ros2.raw_nodes import JOINT_STATES, key_of
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
 from zstate.recorder import Recorder
@@ -141,6 +143,7 @@ def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
     writing, reading = sessions
     file = tmp_path / "one.mcap"
     with Recorder(reading, file) as recorder, StatePublisher(writing, MODEL, "r1") as publisher:
+        settle(writing, "r1")
         source = SineSource(MODEL)
         stamps = [publisher.publish(source.read(n * SECOND).positions) for n in range(3)]
         assert stamps
@@ -151,11 +154,13 @@ def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
         assert world.silent_s("r1") is None
 
 
-def test_robots_that_speak_ros_are_seen_like_others(sessions):
+def test_robots_that_speak_ros_are_seen_like_others(sessions, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     with (
         StatePublisher(sessions[0], MODEL, wires="ros2") as publisher,
         World(sessions[1], wire="ros2") as world,
     ):
+        await_reader(sessions[0], key_of(JOINT_STATES))
         publisher.publish([0.5, -0.5])
         until(lambda: world.moment().stamp is not None)
         assert [model.digest for model in world.models.values()] == [MODEL.digest]

@@ -111,6 +111,7 @@ class Store:
     ) -> bool:
         """One instant of a robot: positions (and velocities) in the order of its ``joint_names``.
 
+        ``positions`` may also be a block: the same as float64, little-endian, in bytes.
         True, or False when it is older than the history reaches, which ``ignored`` counts. A second
         sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity,
         and for a floating joint's quaternion that is not of length one.

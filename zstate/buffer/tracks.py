@@ -86,7 +86,9 @@ class JointTrack:
         return (self.frame(form.parent), self.frame(form.child))
 
     def check_positions(self, positions: ArrayLike) -> NDArray[np.float64]:
-        """As ``RobotModel.check_positions``, and quaternions of floating joints at length one."""
+        """As ``RobotModel.check_positions``, or of a block; floating joints' quaternions at length one."""
+        if isinstance(positions, bytes) and len(positions) % 8 == 0:
+            positions = np.frombuffer(positions, "<f8")
         return self._table.normalised(self.model.check_positions(positions))
 
     def take(self, stamp: object, positions: object, velocities: object) -> bool | None:

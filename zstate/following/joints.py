@@ -86,6 +86,8 @@ class JointFollower(Follower):
     def _insert(self, sample: Sample) -> bool:
         assert isinstance(sample, JointState)
         assert self._track is not None
+        if self._order.is_plain(sample):
+            return self._buffer.insert_joints(self._track, sample.stamp, sample.positions)
         numbers = self._order.read(sample)
         return self._buffer.insert_joints(self._track, sample.stamp, numbers.positions, numbers.velocities)
 

@@ -10,6 +10,8 @@ from zstate.locks import new_lock
 
 _LOG = logging.getLogger("zstate")
 
+_COUNTED = ("received", "dropped", "missed", "late", "recalled", "off_clock")
+
 
 @dataclass(frozen=True, slots=True)
 class Stats:
@@ -35,13 +37,13 @@ class Tally:
 
     def __init__(self) -> None:
         self._lock = new_lock()
-        self._counts: Counter[str] = Counter()
+        self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self._refused: Counter[str] = Counter()
         self._first: dict[str, str] = {}
         self._noted: set[str] = set()
 
     def count(self, what: str, number: int = 1) -> None:
-        """Add to one of received, dropped, missed, late, recalled, off_clock."""
+        """Add to one of the counts that ``Stats`` has."""
         with self._lock:
             self._counts[what] += number
 

@@ -111,6 +111,11 @@ class EdgeTable:
             self._floats.write(positions, out)
         return out
 
+    @property
+    def has_floats(self) -> bool:
+        """Whether there are floating joints, whose quaternions have to be looked at."""
+        return self._floats is not None
+
     def normalised(self, positions: Floats) -> Floats:
         """``positions`` with the quaternions of floating joints at unit length.
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TypeAlias
 
@@ -36,15 +36,24 @@ def capacity_for(keyexpr: str) -> int:
     return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
 
 
-def arrival_of(sample: zenoh.Sample) -> Arrival:
-    """What came, as the wires read it."""
+def arrival_of(sample: zenoh.Sample, key: str = "") -> Arrival:
+    """What came, as the wires read it; ``key`` is on which, where that is known."""
     beside = sample.attachment
     return Arrival(
-        str(sample.key_expr),
+        key or str(sample.key_expr),
         sample.payload.to_bytes(),
         str(sample.encoding),
         None if beside is None else beside.to_bytes(),
     )
+
+
+def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[Arrival]:
+    arrivals = [arrival_of(sample, key) for sample in batch]
+    if all(arrival.payload for arrival in arrivals):
+        return arrivals
+    # What is deleted has no payload either; to ask every sample which kind it is costs as much as its key.
+    puts = zenoh.SampleKind.PUT
+    return [arrival for arrival, sample in zip(arrivals, batch, strict=True) if sample.kind == puts]
 
 
 class StreamPublisher(Closing):
@@ -105,10 +114,12 @@ class StreamSubscriber(Closing):
         capacity: int | None = None,
     ) -> None:
         self._keys = keys = _Keys(session, keyexpr)
+        key = "" if "*" in keyexpr else keyexpr
 
         def hand_over(batch: list[zenoh.Sample]) -> None:
-            arrivals = [arrival_of(sample) for sample in batch if sample.kind == zenoh.SampleKind.PUT]
-            keys.learn(arrival.key for arrival in arrivals)
+            arrivals = _arrivals(batch, key)
+            if not key:
+                keys.learn({arrival.key for arrival in arrivals})
             on_samples(arrivals)
 
         capacity = capacity or capacity_for(keyexpr)
@@ -144,12 +155,12 @@ class _Keys:
     def __init__(self, session: Session, keyexpr: str) -> None:
         self._session = session
         self._known: dict[str, _Key] = {}
-        self._most = _MOST_KEYS if "*" in keyexpr else 0  # of a single key Zenoh knows already
+        self._most = _MOST_KEYS
 
-    def learn(self, keys: Iterable[str]) -> None:
+    def learn(self, keys: set[str]) -> None:
         """Samples have come on ``keys``."""
         if len(self._known) < self._most:
-            for key in set(keys).difference(self._known):
+            for key in keys.difference(self._known):
                 with suppress(Closed, zenoh.ZError):  # closed meanwhile: then nothing more will come
                     self._known[key] = _Key(self._session, key)
 

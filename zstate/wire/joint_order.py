@@ -40,10 +40,12 @@ class JointOrder:
         self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
         self._picks: dict[tuple[str, ...], _Pick] = {}
 
+    def is_plain(self, state: JointState) -> bool:
+        """Whether ``state`` is a block of positions in our order and nothing else, as nearly always."""
+        return state.order == self.digest and state.names is state.velocities is state.efforts is None
+
     def read(self, state: JointState) -> JointNumbers:
         """The numbers of ``state`` in our order. Raises MessageError when they are not all there."""
-        if state.order == self.digest and state.names is state.velocities is state.efforts is None:
-            return JointNumbers(from_block(state.positions), None, None)  # nearly always
         pick = None if state.order == self.digest else self._pick(state.names)
         numbers = JointNumbers(
             from_block(state.positions), _numbers(state.velocities), _numbers(state.efforts)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+from msgspec import Struct
+
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Message
 from zstate.wire.sample_names import SampleNames
 from zstate.wire.writer import Announced, Writer
 
 
-class Arrival(NamedTuple):
+class Arrival(Struct, frozen=True, gc=False):
     """One payload as it came from the network, with what came beside it."""
 
     key: str

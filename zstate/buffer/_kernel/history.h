@@ -299,20 +299,6 @@ take_numbers(History *self, int64_t stamp, const Py_buffer *positions, const Py_
     return 1;
 }
 
-/* A flat buffer of finite doubles. False, without an error, for anything else. */
-static bool
-plain_numbers(PyObject *object, Py_buffer *view, Py_ssize_t count)
-{
-    if (!PyObject_CheckBuffer(object) || get_doubles(object, view, 0) < 0) {
-        PyErr_Clear();
-        return false;
-    }
-    if (view->ndim == 1 && count_of(view) == count && all_finite(view->buf, count))
-        return true;
-    PyBuffer_Release(view);
-    return false;
-}
-
 static PyObject *
 history_take(History *self, PyObject *const *args, Py_ssize_t count)
 {
@@ -329,7 +315,8 @@ history_take(History *self, PyObject *const *args, Py_ssize_t count)
     if (position_count < 0 || position_count > self->width || !plain_stamp(args[0], &stamp) ||
         (has_velocities && position_count == self->width))
         Py_RETURN_NONE;
-    if (!plain_numbers(args[1], &positions, position_count))
+    if (!plain_block(args[1], &positions, position_count) &&
+        !plain_numbers(args[1], &positions, position_count))
         Py_RETURN_NONE;
     if (has_velocities && !plain_numbers(args[2], &velocities, self->width - position_count)) {
         PyBuffer_Release(&positions);
@@ -410,7 +397,9 @@ static PyMethodDef history_methods[] = {
     {"insert", (PyCFunction)(void (*)(void))history_insert, METH_FASTCALL,
      "insert(stamp, row): False when the stamp is older than the history reaches."},
     {"take", (PyCFunction)(void (*)(void))history_take, METH_FASTCALL,
-     "take(stamp, positions, velocities, position_count): as insert; None for what is not plain."},
+     "take(stamp, positions, velocities, position_count): as insert, positions also as a block; "
+     "None "
+     "for what is not plain."},
     {"replace", (PyCFunction)(void (*)(void))history_replace, METH_FASTCALL,
      "replace(stamps, rows): hold copies of these samples and no others."},
     {"reaches", (PyCFunction)history_reaches_stamp, METH_O,

@@ -63,3 +63,49 @@ all_finite(const double *numbers, Py_ssize_t count)
         sum += numbers[i] * 0.0;
     return sum == 0.0;
 }
+
+/* So many finite doubles in a flat buffer. False, without an error, for anything else. */
+static bool
+plain_numbers(PyObject *object, Py_buffer *view, Py_ssize_t count)
+{
+    if (!PyObject_CheckBuffer(object) || get_doubles(object, view, 0) < 0) {
+        PyErr_Clear();
+        return false;
+    }
+    if (view->ndim == 1 && count_of(view) == count && all_finite(view->buf, count))
+        return true;
+    PyBuffer_Release(view);
+    return false;
+}
+
+/* The same as they travel: a block, which is bytes, in this machine's order. */
+static bool
+plain_block(PyObject *object, Py_buffer *view, Py_ssize_t count)
+{
+    if (!PY_LITTLE_ENDIAN || !PyBytes_CheckExact(object) || PyBytes_GET_SIZE(object) / 8 != count ||
+        PyBytes_GET_SIZE(object) % 8 != 0 || PyObject_GetBuffer(object, view, PyBUF_SIMPLE) < 0)
+        return false;
+    if (all_finite(view->buf, count))
+        return true;
+    PyBuffer_Release(view);
+    return false;
+}
+
+/* The block of a flat buffer of so many finite doubles; None for anything else. */
+static PyObject *
+block_of(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t count)
+{
+    Py_buffer numbers;
+    if (count != 2) {
+        PyErr_SetString(PyExc_TypeError, "block_of(numbers, count)");
+        return NULL;
+    }
+    Py_ssize_t wanted = PyLong_AsSsize_t(args[1]);
+    if (wanted == -1 && PyErr_Occurred())
+        return NULL;
+    if (!PY_LITTLE_ENDIAN || !plain_numbers(args[0], &numbers, wanted))
+        Py_RETURN_NONE;
+    PyObject *block = PyBytes_FromStringAndSize(numbers.buf, numbers.len);
+    PyBuffer_Release(&numbers);
+    return block;
+}
