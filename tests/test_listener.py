@@ -19,6 +19,9 @@ from zstate.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
+from zstate.wire.messages import JointState, order_digest
+from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.wire import Arrival
 
 PERIOD = 10_000_000
 GRIPPER = load_model("gripper")
@@ -186,3 +189,17 @@ def test_a_reader_loads_neither_pinocchio_nor_a_window(sessions, spawn, follow):
         assert reader.line() == str(stamp)
         assert reader.line() == "[]"
     assert (reader.wait(), reader.stderr) == (0, "")
+
+
+def test_gaps_in_a_batch_that_filled_the_ring_are_our_own(sessions, monkeypatch: pytest.MonkeyPatch):
+    def come(*seqs: int) -> None:
+        states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
+        key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
+        listener._on_samples([Arrival(key, encode(state), encoding) for state in states])
+
+    with TransformListener(sessions[0], "r1") as listener:
+        monkeypatch.setattr(listener, "_capacity", 3)
+        come(0)
+        come(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
+        come(8)
+        assert (listener.stats.dropped, listener.stats.missed) == (3, 1)

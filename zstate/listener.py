@@ -153,8 +153,9 @@ class TransformListener(Closing):
         return follower
 
     def _on_samples(self, arrivals: list[Arrival]) -> None:
-        if len(arrivals) >= self._capacity:
-            # A ring that is full has lost samples, of whoever sent any.
+        is_full = len(arrivals) >= self._capacity
+        if is_full:
+            # A ring that is full has lost samples, of whoever sent any, and loses more while it is emptied.
             self._overflowed = set(self._followers.values())
         earliest, latest = self._off_clock.look()
         for arrival in arrivals:
@@ -162,7 +163,7 @@ class TransformListener(Closing):
             for sample in self._decode(self._follow, arrival, robot):
                 if isinstance(sample, Sample):
                     follower = self._follower(robot, sample.session)
-                    follower.take(sample, overflowed=follower in self._overflowed)
+                    follower.take(sample, overflowed=is_full or follower in self._overflowed)
                     self._overflowed.discard(follower)
                     self._events.note_sample(robot, sample.session)
                     if not earliest <= sample.stamp <= latest:

@@ -200,8 +200,7 @@ class Recorder(Closing):
         return {robot for robot in robots if robot is not None} | self._announced.copy()
 
     def _write(self, scribe: Scribe, heard: Heard) -> None:
-        if heard.overflowed:
-            self._gaps.note_overflow()
+        self._gaps.begin(overflowed=heard.overflowed)
         for arrival in heard.arrivals:
             robot = self._robot(heard, arrival)
             if robot is not None:

@@ -84,17 +84,19 @@ def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, sour
     if source == "joints":
         started(spawn, "joints", RRBOT).line()
 
-    def answer() -> Transform | None:
+    answers: list[Transform] = []
+
+    def is_told_what_was_heard() -> bool:
         try:
-            return ask_lookup(session, "rrbot", "world", "tool")
+            answers.append(ask_lookup(session, "rrbot", "world", "tool"))
         except (NoData, Unreachable):  # nobody of that name is known yet, or nothing was said
-            return None
+            return False
+        return listener.buffer.can_lookup("world", "tool", answers[-1].stamp)
 
     with connect() as session, TransformListener(session, "rrbot") as listener:
-        until(answer)
-        told = answer()
-        assert told is not None
-        heard = listener.buffer.lookup("world", "tool", told.stamp, timeout_s=5.0)
+        until(is_told_what_was_heard)
+        told = answers[-1]
+        heard = listener.buffer.lookup("world", "tool", told.stamp)
         assert np.allclose(told.pose7, heard.pose7, rtol=0.0, atol=1e-12)
     interrupted(publisher)
 

@@ -29,7 +29,7 @@ _MASKS = {
     r"\(\d+\.\d{9}\)": "(STAMP)",
     r"\d+\.\d{9}|\b\d{14,}\b": "STAMP",
     r"\d+\.\d Hz": "RATE",
-    r"-?\d+(\.\d+)? (us|ms|s|days)\b": "TIME",
+    r"-?\d+(\.\d+)? (ns|us|ms|s|days)\b": "TIME",
     r"-?\d+\.\d{3}\b": "NUMBER",
     r"(ahead of|behind) this": "BESIDE this",
     r"(/\S+)+/arm\.urdf": "PATH/arm.urdf",

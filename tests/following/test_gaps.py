@@ -23,11 +23,15 @@ def test_the_first_sample_and_one_that_comes_late_or_twice_is_no_gap():
     assert counted(tally) == (0, 0)
 
 
-def test_after_an_overflow_the_next_gap_of_each_writer_is_our_own():
+def test_gaps_of_a_batch_that_overflowed_and_the_next_of_writers_that_are_not_in_it_are_our_own():
     gaps = Gaps(tally := Tally())
-    for writer in ("a", "b"):
+    for writer in ("a", "b", "c"):
         gaps.note(writer, 0)
-    gaps.note_overflow()
-    for writer, seq in (("a", 3), ("b", 1), ("a", 5), ("b", 3), ("c", 7), ("c", 9)):
+    gaps.begin(overflowed=True)
+    for writer, seq in (("a", 3), ("b", 1), ("a", 5)):
         gaps.note(writer, seq)
-    assert counted(tally) == (3, 2)
+    assert counted(tally) == (0, 3)
+    gaps.begin(overflowed=False)
+    for writer, seq in (("a", 7), ("b", 3), ("c", 2), ("c", 4), ("d", 7), ("d", 9)):
+        gaps.note(writer, seq)
+    assert counted(tally) == (4, 4)

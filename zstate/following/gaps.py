@@ -13,16 +13,23 @@ class Gaps:
     def __init__(self, tally: Tally) -> None:
         self._tally = tally
         self._next: dict[Hashable, int] = {}
+        self._is_overflowed = False
         self._overflowed: set[Hashable] = set()
 
-    def note_overflow(self) -> None:
-        """A ring of ours has just lost samples: of each writer the next gap is due to that."""
-        self._overflowed = set(self._next)
+    def begin(self, *, overflowed: bool) -> None:
+        """A batch begins; ``overflowed`` says that a ring of ours has lost samples before it, or in it.
+
+        Then gaps in it are due to that, and so is the next one of each writer that is not in it.
+        """
+        self._is_overflowed = overflowed
+        if overflowed:
+            self._overflowed = set(self._next)
 
     def note(self, writer: Hashable, seq: int) -> None:
         """A sample of ``writer`` has come."""
         expected = self._next.get(writer, seq)
         if seq > expected:
-            self._tally.count("dropped" if writer in self._overflowed else "missed", seq - expected)
+            ours = self._is_overflowed or writer in self._overflowed
+            self._tally.count("dropped" if ours else "missed", seq - expected)
         self._overflowed.discard(writer)
         self._next[writer] = max(seq + 1, expected)
