@@ -30,14 +30,17 @@ GONE_WITHIN_S = 0.5
 ROUND_S = 0.005
 ANSWER_WITHIN_S = 0.5
 
-_MET_WITHIN_S = 0.01
-"""Peers that have just connected meet the others one by one; on a loopback that took up to 6 ms."""
+_MET_WITHIN_S = 0.03
+"""Peers that have just connected meet the others one by one; on a quiet loopback that took up to 6 ms."""
 
 _HEARD_WITHIN_S = 0.02
 """So long a token is on its way to all peers, at most; on a loopback that took some milliseconds."""
 
 _LOOK_EVERY_S = 0.05
 """Asking Zenoh who has come is a fifth of what a sample costs its writer."""
+
+_AT_ONCE_S = 1.0
+"""But so long each sample asks: who opened at the same time is heard of by then."""
 
 _Handler: TypeAlias = "zenoh.handlers.Handler[zenoh.Sample]"
 
@@ -60,6 +63,7 @@ class Claim(Closing):
         self._rivals: set[Announced] = set()
         self._first: Announced | None = None
         self._look_at = 0.0
+        self._heard_of_all_at = 0.0
         self._expression = _WIRE.writers_expression(wanted[0].robot)
         # Not before the first ``check``: of the tokens that are followed, a router's answers leave some out.
         self._tokens: zenoh.Subscriber[_Handler] | None = None
@@ -86,14 +90,17 @@ class Claim(Closing):
     def check(self) -> None:
         """Raise SecondWriter if there is somebody who came before; then always. Raises Closed.
 
-        Looks twenty times a second, however often it is called.
+        A second after the first call it looks twenty times a second only, however often it is called.
         """
         if self._first is None:
             self._session.check()
             now = time.monotonic()
             if now < self._look_at:
                 return
-            self._look_at = now + _LOOK_EVERY_S
+            if self._tokens is None:
+                self._heard_of_all_at = now + _AT_ONCE_S
+            elif now > self._heard_of_all_at:
+                self._look_at = now + _LOOK_EVERY_S
             self._follow()
             if not self._rivals:
                 return
