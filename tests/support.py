@@ -2,25 +2,46 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import queue
 import socket
 import subprocess
 import sys
+import tempfile
 import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 DEADLINE_S = 15.0
 SOON_S = 3.0
 """Well within a second, and what a busy machine adds to that."""
 
 
+_TURNS = Path(tempfile.gettempdir(), f"zstate-test-ports-{os.getuid()}")
+
+
 def a_free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    """One that nobody else gets: the system hands out higher ones, and tests that run beside take turns."""
+    with _TURNS.open("a+") as turns:
+        fcntl.flock(turns, fcntl.LOCK_EX)
+        turns.seek(0)
+        turn = int(turns.read() or 0) + 1
+        while not _is_free(port := 12_000 + turn % 20_000):
+            turn += 1
+        turns.truncate(0)
+        turns.write(str(turn))
+    return port
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe, suppress(OSError):
+        probe.bind(("127.0.0.1", port))
+        return True
+    return False
 
 
 def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> None:
