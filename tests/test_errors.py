@@ -150,7 +150,8 @@ def test_the_other_reasons_name_what_is_at_fault() -> None:
     disconnected = str(Disconnected("a", "b", roots=("map", "base")))
     assert "'a' is under root 'map', 'b' under root 'base'" in disconnected
     assert "zstate static map base" in disconnected
-    gone = Disconnected("a", "b", roots=("map", "base"), edge=("map", "base"), writer="odom", gone_s=40.9)
+    gone = Disconnected("a", "b", roots=("map", "base"))
+    gone.edge, gone.writer, gone.gone_s = ("map", "base"), "odom", 40.9
     assert str(gone).endswith("'map' -> 'base' (writer odom) was taken away 40 s ago")
     assert "no sample of 'a' -> 'b'" in str(NoData("a", "b", edge=("a", "b")))
     assert "every edge of the path is static" in str(NoData("a", "b"))

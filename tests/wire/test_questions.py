@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zstate.errors import InFuture, InvalidInput, NetworkError, UnknownFrame, Unreachable
+from zstate.errors import Disconnected, InFuture, InvalidInput, NetworkError, UnknownFrame, Unreachable
 from zstate.wire.questions import LookupQuestion, error_from_json, error_to_json
 
 
@@ -44,12 +44,15 @@ def test_a_frame_that_no_selector_can_say_is_refused(frame: str):
 
 
 FUTURE = InFuture("a", "b", edge=("a", "b"), requested=7, oldest=1, newest=3, rate_hz=100.0, writer="arm")
+GONE = Disconnected("a", "b", roots=("map", "base"))
+GONE.edge, GONE.writer, GONE.gone_s = ("map", "base"), "odom", 40.9
 
 
 @pytest.mark.parametrize(
     "error",
     [
         FUTURE,
+        GONE,
         UnknownFrame("a", "hnad", name="hnad", near_misses=("hand",), frame_count=3),
         InvalidInput("too few"),
         Unreachable("nobody", endpoints=("tcp/1.2.3.4:7447",)),
@@ -60,6 +63,15 @@ def test_an_error_keeps_its_class_its_text_and_its_facts(error):
     assert type(back) is type(error)
     assert str(back) == str(error)
     assert vars(back) == vars(error)
+
+
+def test_what_an_older_version_does_not_tell_of_an_error_is_not_known():
+    facts = json.loads(error_to_json(GONE))
+    del facts["gone_s"]
+    back = error_from_json(json.dumps(facts).encode())
+    assert isinstance(back, Disconnected)
+    assert back.gone_s is None
+    assert "taken away" not in str(back)
 
 
 def test_an_error_in_json_names_its_class_its_text_and_its_facts():

@@ -190,12 +190,13 @@ class Tree:
         return ways
 
     def _disconnected(self, target: str, source: str, roots: tuple[str, str]) -> Disconnected:
+        failure = Disconnected(target, source, roots=roots)
         gone = [self._gone[root] for root in roots if root in self._gone]
-        if not gone:
-            return Disconnected(target, source, roots=roots)
-        last = max(gone, key=lambda one: one.at_s)
-        gone_s = time.monotonic() - last.at_s
-        return Disconnected(target, source, roots=roots, edge=last.edge, writer=last.writer, gone_s=gone_s)
+        if gone:
+            last = max(gone, key=lambda one: one.at_s)
+            failure.edge, failure.writer = last.edge, last.writer
+            failure.gone_s = time.monotonic() - last.at_s
+        return failure
 
     def _ways(self, target_frame: str, source_frame: str) -> tuple[list[Edge], list[Edge]] | None:
         above_target = list(self.upwards(target_frame))

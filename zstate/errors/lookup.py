@@ -149,20 +149,13 @@ class Disconnected(LookupFailed):
     long ago [s] that was taken away.
     """
 
+    gone_s: float | None = None
+
     def __init__(
-        self,
-        target: str,
-        source: str,
-        *,
-        roots: tuple[str, str],
-        requested: int | None = None,
-        edge: tuple[str, str] | None = None,
-        writer: str | None = None,
-        gone_s: float | None = None,
+        self, target: str, source: str, *, roots: tuple[str, str], requested: int | None = None
     ) -> None:
-        super().__init__(target, source, edge=edge, writer=writer, requested=requested)
+        super().__init__(target, source, requested=requested)
         self.roots = roots
-        self.gone_s = gone_s
 
     def explanation(self) -> str:
         target_root, source_root = self.roots
