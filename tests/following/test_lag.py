@@ -18,13 +18,14 @@ def told(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float =
     lag = Lag(Tally())
     with caplog.at_level(logging.WARNING, "zstate"):
         for number, age_s in enumerate(ages_s):
-            lag.note("samples of 'r1'", 7, round(age_s * S), round(number * every_s * S))
+            lag.note("r1", "driver", 7, round(age_s * S), round(number * every_s * S))
     return len(caplog.records)
 
 
 def test_samples_that_come_ever_later_are_told_of_once(caplog):
     assert told(caplog, [1.0 + 0.1 * number for number in range(50)]) == 1
-    assert "samples of 'r1' come 2.1 s after their stamps, 1.0 s shortly before" in caplog.text
+    assert "samples of 'r1', which driver writes, come 2.1 s after their stamps" in caplog.text
+    assert "1.0 s shortly before" in caplog.text
 
 
 @pytest.mark.parametrize(

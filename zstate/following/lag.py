@@ -21,6 +21,7 @@ _PAUSE_NS = 2_000_000_000
 class _Backlog:
     least_ns: int
     last_ns: int
+    is_told: bool = False
 
 
 class Lag:
@@ -34,19 +35,26 @@ class Lag:
         self._tally = tally
         self._backlogs: dict[int, _Backlog] = {}
 
-    def note(self, samples_of: str, session: int, age_ns: int, now_ns: int) -> None:
+    def note(self, robot: str, writer: str | None, session: int, age_ns: int, now_ns: int) -> None:
         """A sample of ``session`` has come ``age_ns`` after its stamp, which is late."""
         known = self._backlogs.get(session)
-        if known is None or now_ns - known.last_ns > _PAUSE_NS:
+        if known is None:
             remember(self._backlogs, session, _Backlog(age_ns, now_ns))
             return
+        went_on = now_ns - known.last_ns <= _PAUSE_NS
         known.last_ns = now_ns
-        known.least_ns = min(known.least_ns, age_ns)
-        if age_ns > known.least_ns + _GROWN_NS:
+        known.least_ns = min(known.least_ns, age_ns) if went_on else age_ns
+        if age_ns > known.least_ns + _GROWN_NS and not known.is_told:
+            known.is_told = True
             age, before = duration_text(age_ns), duration_text(known.least_ns)
             self._tally.note(
                 f"lag {session}",
-                f"{samples_of} come {age} after their stamps, {before} shortly before: more is sent than the "
-                "network carries, or than this program takes; `zstate monitor` shows where it waits, and a "
-                "lower rate helps either way",
+                f"{samples_of(robot, writer)} come {age} after their stamps, {before} shortly before: more "
+                "is sent than the network carries, or than this program takes; `zstate monitor` shows where "
+                "it waits, and a lower rate helps either way",
             )
+
+
+def samples_of(robot: str, writer: str | None) -> str:
+    """Whose samples those are, in the words of a warning."""
+    return f"samples of {robot!r}{f', which {writer} writes,' if writer else ''}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, stamp_text
 from zstate.errors.times import counts_from_start, duration_text, unit_mistaken
-from zstate.following.lag import LATE_NS, Lag
+from zstate.following.lag import LATE_NS, Lag, samples_of
 from zstate.following.tally import Tally
 from zstate.wire.messages import Sample, TransformSample
 
@@ -20,6 +20,7 @@ class OffClock:
     """Counts them in ``off_clock``, and logs the first of each start of a writer.
 
     Those that are late, but not by so much, are given to a ``Lag``.
+
     ``is_described`` says that robots tell whose time they keep, so that one which has not yet may.
     """
 
@@ -43,15 +44,14 @@ class OffClock:
         if not self._keeps_system_time(robot, sample):
             return
         now = self._buffer.clock.now()
-        who = f", which {writer} writes," if writer else ""
-        samples_of = f"samples of {robot!r}{who}"
         if abs(sample.stamp - now) <= FAR_NS:
-            self._lag.note(samples_of, sample.session, now - sample.stamp, now)
+            self._lag.note(robot, writer, sample.session, now - sample.stamp, now)
             return
         self._tally.count("off_clock")
         if sample.session not in self._reported:
             self._reported.add(sample.session)
-            self._tally.note(f"off clock {sample.session}", _text(samples_of, sample.stamp, now))
+            text = _text(samples_of(robot, writer), sample.stamp, now)
+            self._tally.note(f"off clock {sample.session}", text)
 
     def _keeps_system_time(self, robot: str, sample: Sample) -> bool:
         kept = self._buffer.domain.of(robot)
@@ -76,9 +76,9 @@ def likely_cause(stamp: int, now: int) -> str:
     return "the clock of one of the two machines was never set (NTP); or what comes is a recording"
 
 
-def _text(samples_of: str, stamp: int, now: int) -> str:
+def _text(whose: str, stamp: int, now: int) -> str:
     return (
-        f"{samples_of} are stamped {_apart(stamp - now)} this machine's time "
+        f"{whose} are stamped {_apart(stamp - now)} this machine's time "
         f"({stamp_text(stamp)}): {likely_cause(stamp, now)}; they are used and counted in off_clock"
     )
 

@@ -73,6 +73,4 @@ class Tally:
     def stats(self) -> Stats:
         """All counts now."""
         with self._lock:
-            counts = (self._counts[what] for what in ("received", "dropped", "missed", "late"))
-            others = {what: self._counts[what] for what in ("recalled", "off_clock")}
-            return Stats(*counts, refused=dict(self._refused), **others)
+            return Stats(refused=dict(self._refused), **self._counts)
