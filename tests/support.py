@@ -53,12 +53,12 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
 
 
 @contextmanager
-def again_and_again(action: Callable[[], object]) -> Iterator[None]:
-    """Meanwhile ``action`` is done a hundred times a second."""
+def again_and_again(action: Callable[[], object], every_s: float = 0.01) -> Iterator[None]:
+    """Meanwhile ``action`` is done, a hundred times a second unless said otherwise."""
     stop = threading.Event()
 
     def repeat() -> None:
-        while not stop.wait(0.01):
+        while not stop.wait(every_s):
             action()
 
     thread = threading.Thread(target=repeat)

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from support import DEADLINE_S, Child
 
+from zstate import TransformListener, connect
+
 pytestmark = pytest.mark.processes
 
 README = Path(__file__).parent.parent / "README.md"
@@ -161,6 +163,20 @@ def test_a_recording_is_made_described_asked_and_played_again(
     assert asked.wait() == 0, asked.stderr
     replayed = start(replay)
     assert replayed.wait(DEADLINE_S) == 0, replayed.communicate()[1]
+
+
+@pytest.mark.robots
+def test_the_robots_of_the_picture_stand_in_their_hall(
+    start: Callable[[list[str]], subprocess.Popen[str]],
+) -> None:
+    (command,) = re.findall(r"`(zstate up docs/\S+)`", TEXT)
+    *up, file = command.split()
+    hall = start([*up, str(README.parent / file)])
+    with connect() as session, TransformListener(session) as listener:
+        for frame in ("panda/panda_hand", "talos/gripper_right_base_link"):
+            listener.buffer.wait("hall/floor", frame, timeout_s=DEADLINE_S)
+    hall.send_signal(signal.SIGINT)
+    assert hall.wait(DEADLINE_S) == 130, hall.communicate()[1]
 
 
 def test_every_command_of_the_table_exists() -> None:

@@ -1,36 +1,38 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
-from support import Child
+from support import Child, until
 
 pytestmark = pytest.mark.processes
 
 OPENING = """
-    import json, os, sys, time
-    from pathlib import Path
+    import json, os, sys
     from zstate.net.session import connect
-
-    def threads():
-        names = [(task / "comm").read_text() for task in Path("/proc/self/task").iterdir()]
-        pools = ("net", "tx", "rx", "acc")
-        return {pool: sum(name.startswith(pool + "-") for name in names) for pool in pools}
 
     options = json.loads(sys.argv[1])
     with connect(**options) as first, connect(mode="client", endpoints=sys.argv[2]) as second:
-        deadline = time.monotonic() + 15.0
-        while not threads()["tx"] and time.monotonic() < deadline:  # it may only just be starting
-            time.sleep(0.001)
-        print(json.dumps([threads(), os.environ.get("ZENOH_RUNTIME")]))
+        print(json.dumps(os.environ.get("ZENOH_RUNTIME")))
+        sys.stdin.readline()
 """
+
+
+def threads_of(pid: int) -> dict[str, int]:
+    """How many threads each of Zenoh's pools has."""
+    names = [(task / "comm").read_text() for task in Path(f"/proc/{pid}/task").iterdir()]
+    return {pool: sum(name.startswith(f"{pool}-") for name in names) for pool in ("net", "tx", "rx", "acc")}
 
 
 def opened(spawn, *arguments: str) -> tuple[dict[str, int], str | None]:
     child: Child = spawn(OPENING, *arguments)
-    said = json.loads(child.line())
+    left_behind = json.loads(child.line())
+    until(lambda: threads_of(child.process.pid)["tx"])  # it may only just be starting
+    threads = threads_of(child.process.pid)
+    child.tell()
     assert (child.wait(), child.stderr) == (0, "")
-    return tuple(said)
+    return threads, left_behind
 
 
 def test_a_router_has_threads_for_many_who_vanish_and_the_environment_stays_as_it_was(spawn, free_port: int):

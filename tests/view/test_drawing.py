@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support import DEADLINE_S, until
+from support import DEADLINE_S, again_and_again, until
 
 from zstate import StatePublisher, load_model
 from zstate.model.shapes import shapes_of
@@ -35,20 +34,12 @@ NEAR = 25
 @contextmanager
 def standing(session: Session, robot: str) -> Iterator[None]:
     """A robot that publishes all the time where it stands."""
-    model, stop = load_model(robot), threading.Event()
-    with StatePublisher(session, model, robot) as publisher:
-
-        def publish() -> None:
-            while not stop.wait(0.05):
-                publisher.publish(model.neutral)
-
-        thread = threading.Thread(target=publish, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
+    model = load_model(robot)
+    with (
+        StatePublisher(session, model, robot) as publisher,
+        again_and_again(lambda: publisher.publish(model.neutral), every_s=0.05),
+    ):
+        yield
 
 
 def field(looker, label: str):
