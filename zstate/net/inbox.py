@@ -23,7 +23,7 @@ class Heard(NamedTuple):
     """Arrivals of one stream, oldest first. ``robot`` is None where only their keys tell.
 
     ``stamp`` [ns] is when they were heard, by the system clock; ``overflowed`` says that a ring of ours
-    lost some before them.
+    lost some before or among them.
     """
 
     stream: Stream

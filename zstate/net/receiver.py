@@ -30,8 +30,8 @@ class Receiver(Generic[T]):
     """Hands what arrives to ``on_batch``, everything that waits at once, oldest first.
 
     A ring of ``capacity`` lies between: when it is full the oldest samples are lost. A batch that
-    fills it is counted in ``full_batches``, so that a gap in front of it can be told from one of the
-    network. An exception of ``on_batch`` is counted in ``failures``; the first also goes to
+    fills it is counted in ``full_batches``, so that a gap in front of it, or in it, can be told from
+    one of the network. An exception of ``on_batch`` is counted in ``failures``; the first also goes to
     ``threading.excepthook``. The thread goes on.
     """
 

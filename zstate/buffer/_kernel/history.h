@@ -397,9 +397,8 @@ static PyMethodDef history_methods[] = {
     {"insert", (PyCFunction)(void (*)(void))history_insert, METH_FASTCALL,
      "insert(stamp, row): False when the stamp is older than the history reaches."},
     {"take", (PyCFunction)(void (*)(void))history_take, METH_FASTCALL,
-     "take(stamp, positions, velocities, position_count): as insert, positions also as a block; "
-     "None "
-     "for what is not plain."},
+     "take(stamp, positions, velocities, position_count): as insert, of arrays, positions also as "
+     "a block; None for what is not plain."},
     {"replace", (PyCFunction)(void (*)(void))history_replace, METH_FASTCALL,
      "replace(stamps, rows): hold copies of these samples and no others."},
     {"reaches", (PyCFunction)history_reaches_stamp, METH_O,

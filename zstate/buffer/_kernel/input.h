@@ -78,7 +78,7 @@ plain_numbers(PyObject *object, Py_buffer *view, Py_ssize_t count)
     return false;
 }
 
-/* The same as they travel: a block, which is bytes, in this machine's order. */
+/* The same as they travel: a block in bytes, which is little-endian; other machines leave it. */
 static bool
 plain_block(PyObject *object, Py_buffer *view, Py_ssize_t count)
 {
