@@ -100,6 +100,11 @@ def test_the_document_shows_the_files_beside_it():
         assert blocks(language) == [(FOLDER / name).read_text()]
 
 
+@pytest.mark.parametrize("uptime_s", [1, 59, 3_600, 9_999, 10_000, 86_400 * 400])
+def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
+    assert masked([str(uptime_s * 1_000_000_000)]) == ["STAMP"]
+
+
 def test_the_documents_terminal_says_what_stands_there(folder: Path, without_xacro: None):
     with terminal(folder) as shell:
         for one in told():
