@@ -3,10 +3,12 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
 
 import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
-from support import Child, until
+from support import DEADLINE_S, Child, until
 
 pytestmark = pytest.mark.processes
 
@@ -31,15 +33,31 @@ def test_it_shows_transforms_and_ends_with_a_summary():
     assert first.startswith("rrbot (2 joints, 7 links): process ")
     assert "lower in world: xyz [" in lines[0]
     told = re.fullmatch(
-        r"(?P<count>\d+) samples received in (?P<seconds>\d+\.\d) s: (?P<rate>[\d.]+) Hz, \d+ missed, "
+        r"(?P<count>\d+) samples received in (?P<seconds>\d+\.\d\d) s: (?P<rate>[\d.]+) Hz, \d+ missed, "
         r"median latency [\d.]+ [mu]s from stamp to lookup",
         summary,
     )
     assert told
     assert float(told["seconds"]) >= 1.5  # and not before, but a busy machine may come to it later
-    # The seconds are rounded.
-    assert float(told["rate"]) * float(told["seconds"]) == pytest.approx(int(told["count"]), rel=0.1)
+    # The three numbers agree to the last digit shown.
+    rounded = 0.05 * float(told["seconds"]) + 0.005 * float(told["rate"])
+    assert float(told["rate"]) * float(told["seconds"]) == pytest.approx(
+        int(told["count"]), abs=rounded + 1e-6
+    )
     assert "\x1b" not in said
+
+
+def test_without_panda_it_shows_a_robot_of_our_own_and_says_how_to_get_more():
+    code = (
+        "from zstate.model import known\n"
+        "known._COLLECTIONS.pop('example-robot-data')\n"
+        "from zstate.cli.main import main; main()"
+    )
+    command = [sys.executable, "-c", code, "demo", "--seconds", "0.5"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "'panda' is not installed (pip install 'zstate[robots]'), so this shows 'rrbot'" in ended.stderr
+    assert "samples received" in ended.stdout
 
 
 def test_ctrl_c_ends_both_processes_with_the_summary(spawn: Spawn):

@@ -12,6 +12,7 @@ from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import SOON_S
 
 from zstate import connect, load_model
+from zstate.cli import main, usage_hints
 from zstate.sources import SubscribedSource
 
 pytestmark = pytest.mark.processes
@@ -38,6 +39,57 @@ def test_a_path_that_the_shell_has_torn_apart_is_put_together(
 def test_a_mistyped_command_is_met_with_the_nearest():
     message = failure("jonts", code=2)
     assert "there is no command 'jonts'; did you mean 'joints'?" in message
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [
+        ("tf2_echo", "use `zstate tf`"),
+        ("rviz2", "use `zstate view`"),
+        ("list", "use `zstate ls`"),
+        ("bag", "use `zstate record` or `zstate replay` or `zstate info`"),
+        ("launch", "use `zstate up FILE.toml`"),
+        ("static-transform-publisher", "use `zstate static`"),
+        ("quxquux", "`zstate help` lists the commands"),
+    ],
+)
+def test_words_of_ros_lead_to_the_command_that_does_the_same(word: str, hint: str):
+    assert f"there is no command {word!r}; {hint}" in failure(word, code=2)
+
+
+def test_every_synonym_leads_to_commands_that_exist():
+    for commands in usage_hints._SYNONYMS.values():
+        for command in commands.split(" | "):
+            assert command.split()[0] in main._COMMANDS, command
+    assert not set(usage_hints._SYNONYMS) & set(main._COMMANDS)
+
+
+def test_help_is_a_command_too():
+    assert zstate("help").stdout == zstate("--help").stdout
+    assert zstate("help", "tf").stdout == zstate("tf", "--help").stdout
+    assert "there is no command 'nothing'" in failure("help", "nothing", code=2)
+
+
+@pytest.mark.parametrize(
+    ("given", "written"),
+    [
+        ("0.1 0 0.2 3 -2 1 wrist camera", "wrist camera --xyz 0.1 0 0.2 --rpy 1 -2 3"),
+        ("1 2 3 0 0 0 1 wrist camera", "wrist camera --xyz 1 2 3 --quat-xyzw 0 0 0 1"),
+        (
+            "--x 1 --yaw=1.5 --frame-id wrist --child-frame-id camera",
+            "wrist camera --xyz 1 0 0 --rpy 0 0 1.5",
+        ),
+        ("--qx 1 --qw -0 --child-frame-id camera", "TARGET camera --quat-xyzw 1 0 0 -0"),
+    ],
+)
+def test_the_forms_of_static_transform_publisher_are_translated(given: str, written: str):
+    message = failure("static", *given.split(), code=2)
+    assert f"static_transform_publisher; here it is\n  zstate static {written}\n" in message
+
+
+def test_an_unknown_option_is_met_with_a_suggestion_only_where_one_is_near():
+    assert "Did you mean '--connect'?" in failure("ls", "--conect", code=2)
+    assert failure("ls", "--nonsense", code=2).startswith("zstate: No such option '--nonsense'.\n")
 
 
 def test_wrong_usage_is_told_in_words_with_code_2():

@@ -139,3 +139,10 @@ def test_loading_a_model_imports_neither_pinocchio_nor_zenoh():
 def test_xacro_arguments_for_what_is_no_xacro_are_refused():
     with pytest.raises(InvalidInput, match="'URDF text' contains no xacro"):
         load_model(TEXT, xacro_args={"length": "1"})
+
+
+def test_the_robot_of_examples_is_one_that_is_here(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(known, "_COLLECTIONS", {"zstate": known._own})
+    assert known.example_name() == "rrbot"
+    monkeypatch.setattr(known, "_COLLECTIONS", {"zstate": known._own, "more": lambda: {"panda": Path("p")}})
+    assert known.example_name() == "panda"

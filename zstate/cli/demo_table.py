@@ -70,7 +70,8 @@ class DemoTable:
         measure = self._meter.measure(self._begun, now)
         received = count_text(now.count - self._begun.count, "sample")
         return (
-            f"{received} received in {now.time_s - self._begun.time_s:.1f} s: {measure.rate_hz:.2f} Hz, "
+            # With as many digits as agree: so many samples in so long make that rate.
+            f"{received} received in {now.time_s - self._begun.time_s:.2f} s: {measure.rate_hz:.1f} Hz, "
             f"{stats.missed + stats.dropped} missed, median latency {_latency(measure)}"
         )
 

@@ -8,7 +8,6 @@ import signal
 import sys
 import threading
 from contextlib import suppress
-from difflib import get_close_matches
 from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, NoReturn
@@ -42,6 +41,7 @@ _COMMANDS = {
     "view": ("Look", "The robots, drawn in a browser, and moved from there."),
     "plot": ("Look", "Joint positions, or the path of a frame, over time."),
     "check": ("Look", "What is right and wrong with a robot model."),
+    "robots": ("Look", "The robots that are known by name, such as panda."),
     "record": ("Record", "What robots say, into MCAP files."),
     "replay": ("Record", "What was recorded, said again."),
     "recover": ("Record", "A complete file of a recording that was cut off."),
@@ -94,10 +94,15 @@ class Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] == "help":
+            args = [*args[1:2], "--help"]
+            if len(args) == 1:
+                click.echo(ctx.get_help())
+                ctx.exit()
         if args[0] not in _COMMANDS and not args[0].startswith("-"):
-            near = get_close_matches(args[0], _COMMANDS, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"the commands are {', '.join(_COMMANDS)}"
-            ctx.fail(f"there is no command {args[0]!r}; {hint}")
+            from zstate.cli.usage_hints import command_hint
+
+            ctx.fail(f"there is no command {args[0]!r}; {command_hint(args[0], _COMMANDS)}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -181,9 +186,9 @@ def _end_at_once(number: int, _: FrameType | None) -> None:
 
 
 def _usage_text(error: click.UsageError) -> str:
-    from zstate.cli.torn_path import torn_path_hint
+    from zstate.cli.usage_hints import usage_hint
 
-    text = torn_path_hint(sys.argv[1:]) or error.format_message()
+    text = usage_hint(sys.argv[1:], error) or error.format_message()
     return f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text
 
 

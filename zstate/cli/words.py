@@ -91,7 +91,10 @@ class NativeWords:
 
     def announced(self, robots: Sequence[RobotInfo]) -> str:
         if not robots:
-            return "no robot is announced; start one, for instance with `zstate publish panda --source sine`"
+            from zstate.model.known import example_name
+
+            start = f"zstate publish {example_name()} --source sine"
+            return f"no robot is announced; start one, for instance with `{start}`"
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
 
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:

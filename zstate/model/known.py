@@ -71,6 +71,11 @@ def find(name: str) -> CatalogEntry:
     raise _unknown(name, wanted)
 
 
+def example_name() -> str:
+    """The robot of examples and advice: panda, or one of zstate's own where panda is not installed."""
+    return "panda" if any("panda" in collect() for collect in _COLLECTIONS.values()) else "rrbot"
+
+
 def package_folders() -> tuple[Path, ...]:
     """The folders in and below which the collections keep packages, whose meshes their robots name."""
     folders = [folder.parents[1] for folder in _example_folders()] + list(_example_folders())

@@ -39,14 +39,15 @@ _USERS_NETWORK = (
 def demo_command(robot: str | None, robot_option: str | None, rate: float, seconds: float | None) -> None:
     """Publish ROBOT (default: panda) in one process and look its transforms up in another, over Zenoh.
 
-    ROBOT is a name such as panda, or a URDF file. The two processes meet on a port of their own and
-    disturb nobody.
+    ROBOT is a name such as panda, or a URDF file; `zstate robots` lists the names. Where panda is not
+    installed, the default is rrbot, which comes with zstate. The two processes meet on a port of their
+    own and disturb nobody.
     """
     from zstate.cli.children import ChildCommand
 
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"which robot, {robot!r} or {robot_option!r}?")
-    wanted = robot or robot_option or _DEFAULT
+    wanted = robot or robot_option or _default_robot()
     model, called = _load(wanted)
     for variable in _USERS_NETWORK:
         os.environ.pop(variable, None)
@@ -63,6 +64,15 @@ def demo_command(robot: str | None, robot_option: str | None, rate: float, secon
         _look(endpoint, model, called, ended, seconds)
         if ended.is_set():
             fail(f"the publisher ended with exit code {publisher.exit_code}: {publisher.last_error}")
+
+
+def _default_robot() -> str:
+    from zstate.model.known import example_name
+
+    robot = example_name()
+    if robot != _DEFAULT:
+        note(f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {robot!r}")
+    return robot
 
 
 def _load(robot: str) -> tuple[RobotModel, str]:

@@ -147,7 +147,9 @@ def _has_ros(session: Session) -> bool:
 def _start(robot: str) -> str:
     """What would put ``robot`` there."""
     if robot == ANY:
-        return "zstate publish panda --source sine"
+        from zstate.model.known import example_name
+
+        return f"zstate publish {example_name()} --source sine"
     command = writing("publish", robot)
     return command if "FILE" in command else f"{command} --source sine"
 

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import viser
 
+from zstate.model.known import example_name
 from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.look import Look
@@ -51,7 +52,8 @@ class RobotsPanel:
 
     def _table(self, look: Look, silences: Mapping[str, str | None]) -> str:
         if not silences:
-            text = "No robot is announced. Start one, for instance with: zstate publish panda --source sine"
+            start = f"zstate publish {example_name()} --source sine"
+            text = f"No robot is announced. Start one, for instance with: {start}"
             return html.paragraph(text, muted=True)
         rows = [(robot, silence or self._state(robot, look)) for robot, silence in silences.items()]
         colors = [html.ALARM if silence else "" for silence in silences.values()]
