@@ -112,3 +112,9 @@ def test_a_bare_frame_gets_its_robot_and_a_full_name_stays():
     for bad in ("", "/odom", "odom/"):
         with pytest.raises(InvalidInput, match="'robot/frame'"):
             keys.full_name("r1", bad)
+
+
+@pytest.mark.parametrize("frame", ["a\nb", "\x1b[2J", "rb/a\x9b", "a\u202eb"])
+def test_a_frame_name_with_control_characters_is_refused(frame: str):
+    with pytest.raises(InvalidInput, match="control characters"):
+        keys.full_name("r", frame)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def say(text: str = "") -> None:
     """One line of the result, there at once."""
-    click.echo(text)
+    click.echo(logs.without_controls(text, colors=is_terminal()))
 
 
 def say_fitted(text: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+from zstate.errors import printable
+
 Guides = Callable[[str, Mapping[str, Sequence[str]]], Iterator[tuple[str, str]]]
 """What draws a tree: ``tree_lines`` or ``chain_lines``."""
 
@@ -45,10 +47,12 @@ def chain_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tu
 
 
 def in_columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows of cells as lines whose columns stand under each other."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    """Rows of cells as lines whose columns stand under each other; a cell cannot add lines of its own."""
+    shown = [[printable(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
     return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in shown
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import shutil
 import sys
 import threading
@@ -21,6 +22,25 @@ FORMATS = ("text", "json")
 
 # What a record of the library may carry besides its text, as ``extra``.
 _FACTS = ("robot", "writer", "reason")
+
+
+# What a terminal acts on, but for line ends and tabs: escape sequences, C1 controls, overrides of direction.
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+_COLORS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def without_controls(text: str, *, colors: bool = False) -> str:
+    """``text`` with escapes such as ``\\x1b`` for control characters: what prints it may come from anywhere.
+
+    With ``colors`` the sequences that change colours stay: our own, for a terminal.
+    """
+    if not _CONTROLS.search(text):
+        return text
+    if not colors:
+        return _CONTROLS.sub(lambda control: repr(control[0])[1:-1], text)
+    kept = _COLORS.findall(text)
+    parts = [without_controls(part) for part in _COLORS.split(text)]
+    return "".join(part + color for part, color in zip(parts, [*kept, ""], strict=True))
 
 
 class _Chosen:
@@ -69,7 +89,7 @@ def write(text: str, *, level: str = "info", event: str = "note", **facts: objec
         known = {name: fact for name, fact in facts.items() if fact is not None}
         line = json.dumps({"time": _time_text(), "level": level, "event": event, **known, "text": text})
     else:
-        line = _as_wide_as_seen(text if level == "info" else f"zstate: {text}")
+        line = _as_wide_as_seen(without_controls(text if level == "info" else f"zstate: {text}"))
     _write_line(line)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from zstate.cli.console import rate_text
 from zstate.cli.layout import letters_for, narrowed
 from zstate.cli.sampling import Sampler, Source
-from zstate.errors import duration_text
+from zstate.errors import duration_text, printable
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
@@ -49,7 +49,7 @@ def robots_text(robots: Sequence[RobotInfo], sampler: Sampler, *, width: int | N
             letters = letters_for(row[_WRITER] for row in rows)
             named = [(*row[:_WRITER], letters[row[_WRITER]], *row[_SINCE:]) for row in short]
             lines = narrowed(named, width, (_SINCE, _AGE))
-            legend = [f"{letter}: {writer}" for writer, letter in letters.items()]
+            legend = [f"{letter}: {printable(writer)}" for writer, letter in letters.items()]
     text: list[str] = []
     for robot in robots:
         count = len(robot.writers)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from zstate.cli.console import age_text, rate_text
 from zstate.cli.frame_tree import below, roots, short_name
 from zstate.cli.layout import Guides, chain_lines, in_columns, letters_for, tree_lines
+from zstate.errors import printable
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -40,7 +41,7 @@ def tree_text(frames: Sequence[FrameInfo], now: int, *, in_full: bool, width: in
     if width is None or _fits(lines, width):
         return "\n".join(lines)
     letters = letters_for(frame.writer for frame in frames if frame.writer)
-    legend = [f"{letter}: {writer}" for writer, letter in letters.items()]
+    legend = [f"{letter}: {printable(writer)}" for writer, letter in letters.items()]
     for guides, cells in ((tree_lines, _cells), (chain_lines, _cells), (chain_lines, _fewer_cells)):
         lines = _lines(frames, now, in_full=in_full, guides=guides, cells=cells, names=letters)
         if _fits(lines, width):

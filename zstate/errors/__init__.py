@@ -52,6 +52,7 @@ from zstate.errors.base import (
     Unreachable,
     Who,
     ZStateError,
+    printable,
 )
 from zstate.errors.instants import InFuture, InPast, NoData, Stale
 from zstate.errors.lookup import AmbiguousFrame, Disconnected, LookupFailed, UnknownFrame
@@ -89,5 +90,6 @@ __all__ = [
     "Who",
     "ZStateError",
     "duration_text",
+    "printable",
     "timed_out",
 ]

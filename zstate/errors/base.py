@@ -6,6 +6,16 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 
+def printable(text: str) -> str:
+    """``text`` with escapes such as ``\\x1b`` for what a terminal acts on: control characters, line ends.
+
+    For names and texts that come from the network: a program that prints them must not be steered by them.
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
 class ZStateError(Exception):
     """What every error of zstate is. Survives pickling, so that it can cross processes."""
 

@@ -112,6 +112,9 @@ def _check_name(findings: Findings, element: Element) -> str:
     if not name.strip():
         given = "a name that is empty" if "name" in element.attributes else 'no name="..."'
         findings.error(element.line, f"<{element.tag}> has {given}", f'<{element.tag} name="NAME">')
+    elif not name.isprintable():
+        message = f"{element.tag} {quoted(name)} has control characters or line ends in its name"
+        findings.error(element.line, message, f'<{element.tag} name="NAME">')
     elif name.startswith("/"):
         bare = name.lstrip("/")
         message = f"{element.tag} {quoted(name)} begins with a slash; write {quoted(bare)}"

@@ -184,14 +184,16 @@ def robot_of(key: str) -> str:
 def full_name(robot: str, frame: str) -> str:
     """How a frame of ``robot`` is called among several robots: ``robot/frame``.
 
-    A name that has a slash is a full name already. An empty one, or one that begins or ends with a
-    slash, is InvalidInput.
+    A name that has a slash is a full name already. An empty one, one that begins or ends with a slash,
+    and one with control characters are InvalidInput.
     """
     if not frame or frame.startswith("/") or frame.endswith("/"):
         raise InvalidInput(
             f"the frame name {frame!r} of robot {robot!r} is empty or has a slash at its end; "
             "write 'frame' or 'robot/frame'"
         )
+    if not frame.isprintable():
+        raise InvalidInput(f"the frame name {frame!r} of robot {robot!r} has control characters in it")
     return frame if "/" in frame else f"{robot}/{frame}"
 
 

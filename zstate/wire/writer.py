@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, printable
 from zstate.wire.keys import Stream
 
 
@@ -23,7 +23,8 @@ class Writer:
     session: int
 
     def __str__(self) -> str:
-        return f"{self.program}@{self.host} pid {self.pid}" if self.host else self.program
+        program, host = printable(self.program), printable(self.host)
+        return f"{program}@{host} pid {self.pid}" if host else program
 
     @property
     def identity(self) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from zstate.cli.console import rate_text
 from zstate.cli.layout import in_columns, letters_for, narrowed
 from zstate.cli.monitor.meter import Measure, PathMeter
-from zstate.errors import duration_text
+from zstate.errors import duration_text, printable
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -75,7 +75,7 @@ def table_text(
         letters = letters_for(row.edge.writer for row in rows if row.edge is not None and row.edge.writer)
         columns = [_HEADINGS.index(heading) for heading in dispensable]
         lines = narrowed([_HEADINGS, *cells(letters)], width, columns)
-        lines += [f"{letter}: {writer}" for writer, letter in letters.items()]
+        lines += [f"{letter}: {printable(writer)}" for writer, letter in letters.items()]
     return "\n".join([*lines, *_clock_notes(rows)])
 
 
