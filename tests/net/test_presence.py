@@ -60,11 +60,17 @@ def test_an_identity_that_is_not_ours_is_refused(identity: str):
         Writer.parse(identity)
 
 
-@given(st.text(max_size=20))
+@given(st.from_regex(r"[\w.,-]{0,20}", fullmatch=True))
 def test_the_name_of_static_edges_stands_in_the_token_and_without_one_it_is_as_before(name: str):
     announced = Announced("r1", "tf_static", DRIVER, name)
     assert Announced.parse("r1", "tf_static", check_writer(announced.identity)) == announced
     assert Announced.parse("r1", "tf_static", DRIVER.identity).name == ""
+
+
+@pytest.mark.parametrize("name", ["a/b", "line\nend", "\x1b[2J", "@writer", " "])
+def test_a_token_whose_static_name_cannot_be_one_is_foreign(name: str):
+    with pytest.raises(InvalidInput):
+        Announced.parse("r1", "tf_static", Announced("r1", "tf_static", DRIVER, name).identity)
 
 
 def test_a_name_stands_nowhere_else():

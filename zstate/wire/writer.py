@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.wire.keys import Stream
+from zstate.wire.keys import Stream, check_writer
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -65,7 +65,8 @@ class Announced:
     def parse(cls, robot: str, stream: Stream, identity: str) -> Announced:
         """What a token with this ``identity`` says. Raises InvalidInput for anything else."""
         fields = identity.split(",")
-        name = unquote(fields.pop()) if len(fields) == 6 and stream == "tf_static" else ""
+        named = len(fields) == 6 and stream == "tf_static"
+        name = check_writer(unquote(fields.pop())) if named else ""
         return cls(robot, stream, Writer.parse(",".join(fields)), name)
 
     def excludes(self, other: Announced) -> bool:
