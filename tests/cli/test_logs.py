@@ -69,6 +69,18 @@ def test_every_line_of_a_command_that_goes_on_is_json(spawn: Spawn):
     assert {entry.get("robot") for entry in said if "following" in str(entry["text"])} == {publisher.robot}
 
 
+def test_what_a_service_announces_on_standard_output_is_json_too(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = started(spawn, "router", "--listen", endpoint, "--log-format", "json")
+    publisher = started(
+        spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint, "--log-format", "json"
+    )
+    for service, text in ((router, "listens at"), (publisher, "publishing 'rrbot'")):
+        (entry,) = entries(service.line())
+        assert (entry["level"], entry["event"]) == ("info", "result")
+        assert text in str(entry["text"])
+
+
 def test_a_warning_of_the_library_tells_its_event_and_reason(spawn: Spawn):
     command = started(spawn, "listen", "rrbot", "--log-format", "json")
     key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]

@@ -19,11 +19,17 @@ if TYPE_CHECKING:
 
 def say(text: str = "") -> None:
     """One line of the result, there at once."""
-    click.echo(logs.without_controls(text, colors=is_terminal()))
+    click.echo(logs.without_controls(text, colors=True))  # which click takes out where nobody sees them
 
 
 def say_fitted(text: str) -> None:
-    """Lines of the result, which a terminal that is too narrow for them gets folded between words."""
+    """Sentences of the result, folded between words for a narrow terminal; with --log-format json an object.
+
+    A service's log collector gets standard output and standard error together, and parses both.
+    """
+    if logs.is_json():
+        click.echo(logs.as_json(text, event="result"))
+        return
     from zstate.cli.layout import fitted
 
     say(fitted(text, terminal_width()) if is_terminal() else text)
@@ -34,12 +40,13 @@ def say_json(value: Any) -> None:
     click.echo(json.dumps(value))
 
 
-def note(text: str, *, event: str = "note", robot: str | None = None) -> None:
+def note(text: str, *, event: str = "note", robot: str | None = None, level: str = "info") -> None:
     """What goes on: waiting, and the end of waiting. Not part of the result.
 
-    ``event`` and ``robot`` are for programs that read ``--log-format json``.
+    ``event`` and ``robot`` are for programs that read ``--log-format json``. In words, a ``level`` of
+    "warning" begins with the program's name.
     """
-    logs.write(text, event=event, robot=robot)
+    logs.write(text, level=level, event=event, robot=robot)
 
 
 def fail(text: str) -> NoReturn:

@@ -86,11 +86,16 @@ def write(text: str, *, level: str = "info", event: str = "note", **facts: objec
     In words, warnings and errors begin with the program's name. ``facts`` that are None are left out.
     """
     if _Chosen.format == "json":
-        known = {name: fact for name, fact in facts.items() if fact is not None}
-        line = json.dumps({"time": _time_text(), "level": level, "event": event, **known, "text": text})
+        line = as_json(text, level=level, event=event, **facts)
     else:
         line = _as_wide_as_seen(without_controls(text if level == "info" else f"zstate: {text}"))
     _write_line(line)
+
+
+def as_json(text: str, *, level: str = "info", event: str = "note", **facts: object) -> str:
+    """A line of the JSON format: now, and ``facts`` that are not None."""
+    known = {name: fact for name, fact in facts.items() if fact is not None}
+    return json.dumps({"time": _time_text(), "level": level, "event": event, **known, "text": text})
 
 
 def _as_wide_as_seen(text: str) -> str:
@@ -113,16 +118,20 @@ def is_json() -> bool:
     return _Chosen.format == "json"
 
 
-def pass_on(line: str, **facts: object) -> None:
+def pass_on(line: str, *, is_error: bool, **facts: object) -> None:
     """As JSON, a line that another program wrote: an object of ours with ``facts`` besides, or any text."""
     try:
         said = json.loads(line)
     except ValueError:
         said = None
     if isinstance(said, dict):
-        _write_line(json.dumps({**cast("dict[str, object]", said), **facts}))
+        written = json.dumps({**cast("dict[str, object]", said), **facts})
     else:
-        _write_line(json.dumps({"time": _time_text(), "event": "line", "text": line, **facts}))
+        written = json.dumps({"time": _time_text(), "event": "line", "text": line, **facts})
+    if is_error:
+        _write_line(written)
+    else:
+        click.echo(written)
 
 
 def text_in(line: str) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import note, say
+from zstate.cli.console import note, say, say_fitted
 from zstate.cli.identity import router_identity_options
 from zstate.cli.metrics import of_connections, of_writers, served
 from zstate.cli.network import Network, open_session
@@ -150,7 +150,7 @@ def _run(network: Network, listen: tuple[str, ...], metrics: Address | None, fil
         Roster(session) as roster,
         served(metrics, of_connections(session), of_writers(roster)),
     ):
-        say(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
+        say_fitted(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
         if listen == (default := listening("router", (), network.credentials)):
             opened = default[0].replace("127.0.0.1", "0.0.0.0")
             note(f"it serves this host alone; --listen {opened} opens it to the network")

@@ -118,8 +118,8 @@ def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:
             prefixes[name] = click.style(prefixes[name], fg=_COLORS[number % len(_COLORS)])
 
     def show(name: str, line: str, is_error: bool) -> None:
-        if is_error and logs.is_json():
-            logs.pass_on(line, part=name)
+        if logs.is_json():
+            logs.pass_on(line, is_error=is_error, part=name)
         else:
             say(prefixes[name] + line)
 

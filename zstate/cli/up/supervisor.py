@@ -120,7 +120,8 @@ class Supervisor:
         assert child is not None
         is_well = child.exit_code == 0
         if restart == "always" or (restart == "on-failure" and not is_well):
-            note(f"{_end_text(child)}; it starts again in {part.pause():g} s", event="restart")
+            text = f"{_end_text(child)}; it starts again in {part.pause():g} s"
+            note(text, event="restart", level="warning")
         elif is_well:
             part.is_over = part.is_ready = True
         else:
