@@ -40,6 +40,7 @@ def test_a_path_without_a_file_says_so(missing: str | Path, tmp_path: Path, monk
     with pytest.raises(ModelError, match="there is no such file") as caught:
         load_model(missing)
     assert caught.value.source == str(missing)
+    assert f"no such file in {tmp_path}" in str(caught.value)  # the folder that a relative path starts from
 
 
 def test_the_findings_name_the_path_as_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

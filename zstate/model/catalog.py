@@ -68,7 +68,8 @@ def _read(path: Path, source: str) -> bytes:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise _refusal(source, "there is no such file") from None
+        folder = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise _refusal(source, f"there is no such file{folder}") from None
     except IsADirectoryError:
         raise _refusal(source, "this is a directory; name the .urdf file in it") from None
     except (OSError, ValueError) as error:
