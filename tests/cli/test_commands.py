@@ -31,3 +31,14 @@ def test_every_command_has_a_help(command: str, monkeypatch: pytest.MonkeyPatch)
     outcome = CliRunner().invoke(group, [command, "--help"])
     assert outcome.exit_code == 0
     assert "--help" in outcome.output
+
+
+def test_the_options_of_the_network_stand_below_those_of_the_command():
+    text = CliRunner().invoke(group, ["tf", "--help"]).output
+    own, _, network = text.partition("Network, the same for every command:")
+    assert "--once" in own
+    assert "--help" in own
+    assert "--connect ENDPOINT" in network
+    assert "--connect ENDPOINT" not in own
+    for command in ("check", "router", "certs"):
+        assert "Network," not in CliRunner().invoke(group, [command, "--help"]).output
