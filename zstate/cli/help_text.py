@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import click
 
@@ -26,7 +26,8 @@ class HelpText(click.HelpFormatter):
     Examples stay on one line, so the comment of one that is too long goes above it.
     """
 
-    def write_dl(self, rows: Sequence[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
+    def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
+        rows = list(rows)
         network = [row for row in rows if row[0].split(" ")[0] in _NETWORK]
         if len(network) < len(_NETWORK):
             super().write_dl(rows, col_max, col_spacing)
