@@ -16,7 +16,7 @@ import zenoh
 from zstate.closing import Closing
 from zstate.errors import SecondWriter, duration_text
 from zstate.locks import new_lock
-from zstate.net.presence import tokens_now
+from zstate.net.presence import tokens_there
 from zstate.net.receiver import Ring
 from zstate.net.session import Session
 from zstate.wire.keys import ANY
@@ -28,7 +28,6 @@ GONE_WITHIN_S = 0.5
 """So long after a writer was killed its token may still be seen; measured: 2 to 33 ms."""
 
 ROUND_S = 0.005
-ANSWER_WITHIN_S = 0.5
 
 _MET_WITHIN_S = 0.03
 """Peers that have just connected meet the others one by one; on a quiet loopback that took up to 6 ms."""
@@ -175,13 +174,6 @@ class Claim(Closing):
 
     def _is_before_us(self, rival: Announced) -> bool:
         return age_of(rival) < age_of(self._wanted[0])
-
-
-def tokens_there(session: Session, expression: str) -> frozenset[str]:
-    """The liveliness tokens there are, asked for twice before there are said to be none."""
-    # Of a router's answers to a session that follows the same tokens, one in 1500 was empty.
-    found = tokens_now(session, expression, ANSWER_WITHIN_S)
-    return found or tokens_now(session, expression, ANSWER_WITHIN_S)
 
 
 def await_the_meeting(session: Session) -> None:

@@ -24,6 +24,7 @@ from zstate.clock import Clock, SystemClock
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.locks import new_lock
+from zstate.net.replies import query
 from zstate.net.service import Answer, Service
 from zstate.net.session import Session
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
@@ -104,11 +105,12 @@ def _best(
 
 def _round(session: Session, expression: str, clock: Clock, timeout_s: float) -> Iterator[ClockOffset]:
     asked_ns, now = time.monotonic_ns(), clock.now()
-    replies = session.zenoh.get(
+    replies = query(
+        session.zenoh,
         expression,
+        timeout_s,
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=timeout_s,
     )
     for reply in replies:
         round_trip_ns = time.monotonic_ns() - asked_ns

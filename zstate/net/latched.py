@@ -11,7 +11,7 @@ import zenoh
 
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput
-from zstate.net.receiver import Receiver, Ring
+from zstate.net.receiver import Receiver, Ring, take_each
 from zstate.net.session import Session
 from zstate.net.streams import arrival_of
 from zstate.wire.wire import Arrival
@@ -74,9 +74,8 @@ class LatchedSubscriber(Closing):
 
     def __init__(self, session: Session, keyexpr: str, on_value: Callable[[Arrival], None]) -> None:
         def hand_over(batch: list[zenoh.Sample]) -> None:
-            for sample in batch:
-                # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
-                on_value(arrival_of(sample))
+            # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
+            take_each(batch, lambda sample: on_value(arrival_of(sample)))
 
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         subscriber = zenoh.ext.declare_advanced_subscriber(

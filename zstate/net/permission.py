@@ -10,6 +10,7 @@ import time
 import zenoh
 
 from zstate.errors import AccessDenied
+from zstate.net.replies import query_tokens
 from zstate.net.session import Session
 from zstate.net.twin import Twin
 
@@ -44,7 +45,7 @@ def _routers(session: zenoh.Session) -> set[str]:
 def _is_heard(session: zenoh.Session, token: str) -> bool:
     deadline = time.monotonic() + HEARD_WITHIN_S
     while time.monotonic() < deadline:
-        if any(reply.ok for reply in session.liveliness().get(token, timeout=HEARD_WITHIN_S)):
+        if any(query_tokens(session, token, HEARD_WITHIN_S)):
             return True
         time.sleep(ROUND_S)
     return False

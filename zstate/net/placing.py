@@ -13,15 +13,14 @@ import zenoh
 
 from zstate.errors import InvalidInput, MessageError, SecondWriter
 from zstate.net.claims import (
-    ANSWER_WITHIN_S,
     GONE_WITHIN_S,
     ROUND_S,
     age_of,
     await_the_meeting,
-    tokens_there,
     who_text,
 )
-from zstate.net.presence import announce
+from zstate.net.presence import ANSWER_WITHIN_S, announce, tokens_there
+from zstate.net.replies import query
 from zstate.net.session import Session
 from zstate.net.streams import arrival_of
 from zstate.wire.keys import ANY, edge_expression, edge_key, full_name, parse_edge_key
@@ -96,12 +95,8 @@ def check_edges(
 
 def _statics_now(session: Session) -> Iterator[tuple[str, str, StaticTransforms]]:
     """What static writers keep for late joiners, whose key tells robot and name."""
-    kept = session.zenoh.get(
-        f"{_WIRE.expression(ANY, 'tf_static')}/@adv/**",
-        timeout=ANSWER_WITHIN_S,
-        accept_replies=zenoh.ReplyKeyExpr.ANY,
-    )
-    for reply in kept:
+    kept = f"{_WIRE.expression(ANY, 'tf_static')}/@adv/**"
+    for reply in query(session.zenoh, kept, ANSWER_WITHIN_S, accept_replies=zenoh.ReplyKeyExpr.ANY):
         if reply.ok is not None:
             arrival = arrival_of(reply.ok)
             with suppress(MessageError, InvalidInput):  # withdrawn, or not ours

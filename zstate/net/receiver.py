@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import zenoh
@@ -24,6 +24,18 @@ class Subscribed(Undeclarable, Protocol[T]):
 
     @property
     def handler(self) -> zenoh.Handler[T]: ...
+
+
+def take_each(batch: Iterable[T], take: Callable[[T], object]) -> None:
+    """Call ``take`` with each item of ``batch``; an exception of one is raised after the last item."""
+    failure: Exception | None = None
+    for item in batch:
+        try:
+            take(item)
+        except Exception as error:  # noqa: PERF203 - the other items are not to blame
+            failure = error
+    if failure is not None:
+        raise failure
 
 
 class Receiver(Generic[T]):

@@ -14,7 +14,8 @@ import zenoh
 
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, Unreachable, ZStateError
-from zstate.net.receiver import Receiver
+from zstate.net.receiver import Receiver, take_each
+from zstate.net.replies import query
 from zstate.net.session import Session
 from zstate.transform import Transform
 from zstate.wire.json import from_json
@@ -73,30 +74,24 @@ class Service(Closing):
         return self._receiver.failures
 
     def _answer_all(self, queries: list[zenoh.Query]) -> None:
-        failure: Exception | None = None
         began = time.monotonic()
-        for query in queries:
-            # Leaving tells the one who asks that this was all.
-            with query:
-                try:
-                    self._answer_one(query)
-                except Exception as error:  # raised again when the others have their answers
-                    failure = error
-        if len(queries) >= self._capacity:
-            time.sleep(min(3.0 * (time.monotonic() - began), LONGEST_REST_S))
-        if failure is not None:
-            raise failure
+        try:
+            take_each(queries, self._answer_one)
+        finally:
+            if len(queries) >= self._capacity:
+                time.sleep(min(3.0 * (time.monotonic() - began), LONGEST_REST_S))
 
-    def _answer_one(self, query: zenoh.Query) -> None:
-        answer = self._answer(parameters_of(str(query.parameters)))
-        if answer is None:
-            return
-        with suppress(zenoh.ZError):  # who asked, or the session, is gone
-            if answer.is_error:
-                query.reply_err(answer.payload, encoding=answer.encoding)
-            else:
-                query.reply(self._key, answer.payload, encoding=answer.encoding)
-            self.answered += 1
+    def _answer_one(self, asked: zenoh.Query) -> None:
+        with asked:  # leaving tells the one who asks that this was all
+            answer = self._answer(parameters_of(str(asked.parameters)))
+            if answer is None:
+                return
+            with suppress(zenoh.ZError):  # who asked, or the session, is gone
+                if answer.is_error:
+                    asked.reply_err(answer.payload, encoding=answer.encoding)
+                else:
+                    asked.reply(self._key, answer.payload, encoding=answer.encoding)
+                self.answered += 1
 
     def close(self) -> None:
         """Answer no more, within a second. A second call does nothing."""
@@ -125,7 +120,7 @@ def ask_lookup(
         f"nobody answers at {key!r} within {timeout_s:g} s; run `zstate publish {robot}`, or a LookupService",
         endpoints=(key,),
     )
-    for reply in session.zenoh.get(selector, timeout=timeout_s):
+    for reply in query(session.zenoh, selector, timeout_s):
         if reply.ok is not None:
             return from_json(reply.ok.payload.to_bytes())
         if reply.err is not None and str(reply.err.encoding) == "application/json":

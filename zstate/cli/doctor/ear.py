@@ -15,6 +15,7 @@ from zstate.listener import Follow, TransformListener
 from zstate.net.clock_offset import ClockOffset
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
+from zstate.net.replies import query
 from zstate.net.session import Session
 from zstate.net.status import watch_status
 from zstate.net.wires import wire_named
@@ -121,7 +122,7 @@ class Ear(Closing):
         for writer in {writer for _, writer in self.info.writers if writer.session not in known}:
             asked = time.monotonic()
             key = clock_key(self.info.name, writer.identity)
-            answers = list(self._session.zenoh.get(key, timeout=_ANSWERS_WITHIN_S))
+            answers = list(query(self._session.zenoh, key, _ANSWERS_WITHIN_S))
             is_answered = any(answer.ok is not None for answer in answers)
             if not is_answered and time.monotonic() - asked > 0.9 * _ANSWERS_WITHIN_S:
                 self.stuck.add(writer)
