@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
 
+_AT_ONCE = 50
+"""So many robots are listened to at once: each takes eight threads."""
+
 
 def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
     """The links to ``robot``, or to every robot for "*".
@@ -94,21 +97,23 @@ def _of_robots(
     from zstate.net.clock_offset import measure_offsets
 
     words = words_of(wire)
-    with ExitStack() as listening:
-        ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in wanted]
-        if wire == "native":
-            offsets = measure_offsets(session, ANY)
+    offsets = measure_offsets(session, ANY) if wire == "native" else ()
+    for first in range(0, len(wanted), _AT_ONCE):
+        with ExitStack() as listening:
+            some = wanted[first : first + _AT_ONCE]
+            ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in some]
+            if wire == "native":
+                for ear in ears:
+                    ear.offsets = tuple(one for one in offsets if one.robot == ear.info.name)
+                    ear.ask()
+            listen(ears, timeout_s)
             for ear in ears:
-                ear.offsets = tuple(one for one in offsets if one.robot == ear.info.name)
-                ear.ask()
-        listen(ears, timeout_s)
-        for ear in ears:
-            if isinstance(words, RosWords):
-                checks = ros_checks(ear, session, words, called)
-            else:
-                checks = robot_checks(ear, session)
-            for check in checks:
-                yield check.of(ear.info.name)
+                if isinstance(words, RosWords):
+                    checks = ros_checks(ear, session, words, called)
+                else:
+                    checks = robot_checks(ear, session)
+                for check in checks:
+                    yield check.of(ear.info.name)
 
 
 def _absent_check(
