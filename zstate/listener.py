@@ -25,7 +25,7 @@ from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.net.wires import wire_named
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.wire import Arrival
 from zstate.wire.writer import Announced
@@ -158,19 +158,27 @@ class TransformListener(Closing):
             # A ring that is full has lost samples, of whoever sent any, and loses more while it is emptied.
             self._overflowed = set(self._followers.values())
         earliest, latest = self._off_clock.look()
+        failure: Exception | None = None
         for arrival in arrivals:
-            robot = self._robot_of(arrival.key)
-            for sample in self._decode(self._follow, arrival, robot):
-                if isinstance(sample, Sample):
-                    follower = self._follower(robot, sample.session)
-                    follower.take(sample, overflowed=is_full or follower in self._overflowed)
-                    self._overflowed.discard(follower)
-                    self._events.note_sample(robot, sample.session)
-                    if not earliest <= sample.stamp <= latest:
-                        self._off_clock.note(robot, self._names.get(sample.session), sample)
+            try:
+                robot = self._robot_of(arrival.key)
+                for sample in self._decode(self._follow, arrival, robot):
+                    if isinstance(sample, Sample):
+                        follower = self._follower(robot, sample.session)
+                        follower.take(sample, overflowed=is_full or follower in self._overflowed)
+                        self._overflowed.discard(follower)
+                        self._events.note_sample(robot, sample.session)
+                        if not earliest <= sample.stamp <= latest:
+                            self._off_clock.note(robot, self._names.get(sample.session), sample)
+            except InvalidInput as error:  # noqa: PERF203 - not a function of its own: runs for each sample
+                self._note_foreign(arrival.key, error)
+            except Exception as error:  # the samples behind it are not to blame
+                failure = error
+        if failure is not None:
+            raise failure
 
     def _on_past(self, arrivals: list[Arrival]) -> bool:
-        robot = self._robot_of(arrivals[0].key)
+        robot = self._robot_of(arrivals[0].key)  # that was asked for
         samples = [
             sample
             for arrival in arrivals
@@ -182,17 +190,28 @@ class TransformListener(Closing):
     def _note_broken(self, key: str, error: MessageError) -> None:
         self._tally.refuse(error.reason, f"{key}: {error}")
 
+    def _note_foreign(self, key: str, error: InvalidInput) -> None:
+        self._tally.refuse("foreign", f"{shortened(key)}: {error}")
+
     def _on_description(self, arrival: Arrival) -> None:
+        try:
+            robot = self._robot_of(arrival.key)
+        except InvalidInput as error:
+            self._note_foreign(arrival.key, error)
+            return
         if self._is_withdrawn(arrival):
             return
-        robot = self._robot_of(arrival.key)
         for description in self._decode("robot_description", arrival, robot):
             if isinstance(description, RobotDescription):
                 with self._rebuilding:
                     self._follower(robot, description.session).describe(description)
 
     def _on_statics(self, arrival: Arrival) -> None:
-        robot, writer = self._robot_of(arrival.key), self._wire.statics_writer(arrival.key)
+        try:
+            robot, writer = self._robot_of(arrival.key), self._wire.statics_writer(arrival.key)
+        except InvalidInput as error:
+            self._note_foreign(arrival.key, error)
+            return
         if writer == MODEL_WRITER and self._follow == "joint_states":
             return  # the model itself says the same
         if not self._is_withdrawn(arrival):

@@ -219,10 +219,10 @@ class Recorder(Closing):
             scribe.take(robot, message, stamp, static_writer)
 
     def _robot(self, heard: Heard, arrival: Arrival) -> str | None:
-        if heard.robot is not None:
-            return heard.robot
         try:
-            return self._wire.robot_of(arrival.key)
+            if heard.stream == "tf_static":
+                self._wire.statics_writer(arrival.key)  # refuses a key that has none
+            return self._wire.robot_of(arrival.key) if heard.robot is None else heard.robot
         except InvalidInput as error:
             self._tally.refuse("foreign", str(error))
             return None

@@ -46,14 +46,26 @@ def test_a_writer_is_said_as_program_host_and_pid():
     assert str(Writer("zstate-publish", "jetson", 412, 0, 0)) == "zstate-publish@jetson pid 412"
 
 
-@given(st.builds(Writer, *[st.text(max_size=20)] * 2, *[st.integers(0, 2**64 - 1)] * 3))
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+WRITERS = st.builds(Writer, *[NAMES] * 2, *[st.integers(0, 2**63 - 1)] * 2, st.integers(0, 2**64 - 1))
+
+
+@given(WRITERS)
 def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: Writer):
     assert check_writer(writer.identity) == writer.identity
     assert Writer.parse(writer.identity) == writer
 
 
 @pytest.mark.parametrize(
-    "identity", ["", "a", "a,b,c,d,e", "a,b,1,2", "a,b,1,2,3,4", "a,b,-1,2,3", "a,b,1_0,2,3"]
+    "identity",
+    [
+        *("", "a", "a,b,c,d,e", "a,b,1,2", "a,b,1,2,3,4", "a,b,-1,2,3", "a,b,1_0,2,3"),
+        *(f"a,b,{pid},1,1" for pid in ("1" * 5000, 2**63, "1" * 30, "01", "\u0661")),
+        *(f"a,b,1,{since},1" for since in ("1" * 5000, 2**63, "1" * 30)),
+        *(f"a,b,1,1,{session}" for session in ("1" * 5000, 2**64, "1" * 30)),
+        *(f"{'a' * 256},b,1,1,1", f"a,{'b' * 256},1,1,1", f"{'%C3%BC' * 256},b,1,1,1", "a b,c,1,1,1"),
+        *("*,b,1,1,1", "a%,b,1,1,1", "a%ff,b,1,1,1"),
+    ],
 )
 def test_an_identity_that_is_not_ours_is_refused(identity: str):
     with pytest.raises(InvalidInput):

@@ -9,6 +9,7 @@ from contextlib import ExitStack, suppress
 import numpy as np
 import pytest
 from live import RRBOT, await_reader
+from msgspec.structs import replace
 from support import Child, until
 
 from zstate.errors import Closed, InvalidInput
@@ -18,10 +19,13 @@ from zstate.net.status import StatusPublisher, watch_status
 from zstate.net.streams import StreamPublisher
 from zstate.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
+from zstate.wire.keys import status_key
 from zstate.wire.messages import Status
-from zstate.wire.native import ENCODINGS
+from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.writer import Writer
 
 OK = Status(1, 2, "ok", "driver", "nuc", 3, 100.0, 4, 0)
+ME = Writer("driver", "nuc", 3, 1, OK.session).identity
 
 
 class Heard:
@@ -87,7 +91,7 @@ def test_who_comes_later_hears_of_the_last_second_alone(sessions):
         asked.release()
         return OK
 
-    with StatusPublisher(sessions[0], "r1", "me", status):
+    with StatusPublisher(sessions[0], "r1", ME, status):
         assert asked.acquire(timeout=5.0)
         heard = Heard(sessions[1], "r1")
         assert asked.acquire(timeout=5.0)
@@ -165,7 +169,7 @@ def test_a_process_that_is_gone_says_nothing_more(spawn):
 
 def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
     heard = Heard(sessions[1], "r1")
-    key = "zstate/r1/status/me"
+    key = status_key("r1", ME)
     with ExitStack() as opened:
         said = {
             encoding: opened.enter_context(StreamPublisher(sessions[0], key, encoding))
@@ -179,10 +183,23 @@ def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
     assert not heard.statuses
 
 
+def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
+    heard = Heard(sessions[1])
+    theirs = Writer("driver", "nuc", 3, 1, 99).identity
+    wrong = [("r1", theirs, OK), ("*", ME, OK), ("r1", ME, replace(OK, rate_hz=float("nan")))]
+    wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]
+    for robot, identity, status in wrong:
+        key = f"zstate/{robot}/status/{identity}"
+        sessions[0].zenoh.put(key, encode(status), encoding=ENCODINGS[Status])
+    until(lambda: sum(heard.watch.refused.values()) == len(wrong))
+    assert heard.watch.refused == {"foreign": 3, "malformed": 1, "too large": 1}
+    assert not heard.statuses
+
+
 def test_after_its_session_is_gone_it_ends_by_itself():
     before = status_threads()
     with connect() as session:
-        publisher = StatusPublisher(session, "r1", "me", lambda: OK)
+        publisher = StatusPublisher(session, "r1", ME, lambda: OK)
     until(lambda: status_threads() == before)
     publisher.close()
 

@@ -1,8 +1,100 @@
+from collections.abc import Callable
+from contextlib import suppress
+
 import pytest
 import zenoh
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
 from zstate.wire import keys
+from zstate.wire.native import NativeWire
+from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
+from zstate.wire.writer import Announced, Writer
+
+NUMBER = st.one_of(
+    st.integers(-(2**70), 2**70).map(str), st.sampled_from(["1" * 5000, "9" * 20, "", "\u0661", "1_0", "nan"])
+)
+NAME = st.one_of(st.text(max_size=8), st.sampled_from(["*", "**", "@a", " ", "%", "%ff", "%2F", "a" * 9000]))
+IDENTITY = st.builds(lambda *fields: ",".join(fields), NAME, NAME, NUMBER, NUMBER, NUMBER) | st.builds(
+    lambda *fields: ",".join(fields), NAME, NAME, NUMBER, NUMBER, NUMBER, NAME
+)
+CHUNK = st.one_of(
+    NAME,
+    NUMBER,
+    IDENTITY,
+    st.sampled_from(["zstate", "@writer", "@reader", "@clock", "@edge", "tf", "tf_static", "joint_states"]),
+    st.sampled_from(["@ros2_lv", "MP", "MS", "NN", "::,10:,:,:,,", f"::,{'1' * 5000}:,:,:,,", ":1:0:0,10"]),
+)
+FORMS = st.sampled_from(
+    [
+        *("zstate/{}/@writer/{}/{}", "zstate/@reader/{}/{}/{}", "zstate/{}/@clock/{}", "zstate/{}/status/{}"),
+        *(
+            "zstate/{}/@edge/{}/{}/{}",
+            "@ros2_lv/{}/{}/{}/{}/MP/{}/{}/{}/{}/{}/{}/{}",
+            "@/{}/@ros2_lv/MP/{}/{}/{}",
+        ),
+    ]
+)
+TOKEN = st.builds(lambda form, chunks: form.format(*chunks), FORMS, st.lists(CHUNK, min_size=11, max_size=11))
+PARSERS: tuple[Callable[[str], object], ...] = (
+    keys.parse_writer_key,
+    keys.parse_reader_key,
+    keys.parse_clock_key,
+    keys.parse_edge_key,
+    keys.robot_of,
+    Writer.parse,
+    NativeWire().statics_writer,
+)
+
+
+@given(TOKEN | st.lists(CHUNK, max_size=8).map("/".join) | IDENTITY | st.text())
+@example("zstate/evil/@writer/joint_states/p,h," + "1" * 5000 + ",1,1")
+@example("zstate/evil/@writer/joint_states/p,h,1," + "1" * 30 + ",1")
+@example("zstate/e vil/@writer/joint_states/p,h,1,1,1")
+@example("zstate/*/joint_states")
+def test_a_key_of_a_stranger_is_foreign_and_nothing_else(key: str):
+    for parse in PARSERS:
+        with suppress(InvalidInput):
+            parse(key)
+    for wire in (NativeWire(), Ros2Wire(), Ros2DdsWire()):
+        announced = wire.announced(key, "*")
+        if announced is not None:
+            assert keys.check_robot(announced.robot) == announced.robot
+            assert 0 <= announced.writer.since < 2**63
+            assert 0 <= announced.writer.session < 2**64
+
+
+@given(TOKEN)
+def test_an_announced_writer_is_one_that_can_be_asked_under_its_own_keys(key: str):
+    announced = NativeWire().announced(key, "*")
+    if announced is not None:
+        again = keys.writer_key(announced.robot, announced.stream, announced.identity)
+        assert again == key
+        assert Announced.parse(*keys.parse_writer_key(again)) == announced
+        clock = keys.clock_key(announced.robot, announced.writer.identity)
+        assert keys.parse_clock_key(clock) == (announced.robot, announced.writer.identity)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("zstate/*/joint_states", "zstate/r1*/tf", "zstate/r1/tf_static/*", "zstate/a b/tf", "zstate/@r/tf"),
+        *("zstate/", f"zstate/{'a' * 256}/tf", f"zstate/r1/{'a' * 20_000}"),
+    ],
+)
+def test_a_key_with_a_wildcard_or_a_robot_that_cannot_be_one_is_of_no_robot(key: str):
+    with pytest.raises(InvalidInput) as caught:
+        keys.robot_of(key)
+    assert len(str(caught.value)) < 1000
+
+
+def test_names_are_as_long_as_those_of_files():
+    assert keys.check_robot("a" * 255) == "a" * 255
+    with pytest.raises(InvalidInput, match="256 characters, more than 255"):
+        keys.check_robot("a" * 256)
+    with pytest.raises(InvalidInput, match="more than 1024"):
+        keys.full_name("r1", "a" * 1025)
 
 
 def test_every_key_of_a_robot_lies_under_its_own_prefix():
@@ -24,7 +116,7 @@ def test_an_expression_hears_one_robot_or_all_and_every_static_writer():
     assert keys.writer_expression("*") == "zstate/*/@writer/*/*"
 
 
-@pytest.mark.parametrize("robot", ["panda", "*", "%2A", "a@b"])
+@pytest.mark.parametrize("robot", ["panda", "*", "%2A", "a@b", "über"])
 def test_a_reader_stands_apart_from_robots_and_tells_whose_stream_it_reads(robot: str):
     key = keys.reader_key(robot, "joint_states", "x")
     assert key.startswith("zstate/@reader/")

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
-from zstate.errors import Closed, MessageError
+from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
@@ -44,7 +44,11 @@ class StaticCarrier(Closing):
         self._subscriber.close()
 
     def _take(self, arrival: Arrival) -> None:
-        writer = self._wire.statics_writer(arrival.key)
+        try:
+            writer = self._wire.statics_writer(arrival.key)
+        except InvalidInput as error:
+            self._tally.refuse("foreign", str(error))
+            return
         if writer == MODEL_WRITER:
             return
         make = StaticFollower(self._robot, writer or self._wire.name, self._buffer, self._tally)

@@ -11,7 +11,7 @@ from zstate.cli.console import note
 from zstate.cli.roster import Roster
 from zstate.cli.words import is_ros
 from zstate.closing import Closing
-from zstate.errors import MessageError
+from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.messages import RobotDescription
@@ -89,8 +89,8 @@ class Readiness(Closing):
 
     def _note_still(self, arrival: Arrival) -> None:
         """Of a robot without moving joints no sample need come."""
-        robot = self._spoken.robot_of(arrival.key)
-        with suppress(MessageError):  # withdrawn; or broken, which the listener says
+        with suppress(MessageError, InvalidInput):  # withdrawn; or broken, which the listener says
+            robot = self._spoken.robot_of(arrival.key)
             for said in self._spoken.decode("robot_description", arrival, robot):
                 if isinstance(said, RobotDescription) and not said.moving_edges:
                     self._still.add(robot)

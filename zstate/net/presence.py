@@ -19,7 +19,7 @@ from zstate.net.replies import MOST_REPLIES, query_tokens
 from zstate.net.router_losses import RouterLosses
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
-from zstate.wire.keys import ANY, READERS, Stream, parse_reader_key
+from zstate.wire.keys import ANY, MOST_CHARACTERS, READERS, Stream, parse_reader_key, shortened
 from zstate.wire.wire import Wire
 from zstate.wire.writer import Announced, Writer
 
@@ -31,7 +31,13 @@ ROUND_S = 0.1
 
 
 def writer_here(session: int, program: str = "") -> Writer:
-    """A writer in this process, starting now; ``program`` is the script's name unless given."""
+    """A writer in this process, starting now; ``program`` is the script's name unless given.
+
+    Raises InvalidInput for a name of more than 255 characters, which readers would not accept.
+    """
+    if len(program) > MOST_CHARACTERS:
+        text = f"the program name {shortened(program)!r} has {len(program)} characters"
+        raise InvalidInput(f"{text}, more than {MOST_CHARACTERS}")
     script = Path(sys.argv[0]).stem if sys.argv and sys.argv[0] not in ("", "-c") else "python"
     return Writer(program or script, socket.gethostname(), os.getpid(), time.time_ns(), session)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
@@ -10,17 +11,21 @@ from collections.abc import Callable
 import zenoh
 
 from zstate.closing import Closing
-from zstate.errors import Closed, MessageError
+from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.locks import outlive_fork
+from zstate.net.receiver import take_each
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber
-from zstate.wire.keys import robot_of, status_expression, status_key
+from zstate.wire.keys import parse_status_key, status_expression, status_key
 from zstate.wire.messages import Status
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.wire import Arrival
+from zstate.wire.writer import Writer
 
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
+MOST_BYTES = 65_536
+"""A longer status is refused."""
 
 
 class StatusPublisher(Closing):
@@ -70,21 +75,33 @@ class StatusWatch(Closing):
         self._subscriber = StreamSubscriber(session, status_expression(robot), self._take)
 
     def _take(self, arrivals: list[Arrival]) -> None:
-        for arrival in arrivals:
-            status = self._decode(arrival)
-            if status is not None:
-                self._callback(robot_of(arrival.key), status)
+        take_each(arrivals, self._take_one)
 
-    def _decode(self, arrival: Arrival) -> Status | None:
+    def _take_one(self, arrival: Arrival) -> None:
         try:
-            return decode(arrival.payload, arrival.encoding, Status)
-        except MessageError as error:
-            self.refused[error.reason] += 1
-            return None
+            robot, status = _status_in(arrival)
+        except (MessageError, InvalidInput) as error:
+            self.refused[getattr(error, "reason", "foreign")] += 1
+        else:
+            self._callback(robot, status)
 
     def close(self) -> None:
         """Stop within a second. A second call does nothing."""
         self._subscriber.close()
+
+
+def _status_in(arrival: Arrival) -> tuple[str, Status]:
+    """The robot and its writer's status. Raises MessageError, or InvalidInput for a key of no writer."""
+    if len(arrival.payload) > MOST_BYTES:
+        text = f"a Status of {len(arrival.payload)} bytes, more than {MOST_BYTES}"
+        raise MessageError(text, reason="too large")
+    robot, identity = parse_status_key(arrival.key)
+    status = decode(arrival.payload, arrival.encoding, Status)
+    if status.session != Writer.parse(identity).session:
+        raise MessageError(f"the Status of another writer on {arrival.key!r}", reason="foreign")
+    if not math.isfinite(status.rate_hz):
+        raise MessageError(f"a Status with the rate {status.rate_hz}", reason="malformed")
+    return robot, status
 
 
 def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusWatch:

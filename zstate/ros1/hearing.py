@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Protocol
 
 from zstate.closing import Closing
@@ -59,7 +59,8 @@ class Hearing(Closing):
         if arrival.payload:
             self._hand_over("tf_static", arrival)
         else:
-            self._hearer.place(self._wire.statics_writer(arrival.key), None)
+            with suppress(InvalidInput):  # a key that no writer has
+                self._hearer.place(self._wire.statics_writer(arrival.key), None)
 
     def _on_joints(self, arrivals: list[Arrival]) -> None:
         for arrival in arrivals:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from zstate.closing import Closing
-from zstate.errors import MessageError, ModelError
+from zstate.errors import InvalidInput, MessageError, ModelError, ZStateError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
@@ -46,8 +46,8 @@ class Descriptions(Closing):
     def _take(self, arrival: Arrival) -> None:
         if not arrival.payload:
             return
-        robot = self._wire.robot_of(arrival.key) if self._robot == ANY else self._robot
         try:
+            robot = self._wire.robot_of(arrival.key) if self._robot == ANY else self._robot
             (said,) = self._wire.decode("robot_description", arrival, robot)
             assert isinstance(said, RobotDescription)
             if said.urdf == self._said.get(robot):
@@ -55,13 +55,15 @@ class Descriptions(Closing):
             # Text and nothing else: what comes over the network opens no files and runs no xacro.
             model = parse_urdf(said.urdf, f"the URDF of {robot!r}")
         except (MessageError, ModelError) as error:
-            self._refuse(error)
+            self._refuse(error.reason if isinstance(error, MessageError) else "model", error)
+            return
+        except InvalidInput as error:
+            self._refuse("foreign", error)
             return
         self._said[robot] = said.urdf
         self._on_description(robot, model)
 
-    def _refuse(self, error: MessageError | ModelError) -> None:
-        reason = error.reason if isinstance(error, MessageError) else "model"
+    def _refuse(self, reason: str, error: ZStateError) -> None:
         self.refused[reason] += 1
         if self.refused[reason] == 1:
             _LOG.warning("robot_description refused (%s): %s; further ones are only counted", reason, error)

@@ -18,6 +18,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Literal, get_args
 from urllib.parse import quote, unquote
 
@@ -33,6 +34,13 @@ READERS = "zstate/@reader/*/*/*"
 
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
+
+MOST_CHARACTERS = 255
+"""The longest name of a robot, a writer, a program or a host, as in file systems."""
+
+MOST_OF_A_FRAME = 1024
+_MOST_OF_A_KEY = 16_384
+"""A name of ``MOST_CHARACTERS`` is up to 12 times as long when it is quoted."""
 
 _RESERVED = frozenset("/*$?#")
 
@@ -51,8 +59,8 @@ def _check_chunk(what: str, name: str) -> str:
     problem = _chunk_problem(name)
     if problem:
         raise InvalidInput(
-            f"the {what} name {name!r} {problem}; it is one chunk of a Zenoh key: use letters, digits, "
-            "'_', '-' or '.', for instance 'arm_1'"
+            f"the {what} name {shortened(name)!r} {problem}; it is one chunk of a Zenoh key: "
+            "use letters, digits, '_', '-' or '.', for instance 'arm_1'"
         )
     return name
 
@@ -62,10 +70,17 @@ def _chunk_problem(name: str) -> str:
         return "is empty"
     if name.startswith("@"):
         return "begins with '@'"
+    if len(name) > MOST_CHARACTERS:
+        return f"has {len(name)} characters, more than {MOST_CHARACTERS}"
     for character in name:
         if character in _RESERVED or character.isspace() or not character.isprintable():
             return f"contains {character!r}"
     return ""
+
+
+def shortened(text: str) -> str:
+    """``text`` for an error message, which nobody should be able to fill."""
+    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
 
 
 def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
@@ -99,6 +114,14 @@ def status_expression(robot: str) -> str:
     return f"zstate/{robot if robot == ANY else check_robot(robot)}/status/*"
 
 
+def parse_status_key(key: str) -> tuple[str, str]:
+    """Robot and identity in a ``status_key``. Raises InvalidInput for any other key."""
+    chunks = _chunks(key)
+    if len(chunks) == 4 and chunks[0] == "zstate" and chunks[2] == "status":
+        return check_robot(chunks[1]), chunks[3]
+    raise _other_form(key, "zstate/<robot>/status/<identity>")
+
+
 def writer_key(robot: str, stream: Stream, identity: str) -> str:
     """The liveliness token of one writer; ``identity`` is already one chunk."""
     return f"zstate/{check_robot(robot)}/@writer/{stream}/{identity}"
@@ -111,12 +134,12 @@ def writer_expression(robot: str) -> str:
 
 def parse_writer_key(key: str) -> tuple[str, Stream, str]:
     """Robot, stream and identity in a ``writer_key``. Raises InvalidInput for any other key."""
-    chunks = key.split("/")
+    chunks = _chunks(key)
     if len(chunks) == 5 and chunks[0] == "zstate" and chunks[2] == "@writer":
         for stream in get_args(Stream):
             if chunks[3] == stream:
-                return chunks[1], stream, chunks[4]
-    raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@writer/<stream>/<identity>'")
+                return check_robot(chunks[1]), stream, chunks[4]
+    raise _other_form(key, "zstate/<robot>/@writer/<stream>/<identity>")
 
 
 def reader_key(robot: str, stream: Stream, identity: str) -> str:
@@ -126,12 +149,13 @@ def reader_key(robot: str, stream: Stream, identity: str) -> str:
 
 def parse_reader_key(key: str) -> tuple[str, Stream, str]:
     """Robot, stream and identity in a ``reader_key``. Raises InvalidInput for any other key."""
-    chunks = key.split("/")
+    chunks = _chunks(key)
     if len(chunks) == 5 and chunks[:2] == ["zstate", "@reader"]:
         for stream in get_args(Stream):
             if chunks[3] == stream:
-                return unquote(chunks[2]), stream, chunks[4]
-    raise InvalidInput(f"the key {key!r} is not of the form 'zstate/@reader/<robot>/<stream>/<identity>'")
+                robot = unquote(chunks[2])
+                return robot if robot == ANY else check_robot(robot), stream, chunks[4]
+    raise _other_form(key, "zstate/@reader/<robot>/<stream>/<identity>")
 
 
 def clock_key(robot: str, identity: str) -> str:
@@ -146,10 +170,10 @@ def clock_expression(robot: str) -> str:
 
 def parse_clock_key(key: str) -> tuple[str, str]:
     """Robot and identity in a ``clock_key``. Raises InvalidInput for any other key."""
-    chunks = key.split("/")
+    chunks = _chunks(key)
     if len(chunks) == 4 and chunks[0] == "zstate" and chunks[2] == "@clock":
-        return chunks[1], chunks[3]
-    raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/@clock/<identity>'")
+        return check_robot(chunks[1]), chunks[3]
+    raise _other_form(key, "zstate/<robot>/@clock/<identity>")
 
 
 def edge_key(robot: str, edge: tuple[str, str], identity: str) -> str:
@@ -165,28 +189,47 @@ def edge_expression(child: str) -> str:
 
 def parse_edge_key(key: str) -> tuple[str, tuple[str, str], str]:
     """Robot, edge and identity in an ``edge_key``. Raises InvalidInput for any other key."""
-    chunks = key.split("/")
+    chunks = _chunks(key)
     if len(chunks) == 6 and chunks[0] == "zstate" and chunks[2] == "@edge":
-        return chunks[1], (unquote(chunks[4]), unquote(chunks[3])), chunks[5]
-    raise InvalidInput(
-        f"the key {key!r} is not of the form 'zstate/<robot>/@edge/<child>/<parent>/<identity>'"
-    )
+        robot = check_robot(chunks[1])
+        parent, child = unquote(chunks[4]), unquote(chunks[3])
+        for frame in (parent, child):
+            full_name(robot, frame)
+        return robot, (parent, child), chunks[5]
+    raise _other_form(key, "zstate/<robot>/@edge/<child>/<parent>/<identity>")
 
 
+@lru_cache(4096)  # of each sample that comes
 def robot_of(key: str) -> str:
-    """The robot whose key this is. InvalidInput for a key that is not under ``zstate/<robot>/``."""
-    chunks = key.split("/", 2)
-    if len(chunks) < 3 or chunks[0] != "zstate" or not chunks[1]:
-        raise InvalidInput(f"the key {key!r} is not of the form 'zstate/<robot>/...'")
-    return chunks[1]
+    """The robot whose key this is.
+
+    InvalidInput for a key that is not under ``zstate/<robot>/``, or has a wildcard: then it is several keys.
+    """
+    chunks = _chunks(key)
+    if len(chunks) < 3 or chunks[0] != "zstate" or not chunks[1] or "*" in key:
+        raise _other_form(key, "zstate/<robot>/...")
+    return check_robot(chunks[1])
+
+
+def _chunks(key: str) -> list[str]:
+    return key.split("/") if len(key) <= _MOST_OF_A_KEY else []
+
+
+def _other_form(key: str, form: str) -> InvalidInput:
+    return InvalidInput(f"the key {shortened(key)!r} is not of the form {form!r}")
 
 
 def full_name(robot: str, frame: str) -> str:
     """How a frame of ``robot`` is called among several robots: ``robot/frame``.
 
-    A name that has a slash is a full name already. An empty one, one that begins or ends with a slash,
-    and one with control characters are InvalidInput.
+    A name that has a slash is a full name already. An empty one, one that begins or ends with a slash, one
+    with control characters, and one of more than 1024 characters are InvalidInput.
     """
+    if len(frame) > MOST_OF_A_FRAME:
+        raise InvalidInput(
+            f"the frame name {shortened(frame)!r} of robot {robot!r} has {len(frame)} characters, "
+            f"more than {MOST_OF_A_FRAME}"
+        )
     if not frame or frame.startswith("/") or frame.endswith("/"):
         raise InvalidInput(
             f"the frame name {frame!r} of robot {robot!r} is empty or has a slash at its end; "

@@ -12,6 +12,7 @@ import msgspec
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.keys import (
     Stream,
+    check_writer,
     parse_writer_key,
     reader_key,
     robot_of,
@@ -139,7 +140,8 @@ class NativeWire:
         return (decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream]),)
 
     def statics_writer(self, key: str) -> str:
-        return key.rpartition("/")[2]
+        robot_of(key)
+        return check_writer(key.rpartition("/")[2])
 
     def writers_expression(self, robot: str) -> str:
         return writer_expression(robot)

@@ -11,6 +11,7 @@ import msgspec
 import zstate.errors
 from zstate.clock import check_stamp
 from zstate.errors import InvalidInput, LookupFailed, NetworkError, ZStateError
+from zstate.wire.keys import MOST_OF_A_FRAME, shortened
 
 _NAMES = ("target", "source", "at")
 _FORM = "ask target=FRAME;source=FRAME, and at=NANOSECONDS for another instant than the newest"
@@ -29,10 +30,12 @@ class LookupQuestion:
         """What the parameters of a selector ask. Raises InvalidInput naming what is wrong with them."""
         for name in parameters:
             if name not in _NAMES:
-                raise InvalidInput(f"a lookup has no parameter {name!r}; {_FORM}")
+                raise InvalidInput(f"a lookup has no parameter {shortened(name)!r}; {_FORM}")
         for name in ("target", "source"):
             if not parameters.get(name):
                 raise InvalidInput(f"a lookup needs the parameter {name!r}; {_FORM}")
+            if len(parameters[name]) > MOST_OF_A_FRAME:
+                raise InvalidInput(f"the frame {shortened(parameters[name])!r} is too long; {_FORM}")
         at = parameters.get("at")
         return cls(parameters["target"], parameters["source"], None if at is None else _stamp(at))
 
@@ -48,7 +51,9 @@ class LookupQuestion:
 def _stamp(text: str) -> int:
     digits = text.removeprefix("-")
     if not (digits.isascii() and digits.isdecimal() and len(digits) <= 19):
-        raise InvalidInput(f"the parameter 'at' is {text!r}, not a stamp: whole nanoseconds since 1970")
+        raise InvalidInput(
+            f"the parameter 'at' is {shortened(text)!r}, not a stamp: whole nanoseconds since 1970"
+        )
     return check_stamp(int(text))
 
 

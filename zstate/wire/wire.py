@@ -110,7 +110,7 @@ class Wire(Protocol):
         ...
 
     def robot_of(self, key: str) -> str:
-        """The robot that a key speaks of, for whoever listens to all."""
+        """The robot that a key speaks of, for whoever listens to all. InvalidInput for a key of no robot."""
         ...
 
     def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
@@ -118,7 +118,7 @@ class Wire(Protocol):
         ...
 
     def statics_writer(self, key: str) -> str | None:
-        """The name under which the static edges on ``key`` are written, if the key tells."""
+        """The name under which the static edges on ``key`` are written, if the key tells; as ``robot_of``."""
         ...
 
     def writers_expression(self, robot: str) -> str:

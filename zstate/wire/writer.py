@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.wire.keys import Stream, check_writer
+from zstate.wire.keys import MOST_CHARACTERS, Stream, check_writer, shortened
+
+_MOST_DIGITS = 20
+_MOST_OF_AN_IDENTITY = 4 * 12 * MOST_CHARACTERS
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -14,6 +17,7 @@ class Writer:
     """One writer: which program, where, since when [ns], and the ``session`` in its samples.
 
     A wire that does not tell where or since when leaves ``host`` empty, ``pid`` and ``since`` zero.
+    ``pid`` and ``since`` are below 2^63, ``session`` is below 2^64.
     """
 
     program: str
@@ -30,16 +34,24 @@ class Writer:
     def identity(self) -> str:
         """All of it in one chunk of a key."""
         fields = (self.program, self.host, self.pid, self.since, self.session)
-        return ",".join(quote(str(field), safe="") for field in fields)
+        return ",".join(_quoted(str(field)) for field in fields)
 
     @classmethod
     def parse(cls, identity: str) -> Writer:
         """The writer whose ``identity`` this is. Raises InvalidInput for anything else."""
-        fields = identity.split(",")
-        if len(fields) != 5 or not all(field.isascii() and field.isdigit() for field in fields[2:]):
-            raise InvalidInput(f"{identity!r} is not 'program,host,pid,since,session'")
-        program, host = unquote(fields[0]), unquote(fields[1])
-        return cls(program, host, int(fields[2]), int(fields[3]), int(fields[4]))
+        fields = identity.split(",") if len(identity) <= _MOST_OF_AN_IDENTITY else []
+        if len(fields) == 5 and all(map(_is_number, fields[2:])):
+            program, host = unquote(fields[0]), unquote(fields[1])
+            pid, since, session = map(int, fields[2:])
+            found = cls(program, host, pid, since, session)
+            in_range = max(pid, since) < 2**63 and session < 2**64
+            # Written in one way only: two tokens of one writer would be two writers.
+            if in_range and max(len(program), len(host)) <= MOST_CHARACTERS and found.identity == identity:
+                return found
+        raise InvalidInput(
+            f"{shortened(identity)!r} is not 'program,host,pid,since,session', names of at most "
+            f"{MOST_CHARACTERS} characters and 64-bit numbers"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +70,19 @@ class Announced:
     @property
     def identity(self) -> str:
         """Writer and name in one chunk of a key."""
-        named = f",{quote(self.name, safe='')}" if self.name else ""
+        named = f",{_quoted(self.name)}" if self.name else ""
         return self.writer.identity + named
 
     @classmethod
     def parse(cls, robot: str, stream: Stream, identity: str) -> Announced:
         """What a token with this ``identity`` says. Raises InvalidInput for anything else."""
-        fields = identity.split(",")
-        named = len(fields) == 6 and stream == "tf_static"
-        name = check_writer(unquote(fields.pop())) if named else ""
-        return cls(robot, stream, Writer.parse(",".join(fields)), name)
+        fields = identity.split(",", 6)
+        is_named = len(fields) == 6 and stream == "tf_static"
+        name = check_writer(unquote(fields.pop())) if is_named else ""
+        found = cls(robot, stream, Writer.parse(",".join(fields)), name)
+        if found.identity != identity:
+            raise InvalidInput(f"{shortened(identity)!r} is not the identity of a writer and a name")
+        return found
 
     def excludes(self, other: Announced) -> bool:
         """Whether only one of the two writers can be meant: both say the same, and neither knows the other.
@@ -77,3 +92,12 @@ class Announced:
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
         is_one = self.stream != "tf_static" or bool(self.name)
         return same and is_one and self.writer.session != other.writer.session
+
+
+def _quoted(text: str) -> str:
+    # The name of a script may have bytes that are no text.
+    return quote(text, safe="", errors="replace")
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS

@@ -16,7 +16,7 @@ from zstate.cli.snapshot.snapshot import FORMAT, Configuration, RobotShot, Snaps
 from zstate.cli.words import words_of
 from zstate.clock import wait_in_slices
 from zstate.closing import Closing
-from zstate.errors import MessageError
+from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, RobotModel
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo, discover
@@ -96,7 +96,11 @@ class _Sitting(Closing):
         self._source = SubscribedSource(self._session, model, self.info.name, wire=self._wire_name)
 
     def _take_statics(self, arrival: Arrival) -> None:
-        writer = self._wire.statics_writer(arrival.key) or arrival.key
+        try:
+            writer = self._wire.statics_writer(arrival.key) or arrival.key
+        except InvalidInput as error:
+            note(f"{arrival.key}: {error}")
+            return
         if not arrival.payload or writer == MODEL_WRITER:
             self._statics.pop(writer, None)  # the model says the same
             return

@@ -45,6 +45,8 @@ def unpack(data: bytes | None) -> Attachment:
     if len(data) != _LAYOUT.size or data[16] != GID_BYTES:
         raise _foreign(data)
     seq, source_time, _length, gid = _LAYOUT.unpack(data)
+    if seq < 0:
+        raise _foreign(data)
     return Attachment(seq, source_time, gid)
 
 
@@ -61,7 +63,7 @@ def _foreign(data: bytes) -> MessageError:
             reason="foreign",
         )
     return MessageError(
-        f"an attachment of {len(data)} bytes that is not rmw_zenoh_cpp's, which has {_LAYOUT.size} bytes "
-        f"with a {GID_BYTES} before the gid; another program writes on this key",
+        f"an attachment of {len(data)} bytes that is not rmw_zenoh_cpp's, which has {_LAYOUT.size} bytes, "
+        f"a sequence number from 0 on, and a {GID_BYTES} before the gid; another program writes on this key",
         reason="foreign",
     )

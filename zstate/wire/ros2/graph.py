@@ -24,6 +24,7 @@ DDS_GRAPH_EXPRESSION = "@/*/@ros2_lv/**"
 _ADMIN = "@ros2_lv"
 _NODE = "NN"
 _KINDS = ("MP", "MS", "SS", "SC")
+_MOST_CHARACTERS = 8192
 _NUMBER = re.compile(r"\d{1,18}", re.ASCII)
 _DDS_SLASH = "§"
 _TYPE_HASH = re.compile(r"typehash=([^;]+);")
@@ -119,7 +120,7 @@ def parse_token(key: str) -> NodeToken | EndpointToken | None:
 
     What a later version appends to an endpoint is passed over.
     """
-    chunks = key.split("/")
+    chunks = key.split("/") if len(key) <= _MOST_CHARACTERS else []
     if len(chunks) < 9 or not all(chunks) or chunks[0] != _ADMIN:
         return None
     if not all(_NUMBER.fullmatch(chunks[place]) for place in (1, 3, 4)):
@@ -131,7 +132,7 @@ def parse_token(key: str) -> NodeToken | EndpointToken | None:
 
 def parse_dds_token(key: str) -> DdsToken | None:
     """The publisher or subscription that the token ``key`` of a bridge tells; None for other keys."""
-    chunks = key.split("/")
+    chunks = key.split("/") if len(key) <= _MOST_CHARACTERS else []
     if len(chunks) != 7 or chunks[0] != "@" or chunks[2] != _ADMIN or chunks[3] not in ("MP", "MS"):
         return None
     topic, type_name = (chunk.replace(_DDS_SLASH, "/") for chunk in chunks[4:6])

@@ -7,11 +7,12 @@ nothing that would keep them.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.keys import Stream
+from zstate.wire.keys import Stream, shortened
 
 Reliability = Literal["reliable", "best_effort"]
 Durability = Literal["volatile", "transient_local"]
@@ -30,6 +31,7 @@ _DDS_RELIABILITY: dict[Reliability, int] = {"best_effort": 0, "reliable": 1}
 _DDS_DURABILITY: dict[Durability, int] = {"volatile": 0, "transient_local": 1}
 _DDS_HISTORY: dict[History, int] = {"keep_last": 0, "keep_all": 1}
 
+_DEPTH = re.compile(r"(-?[0-9]{1,10})?")
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"  # RMW_DURATION_INFINITE
 
 
@@ -133,8 +135,10 @@ def _word(numbers: dict[Word, int], text: str, default: Word) -> Word:
 
 
 def _kept(history: History, depth: str, default: int) -> tuple[History, int]:
+    if not _DEPTH.fullmatch(depth):
+        raise ValueError(depth)
     return history, 0 if history == "keep_all" else int(depth or default)
 
 
 def _unreadable(text: str, example: str) -> MessageError:
-    return MessageError(f"a malformed QoS {text!r}; written as {example}", reason="malformed")
+    return MessageError(f"a malformed QoS {shortened(text)!r}; written as {example}", reason="malformed")
