@@ -14,6 +14,8 @@ from zstate.clock import ManualClock
 from zstate.errors import AmbiguousFrame, InvalidInput
 from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
+from zstate.net.clock_offset import measure_offsets
+from zstate.net.presence import discover
 from zstate.net.streams import StreamPublisher
 from zstate.publisher import StatePublisher
 from zstate.sources import SineSource
@@ -203,3 +205,47 @@ def test_gaps_in_a_batch_that_filled_the_ring_are_our_own(sessions, monkeypatch:
         come(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
         come(8)
         assert (listener.stats.dropped, listener.stats.missed) == (3, 1)
+
+
+def test_a_key_of_no_robot_is_foreign_and_costs_no_robot_a_sample(sessions):
+    writer, reader = sessions
+    strange = ("zstate/*/joint_states", "zstate/r$*/joint_states", "zstate/a b/joint_states")
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "*", history_on_join=False) as listener,
+    ):
+        settle(writer, "r1")
+        for number in range(50):
+            for key in strange:
+                state = JointState(STAMP + number, number, 99, order_digest(RRBOT.joint_names), bytes(16))
+                writer.zenoh.put(key, encode(state), encoding=ENCODINGS[JointState])
+            publisher.publish([0.0, 0.0])
+        writer.zenoh.put("zstate/*/robot_description", b"noise")
+        writer.zenoh.put("zstate/*/tf_static/mount", b"noise")
+        writer.zenoh.put("zstate/r1/tf_static/*", b"noise")
+        until(lambda: listener.stats.refused.get("foreign", 0) >= 50 * len(strange) + 3)
+        until(lambda: listener.stats.received == 50)
+        assert listener.robots() == ("r1",)
+
+
+@pytest.mark.parametrize("robot", ["*", "r1"])
+def test_a_token_that_no_writer_declares_hides_no_other(sessions, robot):
+    writer, reader = sessions
+    broken = ["p,h," + "1" * 5000 + ",1,1", "p,h,1," + "1" * 30 + ",1", "p,h,1,1," + "1" * 21]
+    keys = [
+        f"zstate/{name}/@writer/joint_states/{identity}" for name in ("r1", "evil") for identity in broken
+    ]
+    tokens = [
+        writer.zenoh.liveliness().declare_token(key) for key in (*keys, "zstate/a b/@writer/tf/p,h,1,1,1")
+    ]
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, robot) as listener,
+    ):
+        publisher.publish([0.0, 0.0])
+        listener.buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        until(lambda: len([event for event in listener.events() if event.kind == "joined"]) == 3)
+        assert [info.name for info in discover(reader)] == ["r1"]
+        assert measure_offsets(reader, "*")
+    for token in tokens:
+        token.undeclare()

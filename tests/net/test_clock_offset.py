@@ -5,16 +5,21 @@ from __future__ import annotations
 import time
 
 import pytest
-from live import RRBOT, settle
-from support import a_free_port, until
+import zenoh
+from live import RRBOT, STAMP, settle
+from support import SOON_S, a_free_port, until
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
 from zstate.listener import TransformListener
 from zstate.net.clock_offset import OffsetMeter, measure_offsets
+from zstate.net.service import Answer, Service
 from zstate.net.session import connect
 from zstate.publisher import StatePublisher
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
+from zstate.wire.messages import Clock
+from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.writer import Writer
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -173,3 +178,32 @@ def test_a_meter_whose_session_is_gone_falls_silent(sessions):
         (known,) = measure_offsets(reader, "r1")
         reader.close()
         assert meter.follow("r1", known.writer)() is None
+
+
+def test_many_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions):
+    writer, reader = sessions
+    silent = [Writer("p", "h", 1, 1, session) for session in range(100)]
+    kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
+    queryable = writer.zenoh.declare_queryable("zstate/r2/@clock/*", kept)
+    with StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)), OffsetMeter(reader, Ahead(0)) as meter:
+        until(lambda: measure_offsets(reader, "r1"))
+        (known,) = measure_offsets(reader, "r1")
+        for one in silent:
+            meter.follow("r2", one)
+        until(queryable.handler.try_recv)
+        ask = meter.follow("r1", known.writer)
+        until(lambda: ask() is not None, timeout_s=SOON_S)
+
+
+def test_an_answer_counts_only_from_the_writer_whose_clock_was_asked(sessions):
+    writer, reader = sessions
+    asked, other = (Writer("p", "h", 1, 1, session) for session in (7, 8))
+    key = clock_key("r1", asked.identity)
+
+    def answer(session: int) -> Answer:
+        return Answer(encode(Clock(STAMP, 0, session)), ENCODINGS[Clock])
+
+    with Service(writer, key, lambda _: answer(other.session)):
+        assert measure_offsets(reader, "r1", timeout_s=0.3) == ()
+    with Service(writer, key, lambda _: answer(asked.session)):
+        until(lambda: [one.writer for one in measure_offsets(reader, "r1")] == [asked])

@@ -5,11 +5,20 @@ from __future__ import annotations
 import threading
 
 import pytest
+import zenoh
 from live import SECOND, STAMP
 from support import until
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.net.history import MOST_BYTES, PAGE_BYTES, PAGE_SAMPLES, Memory, PastReader, answer_past
+from zstate.net.history import (
+    MOST_BYTES,
+    MOST_PAGE_BYTES,
+    PAGE_BYTES,
+    PAGE_SAMPLES,
+    Memory,
+    PastReader,
+    answer_past,
+)
 from zstate.net.service import Answer, Service
 from zstate.net.session import Session
 from zstate.wire.messages import JointState, Past
@@ -244,3 +253,87 @@ def test_who_does_not_answer_costs_no_thread_and_closing_does_not_wait_for_it(se
     heard.reader.close()
     assert (heard.pages, heard.errors) == ([], [])
     queryable.undeclare()
+
+
+def test_many_silent_writers_of_one_robot_do_not_delay_the_history_of_another(sessions):
+    writer, reader = sessions
+    kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
+    silent = writer.zenoh.declare_queryable("zstate/r2/joint_states", kept)
+    heard = Heard(reader)
+    with answer_past(writer, "r1", "joint_states", remembering(PAGE_SAMPLES + 3), encode), heard.reader:
+        await_answers(reader)
+        for session in range(500):
+            heard.reader.ask("zstate/r2/joint_states", session)
+        until(silent.handler.try_recv)
+        heard.reader.ask(KEY, 7)
+        until(lambda: len(heard.pages) == 2)
+    assert not heard.errors
+
+
+def test_a_writer_that_keeps_silent_is_asked_three_times(sessions):
+    writer, reader = sessions
+    asked: list[str] = []
+    silent = writer.zenoh.declare_queryable(KEY, zenoh.handlers.RingChannel(100))
+    heard, kept = Heard(reader), list[zenoh.Query]()
+    with heard.reader:
+        heard.reader.ask(KEY, 7)
+
+        def is_asked_in_all() -> bool:
+            while (query := silent.handler.try_recv()) is not None:
+                asked.append(str(query.parameters))
+                kept.append(query)
+            return len(heard.reader._waiting) == 0 and heard.reader._in_flight == 0 and len(asked) >= 3
+
+        until(is_asked_in_all)
+    assert asked == ["session=7"] * 3
+
+
+def test_of_many_replies_the_first_on_the_right_key_is_the_page(sessions):
+    writer, reader = sessions
+    right, wrong = (encode(Past(ENCODINGS[JointState], (sample,))) for sample in (b"right", b"wrong"))
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply("zstate/*/joint_states", wrong, encoding=ENCODINGS[Past])
+            for payload in (right, wrong, wrong):
+                query.reply(KEY, payload, encoding=ENCODINGS[Past])
+
+    queryable = writer.zenoh.declare_queryable(KEY, answer)
+    heard = Heard(reader)
+    with heard.reader:
+        heard.reader.ask(KEY, 7)
+        until(lambda: heard.pages)
+    assert [[one.payload for one in page] for page in heard.pages] == [[b"right"]]
+    queryable.undeclare()
+
+
+def test_a_page_that_is_too_large_is_refused(sessions):
+    writer, reader = sessions
+    page = encode(Past(ENCODINGS[JointState], (bytes(MOST_PAGE_BYTES),)))
+    heard = Heard(reader)
+    with Service(writer, KEY, lambda _: Answer(page, ENCODINGS[Past])), heard.reader:
+        await_answers(reader)
+        heard.reader.ask(KEY, 7)
+        until(lambda: heard.errors)
+    assert (heard.errors[0].reason, heard.pages) == ("too large", [])
+
+
+def test_a_page_that_cannot_be_taken_does_not_end_the_asking_of_others(sessions, monkeypatch):
+    raised: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", raised.append)
+    writer, reader = sessions
+    pages: list[list[Arrival]] = []
+
+    def take(arrivals: list[Arrival]) -> bool:
+        pages.append(arrivals)
+        if len(pages) == 1:
+            raise InvalidInput("the first")
+        return True
+
+    past = PastReader(reader, take, lambda *_: None)
+    with answer_past(writer, "r1", "joint_states", remembering(3), encode), past:
+        await_answers(reader)
+        past.ask(KEY, 7)
+        past.ask(KEY, 7)
+        until(lambda: len(pages) == 2)
+    assert len(raised) == 1

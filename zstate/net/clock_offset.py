@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import zenoh
@@ -27,6 +26,7 @@ from zstate.locks import new_lock
 from zstate.net.replies import query
 from zstate.net.service import Answer, Service
 from zstate.net.session import Session
+from zstate.net.turns import Turns
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
 from zstate.wire.messages import Clock as Time
 from zstate.wire.native import ENCODINGS, decode, encode
@@ -36,6 +36,9 @@ AGAIN_S = 30.0
 """So old a measurement is repeated when it is asked for; sooner while there was no answer."""
 
 _UNANSWERED_AGAIN_S = 5.0
+
+_TIMEOUTS_S = (0.1, 0.2, 0.5)
+"""Of three attempts, the later two in their turn; then not before it is asked for again."""
 
 _MEETING_S = 0.05
 
@@ -127,28 +130,30 @@ def _told(sample: zenoh.Sample) -> tuple[str, Writer, int] | None:
     try:
         robot, identity = parse_clock_key(str(sample.key_expr))
         time_there = decode(sample.payload.to_bytes(), str(sample.encoding), Time)
-        return robot, Writer.parse(identity), time_there.stamp
+        writer = Writer.parse(identity)
     except (InvalidInput, MessageError):
         return None
+    return (robot, writer, time_there.stamp) if time_there.session == writer.session else None
 
 
 class OffsetMeter(Closing):
     """Measures the clocks of writers as often as somebody wants to know, in a thread of its own.
 
-    The thread lives no longer than there is something to measure.
+    The thread lives no longer than there is something to measure. Each robot has its turn: silent writers
+    of one robot do not delay those of another for long.
     """
 
     def __init__(self, session: Session, clock: Clock) -> None:
         self._session = session
         self._clock = clock
-        self._wanted: deque[_Measured] = deque()
+        self._wanted: Turns[_Measured] = Turns()
         self._lock = new_lock()
         self._is_running = False
         self._is_open = True
 
     def follow(self, robot: str, writer: Writer) -> Callable[[], Offset | None]:
         """What tells how far the clock of ``writer`` is ahead: measured now, and when asked after 30 s."""
-        measured = _Measured(self, clock_key(robot, writer.identity))
+        measured = _Measured(self, robot, clock_key(robot, writer.identity))
         measured()
         return measured
 
@@ -157,7 +162,7 @@ class OffsetMeter(Closing):
         with self._lock:
             if not self._is_open:
                 return
-            self._wanted.append(measured)
+            self._wanted.add(measured.robot, measured)
             if not self._is_running:
                 self._is_running = True
                 threading.Thread(target=self._run, name="zstate clock offsets", daemon=True).start()
@@ -171,13 +176,14 @@ class OffsetMeter(Closing):
     def _run(self) -> None:
         while True:
             with self._lock:
-                if not self._wanted:
+                measured = self._wanted.take(0.0)
+                if measured is None:
                     self._is_running = False
                     return
-                measured = self._wanted.popleft()
             try:
-                for found in _best(self._session, measured.key, 8, self._clock, 0.5):
-                    measured.offset = Offset(found.offset_ns, found.uncertainty_ns)
+                found = list(_best(self._session, measured.key, 8, self._clock, measured.timeout_s))
+                if measured.take(found):
+                    self.want(measured)
             except (Closed, zenoh.ZError):
                 self.close()  # the session is gone
 
@@ -185,11 +191,25 @@ class OffsetMeter(Closing):
 class _Measured:
     """The offset of one writer's clock, as far as it is known."""
 
-    def __init__(self, meter: OffsetMeter, key: str) -> None:
+    def __init__(self, meter: OffsetMeter, robot: str, key: str) -> None:
+        self.robot = robot
         self.key = key
         self.offset: Offset | None = None
+        self._unanswered = 0
         self._meter = meter
         self._wanted_s = -AGAIN_S
+
+    @property
+    def timeout_s(self) -> float:
+        """How long it may take the writer to answer: longer, when it has not answered before."""
+        return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
+
+    def take(self, found: Sequence[ClockOffset]) -> bool:
+        """Keep what was measured; whether to try again, where the writer did not answer."""
+        self._unanswered = 0 if found else self._unanswered + 1
+        for one in found:
+            self.offset = Offset(one.offset_ns, one.uncertainty_ns)
+        return 0 < self._unanswered < len(_TIMEOUTS_S)
 
     def __call__(self) -> Offset | None:
         now_s = time.monotonic()

@@ -17,12 +17,13 @@ history grows backwards from the present, without a gap at any moment.
 from __future__ import annotations
 
 import queue
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 
 import zenoh
@@ -33,6 +34,7 @@ from zstate.net.receiver import JOIN_WITHIN_S
 from zstate.net.service import Answer, Service
 from zstate.net.session import Session
 from zstate.net.streams import arrival_of
+from zstate.net.turns import Turns
 from zstate.wire.keys import Stream, stream_key
 from zstate.wire.messages import JointState, Past
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
@@ -43,10 +45,15 @@ PAGE_SAMPLES = 256
 """So many make a page where samples are small: then a page takes well below a millisecond to make."""
 
 MOST_BYTES = 8_000_000
-TIMEOUT_S = 1.0
+TIMEOUTS_S = (0.25, 0.5, 1.0)
+"""So long a writer may take for its page; one that takes longer three times in a row is not asked again."""
+
 FIRST_REST_S = 0.05
 TRIES = 5
-"""So often a writer is asked that does not answer, with longer and longer rests: 1.5 s in all."""
+"""So often a page is asked for where nothing answers yet, with longer and longer rests: 1.5 s in all."""
+
+MOST_PAGE_BYTES = 524_288
+"""A longer page is refused: one has at most 32 kB, or a single sample."""
 
 _OVERHEAD = 300
 """What a remembered sample takes besides its numbers [bytes]."""
@@ -127,6 +134,13 @@ def _page(states: Sequence[JointState], say: Callable[[JointState], bytes]) -> t
     return tuple(reversed(samples))
 
 
+def _past_in(page: Arrival) -> Past:
+    if len(page.payload) > MOST_PAGE_BYTES:
+        text = f"a page of {len(page.payload)} bytes, more than {MOST_PAGE_BYTES}"
+        raise MessageError(text, reason="too large")
+    return decode(page.payload, page.encoding, Past)
+
+
 def _is_count(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) <= 19
 
@@ -140,8 +154,9 @@ class _Asked:
     before: int | None = None
     pages: int = 0
     tries: int = 0
-    due: float = 0.0
-    replies: list[zenoh.Sample] = field(default_factory=list[zenoh.Sample])
+    timeouts: int = 0
+    sent_s: float = 0.0
+    page: zenoh.Sample | None = None
 
 
 class PastReader(Closing):
@@ -149,7 +164,9 @@ class PastReader(Closing):
 
     ``on_page(arrivals)`` is called from that thread, page by page from the newest to the oldest; the
     arrivals of a page are oldest first. It says whether older ones are wanted. Who does not answer is
-    asked a few times more; a page that cannot be read goes to ``on_error``.
+    asked a few times more; a page that cannot be read goes to ``on_error``. Each key has its turn, so that
+    many silent writers of one robot do not delay those of another. An exception of ``on_page`` ends the
+    asking of that writer, and goes to ``threading.excepthook``, the first of all.
     """
 
     def __init__(
@@ -162,8 +179,9 @@ class PastReader(Closing):
         self._on_page = on_page
         self._on_error = on_error
         self._events: queue.SimpleQueue[tuple[_Asked, bool] | None] = queue.SimpleQueue()
-        self._waiting: list[_Asked] = []
+        self._waiting: Turns[_Asked] = Turns()
         self._in_flight = 0
+        self._failures = 0
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="zstate past", daemon=True)
         self._thread.start()
@@ -180,30 +198,40 @@ class PastReader(Closing):
                     self._take(*event)
             self._send_due()
 
+    def _take(self, asked: _Asked, is_over: bool) -> None:
+        if not is_over:
+            self._waiting.add(asked.key, asked)
+            return
+        self._in_flight -= 1
+        try:
+            due_s = self._hand_over(asked)
+        except Exception:
+            self._failures += 1
+            if self._failures == 1:
+                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
+        else:
+            if due_s is not None:
+                self._waiting.add(asked.key, asked, due_s)
+
     def _pause(self) -> float | None:
         """How long [s] nothing is to be done but to wait for events; None is for ever."""
-        if not self._waiting or self._in_flight >= _IN_FLIGHT:
-            return None
-        return max(0.0, min(asked.due for asked in self._waiting) - time.monotonic())
-
-    def _take(self, asked: _Asked, is_over: bool) -> None:
-        if is_over:
-            self._in_flight -= 1
-        if not is_over or self._hand_over(asked):
-            self._waiting.append(asked)
+        now_s = time.monotonic()
+        next_s = self._waiting.next_s(now_s)
+        return None if next_s is None or self._in_flight >= _IN_FLIGHT else next_s - now_s
 
     def _send_due(self) -> None:
-        now = time.monotonic()
-        due = [asked for asked in self._waiting if asked.due <= now]
-        for asked in due[: _IN_FLIGHT - self._in_flight]:
-            self._waiting.remove(asked)
+        now_s = time.monotonic()
+        while self._in_flight < _IN_FLIGHT and not self._closed:
+            asked = self._waiting.take(now_s)
+            if asked is None:
+                return
             self._send(asked)
 
     def _send(self, asked: _Asked) -> None:
         selector = f"{asked.key}?session={asked.writer}"
         if asked.before is not None:
             selector += f";before={asked.before}"
-        asked.replies = []
+        asked.page, asked.sent_s = None, time.monotonic()
         try:
             self._get(selector, asked)
             self._in_flight += 1
@@ -212,41 +240,50 @@ class PastReader(Closing):
 
     def _get(self, selector: str, asked: _Asked) -> None:
         def take(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                asked.replies.append(reply.ok)
+            # The first is the page. More of them, or on another key, nobody has asked for.
+            if asked.page is None and reply.ok is not None and str(reply.ok.key_expr) == asked.key:
+                asked.page = reply.ok
 
-        # Called in a thread of Zenoh's, which a list and a queue do not hold up.
+        # Called in a thread of Zenoh's, which this and a queue do not hold up.
         handler = zenoh.handlers.Callback(take, lambda: self._events.put((asked, True)), indirect=False)
         self._session.zenoh.get(
             selector,
             handler,
-            timeout=TIMEOUT_S,
+            timeout=TIMEOUTS_S[asked.timeouts],
             consolidation=zenoh.ConsolidationMode.NONE,
             # Replies travel as their queries do: behind all that is live, and sooner lost than waited for.
             priority=zenoh.Priority.DATA_LOW,
             congestion_control=zenoh.CongestionControl.DROP,
         )
 
-    def _hand_over(self, asked: _Asked) -> bool:
-        """Whether there is something to ask for, now or later."""
-        if not asked.replies:
-            # The token of a writer just met may be known before what answers there; or a page was lost.
-            asked.tries += 1
-            asked.due = time.monotonic() + FIRST_REST_S * 2**asked.tries
-            return asked.tries < TRIES
-        asked.tries, asked.due = 0, 0.0
-        page = arrival_of(asked.replies[0])
+    def _hand_over(self, asked: _Asked) -> float | None:
+        """When [s] there is something more to ask for; None for never."""
+        if asked.page is None:
+            return self._try_again_at(asked)
+        asked.tries = asked.timeouts = 0
+        page = arrival_of(asked.page, asked.key)
+        asked.page = None
         try:
-            past = decode(page.payload, page.encoding, Past)
+            past = _past_in(page)
         except MessageError as error:
             self._on_error(page.key, error)
-            return False
+            return None
         arrivals = [Arrival(page.key, sample, past.encoding) for sample in past.samples]
         is_wanted = bool(arrivals) and self._on_page(arrivals)
         asked.pages += 1
         goes_back = past.before is not None and (asked.before is None or past.before < asked.before)
         asked.before = past.before
-        return is_wanted and goes_back and asked.pages < _MOST_PAGES
+        return 0.0 if is_wanted and goes_back and asked.pages < _MOST_PAGES else None
+
+    @staticmethod
+    def _try_again_at(asked: _Asked) -> float | None:
+        # The token of a writer just met may be known before what answers there; or a page was lost.
+        now_s = time.monotonic()
+        asked.tries += 1
+        asked.timeouts += now_s - asked.sent_s > 0.9 * TIMEOUTS_S[asked.timeouts]
+        if asked.tries >= TRIES or asked.timeouts >= len(TIMEOUTS_S):
+            return None
+        return now_s + FIRST_REST_S * 2**asked.tries
 
     def close(self) -> None:
         """Stop asking, within a second. A second call does nothing."""
