@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 
 import pytest
 from live import RRBOT
+from msgspec.structs import replace
 from support import a_free_port, until
 
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.following.events import Event
 from zstate.listener import TransformListener
-from zstate.net.presence import tokens_now
+from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
 from zstate.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
+from zstate.wire.keys import Stream, stream_key, writer_key
+from zstate.wire.messages import JointState, RobotDescription, order_digest
+from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.writer import Writer
 
 WRITER = """
     import sys
@@ -127,6 +133,33 @@ def test_of_two_on_networks_that_are_joined_later_the_later_one_ends(later_publi
         with pytest.raises(SecondWriter):
             second.publish([0.0, 0.0])
         first.publish([0.0, 0.0])
+
+
+@pytest.mark.parametrize("stream", ["joint_states", "robot_description"])
+def test_a_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_publishes(
+    sessions, monkeypatch: pytest.MonkeyPatch, stream
+):
+    monkeypatch.setattr("zstate.net.claims._AT_ONCE_S", 0.0)
+    ours, theirs = sessions
+    stranger = Writer("stranger", "laptop", 9, 1, 99)
+    with StatePublisher(ours, RRBOT, "r1") as publisher:
+        for _ in range(2):
+            publisher.publish([0.0, 0.0])
+        with announce(theirs, writer_key("r1", stream, stranger.identity)):
+            until(lambda: len(tokens_now(ours, f"zstate/r1/@writer/{stream}/*", 1.0)) == 2)
+            looked_until = time.monotonic() + 0.3
+            while time.monotonic() < looked_until:
+                publisher.publish([0.0, 0.0])
+            description = replace(publisher.description(), session=stranger.session)
+            state = JointState(1, 0, stranger.session, order_digest(RRBOT.joint_names), bytes(16))
+            said = state if stream == "joint_states" else description
+            with pytest.raises(SecondWriter) as raised:
+                until(lambda: put(theirs, stream, said) or publisher.publish([0.0, 0.0]))
+    assert raised.value.first == stranger
+
+
+def put(session: Session, stream: Stream, message: JointState | RobotDescription) -> None:
+    session.zenoh.put(stream_key("r1", stream), encode(message), encoding=ENCODINGS[type(message)])
 
 
 def test_parts_of_a_robot_may_have_a_writer_each(sessions):

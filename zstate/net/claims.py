@@ -8,18 +8,21 @@ from __future__ import annotations
 import time
 import weakref
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import datetime
 from typing import TypeAlias
 
 import zenoh
 
 from zstate.closing import Closing
-from zstate.errors import SecondWriter, duration_text
+from zstate.errors import MessageError, SecondWriter, duration_text
 from zstate.locks import new_lock
 from zstate.net.presence import tokens_there
 from zstate.net.receiver import Ring
 from zstate.net.session import Session
-from zstate.wire.keys import ANY
+from zstate.net.streams import arrival_of
+from zstate.wire.keys import ANY, Stream, stream_key
+from zstate.wire.messages import RobotDescription, Sample, StaticTransforms
 from zstate.wire.native import NativeWire
 from zstate.wire.writer import Announced, Writer
 
@@ -54,12 +57,18 @@ class Claim(Closing):
     Raises SecondWriter when somebody else who lives is announced with one of them, or claims it in the
     same session. Two that open at the same time may not see each other yet: ``check`` tells the later
     one, ever after, and ``settle`` at once.
+
+    From a second after the first ``check`` this writer is established. A token alone does not end it any
+    more, whatever start it claims: the other writer must also publish one of the streams. So of two that
+    publish on networks which are joined later, the later one ends.
     """
 
     def __init__(self, session: Session, wanted: Sequence[Announced]) -> None:
         self._session = session
         self._wanted = wanted
         self._rivals: set[Announced] = set()
+        self._received: dict[tuple[Stream, str], zenoh.ext.AdvancedSubscriber[_Handler]] = {}
+        self._publishing: set[int] = set()
         self._first: Announced | None = None
         self._look_at = 0.0
         self._heard_of_all_at = 0.0
@@ -104,6 +113,8 @@ class Claim(Closing):
             if not self._rivals:
                 return
             earlier = {rival for rival in self._rivals if self._is_before_us(rival)}
+            if now > self._heard_of_all_at:
+                earlier = {rival for rival in earlier if self._publishes(rival)}
             # Zenoh now and then goes on telling of a token that is gone, in the session that followed it.
             there = earlier.intersection(self._rivals_now()) if earlier else earlier
             self._rivals -= earlier - there
@@ -117,6 +128,8 @@ class Claim(Closing):
         self._leave()
         if self._tokens is not None:
             self._session.release(self._tokens)
+        while self._received:
+            self._session.release(self._received.popitem()[1])
 
     def _enter(self) -> None:
         """Of those in one session the first is known at once, and without asking the network."""
@@ -154,6 +167,23 @@ class Claim(Closing):
         if seen >= CAPACITY:  # some may have been lost
             self._rivals = set(self._rivals_now())
 
+    def _publishes(self, rival: Announced) -> bool:
+        """Whether a sample or a latched value of ``rival`` has been received, from the first call on."""
+        place = (rival.stream, rival.name)
+        if place not in self._received:
+            self._received[place] = _subscribed(self._session, rival)
+        handler = self._received[place].handler
+        for _ in range(CAPACITY):
+            sample = handler.try_recv()
+            if sample is None:
+                break
+            with suppress(MessageError):  # not ours, or withdrawn
+                for message in _WIRE.decode(rival.stream, arrival_of(sample), rival.robot):
+                    if isinstance(message, Sample | StaticTransforms | RobotDescription):
+                        self._publishing.add(message.session)
+        self._publishing &= {one.writer.session for one in self._rivals}
+        return rival.writer.session in self._publishing
+
     def _followed(self) -> zenoh.Subscriber[_Handler]:
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         return self._session.zenoh.liveliness().declare_subscriber(self._expression, ring, history=True)
@@ -174,6 +204,16 @@ class Claim(Closing):
 
     def _is_before_us(self, rival: Announced) -> bool:
         return age_of(rival) < age_of(self._wanted[0])
+
+
+def _subscribed(session: Session, rival: Announced) -> zenoh.ext.AdvancedSubscriber[_Handler]:
+    ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
+    return zenoh.ext.declare_advanced_subscriber(
+        session.zenoh,
+        stream_key(rival.robot, rival.stream, rival.name),
+        ring,
+        history=zenoh.ext.HistoryConfig(max_samples=1),
+    )
 
 
 def await_the_meeting(session: Session) -> None:
