@@ -221,16 +221,3 @@ def test_zenoh_says_nothing_on_the_terminal(spawn, free_port: int):
     assert child.wait() == 0
     assert [child.line(), child.line()] == ["refused", "refused"]
     assert child.stderr == ""
-
-
-def test_a_program_that_forgets_to_close_ends_all_the_same(spawn):
-    child: Child = spawn(
-        """
-        from zstate.net.session import connect
-        from zstate.net.streams import StreamSubscriber
-        session = connect()
-        inbox = StreamSubscriber(session, "k", print)
-        """
-    )
-    assert child.wait() == 0
-    assert child.stderr == ""

@@ -165,7 +165,7 @@ def main() -> NoReturn:
 def _leave(code: str | int | None) -> NoReturn:
     # A thread that is inside Zenoh as Python shuts down, such as one that still connects, aborts the process.
     code = code or 0
-    if isinstance(code, int) and any(thread.daemon for thread in threading.enumerate()):
+    if isinstance(code, int) and any(map(_is_at_work, threading.enumerate())):
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
@@ -173,6 +173,11 @@ def _leave(code: str | int | None) -> NoReturn:
     # Python looks for garbage as it ends, a tenth of a second long where it has heard a fleet.
     gc.freeze()
     sys.exit(code)
+
+
+def _is_at_work(thread: threading.Thread) -> bool:
+    # The thread that closes sessions at the end has nothing to close where all are closed.
+    return thread.daemon and thread.name != "zstate exit"
 
 
 def _end(number: int, _: FrameType | None) -> None:

@@ -23,6 +23,7 @@ from zstate.clock import Clock, SystemClock
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.locks import new_lock
+from zstate.net.at_exit import join_at_exit
 from zstate.net.replies import query
 from zstate.net.service import Answer, Service
 from zstate.net.session import Session
@@ -165,7 +166,8 @@ class OffsetMeter(Closing):
             self._wanted.add(measured.robot, measured)
             if not self._is_running:
                 self._is_running = True
-                threading.Thread(target=self._run, name="zstate clock offsets", daemon=True).start()
+                thread = threading.Thread(target=self._run, name="zstate clock offsets", daemon=True)
+                join_at_exit(thread).start()
 
     def close(self) -> None:
         """Measure no more. A second call does nothing."""

@@ -12,3 +12,12 @@ def keep_for_ever(entity: object) -> None:
     the parent: the child would wait for them until it is killed.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(entity))
+
+
+def forked_text(what: str) -> str:
+    """``what`` does not work in a forked process, and the two ways out."""
+    return (
+        f"{what}; Zenoh does not work after a fork: call connect() in the child processes alone, once they "
+        "have started, or start them with the 'spawn' or 'forkserver' method (for instance "
+        "multiprocessing.get_context('spawn'), DataLoader(..., multiprocessing_context='spawn'))"
+    )

@@ -9,6 +9,7 @@ from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import zenoh
 
+from zstate.net.at_exit import join_at_exit
 from zstate.net.session import Session
 from zstate.net.undeclaring import Undeclarable
 
@@ -61,7 +62,8 @@ class Receiver(Generic[T]):
         self._on_batch = on_batch
         self._capacity = capacity
         self._closed = False
-        self._thread = threading.Thread(target=self._run, name="zstate receiver", daemon=True)
+        thread = threading.Thread(target=self._run, name="zstate receiver", daemon=True)
+        self._thread = join_at_exit(thread)
         self._thread.start()
 
     def close(self) -> None:

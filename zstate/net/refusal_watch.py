@@ -17,7 +17,10 @@ from contextlib import suppress
 import zenoh
 
 from zstate.closing import Closing
+from zstate.errors import Closed
+from zstate.net.at_exit import join_at_exit
 from zstate.net.rendezvous import JOIN_WITHIN_S
+from zstate.net.runtime import open_zenoh
 from zstate.net.security import Credentials
 
 _LOG = logging.getLogger("zstate")
@@ -55,19 +58,20 @@ class RefusalWatch(Closing):
         self._seeks = json.loads(config.get_json("scouting/multicast/enabled")) is True
         self._settled: set[str] = set()
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="zstate refusals", daemon=True)
+        thread = threading.Thread(target=self._run, name="zstate refusals", daemon=True)
+        self._thread = join_at_exit(thread)
         if endpoints or self._seeks:
             self._thread.start()
 
     def close(self) -> None:
         """Look no more. A second call does nothing."""
         self._stop.set()
-        if self._thread.ident is not None:
+        if self._thread.ident not in (None, threading.get_ident()):
             self._thread.join(JOIN_WITHIN_S)
 
     def _run(self) -> None:
         period_s = FIRST_LOOK_S
-        with suppress(zenoh.ZError):  # the session was closed meanwhile
+        with suppress(zenoh.ZError, Closed):  # the session was closed, or the process ends
             while not self._stop.wait(period_s):
                 self._look()
                 period_s = PERIOD_S
@@ -124,7 +128,7 @@ class RefusalWatch(Closing):
         for path, value in told.items():
             config.insert_json5(path, json.dumps(value))
         try:
-            zenoh.open(config).close()
+            open_zenoh(config).close()
         except zenoh.ZError:
             return False
         return True

@@ -19,8 +19,9 @@ from contextlib import suppress
 
 import zenoh
 
-from zstate.errors import ConfigError
+from zstate.errors import Closed, ConfigError
 from zstate.locks import new_lock
+from zstate.net.at_exit import join_at_exit
 from zstate.net.lobby import Lobby
 from zstate.net.membership import Membership
 
@@ -68,15 +69,16 @@ class Rendezvous:
     def watch(self, session: zenoh.Session, endpoint: str) -> None:
         """Take over when the port falls free; keep ``session`` at ``endpoint`` known there."""
         membership = Membership(session, endpoint, self.endpoint)
-        self._watcher = threading.Thread(
+        watcher = threading.Thread(
             target=self._watch, args=(membership,), name="zstate rendezvous", daemon=True
         )
+        self._watcher = join_at_exit(watcher)
         self._watcher.start()
 
     def close(self) -> None:
         """Give the port up, if it is ours; another process takes it over."""
         self._stop.set()
-        if self._watcher is not None:
+        if self._watcher not in (None, threading.current_thread()):
             self._watcher.join(JOIN_WITHIN_S)
         with self._lock:
             lobby, self._lobby = self._lobby, None
@@ -84,7 +86,7 @@ class Rendezvous:
             lobby.close()
 
     def _watch(self, membership: Membership) -> None:
-        with suppress(zenoh.ZError):  # the session was closed
+        with suppress(zenoh.ZError, Closed):  # the session was closed, or the process ends
             while not self._stop.wait(PROBE_PERIOD_S):
                 self._take_over()
                 membership.renew(self._stop)

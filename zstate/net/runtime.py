@@ -9,6 +9,8 @@ import os
 
 import zenoh
 
+from zstate.net.at_exit import session_opening
+
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 
 # Of Zenoh's runtimes the sockets belong to "net" and "acc", and what receives from them to "rx": each sample
@@ -28,12 +30,16 @@ def runtime(*, is_router: bool) -> str:
 
 
 def open_zenoh(config: zenoh.Config) -> zenoh.Session:
-    """``zenoh.open``; a process's first session decides on the threads, unless ZENOH_RUNTIME does."""
-    if RUNTIME_VARIABLE in os.environ:
-        return zenoh.open(config)
-    mode = config.get_json("mode").strip('"')
-    os.environ[RUNTIME_VARIABLE] = runtime(is_router=mode == "router")
-    try:
-        return zenoh.open(config)
-    finally:
-        os.environ.pop(RUNTIME_VARIABLE, None)  # it was read, and is not for the processes started here
+    """``zenoh.open``; a process's first session decides on the threads, unless ZENOH_RUNTIME does.
+
+    Raises Closed in a forked process (see ``session_opening``), and where the process ends.
+    """
+    with session_opening():
+        if RUNTIME_VARIABLE in os.environ:
+            return zenoh.open(config)
+        mode = config.get_json("mode").strip('"')
+        os.environ[RUNTIME_VARIABLE] = runtime(is_router=mode == "router")
+        try:
+            return zenoh.open(config)
+        finally:
+            os.environ.pop(RUNTIME_VARIABLE, None)  # it was read, and is not for the processes started here

@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-import atexit
 import itertools
 import math
 import os
 import threading
 import time
-import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
@@ -20,6 +18,7 @@ import zenoh
 from zstate.closing import Closing
 from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
 from zstate.locks import new_lock
+from zstate.net.at_exit import close_at_exit, end_sessions, join_at_exit, session_opening
 from zstate.net.config import (
     CONFIG_VARIABLE,
     ConfigSource,
@@ -31,7 +30,7 @@ from zstate.net.config import (
     our_config,
 )
 from zstate.net.environment import naming_the_variable, said_in_environment
-from zstate.net.forked import keep_for_ever
+from zstate.net.forked import forked_text, keep_for_ever
 from zstate.net.modes import (
     check_credentials,
     check_mode,
@@ -103,21 +102,31 @@ def connect(
                     timeout_s=timeout_s,
                     credentials=credentials or said.credentials,
                 )
-    mode = mode or "peer"
-    checked = _check(mode, endpoints, listen, timeout_s)
+    checked = _check(mode or "peer", endpoints, listen, timeout_s)
     if credentials is not None:
         _check_credentials(credentials, checked[1], checked[2])
     source = config if config is not None else os.environ.get(CONFIG_VARIABLE) or None
-    if source is None:
-        return _connect(*checked, timeout_s, credentials)
+    with session_opening():
+        if source is None:
+            return _connect(*checked, timeout_s, credentials)
+        return _connect_as_configured(source, *checked, credentials)
+
+
+def _connect_as_configured(
+    source: ConfigSource,
+    mode: Mode,
+    endpoints: tuple[str, ...],
+    listen: tuple[str, ...],
+    credentials: Credentials | None,
+) -> Session:
     if mode == "loopback":
         raise ConfigError(
             "mode 'loopback' stays on this host, and a Zenoh configuration could leave it; drop the "
             f"configuration ({CONFIG_VARIABLE} names one, too), or the mode",
             path="mode",
         )
-    given = given_config(source, *checked, credentials)
-    where = checked[1] or endpoints_in(given)
+    given = given_config(source, mode, endpoints, listen, credentials)
+    where = endpoints or endpoints_in(given)
     return _session(given, where, credentials or credentials_in(given), patience_in(given))
 
 
@@ -215,7 +224,10 @@ class Session(Closing):
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
         self.twin = twin
-        _OPEN.add(self)
+        close_at_exit(self)
+
+    def __del__(self) -> None:
+        self.leave()
 
     def __repr__(self) -> str:
         return f"Session({self.zid}{', closed' if self._closed else ''})"
@@ -235,10 +247,7 @@ class Session(Closing):
         if self._closed:
             raise Closed("this session is closed; connect() again")
         if os.getpid() != self._pid:
-            raise Closed(
-                f"this session belongs to process {self._pid} and does not work after fork; "
-                "connect() in the child, or start it with the 'spawn' method"
-            )
+            raise Closed(forked_text(f"this session belongs to process {self._pid}"))
 
     def release(self, entity: Undeclarable) -> None:
         """Undeclare something of this session. Nothing happens if that, or the session, is gone."""
@@ -250,37 +259,40 @@ class Session(Closing):
 
     def close(self) -> None:
         """Leave the network within a second. A second call does nothing."""
-        with self._lock:
-            if os.getpid() != self._pid:
-                keep_for_ever(self._raw)
-                return
-            if self._closed:
-                return
-            self._closed = True
-        _run_bounded(self._leave)
+        if self._is_last_call():
+            _run_bounded(self._leave)
 
-    def _stop_companion(self) -> None:
-        """End what runs beside the session to keep it connected."""
-        if self._companion is not None and os.getpid() == self._pid:
-            self._companion.close()
+    def leave(self) -> None:
+        """``close`` in this thread, where a link to a frozen process can hold it up for ten seconds."""
+        if self._is_last_call():
+            self._leave()
+
+    def keep_for_ever(self) -> None:
+        """Never free Zenoh's session, not even at the interpreter's end: in a forked process that hangs."""
+        keep_for_ever(self._raw)
+
+    def _is_last_call(self) -> bool:
+        with self._lock:
+            if self._closed or os.getpid() != self._pid:
+                return False
+            self._closed = True
+        return True
 
     def _leave(self) -> None:
-        self._stop_companion()
-        self._raw.close()
-
-    @staticmethod
-    @atexit.register
-    def _stop_companions() -> None:
-        # A thread that is inside Zenoh as Python shuts down aborts the process.
-        for session in tuple(_OPEN):
-            session._stop_companion()
-
-
-_OPEN: weakref.WeakSet[Session] = weakref.WeakSet()
+        if self._companion is not None:
+            self._companion.close()
+        with suppress(zenoh.ZError):  # it was held up for too long
+            self._raw.close()
 
 
 def _run_bounded(action: Callable[[], None]) -> None:
     # A link to a frozen process can hold Zenoh's own close up; whoever closes does not wait for that.
-    thread = threading.Thread(target=action, name="zstate close", daemon=True)
-    thread.start()
-    thread.join(CLOSE_WITHIN_S)
+    thread = join_at_exit(threading.Thread(target=action, name="zstate close", daemon=True))
+    try:
+        thread.start()
+    except RuntimeError:
+        if threading.main_thread().is_alive():
+            raise
+        end_sessions(action)  # Python is ending, and starts no more threads
+    else:
+        thread.join(CLOSE_WITHIN_S)

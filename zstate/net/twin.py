@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import zenoh
 
+from zstate.net.runtime import open_zenoh
 from zstate.net.security import Credentials
 
 
@@ -30,4 +31,4 @@ class Twin:
 
     def open(self) -> zenoh.Session:
         """It. Raises zenoh.ZError where nobody answers."""
-        return zenoh.open(self.config)
+        return open_zenoh(self.config)

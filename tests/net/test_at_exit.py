@@ -1,0 +1,222 @@
+"""Programs that end without closing anything end with their own exit code."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support import DEADLINE_S, SOON_S, Child
+
+from zstate import SineSource, StatePublisher, connect, load_model
+from zstate.net.at_exit import WITHIN_S
+
+PROGRAMS = {
+    "listener": """
+        listener = zstate.TransformListener(zstate.connect(), "rrbot")
+        listener.buffer.lookup("world", "tool", timeout_s=10.0)
+    """,
+    "events and a watch": """
+        seen = []
+        listener = zstate.TransformListener(zstate.connect(), on_event=seen.append)
+        watch = listener.buffer.watch("rrbot/world", "rrbot/tool", seen.append)
+        listener.buffer.lookup("rrbot/world", "rrbot/tool", timeout_s=10.0)
+    """,
+    "asyncio": """
+        import asyncio
+        async def wait():
+            listener = zstate.TransformListener(zstate.connect(), "rrbot", follow="tf")
+            await listener.buffer.wait_async("world", "tool", timeout_s=10.0)
+            return listener
+        listener = asyncio.run(wait())
+    """,
+    "publishers in daemon threads": """
+        session, model = zstate.connect(), zstate.load_model("rrbot")
+        one = zstate.StatePublisher(session, model, f"one{os.getpid()}")
+        two = zstate.StatePublisher(session, model, f"two{os.getpid()}")
+        edges = zstate.StaticPublisher(session, f"two{os.getpid()}", "camera")
+        edges.set(zstate.Transform("tool", "camera", [0, 0, 1], [0, 0, 0, 1]))
+        def publish():
+            while True:
+                two.publish([0.1, 0.2])
+                time.sleep(0.0005)
+        threading.Thread(target=one.run, args=(zstate.SineSource(model), 1000.0), daemon=True).start()
+        threading.Thread(target=publish, daemon=True).start()
+        while not one.stats.sent: time.sleep(0.001)
+    """,
+    "Zenoh's own callbacks, channels and queryables": """
+        import zenoh
+        session, seen = zstate.connect(), []
+        direct = zenoh.handlers.Callback(seen.append, indirect=False)
+        ring = session.zenoh.declare_subscriber("zstate/**", zenoh.handlers.RingChannel(10))
+        kept = [
+            session.zenoh.declare_subscriber("zstate/**", seen.append),
+            session.zenoh.declare_subscriber("zstate/**", direct),
+            session.zenoh.declare_queryable("question", lambda query: query.reply("question", b"answer")),
+        ]
+        threading.Thread(target=lambda: [seen.append(one) for one in ring], daemon=True).start()
+        list(session.zenoh.get("question", timeout=5.0))
+        while len(seen) < 10: time.sleep(0.001)
+    """,
+    "connecting": """
+        threading.Thread(target=zstate.connect, daemon=True).start()
+    """,
+}
+
+ENDINGS = {
+    "": 0,
+    "sys.exit(3)": 3,
+    "raise RuntimeError": 1,
+    "os.kill(os.getpid(), signal.SIGINT); time.sleep(10.0)": -signal.SIGINT,
+}
+
+IN_A_CHILD = """
+import multiprocessing, sys, zstate
+
+def listen():
+    listener = zstate.TransformListener(zstate.connect(), "rrbot")
+    listener.buffer.lookup("world", "tool", timeout_s=10.0)
+    sys.exit(3)
+
+if __name__ == "__main__":
+    child = multiprocessing.get_context(sys.argv[1]).Process(target=listen)
+    child.start()
+    child.join()
+    sys.exit(child.exitcode)
+"""
+
+BESIDE_A_FROZEN_READER = """
+    import os, sys, time, zenoh, zstate
+    session = zstate.connect()
+    publisher = session.zenoh.declare_publisher("k", congestion_control=zenoh.CongestionControl.DROP)
+    listener = zstate.TransformListener(session)
+    while not publisher.matching_status.matching: time.sleep(0.001)
+    print("matched")
+    sys.stdin.readline()
+    for _ in range(2000): publisher.put(bytes(10_000))
+    print("ending")
+    sys.exit(3)
+"""
+
+
+@pytest.fixture
+def rrbot(rendezvous: str) -> Iterator[None]:
+    """A robot that is published at every moment of a program's end."""
+    model = load_model("rrbot")
+    with connect() as session, StatePublisher(session, model) as publisher:
+        running = threading.Thread(target=publisher.run, args=(SineSource(model), 500.0))
+        running.start()
+        yield
+        publisher.close()
+        running.join()
+
+
+def program(body: str, ending: str, *, in_function: bool) -> str:
+    """What a function has opened may be freed before the program ends."""
+    body = textwrap.dedent(body)
+    if in_function:
+        body = f"def main():\n{textwrap.indent(body, '    ')}\nmain()\n"
+    return f"import os, signal, sys, threading, time, zstate\n{body}\n{ending}"
+
+
+@pytest.mark.usefixtures("rrbot")
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_program_that_closes_nothing_ends_with_its_own_exit_code(spawn, name: str):
+    for in_function in (False, True):
+        children: list[tuple[Child, str]] = [
+            (spawn(program(PROGRAMS[name], ending, in_function=in_function)), ending) for ending in ENDINGS
+        ]
+        for child, ending in children:
+            assert (child.wait(), child.stderr.count("FATAL")) == (ENDINGS[ending], 0), child.stderr
+
+
+@pytest.mark.usefixtures("rrbot")
+@pytest.mark.parametrize("method", ["spawn", "forkserver", "fork"])
+def test_a_child_of_multiprocessing_ends_with_its_own_exit_code(tmp_path: Path, method: str):
+    script = tmp_path / "listening.py"
+    script.write_text(IN_A_CHILD)
+    done = subprocess.run(
+        [sys.executable, script, method], capture_output=True, text=True, timeout=DEADLINE_S, check=False
+    )
+    assert (done.returncode, done.stderr) == (3, "")
+
+
+@pytest.mark.usefixtures("rrbot")
+def test_nothing_is_printed_at_the_end_of_a_program_that_closes_nothing(spawn):
+    child: Child = spawn(program(PROGRAMS["publishers in daemon threads"], "", in_function=False))
+    assert (child.wait(), child.stderr) == (0, "")
+
+
+@pytest.mark.usefixtures("rrbot")
+def test_a_program_goes_on_while_python_waits_for_its_threads_and_in_its_atexit_functions(spawn):
+    body = """
+        import atexit
+        listener = zstate.TransformListener(zstate.connect(), "rrbot")
+        buffer = listener.buffer
+        def next_stamp():
+            return buffer.wait("world", "tool", buffer.latest("world", "tool") + 1, timeout_s=10.0).stamp
+        def work():
+            threading.main_thread().join()
+            for _ in range(20): next_stamp()
+            print("worked")
+        def last():
+            next_stamp()
+            print("looked again")
+        atexit.register(last)
+        buffer.wait("world", "tool", timeout_s=10.0)
+        threading.Thread(target=work).start()
+    """
+    child: Child = spawn(program(body, "sys.exit(3)", in_function=False))
+    assert (child.wait(), child.stderr) == (3, "")
+    assert [child.line(), child.line()] == ["worked", "looked again"]
+
+
+def test_an_atexit_function_may_close_the_session(spawn):
+    child: Child = spawn("""
+        import atexit, zstate
+        session = zstate.connect()
+        atexit.register(session.close)
+    """)
+    assert (child.wait(), child.stderr) == (0, "")
+
+
+def test_no_session_is_opened_once_the_process_ends(spawn):
+    child: Child = spawn("""
+        import atexit
+        @atexit.register
+        def too_late():
+            try:
+                zstate.connect()
+            except zstate.ZStateError as error:
+                print(error)
+        import zstate
+        session = zstate.connect()
+    """)
+    assert (child.wait(), child.stderr) == (0, "")
+    assert "this process is ending" in child.line()
+
+
+def test_a_frozen_reader_holds_the_end_of_a_program_up_for_two_seconds_at_most(spawn):
+    reader: Child = spawn("""
+        import sys, zenoh, zstate
+        with zstate.connect() as session:
+            inbox = session.zenoh.declare_subscriber("k", zenoh.handlers.RingChannel(1))
+            print("ready")
+            sys.stdin.readline()
+    """)
+    reader.line()
+    child: Child = spawn(BESIDE_A_FROZEN_READER)
+    assert child.line() == "matched"
+    os.kill(reader.process.pid, signal.SIGSTOP)
+    child.tell()
+    assert child.line() == "ending"
+    began = time.monotonic()
+    assert child.wait() == 3
+    assert time.monotonic() - began < SOON_S + WITHIN_S
