@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import secrets
-import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 
 from zstate.clock import check_stamp
 from zstate.closing import Closing
 from zstate.errors import Closed
+from zstate.locks import new_lock
 from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
@@ -28,7 +28,7 @@ class ClockPublisher(Closing):
     def __init__(self, session: Session, wires: str | Sequence[str] = ("native",)) -> None:
         self._session_id = secrets.randbits(32)
         self._seq = 0
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         writer = writer_here(self._session_id)
         with ExitStack() as opening:
             # The time is no robot's; on a ROS wire it stands where nobody in particular does.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import weakref
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Literal
@@ -45,6 +47,9 @@ class TransformListener(Closing):
     All robots in a buffer keep one time, that of ``clock`` where it is given; robots of a simulation want
     a ``SimulatedClock``. What cannot be used is counted in ``stats``, reported once through ``logging``,
     and never stops the stream.
+
+    In a forked process nothing fills the buffer: there it answers from what it held, waits end at once, and
+    the errors say so.
 
     ``on_event(event)`` is called, from a thread of its own, when a writer joins, leaves, is restarted or
     cut off and comes back, falls silent, or fights with another one: see ``Event``.
@@ -90,6 +95,8 @@ class TransformListener(Closing):
             self._events = opening.enter_context(events)
             self._open(session, wire, opening)
             self._opened = opening.pop_all()
+        self._pid = os.getpid()
+        _LISTENERS.add(self)
 
     def _open(self, session: Session, wire: str, opening: ExitStack) -> None:
         expression, robot = self._wire.expression, self.robot
@@ -134,7 +141,16 @@ class TransformListener(Closing):
 
     def close(self) -> None:
         """Stop listening; the buffer keeps what it has. A second call does nothing."""
+        _LISTENERS.discard(self)
         self._opened.close()
+
+    def end_after_fork(self) -> None:
+        """In a forked child: nothing fills the buffer there."""
+        self.buffer.end(
+            f"its listener belongs to process {self._pid} and does not run after a fork: no more data comes; "
+            "call connect() and open a listener in the child processes alone, or start them with the 'spawn' "
+            "or 'forkserver' method"
+        )
 
     def _robot_of(self, key: str) -> str:
         return self._wire.robot_of(key) if self.robot == ANY else self.robot
@@ -296,3 +312,14 @@ class TransformListener(Closing):
             follower.name_writer(session, self._names[session])
         else:
             follower.writer_left(session)
+
+
+_LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()
+
+
+def _end_after_fork() -> None:
+    for listener in tuple(_LISTENERS):
+        listener.end_after_fork()
+
+
+os.register_at_fork(after_in_child=_end_after_fork)

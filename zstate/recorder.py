@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import math
 import os
 import threading
@@ -13,9 +14,11 @@ from pathlib import Path
 
 from zstate.clock import SystemClock, wait_in_slices
 from zstate.closing import Closing
-from zstate.errors import InvalidInput, MessageError
+from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.following.gaps import Gaps
 from zstate.following.tally import Tally
+from zstate.locks import new_lock, outlive_fork
+from zstate.net.forked import forked_text
 from zstate.net.inbox import Heard, Inbox
 from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
@@ -97,9 +100,9 @@ class Recorder(Closing):
         self._held: list[Heard] = []
         self._begins_at: int | None = None
         self._scribe: Scribe | None = None
-        self._closing = threading.Lock()
-        self._stop = threading.Event()
-        self._ended = threading.Event()
+        self._closing = new_lock()
+        self._stop = outlive_fork(threading.Event())
+        self._ended = outlive_fork(threading.Event())
         with ExitStack() as opening:
             self._inbox = opening.enter_context(Inbox(session))
             robot = self._chosen[0] if len(self._chosen) == 1 else ANY
@@ -112,6 +115,9 @@ class Recorder(Closing):
                 path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
             )
             self._opened = opening.pop_all()
+        self._pid = os.getpid()
+        # Before sessions are closed at the end of a program that forgets to close: the file is finished.
+        atexit.register(self.close)
         self._thread = threading.Thread(target=self._run, name="zstate recorder", daemon=True)
         self._thread.start()
 
@@ -130,11 +136,17 @@ class Recorder(Closing):
         )
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Block until the recording has ended, or for ``timeout_s``; whether it has ended."""
+        """Block until the recording has ended, or for ``timeout_s``; whether it has ended.
+
+        Raises Closed in a forked process, where the recorder does not run.
+        """
+        if os.getpid() != self._pid:
+            raise Closed(forked_text(f"this recorder belongs to process {self._pid}"))
         return wait_in_slices(self._ended, timeout_s)
 
     def close(self) -> None:
         """End the recording within a second: what was heard is written, and the file finished."""
+        atexit.unregister(self.close)
         self._stop_hearing()
         self._stop.set()
         self._thread.join(_JOIN_WITHIN_S)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from zstate.clock import SIMULATED, wait_in_slices
 from zstate.closing import Closing
 from zstate.errors import Closed, MessageError, NoClock, duration_text
+from zstate.locks import new_lock
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
@@ -50,7 +51,7 @@ class SimulatedClock(Closing):
         self._ended_sessions: set[int] = set()
         self._heard_s = 0.0
         self._has_begun = threading.Event()
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._waits: list[tuple[int, threading.Event]] = []
         self._is_open = True
         self.key = self._wire.expression(SHARED, "clock")

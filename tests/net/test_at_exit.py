@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from support import DEADLINE_S, SOON_S, Child
 
-from zstate import SineSource, StatePublisher, connect, load_model
+from zstate import Recording, SineSource, StatePublisher, connect, load_model
 from zstate.net.at_exit import WITHIN_S
 
 PROGRAMS = {
@@ -146,6 +146,19 @@ def test_a_child_of_multiprocessing_ends_with_its_own_exit_code(tmp_path: Path, 
         [sys.executable, script, method], capture_output=True, text=True, timeout=DEADLINE_S, check=False
     )
     assert (done.returncode, done.stderr) == (3, "")
+
+
+@pytest.mark.usefixtures("rrbot")
+def test_a_recording_that_nobody_closes_is_finished_at_the_end(spawn, tmp_path: Path):
+    body = """
+        from zstate.recorder import Recorder
+        recorder = Recorder(zstate.connect(), sys.argv[1], "rrbot")
+        while not recorder.stats.messages: time.sleep(0.001)
+    """
+    child: Child = spawn(program(body, "sys.exit(3)", in_function=True), str(tmp_path / "run.mcap"))
+    assert (child.wait(), child.stderr) == (3, "")
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert recording.robots == ("rrbot",)
 
 
 @pytest.mark.usefixtures("rrbot")

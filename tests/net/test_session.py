@@ -153,6 +153,42 @@ def test_a_forked_child_is_refused_and_may_close_without_harm():
     session.close()
 
 
+def test_connect_is_refused_in_a_fork_of_a_process_that_used_zenoh_and_in_forks_of_that(spawn):
+    child: Child = spawn("""
+        import os, sys
+        from zstate import ZStateError, connect
+
+        def try_to_connect():
+            try:
+                connect()
+            except ZStateError as error:
+                print(os.getpid(), error)
+
+        def forked(action):
+            pid = os.fork()
+            if pid == 0:
+                action()
+                sys.exit()  # which frees what was inherited
+            assert os.waitpid(pid, 0)[1] == 0
+
+        print(os.getpid())
+        forked(lambda: connect().close())  # before Zenoh was used
+        session = connect()
+        forked(try_to_connect)
+        forked(lambda: None)
+        session.close()
+        forked(try_to_connect)
+        forked(lambda: forked(try_to_connect))
+    """)
+    parent = child.line()
+    for _ in range(3):
+        refusal = child.line()
+        assert f"process {parent} used Zenoh before this one was forked from it" in refusal
+        assert "in the child processes alone" in refusal
+        assert "'spawn' or 'forkserver'" in refusal
+    assert (child.wait(), child.stderr) == (0, "")
+
+
 def test_a_configuration_is_taken_from_a_file_a_mapping_zenoh_or_the_environment(
     tmp_path, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):

@@ -19,7 +19,7 @@ from zstate.buffer.questions import Question, Questions, seconds
 from zstate.buffer.tracks import JointTrack
 from zstate.buffer.watch import Watch
 from zstate.clock import Clock, check_stamp, wait_in_slices
-from zstate.errors import LookupFailed, timed_out
+from zstate.errors import Closed, LookupFailed, timed_out
 from zstate.transform import Transform
 from zstate.twist import Twist
 
@@ -79,9 +79,10 @@ class TransformBuffer(Questions):
                 transform = known[1].at(at)
                 if transform is not None:
                     return transform
-                known[1].refuse(at)
+                if not self._ended:
+                    known[1].refuse(at)
         question = self._question(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
-        if seconds("timeout_s", timeout_s) > 0.0:
+        if seconds("timeout_s", timeout_s) > 0.0 and not self._ended:
             return self._wait(question, timeout_s)
         return self._answer(question)
 
@@ -146,10 +147,12 @@ class TransformBuffer(Questions):
     def wait(self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0) -> Transform:
         """``lookup`` as soon as it has an answer; unknown and unconnected frames are waited for, too.
 
-        Raises at once what waiting cannot mend: InPast for an ``at`` before all samples kept. After
+        Raises at once what waiting cannot mend: InPast for an ``at`` before all samples kept, and anything
+        in a process forked from that of the listener which fills this buffer. After
         ``timeout_s`` raises the reason of the last try, as an error that is also a TimeoutError.
         """
-        return self._wait(self._question(target, source, at), seconds("timeout_s", timeout_s))
+        question, timeout_s = self._question(target, source, at), seconds("timeout_s", timeout_s)
+        return self._answer(question) if self._ended else self._wait(question, timeout_s)
 
     async def wait_async(
         self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0
@@ -158,6 +161,8 @@ class TransformBuffer(Questions):
         import asyncio  # noqa: PLC0415  # who calls this has it already, and others do not need it
 
         question = self._question(target, source, at)
+        if self._ended:
+            return self._answer(question)
         loop, event = asyncio.get_running_loop(), asyncio.Event()
         deadline = loop.time() + seconds("timeout_s", timeout_s)
 
@@ -204,6 +209,8 @@ class TransformBuffer(Questions):
         still be unknown. The callback runs on the thread that inserts: keep it short.
         """
 
+        if self._ended:
+            raise Closed(self._ended)
         look = partial(self._newest, self._question(target, source, None))
         return Watch(self._room, look, callback, translation_m, rotation_rad)
 

@@ -56,6 +56,11 @@ class Questions(Store):
     def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self._paths: dict[tuple[str, str], KnownPath] = {}
+        self._ended = ""
+
+    def end(self, why: str) -> None:
+        """No data comes any more, which errors then say: waits become lookups. What is kept still answers."""
+        self._ended = self._ended or why
 
     def _try(self, question: Question, waiter: Waiter) -> Transform | LookupFailed:
         """An answer; or the reason against it, with ``waiter`` told what would change that."""
@@ -117,6 +122,7 @@ class Questions(Store):
         except LookupFailed as reason:
             if reason.requested is None:
                 reason.requested = question.at
+            reason.ended = self._ended
             raise
         if question.max_age_s is not None:
             self._refuse_stale(path, transform, question.max_age_s)

@@ -67,9 +67,8 @@ class InFuture(_OutsideHistory):
         )
 
     def _advice(self) -> str:
-        return (
-            "; wait for it (timeout_s=...), ask for the newest instant (at=None), or predict (predict_s=...)"
-        )
+        wait = "" if self.ended else "wait for it (timeout_s=...), "
+        return f"; {wait}ask for the newest instant (at=None), or predict (predict_s=...)"
 
 
 class InPast(_OutsideHistory):

@@ -19,13 +19,15 @@ class LookupFailed(ZStateError):
     ``target`` and ``source`` are the frames as asked, ``edge`` is the (parent, child) at fault.
     ``requested``, ``oldest`` and ``newest`` are stamps [ns]; ``track`` (whose history it is), ``rate_hz``
     and ``writer`` belong to the edge; each is None when it does not apply. The text is built when it is
-    read: a failed lookup in a control loop costs little. ``note`` says what else there is to know.
+    read: a failed lookup in a control loop costs little. ``note`` says what else there is to know, ``ended``
+    why no more data comes, where that is so.
     ``clock_offset_ns`` is how far the clock of the edge's writer is ahead of the one here, where that was
     measured, and ``clock_uncertainty_ns`` how far off that may be.
     """
 
     clock_offset_ns: int | None = None
     clock_uncertainty_ns: int | None = None
+    ended: str = ""
 
     def __init__(
         self,
@@ -52,7 +54,7 @@ class LookupFailed(ZStateError):
         self.note = ""
 
     def __str__(self) -> str:
-        note = f" ({self.note})" if self.note else ""
+        note = "".join(f" ({note})" for note in (self.note, self.ended) if note)
         return f"pose of {self.source!r} in {self.target!r}: {self.explanation()}{note}"
 
     def explanation(self) -> str:

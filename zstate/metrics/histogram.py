@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import accumulate
+
+from zstate.locks import new_lock
 
 
 class Histogram:
@@ -15,7 +16,7 @@ class Histogram:
         self._bounds = tuple(bounds)
         self._counts = [0] * (len(self._bounds) + 1)
         self._total = 0.0
-        self._lock = threading.Lock()
+        self._lock = new_lock()
 
     def note(self, value: float) -> None:
         """Another value."""

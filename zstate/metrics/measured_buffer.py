@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Sequence
 
@@ -12,6 +11,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock
 from zstate.errors import LookupFailed, WaitTimeout
+from zstate.locks import new_lock
 from zstate.metrics.histogram import Histogram
 from zstate.transform import Transform
 
@@ -32,7 +32,7 @@ class MeasuredBuffer(TransformBuffer):
     def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self.latency = Histogram(LATENCY_BOUNDS_S)
-        self._counting = threading.Lock()
+        self._counting = new_lock()
         self._lookups = 0
         self._failures: Counter[str] = Counter()
 

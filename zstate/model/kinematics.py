@@ -7,7 +7,6 @@ or text: its model is built joint by joint from the RobotModel, depth first as i
 
 from __future__ import annotations
 
-import threading
 from collections import defaultdict
 from difflib import get_close_matches
 from functools import cached_property
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.errors import InvalidInput, LibraryMissing
+from zstate.locks import new_lock
 from zstate.model.edges import EdgeForm, EdgeTable, Floats
 from zstate.model.robot import RobotModel
 
@@ -36,7 +36,7 @@ class Kinematics:
         self.model = model
         self.edges = tuple((joint.parent, joint.child) for joint in model.joints)
         self._table = EdgeTable(model)
-        self._lock = threading.Lock()
+        self._lock = new_lock()
 
     def edge_poses(self, positions: ArrayLike, out: Floats | None = None) -> Floats:
         """The pose of every link but the root in its parent.

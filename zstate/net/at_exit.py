@@ -142,7 +142,7 @@ def _join_users(deadline: float) -> None:
     That is closed, so they get Closed or ZError at the next step. A moment for those of which no frame shows
     it, as they use Zenoh directly.
     """
-    frames = sys._current_frames()
+    frames = sys._current_frames()  # pyright: ignore[reportPrivateUsage]  # but documented
     for thread in threading.enumerate():
         is_ours = not thread.daemon or thread.name.startswith("zstate ")
         if not is_ours and _uses_a_session(frames.get(thread.ident or 0)):
@@ -165,7 +165,8 @@ def _ignore_that_sessions_are_closed() -> None:
     report = threading.excepthook
 
     def report_others(args: threading.ExceptHookArgs) -> None:
-        if not issubclass(args.exc_type, (Closed, zenoh.ZError)):
+        is_refused_thread = args.exc_type is RuntimeError and "interpreter shutdown" in str(args.exc_value)
+        if not (is_refused_thread or issubclass(args.exc_type, (Closed, zenoh.ZError))):
             report(args)
 
     threading.excepthook = report_others

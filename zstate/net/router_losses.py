@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from contextlib import suppress
 
 import zenoh
 
 from zstate.closing import Closing
+from zstate.locks import new_lock
 from zstate.net.session import Session
 
 _JUST_NOW_S = 0.1
@@ -27,7 +27,7 @@ class RouterLosses(Closing):
         self._session = session
         self._known: set[str] = set()
         self._lost_at = -math.inf
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         channel: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(256)
         self._events = session.zenoh.info.declare_transport_events_listener(channel, history=True)
 

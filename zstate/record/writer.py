@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 import uuid
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from typing import NewType
 
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, RecordingError
+from zstate.locks import new_lock
 from zstate.record.split import Declared, Message, Split
 from zstate.record.splits import later_splits, split_path
 from zstate.wire.ros2.qos import Qos
@@ -57,7 +57,7 @@ class RecordWriter(Closing):
         self._overwrite = overwrite
         if not overwrite and (max_bytes or max_seconds):
             self._refuse_later_splits()
-        self._lock = threading.Lock()
+        self._lock = new_lock()
         self._recording = uuid.uuid4().hex
         self._declared: list[Declared] = []
         self._latched: dict[tuple[ChannelId, str], Message] = {}
