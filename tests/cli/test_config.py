@@ -28,7 +28,8 @@ def told(*arguments: str, code: int = 0) -> tuple[dict[str, tuple[Any, str]], li
 def test_without_a_word_everything_is_default():
     settings, problems = told()
     assert settings["mode"] == ("peer", "default")
-    assert settings["rendezvous"] == ("127.0.0.1:7450", "default")
+    addresses = "127.0.0.1:7450 127.0.0.1:7451 127.0.0.1:7452"
+    assert settings["rendezvous"] == (addresses, "default")
     assert settings["wire"] == ("native", "default")
     assert {origin for name, (_, origin) in settings.items() if name != "kernel"} == {"default"}
     assert problems == []

@@ -265,6 +265,27 @@ def test_a_stranger_at_the_rendezvous_is_seen(monkeypatch: pytest.MonkeyPatch):
     assert (found["name"], "does not answer: it is another program" in found["text"]) == ("network", True)
 
 
+def test_a_stopped_program_that_keeps_the_others_from_meeting_is_named_by_whoever_finds_nobody(
+    spawn: Spawn, rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch
+):
+    keeper = spawn("import sys, zstate; s = zstate.connect(); print(s.zid); sys.stdin.readline()")
+    keeper.line()
+    os.kill(keeper.process.pid, signal.SIGSTOP)
+    why = f"programs of this host meet at {rendezvous}, and process {keeper.process.pid} ("
+    found = broken_link()
+    assert why in found["text"]
+    assert "does not answer: it is stopped, as by Ctrl-Z" in found["text"]
+    assert found["next"] == f"kill -CONT {keeper.process.pid}"
+    assert why in zstate("ls").stderr.decode()
+    # The same with a second address: there the others meet, and are found.
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
+    with standing("r1"):
+        assert b"r1" in zstate("ls", "--json").stdout
+        said = warnings()["network"]
+    assert why in said
+    assert f"the others meet at 127.0.0.1:{free_port} meanwhile" in said
+
+
 @pytest.fixture
 def guarded(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A router that lets r1 be r1, desk look, and r3 in without a right to anything; r1 is there."""

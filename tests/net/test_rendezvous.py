@@ -1,12 +1,14 @@
+import os
+import signal
 import socket
 import threading
 import time
 
 import pytest
-from support import Child, until
+from support import SOON_S, Child, until
 
 from zstate.errors import ConfigError
-from zstate.net.rendezvous import RENDEZVOUS, rendezvous_address
+from zstate.net.rendezvous import RENDEZVOUS, rendezvous_addresses, silent_addresses
 from zstate.net.session import Session, connect
 
 # Says its zid, then puts its name on k/<name> until it is told to stop; says every name it hears.
@@ -100,6 +102,55 @@ def test_who_connects_while_the_lobby_closes_still_meets_who_comes_later():
             until(lambda early=early, late=late: have_met(early, late) and have_met(late, early))
 
 
+@pytest.fixture
+def two_places(rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where this test meets, with a second address for while the first is silent."""
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
+
+
+@pytest.mark.usefixtures("two_places")
+def test_sessions_meet_at_the_next_address_while_the_keeper_of_the_first_is_stopped(spawn):
+    keeper = spawn(NODE, "keeper")
+    hears(keeper, "keeper")  # it alone has the port before the others come
+    early = spawn(NODE, "early")
+    hears(early, "keeper")
+    os.kill(keeper.process.pid, signal.SIGSTOP)
+    try:
+        late, _ = spawn(NODE, "late"), spawn(NODE, "last")
+        hears(late, "early", "last")
+        hears(early, "late")
+    finally:
+        os.kill(keeper.process.pid, signal.SIGCONT)
+    hears(keeper, "late", "last")
+    hears(late, "keeper")
+    with connect() as newcomer:
+        until(lambda: len(list(newcomer.zenoh.info.peers_zid())) >= 4)
+
+
+@pytest.mark.usefixtures("two_places")
+def test_a_session_that_opens_beside_a_stopped_keeper_has_met_the_others_when_it_is_open(spawn):
+    keeper = spawn(NODE, "keeper")
+    hears(keeper, "keeper")
+    with connect() as other:
+        until(lambda: len(list(other.zenoh.info.peers_zid())) >= 2)  # the keeper and its lobby
+        os.kill(keeper.process.pid, signal.SIGSTOP)
+        until(silent_addresses)
+        with connect() as newcomer:
+            until(lambda: have_met(newcomer, other), SOON_S)
+            assert len(silent_addresses()) == 1
+        os.kill(keeper.process.pid, signal.SIGCONT)
+        until(lambda: not silent_addresses())
+
+
+def test_the_second_address_is_left_alone_while_the_first_answers(
+    rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
+    with connect() as one, connect() as other, socket.socket() as probe:
+        until(lambda: have_met(one, other))
+        probe.bind(("127.0.0.1", free_port))
+
+
 def test_a_session_that_is_told_where_to_go_leaves_the_rendezvous_alone(rendezvous: str, free_port: int):
     host, port = rendezvous.split(":")
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -114,12 +165,18 @@ def test_a_session_that_is_told_where_to_go_leaves_the_rendezvous_alone(rendezvo
 
 def test_the_rendezvous_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", "box.local:1234")
-    assert rendezvous_address() == ("box.local", 1234)
+    assert rendezvous_addresses() == (("box.local", 1234),)
+    monkeypatch.setenv("ZSTATE_RENDEZVOUS", "127.0.0.1:1 127.0.0.1:2")
+    assert rendezvous_addresses() == (("127.0.0.1", 1), ("127.0.0.1", 2))
     monkeypatch.delenv("ZSTATE_RENDEZVOUS")
-    assert rendezvous_address() == ("127.0.0.1", int(RENDEZVOUS.split(":")[1]))
+    assert rendezvous_addresses() == tuple(
+        ("127.0.0.1", int(address.split(":")[1])) for address in RENDEZVOUS.split()
+    )
 
 
-@pytest.mark.parametrize("text", ["7450", "box:", "box:0", "box:70000", "tcp/box:1", ":1"])
+@pytest.mark.parametrize(
+    "text", ["7450", "box:", "box:0", "box:70000", "tcp/box:1", ":1", " ", "box:1 box", "box:1,box:2"]
+)
 def test_a_rendezvous_that_is_no_address_is_refused(text: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", text)
     with pytest.raises(ConfigError, match="host:port") as caught:

@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from zstate.cli.console import count_text
+from zstate.cli.probe import silent_rendezvous
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -93,8 +94,10 @@ class NativeWords:
         if not robots:
             from zstate.model.known import example_name
 
-            start = f"zstate publish {example_name()} --source sine"
-            return f"no robot is announced; start one, for instance with `{start}`"
+            start = f"start one, for instance with `zstate publish {example_name()} --source sine`"
+            silent = silent_rendezvous()
+            advice = f"{silent.text}; `zstate doctor` says more" if silent else start
+            return f"no robot is announced; {advice}"
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
 
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:

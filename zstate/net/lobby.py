@@ -14,15 +14,20 @@ from zstate.net.runtime import open_zenoh
 LOBBY_KEY = "@zstate/lobby"
 
 
+def lobby_key(number: int) -> str:
+    """What the lobby at the rendezvous address ``number`` subscribes to: each is told from the others."""
+    return f"{LOBBY_KEY}/{number}" if number else LOBBY_KEY
+
+
 class Lobby:
-    """A Zenoh peer that listens at ``endpoint``, and subscribes to ``LOBBY_KEY`` to show that it is open.
+    """A Zenoh peer that listens at ``endpoint``, and subscribes to ``key`` to show that it is open.
 
     Raises ZError where somebody listens already.
     """
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, key: str = LOBBY_KEY) -> None:
         self._session = open_zenoh(our_config("peer", (), [endpoint]))
-        self._sign = self._session.declare_subscriber(LOBBY_KEY, zenoh.handlers.RingChannel(1))
+        self._sign = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
 
     def close(self) -> None:
         """Leave."""

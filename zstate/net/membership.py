@@ -29,11 +29,13 @@ class Membership:
     is not tried again. Zenoh calls both connected. An open lobby is told by what it subscribes to.
     """
 
-    def __init__(self, session: zenoh.Session, endpoint: str, lobby: str) -> None:
-        self._publisher = session.declare_publisher(LOBBY_KEY)
+    def __init__(self, session: zenoh.Session, endpoint: str, lobby: str, key: str = LOBBY_KEY) -> None:
+        self._publisher = session.declare_publisher(key)
         self._endpoints = (lobby, endpoint)
         self._pause_s = _FIRST_PAUSE_S
         self._due: float | None = None
+        self.is_silent = False
+        """Whether no lobby was found when the session was to be introduced there last."""
 
     def renew(self, stop: threading.Event) -> None:
         """Look, and have the session introduced where it has seen no lobby for a while.
@@ -41,17 +43,19 @@ class Membership:
         To be called several times a second. Takes up to a second, or until ``stop``. Raises ZError when
         that is due and the session is closed.
         """
-        if self._is_known:
-            self._pause_s, self._due = _FIRST_PAUSE_S, None
+        if self.is_known:
+            self._pause_s, self._due, self.is_silent = _FIRST_PAUSE_S, None, False
         elif self._due is None:
             self._due = time.monotonic() + self._pause_s
         elif time.monotonic() >= self._due:
             self._introduce(stop)
+            self.is_silent = not self.is_known
             self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
             self._due = time.monotonic() + self._pause_s
 
     @property
-    def _is_known(self) -> bool:
+    def is_known(self) -> bool:
+        """Whether a lobby is seen there now."""
         # the stub says bool, but it is an object and always true
         return bool(self._publisher.matching_status.matching)  # pyright: ignore
 
@@ -63,5 +67,5 @@ class Membership:
         config.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')  # and to nobody else
         deadline = time.monotonic() + INTRODUCED_WITHIN_S
         with suppress(zenoh.ZError), open_zenoh(config):
-            while not self._is_known and time.monotonic() < deadline and not stop.wait(_ROUND_S):
+            while not self.is_known and time.monotonic() < deadline and not stop.wait(_ROUND_S):
                 pass

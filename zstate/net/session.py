@@ -39,7 +39,7 @@ from zstate.net.modes import (
 )
 from zstate.net.opening import open_within, patience_in
 from zstate.net.refusal_watch import RefusalWatch
-from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_address
+from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
 from zstate.net.security import Credentials
 from zstate.net.twin import Twin
 from zstate.net.undeclaring import Undeclarable, undeclare
@@ -181,11 +181,11 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
             "(--connect) or listen= (--listen)",
             path="credentials",
         )
-    host, port = rendezvous_address()
+    addresses = rendezvous_addresses()
     if mode == "loopback":
-        check_stays_here([f"tcp/{host}:{port}"])
+        check_stays_here([f"tcp/{host}:{port}" for host, port in addresses])
     # The lobby first: while the rendezvous is silent, opening a session takes half a second longer.
-    rendezvous = Rendezvous((host, port))
+    rendezvous = Rendezvous(addresses)
     try:
         raw, endpoint = _open_on_this_host(rendezvous.endpoint)
         rendezvous.watch(raw, endpoint)

@@ -14,7 +14,7 @@ from zstate.cli.logs import FORMAT_VARIABLE, FORMATS
 from zstate.errors import ZStateError
 from zstate.extension import VARIABLE as KERNEL_VARIABLE
 from zstate.net.config import CONFIG_VARIABLE, endpoint_list
-from zstate.net.rendezvous import RENDEZVOUS_VARIABLE, rendezvous_address
+from zstate.net.rendezvous import RENDEZVOUS_VARIABLE, rendezvous_addresses
 
 _PREFIX = "ZSTATE_"
 _VARIABLES = (
@@ -31,7 +31,7 @@ def problems(context: click.Context) -> list[str]:
     network_said = context.params
     checks: tuple[Callable[[], object], ...] = (
         lambda: endpoint_list((*network_said["connect"], *network_said["listen"])),
-        rendezvous_address,
+        rendezvous_addresses,
         lambda: network_of(context),
     )
     found = [text for check in checks if (text := _objection(check))]

@@ -5,21 +5,22 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from importlib import metadata
 
 from zstate import __version__
 from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.network import Network
-from zstate.cli.probe import is_open, objection, unanswered
+from zstate.cli.probe import is_open, objection, silent_rendezvous, unanswered
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.connections import connections
-from zstate.net.lobby import LOBBY_KEY
+from zstate.net.lobby import lobby_key
 from zstate.net.presence import announce, discover
 from zstate.net.refusal import knock
-from zstate.net.rendezvous import rendezvous_address
+from zstate.net.rendezvous import rendezvous_addresses
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
 
@@ -84,26 +85,34 @@ def network_check(session: Session, network: Network) -> Check:
 
 
 def _host_check(session: Session) -> Check:
-    host, port = rendezvous_address()
-    if not _is_met(session):
-        text = (
-            f"programs of this host meet at {host}:{port}, and whoever has that port does not answer: it is "
-            "another program, or one of zstate that is stopped"
+    addresses = [f"{host}:{port}" for host, port in rendezvous_addresses()]
+    met = _met_at(session, len(addresses))
+    if met == 0:
+        count = connections(session).sessions["peer"] - 1
+        return ok("network", f"programs of this host, which meet at {addresses[0]}: {count} besides this one")
+    silent = silent_rendezvous()
+    if silent is None:
+        return broken(
+            "network", f"programs of this host meet at {addresses[0]}, and none of them is found", ""
         )
-        return broken("network", text, f"ss -ltnp 'sport = :{port}'  # who is it?")
-    count = connections(session).sessions["peer"] - 1
-    return ok("network", f"programs of this host, which meet at {host}:{port}: {count} besides this one")
+    if met is None:
+        return broken("network", silent.text, silent.next)
+    return warning("network", f"{silent.text}; the others meet at {addresses[met]} meanwhile", silent.next)
 
 
-def _is_met(session: Session) -> bool:
-    """Whether there is a lobby; who has just joined may not know yet."""
+def _met_at(session: Session, count: int) -> int | None:
+    """At which of the rendezvous addresses there is a lobby; who has just joined may not know yet."""
     deadline = time.monotonic() + _MET_WITHIN_S
-    with StreamPublisher(session, LOBBY_KEY, "") as probe:
-        while not probe.has_readers:
-            if time.monotonic() > deadline:
-                return False
+    with ExitStack() as opened:
+        probes = [
+            opened.enter_context(StreamPublisher(session, lobby_key(number), "")) for number in range(count)
+        ]
+        while time.monotonic() < deadline:
+            for number, probe in enumerate(probes):
+                if probe.has_readers:
+                    return number
             time.sleep(0.02)
-    return True
+    return None
 
 
 def access_check(session: Session, network: Network, robot: str) -> Check | None:
