@@ -70,9 +70,7 @@ def silent_rendezvous() -> Objection | None:
         met = f"programs of this host meet at {host}:{port}, and"
         holder = _holder(port)
         if holder is None:
-            text = (
-                f"{met} whoever has that port does not answer: it is another program, or a stopped one"
-            )
+            text = f"{met} whoever has that port does not answer: it is another program, or a stopped one"
             return Objection(text, f"ss -ltnp 'sport = :{port}'  # who is it?")
         pid, command, is_stopped = holder
         met += f" process {pid} ({command}), which has that port, does not answer:"

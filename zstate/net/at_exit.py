@@ -98,6 +98,7 @@ class _Process:
 
     def _run(self) -> None:
         threading.main_thread().join()
+        self._ignore_what_is_no_news()
         _join_the_program()
         if not any(_runs_callbacks(thread) and not thread.daemon for thread in threading.enumerate()):
             self._requested.wait()
@@ -107,7 +108,6 @@ class _Process:
     def _close_all(self) -> None:
         with self._lock:
             self.is_ending = True
-        _ignore_that_sessions_are_closed()
         deadline = time.monotonic() + WITHIN_S
         for leave in (*self._leaving, *(session.leave for session in tuple(self.sessions))):
             leave()
@@ -119,6 +119,18 @@ class _Process:
             if thread in self.threads or _runs_callbacks(thread):
                 thread.join(max(0.0, deadline - time.monotonic()))
         _join_users(min(deadline, time.monotonic() + _USERS_END_WITHIN_S))
+
+    def _ignore_what_is_no_news(self) -> None:
+        """Threads that go on to the last find their session closed, and start no more threads themselves."""
+        report = threading.excepthook
+
+        def report_others(args: threading.ExceptHookArgs) -> None:
+            is_of_python = args.exc_type is RuntimeError and "interpreter shutdown" in str(args.exc_value)
+            is_closed = self.is_ending and issubclass(args.exc_type, (Closed, zenoh.ZError))
+            if not (is_of_python or is_closed):
+                report(args)
+
+        threading.excepthook = report_others
 
 
 def _join_the_program() -> None:
@@ -158,18 +170,6 @@ def _uses_a_session(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-def _ignore_that_sessions_are_closed() -> None:
-    """Threads of the program that go on to the last find closed what they use, which is no news."""
-    report = threading.excepthook
-
-    def report_others(args: threading.ExceptHookArgs) -> None:
-        is_refused_thread = args.exc_type is RuntimeError and "interpreter shutdown" in str(args.exc_value)
-        if not (is_refused_thread or issubclass(args.exc_type, (Closed, zenoh.ZError))):
-            report(args)
-
-    threading.excepthook = report_others
 
 
 _process = _Process()

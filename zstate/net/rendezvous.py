@@ -87,8 +87,8 @@ class Rendezvous:
         watcher = threading.Thread(
             target=self._watch, args=(session, endpoint), name="zstate rendezvous", daemon=True
         )
-        self._watcher = join_at_exit(watcher)
-        self._watcher.start()
+        join_at_exit(watcher).start()
+        self._watcher = watcher
         self._await_a_lobby()
 
     def _await_a_lobby(self) -> None:
