@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import json
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 import zenoh
+from live import Tap
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import until
 
 from zstate import TransformListener, connect
+from zstate.net.security import Credentials
+from zstate.net.session import Session
 
 pytestmark = pytest.mark.processes
 
@@ -122,3 +126,36 @@ def test_a_file_is_the_whole_configuration(tmp_path):
         message = failure("router", "--config", str(file), *option, code=2)
         assert option[0] in message
         assert "exclude each other" in message
+
+
+def test_peers_are_not_introduced_past_its_access_control(spawn: Spawn, free_port: int, tmp_path: Path):
+    """Over a direct link a robot could write another robot's keys."""
+    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    certs, acl, endpoint = str(tmp_path / "pki"), tmp_path / "acl.json5", f"tls/127.0.0.1:{free_port}"
+    zstate(
+        "certs", certs, "--identity", "router", "--identity", "ra", "--identity", "rb", "--identity", "desk"
+    )
+    acl.write_bytes(zstate("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
+    options = ("--listen", endpoint, "--certs", certs, "--identity", "router", "--acl", str(acl))
+    started(spawn, "router", *options).line()
+
+    def join(mode: str, name: str) -> Session:
+        return connect(mode=mode, endpoints=endpoint, credentials=Credentials.from_folder(certs, name))
+
+    with (
+        join("peer", "rb") as victim,
+        join("peer", "ra") as intruder,
+        join("client", "rb") as own,
+        join("client", "desk") as viewer,
+    ):
+        direct = Tap(victim, "zstate/rb/joint_commands")
+        routed = Tap(viewer, "zstate/*/tf_static/*")
+
+        def is_routed() -> bool:
+            intruder.zenoh.put("zstate/rb/joint_commands", b"go")
+            own.zenoh.put("zstate/rb/tf_static/model", b"from rb")
+            return len(routed.arrivals) >= 100
+
+        until(is_routed)
+        assert direct.arrivals == []
+        assert list(victim.zenoh.info.peers_zid()) == []

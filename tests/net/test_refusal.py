@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 from refusing import ROUTERS, Fleet
 
@@ -147,3 +149,53 @@ def test_where_nobody_listens_there_is_no_refusal_and_of_two_the_one_that_refuse
         connect(mode="client", endpoints=both, credentials=fleet.identity("expired"), timeout_s=0.2)
     assert caught.value.endpoint == fleet.tls("mtls")
     assert f"nothing answers at '{nobody}'" in str(caught.value)
+
+
+def test_a_listener_that_accepts_and_never_answers_is_not_taken_for_one_without_tls(fleet: Fleet):
+    """As the kernel accepts for a router process that is stopped."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        for endpoint, credentials in (
+            (f"tls/127.0.0.1:{port}", fleet.identity("r1")),
+            (f"tcp/127.0.0.1:{port}", None),
+        ):
+            with pytest.raises(Unreachable, match="accepted and nothing is answered") as caught:
+                connect(mode="client", endpoints=endpoint, credentials=credentials, timeout_s=0.2)
+            assert caught.value.endpoints == (endpoint,)
+
+
+def test_a_router_that_is_busy_with_failed_handshakes_is_told_from_one_that_refuses(
+    fleet: Fleet, spawn, free_port: int
+):
+    """Zenoh pauses its accepting for 0.1 s after each handshake that failed."""
+    endpoint = f"tls/127.0.0.1:{free_port}"
+    assert spawn(ROUTERS, str(fleet.folder), endpoint).line() == "ready"
+    with connect(mode="client", endpoints=endpoint, credentials=fleet.identity("r1")) as session:
+        for idle in [socket.create_connection(("127.0.0.1", free_port)) for _ in range(80)]:
+            idle.close()
+        with pytest.raises(Unreachable, match="busy with other connections that never complete"):
+            connect(mode="client", endpoints=endpoint, credentials=fleet.identity("r1"), timeout_s=0.2)
+        assert list(session.zenoh.info.routers_zid())
+
+
+def test_idle_connections_do_not_keep_a_client_out_of_a_router_that_asks_for_users(
+    fleet: Fleet, spawn, free_port: int
+):
+    """By Zenoh's own settings the first hundred do, for ten seconds."""
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    code = """
+        import sys
+        from zstate.net.router_config import RouterConfig
+        from zstate.net.security import Credentials
+        from zstate.net.session import connect
+        with connect(RouterConfig((sys.argv[1],), credentials=Credentials(users=sys.argv[2])).settings()):
+            print("ready")
+            sys.stdin.readline()
+    """
+    assert spawn(code, endpoint, str(fleet.folder / "users")).line() == "ready"
+    idle = [socket.create_connection(("127.0.0.1", free_port)) for _ in range(300)]
+    try:
+        assert lets_in(endpoint, Credentials(user="alice", password="wonder"))
+    finally:
+        for connection in idle:
+            connection.close()

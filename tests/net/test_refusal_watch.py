@@ -44,7 +44,8 @@ def refusals(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
     """The reasons and texts that were logged."""
     said = [record for record in caplog.records if record.name == "zstate"]
     assert {record.levelno for record in said} <= {logging.WARNING}
-    return [(record.__dict__["reason"], record.getMessage()) for record in said]
+    refused = [record for record in said if record.__dict__["event"] == "refused"]
+    return [(record.__dict__["reason"], record.getMessage()) for record in refused]
 
 
 def own_listener(credentials: Credentials | None) -> str:
@@ -149,3 +150,23 @@ def test_after_there_was_a_link_it_is_told_again(
     assert [text.partition(" ")[0] for _, text in refusals(caplog)] == [
         repr(e) for e in (endpoint, other, endpoint)
     ]
+
+
+def test_a_peer_with_credentials_is_warned_at_a_router_and_a_client_is_not(
+    fleet: Fleet, caplog: pytest.LogCaptureFixture
+):
+    endpoint, identity = fleet.tls("mtls"), fleet.identity("r1")
+    with (
+        connect(mode="client", endpoints=endpoint, credentials=identity),
+        connect(endpoints=endpoint, listen=own_listener(identity), credentials=identity),
+    ):
+        until(lambda: warnings(caplog))
+    ((event, text),) = warnings(caplog)
+    assert event == "bypass"
+    assert text.startswith(f"{endpoint!r}: this session is a peer of a router")
+    assert "mode='client'" in text
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
+    said = [record for record in caplog.records if record.name == "zstate"]
+    return [(record.__dict__["event"], record.getMessage()) for record in said]

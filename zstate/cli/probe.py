@@ -51,8 +51,12 @@ def _listening(host: str, port: int, endpoint: str) -> str:
 
 def unanswered(endpoints: Sequence[str]) -> Objection:
     """Why nobody answers at any of ``endpoints``."""
+    from zstate.net.refusal import SILENT  # loads ssl, which few need
+
     found = {endpoint: objection(endpoint) for endpoint in endpoints}
-    reasons = [f"{endpoint!r} ({why.text if why else 'no answer'})" for endpoint, why in found.items()]
+    # Where a connection is accepted, the session was not.
+    accepted = {endpoint: SILENT.text if _ADDRESS.match(endpoint) else "no answer" for endpoint in endpoints}
+    reasons = [f"{endpoint!r} ({why.text if why else accepted[endpoint]})" for endpoint, why in found.items()]
     then = next((why.next for why in found.values() if why), "")
     return Objection(f"nothing answers at {' or '.join(reasons)}", then)
 

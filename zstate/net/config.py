@@ -35,6 +35,9 @@ SETTINGS: dict[str, object] = {
     # A connection that was cut comes back within a second of the heal: TCP asks again after one second,
     # then a new attempt follows. Two round trips and those of TLS must fit into one.
     "transport/unicast/open_timeout": 1800,
+    # By default 100 connections that send nothing keep everybody else out for 10 s each time.
+    "transport/unicast/accept_timeout": 3000,
+    "transport/unicast/accept_pending": 1000,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
 }
 

@@ -29,27 +29,34 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What those behind some endpoints object to: None where nobody is, or where it cannot be asked."""
+    """What those behind some endpoints object to: None where nobody is, or where it cannot be asked.
+
+    SILENT where connections are accepted and nothing is answered: that router may let us in later.
+    """
 
     refusals: Mapping[str, Refusal | None]
 
     @property
     def are_refusals(self) -> bool:
         """Whether there are any, and nobody is left who might let us in."""
-        return bool(self.refusals) and None not in self.refusals.values()
+        return bool(self.refusals) and {None, SILENT}.isdisjoint(self.refusals.values())
 
     @property
     def error(self) -> NetworkError:
-        """The error for whoever reached none of them: AccessDenied, or Unreachable if nobody is there."""
+        """The error for whoever reached none of them: AccessDenied, or Unreachable if none answers."""
         for endpoint, refusal in self.refusals.items():
-            if refusal is not None:
+            if refusal not in (None, SILENT):
                 return AccessDenied(self._text(endpoint, refusal), reason=refusal.reason, endpoint=endpoint)
+        endpoints = tuple(self.refusals)
+        silent = [repr(endpoint) for endpoint, refusal in self.refusals.items() if refusal is SILENT]
+        if silent:
+            return Unreachable(f"{' and '.join(silent)}: {SILENT.text}", endpoints=endpoints)
         where = " or ".join(map(repr, self.refusals)) or "the configured endpoints"
         text = f"nothing answers at {where}; is the router running? `zstate router`"
-        return Unreachable(text, endpoints=tuple(self.refusals))
+        return Unreachable(text, endpoints=endpoints)
 
     def _text(self, endpoint: str, refusal: Refusal) -> str:
-        silent = [repr(other) for other, answer in self.refusals.items() if answer is None]
+        silent = [repr(other) for other, answer in self.refusals.items() if answer in (None, SILENT)]
         rest = f" (nothing answers at {' or '.join(silent)})" if silent else ""
         return f"{endpoint!r} answers and does not let this session in: {refusal.text}{rest}"
 
@@ -75,12 +82,33 @@ def _knock(endpoint: str, credentials: Credentials | None) -> Refusal | None:
     try:
         with socket.create_connection((match["host"], int(match["port"])), ANSWERS_WITHIN_S) as link:
             if match["protocol"] == "tls":
-                return _greet(link, match["host"], credentials)
-            if credentials is not None and credentials.ca is not None:
-                return _SPEAKS_NO_TLS  # found by multicast; ours would not speak to it
-            return _SPEAKS_TLS if _speaks_tls(link) else _of_user(credentials)
+                refusal = _greet(link, match["host"], credentials)
+            elif credentials is not None and credentials.ca is not None:
+                refusal = _SPEAKS_NO_TLS  # found by multicast; ours would not speak to it
+            else:
+                refusal = _SPEAKS_TLS if _speaks_tls(link) else _of_user(credentials)
     except (OSError, UnicodeError):
         return None
+    presumes_plain = refusal is _SPEAKS_NO_TLS or (match["protocol"] == "tcp" and refusal is not _SPEAKS_TLS)
+    if presumes_plain and not _answers_plainly((match["host"], int(match["port"]))):
+        return SILENT
+    return refusal
+
+
+def _answers_plainly(address: tuple[str, int]) -> bool:
+    """Whether a Zenoh session without TLS answers there.
+
+    It answers a message of one byte, which is none of its protocol, by closing the link with a reason. A
+    listener that is stopped says nothing, nor does one of TLS that is busy with other handshakes; one
+    that has too many connections pending closes this one without a word.
+    """
+    try:
+        with socket.create_connection(address, ANSWERS_WITHIN_S) as link:
+            link.settimeout(_REFUSES_WITHIN_S)
+            link.sendall(b"\x01\x00\x00")
+            return bool(link.recv(1))
+    except OSError:
+        return False
 
 
 def _speaks_tls(link: socket.socket) -> bool:
@@ -125,6 +153,13 @@ def _context(credentials: Credentials | None) -> ssl.SSLContext:
         return ssl.create_default_context()
     return trusting(credentials)
 
+
+SILENT = Refusal(
+    "no answer",
+    "connections are accepted and nothing is answered: the router process is stopped, or busy with other "
+    "connections that never complete (deploy/README.md: firewall), or it is no router",
+)
+"""The answer of a listener that accepts connections and is silent: not a refusal, it may be over soon."""
 
 _SPEAKS_NO_TLS = Refusal(
     "no TLS there",

@@ -29,6 +29,11 @@ FIRST_LOOK_S = 1.0
 PERIOD_S = 5.0
 
 _FOUND_WITHIN_S = 0.5
+_BYPASS = (
+    "%s: this session is a peer of a router, with credentials. Access control applies to what passes through "
+    "the router; peers send over direct links, and get nothing from each other without. Connect as "
+    "a client: mode='client' (--mode client)"
+)
 _ADDRESS = re.compile(r"(?P<protocol>tcp|tls)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
 
 Address = tuple[str, str, int]
@@ -41,6 +46,9 @@ class RefusalWatch(Closing):
     With multicast, and nobody met, also at those who are found by it. A refusal is logged once, until
     there was a link. A client needs one link only. Nothing is said of endpoints where nobody is: in no
     order need programs start.
+
+    A peer with credentials that is linked to a router is warned once: access control applies to what
+    passes through a router, and peers exchange data over direct links.
     """
 
     def __init__(
@@ -54,7 +62,9 @@ class RefusalWatch(Closing):
         self._config = config
         self._endpoints = endpoints
         self._credentials = credentials
-        self._needs_all = json.loads(config.get_json("mode")) != "client"
+        mode = json.loads(config.get_json("mode"))
+        self._needs_all = mode != "client"
+        self._may_bypass = mode == "peer" and credentials is not None
         self._seeks = json.loads(config.get_json("scouting/multicast/enabled")) is True
         self._settled: set[str] = set()
         self._stop = threading.Event()
@@ -77,6 +87,9 @@ class RefusalWatch(Closing):
                 period_s = PERIOD_S
 
     def _look(self) -> None:
+        if self._may_bypass and self._session.info.routers_zid():
+            self._may_bypass = False
+            _LOG.warning(_BYPASS, " and ".join(map(repr, self._endpoints)), extra={"event": "bypass"})
         links = {_addresses(str(link.dst)) for link in self._session.info.links()}
         linked = frozenset[Address]().union(*links)
         if linked and not self._needs_all:

@@ -30,7 +30,7 @@ _COMMENTS = {
     "scouting": "Nobody is sought by multicast.",
     "timestamping": "Samples carry their own stamps, and a router would replace those ahead of its clock.",
     "transport/link/tx": "Whoever is silent for so long [ms] is gone, and its liveliness tokens with it.",
-    "transport/unicast": "How long the opening of a connection may take [ms] before it is tried anew.",
+    "transport/unicast": "How long opening and accepting a connection may take [ms]; how many may pend.",
     "transport/link/tls": "Encryption; with enable_mtls everybody shows a certificate of this authority.",
     "transport/auth": "Who may connect by name and password.",
     "transport/shared_memory": "No gain for messages this small.",
@@ -44,6 +44,10 @@ _ROS_COMMENTS = {
     "transport/link/tx": "",
     "transport/unicast": "",
 }
+_ACCESS_COMMENTS = {
+    "scouting/gossip": "Peers that it introduces link directly, which access control does not see.\n"
+    'Without, they get nothing from each other: connect with mode "client", ROS nodes too.',
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +55,10 @@ class RouterConfig:
     """A router: where it listens, which routers it joins, whom it lets in, what it passes on.
 
     It listens at ``tcp/127.0.0.1:7447`` unless told otherwise. ``access_control`` is that section of a
-    Zenoh configuration, for which somebody has to be asked for names. With ``ros2`` the rest is as
-    rmw_zenohd has it. With certificates everything is encrypted, but for what stays on this host.
+    Zenoh configuration, for which somebody has to be asked for names; with it peers are not introduced
+    to each other by gossip, as the router does not see what goes over their direct links. With ``ros2``
+    the rest is as rmw_zenohd has it. With certificates everything is encrypted, but for what stays on
+    this host.
 
     Raises InvalidInput and ConfigError for what cannot be used.
     """
@@ -92,7 +98,7 @@ class RouterConfig:
         if self.thinning is not None:
             told["downsampling"] = self.thinning.settings()
         if self.access_control:
-            told["access_control"] = self.access_control
+            told |= {"scouting/gossip/enabled": False, "access_control": self.access_control}
         whole: dict[str, Any] = {}
         _merge(whole, told)
         return whole
@@ -100,6 +106,8 @@ class RouterConfig:
     def text(self) -> str:
         """As commented JSON5."""
         comments = _COMMENTS | (_ROS_COMMENTS if self.ros2 else {})
+        if self.access_control:
+            comments |= _ACCESS_COMMENTS
         return json5_text(self.settings(), comments, _HEAD)
 
 
