@@ -491,3 +491,30 @@ def test_what_cannot_be_recorded_is_refused_and_no_file_made(sessions, tmp_path:
     with Recorder(session, path, overwrite=True):
         pass
     assert path.read_bytes().startswith(b"\x89MCAP")
+
+
+def test_what_is_latched_is_recorded_whole_beside_the_samples_in_a_thread_of_its_own(
+    sessions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As if all of it were large: sets of edges in their order, and samples that wait for the description."""
+    monkeypatch.setattr("zstate.recorder.LARGE_BYTES", 1)
+    writer, reader = sessions
+    with (
+        Recorder(reader, tmp_path / "run.mcap", "r1") as recorder,
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        StaticPublisher(writer, "r1") as statics,
+    ):
+        settle(writer, "r1", "joint_states", "tf")
+        for number in range(20):
+            publisher.publish([0.1, number / 100], stamp=STAMP + number * PERIOD)
+            statics.set(Transform("tool", f"mark_{number}", (0.0, 0.0, 0.1), UPRIGHT))
+            until(lambda: count(recorder, "r1", "tf_static") >= number + 2)  # noqa: B023  # called at once
+        until(lambda: count(recorder, "r1") == 20)
+    fixed = [
+        [edge.child_frame_id for edge in message.transforms]
+        for message in read(tmp_path / "run.mcap", "/tf_static")
+    ]
+    marks = [f"mark_{number}" for number in range(20)]
+    assert [children for children in fixed if "mark_0" in children] == [marks[: n + 1] for n in range(20)]
+    assert len(read(tmp_path / "run.mcap", "/joint_states")) == 20
+    assert recorder.stats.dropped == recorder.stats.unwritten == 0

@@ -7,14 +7,16 @@ import math
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from zstate.clock import SystemClock, wait_in_slices
 from zstate.closing import Closing
-from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
+from zstate.following.bounded import remember
 from zstate.following.gaps import Gaps
 from zstate.following.tally import Tally
 from zstate.locks import new_lock, outlive_fork
@@ -42,6 +44,10 @@ _MEETING_NS = 300_000_000
 _LAST_WORDS_S = 0.5
 _JOIN_WITHIN_S = 0.9
 
+LARGE_BYTES = 1 << 16
+"""Latched values from this size on are decoded and encoded in a thread of their own."""
+_LARGE_WAITING_BYTES = 1 << 26
+
 _LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
@@ -51,9 +57,9 @@ class RecorderStats:
     """Counts since the recorder opened.
 
     ``messages`` were written, by robot and stream (the clock is of the robot "ros"); ``bytes`` is the
-    size of all ``files``. Samples were ``dropped`` by our own full ring, ``missed`` between the
-    writers' sequence numbers, ``unwritten`` for want of a description that fits; ``refused`` says why
-    others could not be written.
+    size of all ``files``. Messages were ``dropped`` by our own full ring, as too much waited or as the
+    recording ended, ``missed`` between the writers' sequence numbers, ``unwritten`` for want of a
+    description that fits; ``refused`` says why others could not be written.
     """
 
     messages: Mapping[tuple[str, Stream], int]
@@ -98,11 +104,13 @@ class Recorder(Closing):
         self._programs: dict[int, str] = {}
         self._announced: set[str] = set()
         self._held: list[Heard] = []
+        self._ends_at = math.inf
         self._begins_at: int | None = None
         self._scribe: Scribe | None = None
         self._closing = new_lock()
         self._stop = outlive_fork(threading.Event())
         self._ended = outlive_fork(threading.Event())
+        self._large = _Large(self._write_large, self._tally)
         with ExitStack() as opening:
             self._inbox = opening.enter_context(Inbox(session))
             robot = self._chosen[0] if len(self._chosen) == 1 else ANY
@@ -148,6 +156,7 @@ class Recorder(Closing):
         """End the recording within a second: what was heard is written, and the file finished."""
         atexit.unregister(self.close)
         self._stop_hearing()
+        self._ends_at = min(self._ends_at, time.monotonic() + _LAST_WORDS_S)
         self._stop.set()
         self._thread.join(_JOIN_WITHIN_S)
 
@@ -157,7 +166,7 @@ class Recorder(Closing):
 
     def _on_writer(self, announced: Announced, alive: bool) -> None:
         if alive:
-            self._programs[announced.writer.session] = str(announced.writer)
+            remember(self._programs, announced.writer.session, str(announced.writer))
             if not self._chosen:
                 self._announced.add(announced.robot)
 
@@ -168,6 +177,7 @@ class Recorder(Closing):
             self.failure = error
             self._stop_hearing()
         finally:
+            self._large.close()
             self._ended.set()
 
     def _write_until_stopped(self) -> None:
@@ -177,20 +187,20 @@ class Recorder(Closing):
             if now // FLUSH_NS != flushed:
                 flushed = now // FLUSH_NS
                 self._writer.flush()
-        self._write_heard(time.monotonic() + _LAST_WORDS_S)
+            if self._large.failure is not None:
+                raise self._large.failure
+        self._write_heard()
+        self._large.finish(self._ends_at)
         self._writer.close()
 
-    def _write_heard(self, until_s: float = math.inf) -> None:
+    def _write_heard(self) -> None:
         self._held += self._inbox.take()
         if self._scribe is None:
             self._scribe = self._new_scribe()
         if self._scribe is None:
             return
         for heard in self._held:
-            if time.monotonic() < until_s:
-                self._write(self._scribe, heard)
-            else:
-                self._tally.count("dropped", len(heard.arrivals))
+            self._write(self._scribe, heard)
         self._held = []
 
     def _new_scribe(self) -> Scribe | None:
@@ -214,9 +224,20 @@ class Recorder(Closing):
     def _write(self, scribe: Scribe, heard: Heard) -> None:
         self._gaps.begin(overflowed=heard.overflowed)
         for arrival in heard.arrivals:
+            if time.monotonic() > self._ends_at:
+                self._tally.count("dropped")
+                continue
             robot = self._robot(heard, arrival)
-            if robot is not None:
+            if robot is None:
+                continue
+            if heard.stream in _LATCHED and self._large.takes(robot, len(arrival.payload)):
+                self._large.put(robot, heard, arrival)
+            else:
                 self._write_arrival(scribe, heard, robot, arrival)
+
+    def _write_large(self, robot: str, heard: Heard, arrival: Arrival) -> None:
+        assert self._scribe is not None
+        self._write_arrival(self._scribe, heard, robot, arrival)
 
     def _write_arrival(self, scribe: Scribe, heard: Heard, robot: str, arrival: Arrival) -> None:
         stream, stamp = heard.stream, heard.stamp
@@ -226,9 +247,9 @@ class Recorder(Closing):
                 scribe.withdraw(robot, static_writer, stamp)
             return
         for message in self._decode(stream, arrival, robot):
-            if isinstance(message, Sample | Clock):
+            is_known = scribe.take(robot, message, stamp, static_writer)
+            if is_known and isinstance(message, Sample | Clock):
                 self._gaps.note((robot, stream, message.session), message.seq)
-            scribe.take(robot, message, stamp, static_writer)
 
     def _robot(self, heard: Heard, arrival: Arrival) -> str | None:
         try:
@@ -245,6 +266,88 @@ class Recorder(Closing):
         except MessageError as error:
             self._tally.refuse(error.reason, f"{arrival.key}: {error}")
             return ()
+
+
+class _Large:
+    """Large latched values, written in a thread of their own, so that samples are written meanwhile.
+
+    A latched value that follows a large one of the same robot waits behind it. Of more bytes than
+    can wait, the oldest values are dropped and counted.
+    """
+
+    def __init__(self, write: Callable[[str, Heard, Arrival], None], tally: Tally) -> None:
+        self.failure: Exception | None = None
+        self._write = write
+        self._tally = tally
+        self._waiting: deque[tuple[str, Heard, Arrival]] = deque()
+        self._bytes = 0
+        self._behind: Counter[str] = Counter()
+        self._changed = outlive_fork(threading.Condition())
+        self._is_open = True
+        self._thread: threading.Thread | None = None
+
+    def takes(self, robot: str, size: int) -> bool:
+        """Whether a latched value of ``robot`` with so many bytes is written here."""
+        return size >= LARGE_BYTES or self._behind[robot] > 0
+
+    def put(self, robot: str, heard: Heard, arrival: Arrival) -> None:
+        """Write it later."""
+        with self._changed:
+            self._waiting.append((robot, heard, arrival))
+            self._behind[robot] += 1
+            self._bytes += len(arrival.payload)
+            while self._bytes > _LARGE_WAITING_BYTES and len(self._waiting) > 1:
+                self._drop_oldest()
+            self._changed.notify_all()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="zstate recorder latched", daemon=True)
+            self._thread.start()
+
+    def finish(self, until_s: float) -> None:
+        """Wait until all is written, or the monotonic clock reads ``until_s``; the rest is dropped."""
+        with self._changed:
+            self._changed.wait_for(lambda: not +self._behind, max(0.0, until_s - time.monotonic()))
+        self.close()
+        if self.failure is not None:
+            raise self.failure
+
+    def close(self) -> None:
+        """Write nothing more."""
+        with self._changed:
+            self._is_open = False
+            while self._waiting:
+                self._drop_oldest()
+            self._changed.notify_all()
+
+    def _drop_oldest(self) -> None:
+        robot, _, arrival = self._waiting.popleft()
+        self._bytes -= len(arrival.payload)
+        self._behind[robot] -= 1
+        self._tally.count("dropped")
+
+    def _run(self) -> None:
+        while (taken := self._take()) is not None:
+            robot, heard, arrival = taken
+            try:
+                self._write(robot, heard, arrival)
+            except RecordingError as error:
+                if self._is_open:  # else the recording ended first
+                    self.failure = error
+                self._tally.count("dropped")
+            except Exception as error:  # it ends the recording, as it would in its own thread
+                self.failure = error
+            with self._changed:
+                self._behind[robot] -= 1
+                self._changed.notify_all()
+
+    def _take(self) -> tuple[str, Heard, Arrival] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or not self._is_open)
+            if not self._is_open:
+                return None
+            taken = self._waiting.popleft()
+            self._bytes -= len(taken[2].payload)
+            return taken
 
 
 def _subscribe(inbox: Inbox, wire: Wire, robots: Sequence[str]) -> None:

@@ -353,3 +353,39 @@ def test_threads_may_write_and_flush_at_once(tmp_path: Path):
         payloads = [record.payload for record in reader.records(["/joint_states"])]
     every = itertools.product(range(4), range(400))
     assert sorted(payloads) == sorted(string_bytes(f"{sender} {number}" * 9) for sender, number in every)
+
+
+def test_a_file_with_all_channels_it_can_number_is_followed_by_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("zstate.record.writer.MOST_CHANNELS", 10)
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        described = writer.channel("/robot_description", STRING, LATCHED)
+        writer.latch(described, "", DESCRIPTION, START, START)
+        for number in range(25):
+            channel = writer.channel(f"/topic_{number}", STRING, Qos())
+            assert writer.channel(f"/topic_{number}", STRING, Qos()) == channel
+            writer.write(channel, string_bytes(str(number)), START + number, START)
+            writer.release(channel)
+    assert len(writer.files) == 3
+    with RecordReader(tmp_path / "run.mcap") as reader:
+        assert reader.complete
+        assert max(len(file.channels) for file in reader.storages) == 10
+        topics = [record.topic for record in reader.records() if record.topic != "/robot_description"]
+    assert topics == [f"/topic_{number}" for number in range(25)]
+
+
+def test_a_released_channel_is_left_out_of_the_next_file_unless_it_is_declared_again(tmp_path: Path):
+    with RecordWriter(tmp_path / "run.mcap", max_seconds=1.0) as writer:
+        one, other, third = (writer.channel(f"/{name}", STRING, Qos()) for name in ("one", "other", "third"))
+        writer.write(one, DESCRIPTION, START, START)
+        writer.release(one)
+        writer.release(other)
+        again = writer.channel("/one", STRING, Qos())
+        writer.write(again, DESCRIPTION, START + 1, START)
+        with pytest.raises(InvalidInput, match="is no channel"):
+            writer.write(one, DESCRIPTION, START + 2, START)
+        writer.write(third, DESCRIPTION, START + 2 * S, START)
+    with RecordReader(tmp_path / "run.mcap") as reader:
+        topics = [[(channel.topic, channel.count) for channel in file.channels] for file in reader.storages]
+    assert topics == [[("/one", 2), ("/other", 0), ("/third", 0)], [("/third", 1), ("/one", 0)]]

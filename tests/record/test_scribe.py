@@ -14,8 +14,10 @@ from recordings import STORE, S
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.record.channel import Record
+from zstate.record.orders import EARLY, EARLY_BYTES, EarlySamples
+from zstate.record.pen import BURST
 from zstate.record.reader import RecordReader
-from zstate.record.scribe import EARLY, Scribe
+from zstate.record.scribe import MOST_LATCHED, Scribe
 from zstate.record.writer import RecordWriter
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
@@ -307,3 +309,58 @@ def test_simulated_time_is_recorded_from_zero_on(desk: Desk):
     assert [message.clock.sec for message in desk.read("/clock")] == [0, 1, 2]
     assert {record.publish_time for record in desk.records()} == {0, S, 2 * S}
     assert "zstate.robot" not in desk.records()[0].metadata
+
+
+def test_a_robot_whose_writer_starts_without_end_takes_no_channels_from_another(desk: Desk):
+    desk.scribe.take("cart", description(), NOW)
+    desk.scribe.take("flapping", description(), NOW)
+    for number in range(3 * BURST):
+        assert desk.scribe.take("cart", joints(NOW + number, number), NOW + number)
+        is_known = desk.scribe.take("flapping", joints(NOW + number, 0, session=number + 9), NOW + number)
+        assert is_known == (number < BURST - 1)
+    assert desk.refused == {"too many writers": 2 * BURST + 1}
+    later = NOW + S
+    assert (
+        sum(
+            desk.scribe.take("flapping", joints(later, 0, session=n), later)
+            for n in range(10**6, 10**6 + 100)
+        )
+        == 10
+    )
+    assert desk.scribe.messages["cart", "joint_states"] == 3 * BURST
+    counts = Counter(record.metadata["zstate.robot"] for record in desk.records())
+    assert counts == {"cart": 3 * BURST + 1, "flapping": BURST + 10}
+
+
+def test_channels_of_writers_that_are_gone_are_released_and_those_that_hold_something_are_not(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("zstate.record.pen.OPEN_CHANNELS", 10)
+    desk.scribe.take("cart", description(), NOW)
+    for session in range(2, 40):
+        desk.scribe.take("cart", joints(session=session), NOW)
+    desk.scribe.take("cart", joints(session=2, seq=1), NOW)
+    assert repeated(desk) == [("/robot_description", "1", [])]
+    with RecordReader(desk.path.with_name("run_1.mcap")) as reader:
+        assert len(reader.channels()) <= 11
+    sessions = [r.metadata["zstate.session"] for r in desk.records() if r.topic == "/joint_states"]
+    assert sessions == [*map(str, range(2, 40)), "2"]
+
+
+def test_static_writers_without_end_are_refused_and_counted(desk: Desk):
+    for number in range(MOST_LATCHED + 3):
+        desk.scribe.take("cart", statics(("arm", "tool")), NOW, f"writer_{number}")
+    assert desk.refused == {"too many writers": 3}
+    assert desk.scribe.take("cart", statics(("arm", "other")), NOW, "writer_0")
+    desk.scribe.withdraw("cart", "writer_0", NOW)
+    assert desk.scribe.take("cart", statics(("arm", "other")), NOW, "another")
+
+
+def test_of_large_samples_without_a_description_fewer_are_kept():
+    early = EarlySamples()
+    large = JointState(NOW, 0, 1, order_digest(CART.joint_names), bytes(EARLY_BYTES // 24 * 8))
+    for number in range(5):
+        early.keep("cart", large, NOW + number)
+    assert (early.waiting, early.given_up) == (3, 2)
+    assert [log_time for _, log_time in early.pop("cart")] == [NOW + 2, NOW + 3, NOW + 4]
+    assert early.waiting == 0

@@ -1,11 +1,19 @@
-"""Orders: what the numbers in a robot's samples are called, as its descriptions tell."""
+"""Orders: the names of the numbers in a robot's samples, and the samples that wait for them."""
 
 from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
 
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.urdf import parse_urdf
 from zstate.wire.messages import Clock, JointState, RobotDescription, Sample, TransformSample, order_digest
 from zstate.wire.sample_names import SampleNames
+
+EARLY = 1024
+"""So many samples of a robot wait for the description that names their numbers."""
+EARLY_BYTES = 1 << 22
+"""So many bytes of them, if that is less."""
 
 _NAMED = SampleNames()
 
@@ -33,3 +41,41 @@ class Orders:
         if isinstance(sample, TransformSample):
             return self._edges.get(sample.order) if sample.edges is None else _NAMED
         return _NAMED
+
+
+class EarlySamples:
+    """Samples that came before the description that names their numbers, the newest of each robot.
+
+    ``given_up`` counts those that were dropped for newer ones.
+    """
+
+    def __init__(self) -> None:
+        self.given_up = 0
+        self._robots: dict[str, deque[tuple[Sample | Clock, int]]] = {}
+        self._bytes: dict[str, int] = {}
+
+    @property
+    def waiting(self) -> int:
+        """How many wait."""
+        return sum(len(early) for early in list(self._robots.values()))
+
+    def keep(self, robot: str, sample: Sample | Clock, log_time: int) -> None:
+        """Keep a sample that was heard at ``log_time``, unless it is too large by itself."""
+        early = self._robots.setdefault(robot, deque())
+        early.append((sample, log_time))
+        self._bytes[robot] = self._bytes.get(robot, 0) + _size(sample)
+        while len(early) > EARLY or self._bytes[robot] > EARLY_BYTES:
+            dropped, _ = early.popleft()
+            self._bytes[robot] -= _size(dropped)
+            self.given_up += 1
+
+    def pop(self, robot: str) -> Iterable[tuple[Sample | Clock, int]]:
+        """Those of ``robot`` with their log times, which are kept no longer."""
+        self._bytes.pop(robot, None)
+        return self._robots.pop(robot, ())
+
+
+def _size(sample: Sample | Clock) -> int:
+    if isinstance(sample, JointState):
+        return sum(len(block or b"") for block in (sample.positions, sample.velocities, sample.efforts))
+    return len(sample.poses) if isinstance(sample, TransformSample) else 0

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from zstate.errors import InvalidInput, ModelError
+from zstate.locks import new_lock
 from zstate.record.channel import ROBOT
 from zstate.record.gathered import Gathered
 from zstate.record.naming import Naming
-from zstate.record.orders import Orders
-from zstate.record.pen import Pen
+from zstate.record.orders import EarlySamples, Orders
+from zstate.record.pen import Pen, Pens
 from zstate.record.writer import RecordWriter
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
@@ -28,8 +29,8 @@ from zstate.wire.ros2.qos import STREAM_QOS
 from zstate.wire.ros2.times import to_time
 from zstate.wire.ros2.topics import RmwKeys, type_of
 
-EARLY = 1024
-"""So many samples of a robot wait for the description that names their numbers."""
+MOST_LATCHED = 256
+"""So many descriptions and sets of static edges of a robot hold at once, one of each static writer."""
 
 _STREAMS: dict[type[Message], Stream] = {
     JointState: "joint_states",
@@ -41,12 +42,16 @@ _STREAMS: dict[type[Message], Stream] = {
 
 
 class Scribe:
-    """Writes the messages of robots, each writer's on channels of its own. For one thread.
+    """Writes the messages of robots, each writer's on channels of its own.
+
+    Samples are taken in one thread, latched messages in the same or in one other, as large ones take long
+    to encode: samples are written meanwhile.
 
     ``alone`` is the robot that stands in the root of ROS's names (see ``Naming``). ``refuse(reason,
     text)`` is told of each message that cannot be written: CDR has no place for it ("no stamp", "stamp
-    outside 1901 to 2038", "not sayable"), or its model is of no use ("unusable model"). ``programs``
-    says who is behind a session, as far as is known when its first message is written.
+    outside 1901 to 2038", "not sayable"), its model is of no use ("unusable model"), or its robot has
+    opened too many channels ("too many writers", see ``Pens``). ``programs`` says who is behind a session,
+    as far as is known when its first message is written.
     """
 
     def __init__(
@@ -61,12 +66,12 @@ class Scribe:
         self._refuse = refuse
         self._naming = Naming(alone)
         self._programs = programs
-        self._pens: dict[tuple[str, Stream, int, str], Pen] = {}
-        self._latched: dict[str, Pen] = {}
+        self._lock = new_lock()
+        self._pens: dict[str, Pens] = {}
+        self._latched: dict[str, dict[str, Pen]] = {}
         self._gathered: dict[tuple[str, int], Gathered] = {}
         self._orders: dict[str, Orders] = {}
-        self._early: dict[str, deque[tuple[Sample | Clock, int]]] = {}
-        self._given_up = 0
+        self._early = EarlySamples()
         self._counts: Counter[tuple[str, Stream]] = Counter()
 
     @property
@@ -77,13 +82,14 @@ class Scribe:
     @property
     def unwritten(self) -> int:
         """The samples that no description fitted: those that were given up, and those that still wait."""
-        return self._given_up + sum(len(early) for early in list(self._early.values()))
+        return self._early.given_up + self._early.waiting
 
-    def take(self, robot: str, message: Message, log_time: int, static_writer: str | None = None) -> None:
+    def take(self, robot: str, message: Message, log_time: int, static_writer: str | None = None) -> bool:
         """Write ``message`` of ``robot``, which was heard at ``log_time`` [ns]; the clock is SHARED's.
 
         ``static_writer`` is the name under which static edges are written; without one, as in ROS, those
-        of a session add up. Raises RecordingError when the file cannot grow.
+        of a session add up. Whether the robot may have a channel for that writer. Raises RecordingError
+        when the file cannot grow.
         """
         try:
             if isinstance(message, StaticTransforms):
@@ -91,25 +97,31 @@ class Scribe:
             elif isinstance(message, RobotDescription):
                 self._take_description(robot, message, log_time)
             elif isinstance(message, Sample | Clock):
-                self._take_sample(robot, message, log_time)
+                with self._lock:
+                    self._take_sample(robot, message, log_time)
+        except _TooManyWriters as error:
+            self._refuse("too many writers", f"{robot!r}: {error}")
+            return False
         except InvalidInput as error:
             self._refuse(_reason(message), f"{robot!r}: {error}")
+        return True
 
     def withdraw(self, robot: str, static_writer: str, log_time: int) -> None:
         """Write that a static writer has taken all its edges back."""
-        pen = self._latched.pop(key := f"{robot}/{static_writer}", None)
-        if pen is not None:
-            pen.latch(key, StaticTransforms(0, (), b""), log_time)
-            pen.unlatch(key)
-            self._counts[robot, "tf_static"] += 1
+        with self._lock:
+            pen = self._latched.get(robot, {}).pop(key := f"{robot}/{static_writer}", None)
+            if pen is not None:
+                pen.latch(key, pen.encode(StaticTransforms(0, (), b"")), log_time)
+                pen.unlatch(key)
+                self._counts[robot, "tf_static"] += 1
 
     def _take_sample(self, robot: str, message: Sample | Clock, log_time: int) -> None:
         sample_names = self._orders_of(robot).sample_names(message)
         if sample_names is None:
-            self._keep_early(robot, message, log_time)
+            self._early.keep(robot, message, log_time)
             return
         stream = _STREAMS[type(message)]
-        self._pen(robot, stream, message.session).write(message, sample_names, log_time)
+        self._pen(robot, stream, message.session, log_time).write(message, sample_names, log_time)
         self._counts[robot, stream] += 1
 
     def _take_description(self, robot: str, description: RobotDescription, log_time: int) -> None:
@@ -118,7 +130,9 @@ class Scribe:
             self._orders_of(robot).learn(description, robot)
         except ModelError as error:
             self._refuse("unusable model", str(error))
-        for sample, heard in self._early.pop(robot, ()):
+        with self._lock:
+            early = self._early.pop(robot)
+        for sample, heard in early:
             self.take(robot, sample, heard)
 
     def _take_statics(
@@ -138,27 +152,37 @@ class Scribe:
         static_writer: str = "",
     ) -> None:
         stream = _STREAMS[type(message)]
-        pen = self._pen(robot, stream, message.session, static_writer)
-        pen.latch(key, message, log_time)
-        before = self._latched.get(key, pen)
-        if before is not pen:
-            before.unlatch(key)
-        self._latched[key] = pen
-        self._counts[robot, stream] += 1
-
-    def _keep_early(self, robot: str, sample: Sample | Clock, log_time: int) -> None:
-        early = self._early.setdefault(robot, deque(maxlen=EARLY))
-        self._given_up += len(early) == EARLY
-        early.append((sample, log_time))
+        with self._lock:
+            latched = self._latched.setdefault(robot, {})
+            if key not in latched and len(latched) >= MOST_LATCHED:
+                raise _TooManyWriters(
+                    f"it has {MOST_LATCHED} static writers, and {static_writer!r} is one more"
+                )
+            pen = self._pen(robot, stream, message.session, log_time, static_writer)
+        payload = pen.encode(message)
+        with self._lock:
+            pen.latch(key, payload, log_time)
+            before = latched.get(key, pen)
+            if before is not pen:
+                before.unlatch(key)
+            latched[key] = pen
+            self._counts[robot, stream] += 1
 
     def _orders_of(self, robot: str) -> Orders:
         return self._orders.setdefault(robot, Orders())
 
-    def _pen(self, robot: str, stream: Stream, session: int, static_writer: str = "") -> Pen:
-        key = (robot, stream, session, static_writer)
-        if key not in self._pens:
-            self._pens[key] = self._new_pen(*key)
-        return self._pens[key]
+    def _pen(self, robot: str, stream: Stream, session: int, log_time: int, static_writer: str = "") -> Pen:
+        key = (stream, session, static_writer)
+        pens = self._pens.get(robot)
+        if pens is None:
+            pens = self._pens[robot] = Pens()
+        pen = pens.find(key)
+        if pen is None:
+            if not pens.may_open(log_time):
+                raise _TooManyWriters("its writers start too often, each with channels of its own")
+            pen = self._new_pen(robot, *key)
+            pens.open(key, pen, self._latched.get(robot, {}).values())
+        return pen
 
     def _new_pen(self, robot: str, stream: Stream, session: int, static_writer: str) -> Pen:
         options = self._naming.options(robot)
@@ -172,6 +196,10 @@ class Scribe:
         topic = RmwKeys(options).topic(robot, stream)
         channel = self._writer.channel(topic, type_of(stream), STREAM_QOS[stream], metadata)
         return Pen(self._writer, channel, stream, FrameNames(options, robot))
+
+
+class _TooManyWriters(InvalidInput):
+    """The robot has used up its channels."""
 
 
 def _reason(message: Message) -> str:

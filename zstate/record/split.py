@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NewType, TypeAlias
 
 from zstate.record.channel import CDR
 from zstate.record.output import Output
@@ -17,6 +17,10 @@ GROUP_NS = 10_000_000_000
 _MESSAGE_SIZE = 31  # of a message's record, beside its payload
 _SEQUENCE = (1 << 32) - 1
 
+ChannelId = NewType("ChannelId", int)
+"""A channel of a whole recording, whatever its number in each file."""
+ChannelKey: TypeAlias = tuple[str, str, frozenset[tuple[str, str]]]
+
 
 class Declared(NamedTuple):
     """A channel as every file of the recording declares it."""
@@ -26,10 +30,15 @@ class Declared(NamedTuple):
     metadata: Mapping[str, str]
 
 
-class Message(NamedTuple):
-    """One message; ``channel`` counts the declared channels, starting at 1."""
+def channel_key(channel: Declared) -> ChannelKey:
+    """What is the same for equal channels, and hashable."""
+    return channel.topic, channel.type.hash, frozenset(channel.metadata.items())
 
-    channel: int
+
+class Message(NamedTuple):
+    """One message of a declared channel."""
+
+    channel: ChannelId
     payload: bytes
     log_time: int
     publish_time: int
@@ -44,6 +53,8 @@ class Split:
         self._output.writer.add_metadata(IDENTITY, {"id": recording, "part": str(part)})
         self._output.flush()
         self._schemas: dict[str, int] = {}
+        self._numbers: dict[ChannelKey, int] = {}
+        self._number_of: dict[ChannelId, int] = {}
         self._waiting = 0
         self._opening = 0
         self._first: int | None = None
@@ -58,14 +69,25 @@ class Split:
         """Bytes in the file."""
         return self._output.size
 
-    def declare(self, channel: Declared) -> None:
-        """Add a channel. Channels are numbered in this order, the same in each file."""
-        topic, kind, metadata = channel
+    @property
+    def channel_count(self) -> int:
+        """The channels in the file."""
+        return len(self._numbers)
+
+    def declare(self, channel: ChannelId, declared: Declared) -> None:
+        """Add a channel, unless the file has an equal one."""
+        key = channel_key(declared)
+        if key not in self._numbers:
+            self._numbers[key] = self._register(declared)
+        self._number_of[channel] = self._numbers[key]
+
+    def _register(self, declared: Declared) -> int:
+        topic, kind, metadata = declared
         writer = self._output.writer
         if kind.name not in self._schemas:
             text = kind.definition.encode()
             self._schemas[kind.name] = writer.register_schema(kind.name, "ros2msg", text)
-        writer.register_channel(topic, CDR, self._schemas[kind.name], dict(metadata))
+        return writer.register_channel(topic, CDR, self._schemas[kind.name], dict(metadata))
 
     def is_over(self, log_time: int, max_bytes: float, max_ns: float) -> bool:
         """Whether the message of that log time belongs into the next file."""
@@ -91,7 +113,8 @@ class Split:
     def add(self, message: Message) -> None:
         """Write it: into memory, until the chunk is full."""
         channel, payload, log_time, publish_time, sequence = message
-        self._output.writer.add_message(channel, log_time, payload, publish_time, sequence & _SEQUENCE)
+        number = self._number_of[channel]
+        self._output.writer.add_message(number, log_time, payload, publish_time, sequence & _SEQUENCE)
         self._waiting += len(payload) + _MESSAGE_SIZE
         if self._output.has_waiting:
             self.flush()

@@ -8,20 +8,19 @@ import uuid
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NewType
 
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, RecordingError
 from zstate.locks import new_lock
-from zstate.record.split import Declared, Message, Split
+from zstate.record.split import ChannelId, ChannelKey, Declared, Message, Split, channel_key
 from zstate.record.splits import later_splits, split_path
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.types import RosType
 
-ChannelId = NewType("ChannelId", int)
-
 LEAST_BYTES = 1 << 16
 LEAST_SECONDS = 1.0
+MOST_CHANNELS = 60_000
+"""Of a file; MCAP numbers channels in 16 bits."""
 
 _END_OF_TIME = 1 << 63
 
@@ -30,9 +29,10 @@ class RecordWriter(Closing):
     """Writes CDR messages into ``path``, and into path_1, path_2 ... when it splits. Any thread may write.
 
     A file ends once it has grown by ``max_bytes`` (the chunk in progress counted without compression,
-    the index at its end not counted) or its log times span ``max_seconds``; the next begins with all
-    channels and latched values. These are also repeated every 10 s of log time, at the start of a chunk,
-    so that whatever part of a recording remains can be understood.
+    the index at its end not counted), its log times span ``max_seconds`` or it has 60,000 channels; the
+    next begins with all channels that were not released, and the latched values. These are also repeated
+    every 10 s of log time, at the start of a chunk, so that whatever part of a recording remains can be
+    understood.
 
     What was written is safe from ``kill -9`` after ``flush()``, to be called every half a second.
     RecordingError when the file exists (unless ``overwrite``), cannot be made, or cannot grow; what was
@@ -59,7 +59,9 @@ class RecordWriter(Closing):
             self._refuse_later_splits()
         self._lock = new_lock()
         self._recording = uuid.uuid4().hex
-        self._declared: list[Declared] = []
+        self._declared: dict[ChannelId, Declared] = {}
+        self._ids: dict[ChannelKey, ChannelId] = {}
+        self._id = 0
         self._latched: dict[tuple[ChannelId, str], Message] = {}
         self._files: list[Path] = []
         self._finished_bytes = 0
@@ -87,12 +89,26 @@ class RecordWriter(Closing):
         """Declare a channel; the same one again gives the same answer."""
         known = {"offered_qos_profiles": qos.to_rosbag_yaml(), "topic_type_hash": type.hash}
         declared = Declared(topic, type, {**known, **(metadata or {})})
-        with self._lock:
+        key = channel_key(declared)
+        with self._lock, self._ending_on_failure():
             self._check_open()
-            if declared not in self._declared:
-                self._declared.append(declared)
-                self._split.declare(declared)
-            return ChannelId(self._declared.index(declared) + 1)
+            known = self._ids.get(key)
+            if known is not None:
+                return known
+            if self._split.channel_count >= MOST_CHANNELS:
+                self._begin_split()
+            self._id += 1
+            channel = self._ids[key] = ChannelId(self._id)
+            self._declared[channel] = declared
+            self._split.declare(channel, declared)
+            return channel
+
+    def release(self, channel: ChannelId) -> None:
+        """Declare a channel that nothing is latched on no longer in the files that follow."""
+        with self._lock:
+            declared = self._declared.pop(channel, None)
+            if declared is not None:
+                del self._ids[channel_key(declared)]
 
     def write(
         self, channel: ChannelId, payload: bytes, log_time: int, publish_time: int, *, sequence: int = 0
@@ -144,21 +160,24 @@ class RecordWriter(Closing):
         """Begin the file or the group that this log time belongs into; say whether there was one to begin."""
         self._check_open()
         if self._split.is_over(log_time, self._max_bytes, self._max_ns):
-            self._split.finish()
-            self._finished_bytes += self._split.size
-            self._split = self._new_split()
+            self._begin_split()
         if not self._split.group_is_over(log_time):
             return False
         self._split.begin_group(log_time, self._latched.values())
         return True
+
+    def _begin_split(self) -> None:
+        self._split.finish()
+        self._finished_bytes += self._split.size
+        self._split = self._new_split()
 
     def _new_split(self) -> Split:
         part = len(self._files)
         path = split_path(self._first, part)
         split = Split(path, overwrite=self._overwrite, recording=self._recording, part=part)
         self._files.append(path)
-        for channel in self._declared:
-            split.declare(channel)
+        for channel, declared in self._declared.items():
+            split.declare(channel, declared)
         return split
 
     @contextmanager
@@ -172,7 +191,7 @@ class RecordWriter(Closing):
 
     def _checked(self, message: Message) -> Message:
         # MCAP's writer would notice half way through a record, or not at all.
-        if not 0 < message.channel <= len(self._declared):
+        if message.channel not in self._declared:
             text = f"{message.channel} is no channel of {str(self._first)!r}; declare it with channel()"
             raise InvalidInput(text)
         for time in (message.log_time, message.publish_time):

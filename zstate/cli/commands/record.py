@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _LINE_S = 1.0
 _REFRESH_S = 0.25
+_INDEX_WITHIN_S = 10.0
 
 
 def _checked_megabytes(_: click.Context, __: click.Parameter, size: float | None) -> float | None:
@@ -109,6 +110,7 @@ def _run(recorder: Recorder, roster: Roster, robots: tuple[str, ...], duration: 
         _show(recorder, progress, duration)
     finally:
         recorder.close()
+        recorder.wait(_INDEX_WITHIN_S)  # on a busy machine, the index of a large file takes its time
         say_fitted(progress.summary())
     if recorder.failure is not None:
         raise recorder.failure
