@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import random
 import sqlite3
+import struct
 from contextlib import closing, suppress
 from io import BytesIO
 from pathlib import Path
 
+import lz4.frame
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
@@ -16,6 +19,7 @@ from recordings import DESCRIPTION, MS, START, STORE, S, declared, joint_states,
 from rosbags.rosbag2 import Reader as RosbagReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
+from support import Child
 
 from zstate.errors import RecordingError
 from zstate.record.info import describe
@@ -357,3 +361,73 @@ def test_damage_anywhere_is_refused_or_read_but_never_crashes(
         data[int(place * len(data))] = value
     scratch.write_bytes(data[: int(end * len(data))])
     read_all(scratch)
+
+
+def a_chunk(compression: str, content: bytes, size: int) -> bytes:
+    """An MCAP file that is not closed, with one chunk that says it holds ``size`` bytes."""
+    word = compression.encode()
+    body = struct.pack("<QQQII", 1, 1, size, 0, len(word)) + word + struct.pack("<Q", len(content)) + content
+    header = struct.pack("<I", 0) * 2
+    return b"".join(
+        [MAGIC, struct.pack("<BQ", 1, len(header)), header, struct.pack("<BQ", 6, len(body)), body]
+    )
+
+
+BOMB = (1 << 28) + 1000
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("says", [1 << 40, 1000])
+def test_a_chunk_that_grows_without_bounds_is_not_decompressed(tmp_path: Path, compression: str, says: int):
+    """A quarter of a gigabyte of zeros, of which the chunk says that it is so much, or little."""
+    zeros = bytes(BOMB)
+    packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
+    (tmp_path / "bomb.mcap").write_bytes(a_chunk(compression, packed, says))
+    (tmp_path / "cut.mcap").write_bytes(a_chunk(compression, packed, says)[:-1000])
+    del zeros
+    code = """
+        import resource, sys
+        from pathlib import Path
+        from zstate.record.reader import RecordReader
+        for name in ("bomb.mcap", "cut.mcap"):
+            with RecordReader(Path(sys.argv[1]) / name) as reader:
+                print(reader.losses)
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+    """
+    child = Child(code, str(tmp_path))
+    bomb, cut, peak_mb = child.line(60.0), child.line(60.0), int(child.line())
+    assert child.wait() == 0
+    assert f"says it holds {says}" in bomb or f"says {says}" in bomb or "disagree on their size" in bomb
+    assert "longer than its record" in cut or "cut off" in cut
+    assert peak_mb < (450 if says > BOMB else 250)
+
+
+def test_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path):
+    """It may have rows without end."""
+    path = tmp_path / "endless.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT)")
+        database.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) "
+            "SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"
+        )
+    with pytest.raises(RecordingError, match="'messages' is a view"):
+        RecordReader(path)
+
+
+def test_a_query_that_takes_too_long_for_the_size_of_its_file_is_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    path = tmp_path / "bag.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT)")
+        database.execute("CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        rows = ((number, 1, number, b"") for number in range(20_000))
+        database.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+        database.commit()
+    with RecordReader(path) as reader:
+        assert reader.span == (0, 19_999)
+    monkeypatch.setattr("zstate.record.sqlite_file._STEPS", 0)
+    monkeypatch.setattr("zstate.record.sqlite_file._STEPS_PER_BYTE", 0)
+    with pytest.raises(RecordingError, match="took more than 0 steps"):
+        RecordReader(path)

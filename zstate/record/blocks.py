@@ -30,6 +30,9 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; t
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, size and CRC of the content, length of a word
 _INDEX = struct.Struct("<HI")  # channel, size of what follows
 
+MOST_CONTENT = 1 << 28
+"""A chunk holds this many bytes at most without compression, 256 MiB; writers make chunks of about 1 MiB."""
+
 FIRST_PRIVATE_OPCODE = 0x80
 """Opcodes from here on are anybody's own; those below that the specification does not name are damage."""
 
@@ -64,6 +67,8 @@ def entries(content: bytes) -> Iterator[tuple[int, int, int]]:
         start, at = at + HEAD.size, at + HEAD.size + length
         if at > size:
             raise Damaged("it ends within a record")
+        if opcode == 0:
+            raise Damaged("no record begins with the byte 0")
         if opcode == Opcode.MESSAGE and length < MESSAGE.size:
             raise Damaged(f"a message of {length} bytes, where {MESSAGE.size} say which it is")
         yield opcode, start, at
@@ -114,7 +119,11 @@ def chunk(body: bytes, *, whole: bool = True) -> Chunk:
 
 
 def content(chunk: Chunk) -> bytes:
-    """What a chunk holds, checked against its size and checksum."""
+    """What a chunk holds, checked against its size and checksum. Of a large one nothing is decompressed."""
+    if chunk.size > MOST_CONTENT:
+        raise Damaged(
+            f"a chunk that says it holds {chunk.size} bytes; at most {MOST_CONTENT} are read at once"
+        )
     try:
         data = _decompressed(chunk)
     except _UNREADABLE as error:
@@ -133,7 +142,12 @@ def _decompressed(chunk: Chunk) -> bytes:
             raise Damaged("a chunk and its zstd frame that disagree on their size")
         return zstandard.decompress(chunk.data, max_output_size=chunk.size)
     if chunk.compression == "lz4":
-        return bytes(lz4.frame.decompress(chunk.data))
+        # One byte more than there should be shows that there is more.
+        frame = lz4.frame.LZ4FrameDecompressor()
+        data = bytes(frame.decompress(chunk.data, max_length=chunk.size + 1))
+        if not frame.eof:
+            raise Damaged(f"a chunk that says {chunk.size} bytes and has another lz4 frame, or one cut off")
+        return data
     if not chunk.compression:
         return chunk.data
     raise Damaged(f"a chunk with the unknown compression {chunk.compression!r}")
@@ -141,11 +155,13 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 def content_so_far(chunk: Chunk) -> bytes:
     """The whole records at the beginning of a chunk that is cut off."""
+    most = min(chunk.size, MOST_CONTENT)
     try:
         if chunk.compression == "zstd":
-            data = zstandard.ZstdDecompressor().decompressobj().decompress(chunk.data)
+            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+                data = stream.read(most)
         elif chunk.compression == "lz4":
-            data = bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data))
+            data = bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most))
         else:
             data = chunk.data
     except _UNREADABLE:

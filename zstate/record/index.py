@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from mcap.records import Channel, Header, Schema
 
-from zstate.record.blocks import HEAD, chunk, content, content_so_far
+from zstate.record.blocks import HEAD, Damaged, chunk, content, content_so_far
 from zstate.record.byte_file import ByteFile
 
 
@@ -33,7 +33,10 @@ class Piece(NamedTuple):
             return file.at(self.offset, self.end - self.offset)
         body = file.at(self.offset + HEAD.size, self.end - self.offset - HEAD.size)
         if self.kind == "chunk":
-            return content(chunk(body))
+            try:
+                return content(chunk(body))
+            except Damaged as damage:
+                raise Damaged(f"at byte {self.offset} there is {damage}") from damage
         return content_so_far(chunk(body, whole=False))
 
 

@@ -16,6 +16,9 @@ from zstate.record.storage import Choice, Format
 from zstate.record.time_order import Part
 
 _OPTIONAL = {"offered_qos_profiles": "offered_qos_profiles", "type_description_hash": "topic_type_hash"}
+# A row takes more than four bytes and less than fifty steps of SQLite's virtual machine.
+_STEPS, _STEPS_PER_BYTE = 100_000_000, 16
+_STEPS_BETWEEN = 100_000
 _STAMPS = (-(1 << 63), (1 << 63) - 1)
 
 
@@ -31,11 +34,14 @@ class SqliteFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.size = self._steps = 0
         with self._reading():
             self.size = path.stat().st_size
             self._database = sqlite3.connect(_location(path), uri=True, check_same_thread=False)
+            self._database.set_progress_handler(self._is_over, _STEPS_BETWEEN)
         try:
             with self._reading():
+                self._check_tables()
                 self._channels = dict(self._read_channels())
                 self.span = self._read_span()
         except RecordingError:
@@ -47,12 +53,39 @@ class SqliteFile:
     def _reading(self) -> Generator[None, None, None]:
         try:
             yield
+        except sqlite3.OperationalError as error:
+            if "interrupted" in str(error) and self._steps <= self._most_steps:
+                raise KeyboardInterrupt from None  # SQLite swallows what a signal raises in the handler
+            raise self._unreadable(error) from error
         except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError) as error:
-            text = (
-                f"{str(self.path)!r} cannot be read as a rosbag2 database: {error}; if it is damaged, "
-                "`sqlite3 FILE .recover` may save a part of it"
-            )
-            raise RecordingError(text, path=str(self.path)) from error
+            raise self._unreadable(error) from error
+
+    def _unreadable(self, error: Exception) -> RecordingError:
+        reason = str(error)
+        if self._steps > self._most_steps:
+            reason = f"a query took more than {self._most_steps} steps, too many for {self.size} bytes"
+        text = (
+            f"{str(self.path)!r} cannot be read as a rosbag2 database: {reason}; if it is damaged, "
+            "`sqlite3 FILE .recover` may save a part of it"
+        )
+        return RecordingError(text, path=str(self.path))
+
+    def _check_tables(self) -> None:
+        """Refuse views in the place of tables, which may have rows without end."""
+        found = self._rows(
+            "SELECT name, type, rootpage FROM sqlite_master WHERE name IN ('topics', 'messages')"
+        )
+        for name, kind, page in found:
+            if kind != "table" or not page:
+                raise ValueError(f"{name!r} is a {kind if page else 'view or virtual table'}, not a table")
+
+    @property
+    def _most_steps(self) -> int:
+        return _STEPS + _STEPS_PER_BYTE * self.size
+
+    def _is_over(self) -> bool:
+        self._steps += _STEPS_BETWEEN
+        return self._steps > self._most_steps
 
     def _read_channels(self) -> Iterator[tuple[int, Channel]]:
         counts = dict(self._rows("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
@@ -71,6 +104,7 @@ class SqliteFile:
         return None if first is None else (int(first), int(last))
 
     def _rows(self, question: str, values: tuple[Any, ...] = ()) -> Iterator[Any]:
+        self._steps = 0
         return self._database.execute(question, values)
 
     def parts(self, choice: Choice) -> list[Part]:
