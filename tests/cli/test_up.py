@@ -205,6 +205,25 @@ def test_programs_end_with_it_however_it_ends(up):
     until(lambda: not is_alive(pid))
 
 
+def test_what_a_program_left_behind_and_what_ignores_signals_ends_when_it_is_killed(up):
+    """Else a second driver would come to the same arm when it is started again."""
+    deaf = "trap '' INT TERM; sleep 60 & echo at $!; echo at $$; sleep 60"
+    child = up(table("program", run=["sh", "-c", deaf]))
+    pids = [pid_said(child, "at"), pid_said(child, "at")]
+    child.kill()
+    until(lambda: not any(map(is_alive, pids)))
+
+
+def test_a_line_without_an_end_is_cut(up):
+    code = "import sys; [sys.stdout.write('x' * 65536) for _ in range(100)]; print(); print('after')"
+    child = up(table("program", name="loud", run=["python3", "-c", code], restart="always"))
+    line, after = child.line(), child.line()
+    assert "x" * 65536 + " ... (cut at 65536 characters)" in line
+    assert len(line) < 66_000
+    assert after.endswith("after")
+    interrupted(child)
+
+
 def test_models_and_included_files_are_found_beside_the_file(tmp_path: Path, up):
     (tmp_path / "arm.urdf").write_text(Path(RRBOT).read_text())
     (tmp_path / "robots.toml").write_text(robot(model="arm.urdf", name="${arm}"))

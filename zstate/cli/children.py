@@ -19,16 +19,48 @@ END_WITHIN_S = 0.8
 _PROGRAM_ENDS_WITHIN_S = 3.0
 _LONGEST_ERROR = 500
 
-# Linux ends the program with whoever started it, however that ended. The rest of POSIX does not offer it.
-_TIED = """
-import ctypes, os, signal, sys
-if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
-try:
-    os.execvp(sys.argv[1], sys.argv[1:])
-except OSError as error:
-    sys.exit(f"{sys.argv[1]!r} cannot be started: {error.strerror}")
-"""
+_LONGEST_LINE = 1 << 16
+
+# The parent of a user's program, in one process group with it and what it starts. When its standard input
+# ends, whoever started it is gone, however that ended: it ends the group, which a program that ignores
+# signals or has left others behind would survive. Signals to the group are for the program, and it ends
+# as the program does. Linux ends the program with it; the rest of POSIX does not offer that.
+_GUARDIAN = """
+import ctypes, os, select, signal, sys, threading, time
+for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda *_: None)
+guardian = os.getpid()
+end, kept_open = os.pipe()
+program = os.fork()
+if program == 0:
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    os.dup2(end, 0)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+        if os.getppid() != guardian:
+            os._exit(1)
+    try:
+        os.execvp(sys.argv[1], sys.argv[1:])
+    except OSError as error:
+        os.write(2, f"{sys.argv[1]!r} cannot be started: {error.strerror}\\n".encode())
+        os._exit(1)
+def end_group():
+    while os.read(0, 1024):
+        pass
+    os.killpg(0, signal.SIGTERM)
+    time.sleep(PATIENCE)
+    os.killpg(0, signal.SIGKILL)
+watch = threading.Thread(target=end_group, daemon=True)
+watch.start()
+_, status = os.waitpid(program, 0)
+if select.select([0], [], [], 0)[0]:
+    watch.join()
+code = os.waitstatus_to_exitcode(status)
+if code >= 0:
+    os._exit(code)
+signal.signal(-code, signal.SIG_DFL) if -code != signal.SIGKILL else None
+os.kill(guardian, -code)
+""".replace("PATIENCE", str(_PROGRAM_ENDS_WITHIN_S))
 
 
 class ChildCommand(Closing):
@@ -53,7 +85,7 @@ class ChildCommand(Closing):
         self.name = name
         self.last_error = ""
         self._is_program = is_program
-        own = ["-c", _TIED] if is_program else ["-m", "zstate", "--until-eof"]
+        own = ["-ISc", _GUARDIAN] if is_program else ["-m", "zstate", "--until-eof"]
         # A session of its own: Ctrl-C at the terminal reaches this process alone, which ends the others.
         self._process = subprocess.Popen(
             [sys.executable, *own, *arguments],
@@ -128,7 +160,12 @@ class ChildCommand(Closing):
 
 
 def _lines(stream: IO[str] | None) -> Iterator[str]:
-    return (line.rstrip("\n") for line in stream or ())
+    """The lines of ``stream``, cut where they are too long: one without an end would fill the memory."""
+    while stream is not None and (line := stream.readline(_LONGEST_LINE)):
+        is_cut = len(line) == _LONGEST_LINE and not line.endswith("\n")
+        yield f"{line} ... (cut at {_LONGEST_LINE} characters)" if is_cut else line.rstrip("\n")
+        while is_cut and (rest := stream.readline(_LONGEST_LINE)) and not rest.endswith("\n"):
+            pass
 
 
 def end_with_parent() -> None:
