@@ -6,6 +6,11 @@ from pathlib import Path
 
 import pytest
 from looking import RRBOT, Spawn, failure, interrupted, started, zstate
+from support import a_free_port
+
+from zstate import connect
+from zstate.errors import AccessDenied
+from zstate.net.security import Credentials
 
 pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
 pytestmark = pytest.mark.processes
@@ -89,3 +94,34 @@ def test_a_router_that_listens_unencrypted_with_certificates_is_refused(tmp_path
     assert "write 'tls/0.0.0.0:7447'" in failure("router", "--listen", "tcp/0.0.0.0:7447", *identity)
     assert "needs a certificate" in failure("router", "--listen", "tls/0.0.0.0:7447")
     assert "'tls/127.0.0.1:7447'" in zstate("router", "--print", *identity).stdout.decode().replace('"', "'")
+
+
+def test_only_those_that_listen_can_pose_as_a_router(tmp_path):
+    folder = str(tmp_path / "pki")
+    assert (
+        zstate("certs", folder, "--identity", "router", "--identity", "r1", "--server", "peer").returncode
+        == 0
+    )
+    router, peer, r1 = (Credentials.from_folder(folder, name) for name in ("router", "peer", "r1"))
+    for credentials in (router, peer):
+        endpoint = f"tls/127.0.0.1:{a_free_port()}"
+        with (
+            connect(mode="router", listen=endpoint, credentials=credentials),
+            connect(mode="client", endpoints=endpoint, credentials=r1) as client,
+        ):
+            assert list(client.zenoh.info.routers_zid())
+    endpoint = f"tls/127.0.0.1:{a_free_port()}"
+    with (
+        connect(mode="router", listen=endpoint, credentials=r1),
+        pytest.raises(AccessDenied, match="one to connect with, not to listen") as caught,
+    ):
+        connect(mode="client", endpoints=endpoint, credentials=peer, timeout_s=0.2)
+    assert caught.value.reason == "not a server"
+
+
+def test_hosts_are_for_those_that_listen(tmp_path):
+    folder = str(tmp_path / "pki")
+    assert "--host is for those that listen" in failure(
+        "certs", folder, "--identity", "r1", "--host", "10.0.0.1", code=2
+    )
+    assert "say whom" in failure("certs", folder, code=2)

@@ -159,3 +159,21 @@ def test_peers_are_not_introduced_past_its_access_control(spawn: Spawn, free_por
         until(is_routed)
         assert direct.arrivals == []
         assert list(victim.zenoh.info.peers_zid()) == []
+
+
+def test_the_password_is_in_the_file_it_writes_and_not_in_what_it_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("ZSTATE_PASSWORD", "open sesame")
+    users, file = tmp_path / "users", tmp_path / "router.json5"
+    users.touch(0o600)
+    users.write_text("r1:open sesame\n")
+    options = ("router", "--user", "r1", "--users", str(users))
+    printed = zstate(*options, "--print").stdout.decode()
+    assert 'user: "r1"' in printed
+    assert "sesame" not in printed
+    assert zstate(*options, "--output", str(file)).stdout == b""
+    assert 'password: "open sesame"' in file.read_text()
+    assert file.read_text() == printed.replace("********", "open sesame")
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert f"'{file}' cannot be written: File exists" in failure(*options, "--output", str(file))

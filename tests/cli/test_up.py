@@ -230,6 +230,15 @@ def test_models_and_included_files_are_found_beside_the_file(tmp_path: Path, up)
     lines_until(up("include = 'robots.toml'\n[parameters]\narm = 'left'\n"), "publishing 'left'")
 
 
+def test_a_file_that_several_include_is_read_once(tmp_path: Path):
+    """Else 24 files that each include the next one twice would be read 16 million times."""
+    for number in range(24):
+        (tmp_path / f"part_{number}.toml").write_text(f"include = {[f'part_{number + 1}.toml'] * 2}\n")
+    (tmp_path / "part_24.toml").write_text(robot())
+    shown = zstate("up", str(tmp_path / "part_0.toml"), "--check")
+    assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == ["rrbot"], shown.stderr
+
+
 def test_what_would_start_can_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SPEED", "20")
     text = robot(rate="${SPEED}", wires=["native", "ros2"], metrics=9100, takeover=True, restart="always")
@@ -302,6 +311,10 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         ("include = 'cell.toml'\n", "cell.toml:1: include: 'cell.toml' includes this file again"),
         ("include = 'gone.toml'\n", "include: there is no file"),
         (table("program", run=""), "program[0].run: is empty"),
+        (
+            '[parameters]\nwho = "O\'Neill"\n' + table("program", run="echo ${who}"),
+            'program[0].run: "echo O\'Neill" is not a command line (No closing quotation)',
+        ),
         (
             table("program", run="./gone"),
             "'gone' ended with exit code 1: './gone' cannot be started: No such file",

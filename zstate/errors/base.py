@@ -141,8 +141,8 @@ class AccessDenied(NetworkError):
 
     ``reason`` is "not allowed to write", and then ``endpoint`` is the key; or one of "no TLS there", "TLS
     demanded", "wrong CA", "name mismatch", "their certificate expired", "their certificate not yet
-    valid", "our certificate expired", "our certificate refused", "certificate demanded", "user or
-    password", "user demanded".
+    valid", "our certificate expired", "our certificate refused", "certificate demanded", "not a
+    server", "user or password", "user demanded".
     """
 
     def __init__(self, message: str, *, reason: str, endpoint: str) -> None:

@@ -99,10 +99,13 @@ class Authority:
             )
 
     def issue(self, name: str, files: CertificateFiles, hosts: Iterable[str], valid: Validity) -> None:
-        """Write a key and a certificate for ``name``, good for ``hosts``, to listen and to connect."""
+        """Write a key and a certificate for ``name``: to connect, and to listen at ``hosts``, if any."""
         key = _new_key()
         issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
-        purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        names = _alternatives(hosts)
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        if names:
+            purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
         builder = (
             _builder(name, key, valid)
             .issuer_name(self.certificate.subject)
@@ -110,8 +113,9 @@ class Authority:
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_usage(signs_certificates=False), critical=True)
             .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-            .add_extension(x509.SubjectAlternativeName(_alternatives(hosts)), critical=False)
         )
+        if names:
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         _write(files, key, builder.sign(self.key, hashes.SHA256()))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
@@ -24,15 +24,17 @@ def issue_identities(
     names: Sequence[str],
     *,
     hosts: Sequence[str] = (),
+    servers: Collection[str] | None = None,
     days: int = 365,
     valid_from: datetime | None = None,
 ) -> dict[str, CertificateFiles]:
     """Certificates for ``names``, by the authority in ``folder``, which is made if there is none.
 
-    The common name of each is its name, which is how access control knows it. They serve to listen
-    and to connect, are good for this host's loopback addresses and for ``hosts`` (names or IP
-    addresses), and are valid for ``days`` from ``valid_from`` (an aware time; now unless given). Keys
-    are readable by their owner only. No file is ever overwritten.
+    The common name of each is its name, which is how access control knows it. Those of ``servers``
+    (all unless given) serve to listen, too, at this host's loopback addresses and at ``hosts`` (names
+    or IP addresses); the others serve to connect and cannot pose as a router. All are valid for
+    ``days`` from ``valid_from`` (an aware time; now unless given). Keys are readable by their owner
+    only. No file is ever overwritten.
 
     Raises InvalidInput before anything is written, ConfigError for an authority that cannot be used
     and files that cannot be written, LibraryMissing without ``cryptography``.
@@ -49,7 +51,8 @@ def issue_identities(
     authority = Authority.in_folder(Path(folder))
     authority.check_outlives(last)
     for name, files in issued.items():
-        authority.issue(name, files, (*THIS_HOST, *hosts), (first, last))
+        is_server = servers is None or name in servers
+        authority.issue(name, files, (*THIS_HOST, *hosts) if is_server else (), (first, last))
     return issued
 
 

@@ -64,7 +64,7 @@ def check_credentials(mode: Mode, credentials: Credentials | None, listen: Itera
             if endpoint.startswith(("tls/", "quic/")):
                 raise ConfigError(
                     f"listening at {endpoint!r} needs a certificate; give credentials= (--certs DIR "
-                    "--identity NAME); `zstate certs DIR --identity NAME` makes one for tests",
+                    "--identity NAME); `zstate certs DIR --server NAME` makes one for tests",
                     path=endpoint,
                 )
     elif mode == "router" and credentials.user is not None and credentials.users is None:

@@ -184,6 +184,11 @@ _OF_ANOTHER_AUTHORITY = Refusal(
     "its certificate is signed by no public authority, and this session was given no other to trust; give "
     "--certs DIR --identity NAME, or credentials= with the ca.pem of the authority that signed it",
 )
+_NO_SERVER = Refusal(
+    "not a server",
+    "its certificate is one to connect with, not to listen; make one for it that is: `zstate certs DIR "
+    "--server NAME`",
+)
 _EXPIRED = Refusal(
     "their certificate expired", "its certificate has expired; renew it there, and check both clocks"
 )
@@ -198,11 +203,13 @@ def _of_their_certificate(
     # OpenSSL's numbers (x509_vfy.h).
     if error.verify_code in (9, 10):
         return _NOT_YET_VALID if error.verify_code == 9 else _EXPIRED
+    if error.verify_code == 26:
+        return _NO_SERVER
     if error.verify_code in (62, 64):
         return Refusal(
             "name mismatch",
             f"its certificate is not for {host!r}; connect to a name or address that is in it, or make one "
-            f"that is: `zstate certs DIR --identity NAME --host {host}`",
+            f"that is: `zstate certs DIR --server NAME --host {host}`",
         )
     if credentials is None or credentials.ca is None:
         return _OF_ANOTHER_AUTHORITY

@@ -103,12 +103,15 @@ class RouterConfig:
         _merge(whole, told)
         return whole
 
-    def text(self) -> str:
-        """As commented JSON5."""
+    def text(self, *, masked: bool = False) -> str:
+        """As commented JSON5; ``masked``, with asterisks for the password."""
         comments = _COMMENTS | (_ROS_COMMENTS if self.ros2 else {})
         if self.access_control:
             comments |= _ACCESS_COMMENTS
-        return json5_text(self.settings(), comments, _HEAD)
+        settings = self.settings()
+        if masked and self.credentials is not None and self.credentials.password is not None:
+            _merge(settings, {"transport/auth/usrpwd/password": "********"})
+        return json5_text(settings, comments, _HEAD)
 
 
 def _merge(whole: dict[str, Any], told: Mapping[str, Any]) -> None:

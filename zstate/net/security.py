@@ -127,7 +127,7 @@ class Credentials:
             if self.certificate is None and endpoint.startswith(_ENCRYPTED):
                 raise ConfigError(
                     f"listening at {endpoint!r} needs a certificate and its key, which these credentials "
-                    "lack; `zstate certs DIR --identity NAME` makes them for tests",
+                    "lack; `zstate certs DIR --server NAME` makes them for tests",
                     path=endpoint,
                 )
 

@@ -6,39 +6,57 @@ import click
 
 from zstate.cli.console import note, say_fitted
 
+_ROUTER = "router"
+
 
 @click.command("certs")
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False))
+@click.option("--identity", "identities", multiple=True, metavar="NAME", help="Whom; may be repeated.")
 @click.option(
-    "--identity", "identities", multiple=True, required=True, metavar="NAME", help="Whom; may be repeated."
+    "--server",
+    "servers",
+    multiple=True,
+    metavar="NAME",
+    help="An identity that others connect to, as they do to one called router; may be repeated.",
 )
 @click.option(
     "--host",
     "hosts",
     multiple=True,
     metavar="HOST",
-    help="A name or address at which it is reached, besides localhost, 127.0.0.1 and ::1; may be repeated.",
+    help="Where servers are reached, besides localhost, 127.0.0.1 and ::1; may be repeated.",
 )
 @click.option(
     "--days", type=click.IntRange(min=1), default=365, show_default=True, help="How long they are valid."
 )
-def certs_command(folder: str, identities: tuple[str, ...], hosts: tuple[str, ...], days: int) -> None:
+def certs_command(
+    folder: str, identities: tuple[str, ...], servers: tuple[str, ...], hosts: tuple[str, ...], days: int
+) -> None:
     """Make certificates for tests: an authority in DIR, and an identity for each NAME.
 
-    A second call adds identities to the authority that is there. Nothing is ever overwritten. Whoever
-    listens is checked by the host it is reached at, so give a router its --host.
+    A second call adds identities to the authority that is there. Nothing is ever overwritten. Those of
+    --server, and one called router, may listen, and are checked by the host they are reached at, so give
+    a router its --host. The others connect, and cannot pose as a router; a peer that listens is a --server.
 
     \b
     zstate certs fleet --identity router --host 192.168.1.10
     zstate certs fleet --identity robot1 --identity viewer
     zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router
     zstate listen --connect tls/192.168.1.10:7447 --certs fleet --identity viewer
+    zstate certs fleet --server peer1 --server peer2   # for direct links, without a router
     """
     from zstate.net.certificates import issue_identities
     from zstate.net.security import AUTHORITY, CertificateFiles
 
     authority = CertificateFiles.of(folder, AUTHORITY)
-    for name, files in issue_identities(folder, identities, hosts=hosts, days=days).items():
+    names = (*identities, *(name for name in servers if name not in identities))
+    if not names:
+        raise click.UsageError("say whom: --identity NAME, or --server NAME for whoever listens")
+    may_listen = {_ROUTER, *servers}.intersection(names)
+    if hosts and not may_listen:
+        raise click.UsageError(f"--host is for those that listen: --server NAME, or --identity {_ROUTER}")
+    issued = issue_identities(folder, names, hosts=hosts, servers=may_listen, days=days)
+    for name, files in issued.items():
         say_fitted(f"{name}: {files.certificate} and {files.key}, for {days} days")
     note(
         f"These are for tests: whoever has {authority.key} can be anybody. In production keep it off every "

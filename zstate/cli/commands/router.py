@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import note, say, say_fitted
+from zstate.cli.console import fail, note, say, say_fitted
 from zstate.cli.identity import router_identity_options
 from zstate.cli.metrics import of_connections, of_writers, served
 from zstate.cli.network import Network, open_session
@@ -52,6 +52,12 @@ if TYPE_CHECKING:
 @config_option
 @metrics_option
 @click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5), and run nothing.")
+@click.option(
+    "--output",
+    type=click.Path(dir_okay=False),
+    metavar="FILE",
+    help="Write it into a new FILE that only you can read, with the password of --user.",
+)
 def router_command(
     *,
     listen: tuple[str, ...],
@@ -65,12 +71,14 @@ def router_command(
     config: str | None,
     metrics: Address | None,
     only_print: bool,
+    output: str | None,
     credentials: Credentials | None,
 ) -> None:
     """Run a Zenoh router until Ctrl-C.
 
     By default it serves this host alone; `--listen tcp/0.0.0.0:7447` opens it to the network. Other
-    commands reach it with `--connect tcp/HOST:7447`. What `--print` prints, zenohd takes as it is.
+    commands reach it with `--connect tcp/HOST:7447`. What `--print` prints, zenohd takes as it is; for the
+    password of --user it prints asterisks, and `--output FILE` has it.
 
     \b
     zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router --acl acl.json5
@@ -81,17 +89,33 @@ def router_command(
     """
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
     if file:
-        made = {"--ros2": ros2, "--acl": acl, "--downsample": downsample, "--print": only_print}
+        made = {
+            "--ros2": ros2,
+            "--acl": acl,
+            "--downsample": downsample,
+            "--print": only_print,
+            "--output": output,
+        }
         _refuse_beside(file, [option for option, is_given in made.items() if is_given])
         _run(Network("router", connect, listen, config, credentials), listen, metrics, file)
         return
     thinning = _thinning(downsample, robot, wan, namespace)
     router = _router(listen, connect, credentials, acl, thinning, ros2=ros2)
     if only_print:
-        say(router.text().rstrip("\n"))
-    else:
+        say(router.text(masked=True).rstrip("\n"))
+    if output is not None:
+        _write_private(output, router.text())
+    if not only_print and output is None:
         network = Network("router", config=router.settings(), credentials=credentials)
         _run(network, router.listen, metrics)
+
+
+def _write_private(file: str, text: str) -> None:
+    try:
+        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
+            opened.write(text)
+    except OSError as error:
+        fail(f"{file!r} cannot be written: {error.strerror}")
 
 
 def _refuse_beside(file: str, options: list[str]) -> None:

@@ -39,7 +39,7 @@ def read_cell(path: str, settings: Mapping[str, str] | None = None) -> Cell:
 
     Raises ConfigError naming the file, the line, the table and the key.
     """
-    files = list(_with_includes(TomlFile(Path(path)), ()))
+    files = list(_with_includes(TomlFile(Path(path)), (), set()))
     for file in files:
         _check_names(file)
     scope = parameter_scope(files, settings or {})
@@ -53,8 +53,8 @@ def read_cell(path: str, settings: Mapping[str, str] | None = None) -> Cell:
     return cell
 
 
-def _with_includes(file: TomlFile, above: tuple[Path, ...]) -> Iterator[TomlFile]:
-    """The files that ``file`` includes, each before whoever includes it."""
+def _with_includes(file: TomlFile, above: tuple[Path, ...], read: set[Path]) -> Iterator[TomlFile]:
+    """The files that ``file`` includes, each once and before whoever includes it; ``read`` is their paths."""
     chain = (*above, file.path.resolve())
     includes = file.tables.get("include", [])
     for name in [includes] if isinstance(includes, str) else includes:
@@ -66,7 +66,9 @@ def _with_includes(file: TomlFile, above: tuple[Path, ...]) -> Iterator[TomlFile
             raise file.error("include", f"{name!r} includes this file again")
         if not path.is_file():
             raise file.error("include", f"there is no file {str(path)!r}")
-        yield from _with_includes(TomlFile(path), chain)
+        if path.resolve() not in read:
+            read.add(path.resolve())
+            yield from _with_includes(TomlFile(path), chain, read)
     yield file
 
 

@@ -131,7 +131,11 @@ def _metrics(placed: Placed[RobotSection]) -> tuple[str, ...]:
 
 def _program_start(placed: Placed[ProgramSection], cell: Cell, first: tuple[str, ...]) -> Start:
     program = placed.section
-    command = tuple(shlex.split(program.run) if isinstance(program.run, str) else program.run)
+    try:
+        command = tuple(shlex.split(program.run) if isinstance(program.run, str) else program.run)
+    except ValueError as error:
+        advice = "an argument with a quote needs a list: run = ['python', 'driver.py', '...']"
+        raise placed.error(f"{program.run!r} is not a command line ({error}); {advice}", "run") from None
     if not command:
         raise placed.error("is empty; write for instance run = 'python driver.py'", "run")
     is_ours = command[0] == "zstate"
