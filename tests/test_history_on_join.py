@@ -287,7 +287,7 @@ def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Sessi
         assert publisher.memory is not None
         said = tap.payloads(2)
         pages: list[list[Arrival]] = []
-        with PastReader(reader, lambda page: bool(pages.append(page)), lambda *_: None) as past:
+        with PastReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
             past.ask(JOINTS, publisher.memory.since(0)[0].session)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == said

@@ -89,7 +89,7 @@ SIGNATURES = {
     "Recording.close": "()",
     "TransformListener": (
         "(session, robot='*', buffer=None, wire='native', follow='joint_states', history_s=10.0, "
-        "*, clock=None, history_on_join=True, on_event=None)"
+        "*, clock=None, history_on_join=True, on_event=None, placers=None)"
     ),
     "TransformListener.robots": "()",
     "TransformListener.events": "()",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from typing import Literal
 
@@ -17,10 +17,10 @@ from zstate.following.events import Event, Events
 from zstate.following.follower import Follower
 from zstate.following.joints import JointFollower
 from zstate.following.off_clock import OffClock
+from zstate.following.ownership import FrameOwnership
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
 from zstate.following.writer_clocks import WriterClocks
-from zstate.locks import new_lock
 from zstate.net.history import PastReader
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
@@ -51,6 +51,9 @@ class TransformListener(Closing):
     In a forked process nothing fills the buffer: there it answers from what it held, waits end at once, and
     the errors say so.
 
+    A frame ``robot/...`` is placed by that robot's own writers; its root may also be placed by writers of
+    other robots, in their frames. ``placers`` names the robots that may; None: every robot.
+
     ``on_event(event)`` is called, from a thread of its own, when a writer joins, leaves, is restarted or
     cut off and comes back, falls silent, or fights with another one: see ``Event``.
     """
@@ -67,7 +70,10 @@ class TransformListener(Closing):
         clock: Clock | None = None,
         history_on_join: bool = True,
         on_event: Callable[[Event], None] | None = None,
+        placers: Collection[str] | None = None,
     ) -> None:
+        if isinstance(placers, str):
+            raise InvalidInput(f"placers is a collection of robot names, for instance {[placers]!r}")
         if follow not in ("joint_states", "tf"):
             raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
         self.robot = robot
@@ -81,18 +87,22 @@ class TransformListener(Closing):
         self._tally = Tally()
         self._off_clock = OffClock(self.buffer, self._tally, is_described=not self._wire.shared)
         self._clocks: WriterClocks | None = None
-        self._names: dict[int, str] = {}
+        self._heard: tuple[Stream, ...] = ("robot_description", "tf_static", follow)
+        self._events = Events(self._heard, follow, self._wire.shared, on_event)
+        self._ownership = FrameOwnership(
+            self.buffer,
+            self._tally,
+            is_shared=bool(self._wire.shared),
+            placers=placers,
+            on_conflict=self._events.note_second_edge,
+        )
+        self._names = self._ownership.live
         self._followers: dict[tuple[str, int], Follower] = {}
         self._statics: dict[tuple[str, int], StaticFollower] = {}
-        self._departed: set[int] = set()
         self._overflowed: set[Follower] = set()
-        # A model makes room for its links before it is added: no static edge may come between.
-        self._rebuilding = new_lock()
         self._past: PastReader | None = None
-        self._heard: tuple[Stream, ...] = ("robot_description", "tf_static", follow)
         with ExitStack() as opening:
-            events = Events(self._heard, follow, self._wire.shared, on_event)
-            self._events = opening.enter_context(events)
+            opening.enter_context(self._events)
             self._open(session, wire, opening)
             self._opened = opening.pop_all()
         self._pid = os.getpid()
@@ -160,12 +170,13 @@ class TransformListener(Closing):
         follower = self._followers.get(key)
         if follower is None:
             if self._follow == "joint_states":
-                follower = JointFollower(robot, self.buffer, self._tally)
+                follower = JointFollower(robot, self._ownership)
             else:
-                follower = EdgeFollower(robot, self.buffer, self._tally, self._names)
+                follower = EdgeFollower(robot, self._ownership)
             follower = self._followers.setdefault(key, follower)
-            if self._is_shared and session in self._names:
-                follower.name_writer(session, self._names[session])
+            self._ownership.add_robot(robot)
+            if self._is_shared and (robot, session) in self._names:
+                follower.name_writer(session, self._names[robot, session])
         return follower
 
     def _on_samples(self, arrivals: list[Arrival]) -> None:
@@ -185,7 +196,7 @@ class TransformListener(Closing):
                         self._overflowed.discard(follower)
                         self._events.note_sample(robot, sample.session)
                         if not earliest <= sample.stamp <= latest:
-                            self._off_clock.note(robot, self._names.get(sample.session), sample)
+                            self._off_clock.note(robot, self._names.get((robot, sample.session)), sample)
             except InvalidInput as error:  # noqa: PERF203 - not a function of its own: runs for each sample
                 self._note_foreign(arrival.key, error)
             except Exception as error:  # the samples behind it are not to blame
@@ -193,7 +204,7 @@ class TransformListener(Closing):
         if failure is not None:
             raise failure
 
-    def _on_past(self, arrivals: list[Arrival]) -> bool:
+    def _on_past(self, arrivals: list[Arrival], writer: int) -> bool:
         robot = self._robot_of(arrivals[0].key)  # that was asked for
         samples = [
             sample
@@ -201,7 +212,11 @@ class TransformListener(Closing):
             for sample in self._decode(self._follow, arrival, robot)
             if isinstance(sample, Sample)
         ]
-        return bool(samples) and self._follower(robot, samples[-1].session).take_past(samples)
+        if any(sample.session != writer for sample in samples):
+            text = f"{robot!r}: samples of another session than {writer}, whose past was requested"
+            self._tally.refuse("foreign answer", text)
+            return False
+        return bool(samples) and self._follower(robot, writer).take_past(samples)
 
     def _note_broken(self, key: str, error: MessageError) -> None:
         self._tally.refuse(error.reason, f"{key}: {error}")
@@ -219,8 +234,7 @@ class TransformListener(Closing):
             return
         for description in self._decode("robot_description", arrival, robot):
             if isinstance(description, RobotDescription):
-                with self._rebuilding:
-                    self._follower(robot, description.session).describe(description)
+                self._follower(robot, description.session).describe(description)
 
     def _on_statics(self, arrival: Arrival) -> None:
         try:
@@ -244,19 +258,17 @@ class TransformListener(Closing):
 
     def _take_statics(self, key: str, robot: str, writer: str | None, message: StaticTransforms) -> None:
         self._follower(robot, message.session).note_heard()
-        with self._rebuilding:
-            if writer is not None:
-                follower = self._static_follower(key, robot, writer)
-                follower.replace(message)
-                self._events.note_statics(robot, writer, follower.children)
-            else:
-                departed = [one for (_, left), one in self._statics.items() if left in self._departed]
-                # A ROS node may not have announced itself yet: told from others by its number.
-                name = self._names.get(message.session, f"a ROS node {message.session:016x}")
-                self._static_follower(key, robot, name, message.session).add(message, departed)
+        if writer is not None:
+            follower = self._static_follower(key, robot, writer)
+            follower.replace(message)
+            self._events.note_statics(robot, writer, follower.children)
+        else:
+            # A ROS node may not have announced itself yet: told from others by its number.
+            name = self._names.get((robot, message.session), f"a ROS node {message.session:016x}")
+            self._static_follower(key, robot, name, message.session).add(message)
 
     def _static_follower(self, key: str, robot: str, writer: str, session: int = 0) -> StaticFollower:
-        make = StaticFollower(robot, writer, self.buffer, self._tally, self._events.note_second_edge)
+        make = StaticFollower(robot, writer, self._ownership, is_model=writer == MODEL_WRITER)
         return self._statics.setdefault((key, session), make)
 
     def _decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
@@ -275,41 +287,41 @@ class TransformListener(Closing):
         self._follow_writer(announced, alive=False)
 
     def _follow_writer(self, announced: Announced, *, alive: bool) -> None:
-        session = announced.writer.session
+        robot, session = announced.robot, announced.writer.session
         if alive:
-            self._names[session] = str(announced.writer)
+            self._names[robot, session] = str(announced.writer)
+            self._ownership.add_robot(robot)
         else:
-            self._names.pop(session, None)
-        if announced.stream == "tf_static" and announced.stream in self._wire.shared:
-            self._note_static_writer(session, alive=alive)
+            self._names.pop((robot, session), None)
+        if announced.stream == "tf_static":
+            self._note_static_writer(robot, session, alive=alive)
         if announced.stream == "robot_description" and self._follow == "joint_states" and alive:
-            self._follower(announced.robot, session).name_writer(session, self._names[session])
+            self._follower(robot, session).name_writer(session, self._names[robot, session])
         if announced.stream != self._follow:
             return
         if self._clocks is not None:
             self._clocks.note(announced, alive=alive)
         if alive and self._past is not None:
-            self._past.ask(self._wire.expression(announced.robot, self._follow), session)
+            self._past.ask(self._wire.expression(robot, self._follow), session)
         if not self._is_shared:
-            self._note_writer(self._follower(announced.robot, session), session, alive=alive)
-        elif (announced.robot, session) in self._followers:
-            self._note_writer(self._followers[announced.robot, session], session, alive=alive)
+            self._note_writer(self._follower(robot, session), session, alive=alive)
+        elif (robot, session) in self._followers:
+            self._note_writer(self._followers[robot, session], session, alive=alive)
             if not alive:
-                del self._followers[announced.robot, session]
+                del self._followers[robot, session]
 
-    def _note_static_writer(self, session: int, *, alive: bool) -> None:
-        with self._rebuilding:
-            ours = [one for (_, writing), one in self._statics.items() if writing == session]
-            if alive:
-                self._departed.discard(session)
-                for follower in ours:
-                    follower.name_writer(self._names[session])
-            elif ours:
-                self._departed.add(session)
+    def _note_static_writer(self, robot: str, session: int, *, alive: bool) -> None:
+        if not alive:
+            self._ownership.remove_writer(robot, session)
+            return
+        self._ownership.add_writer(robot, session)
+        for (_, writing), follower in list(self._statics.items()):
+            if writing == session:  # of a ROS node, whose edges may have come before its name
+                follower.name_writer(self._names[robot, session])
 
     def _note_writer(self, follower: Follower, session: int, *, alive: bool) -> None:
         if alive:
-            follower.name_writer(session, self._names[session])
+            follower.name_writer(session, self._names[follower.robot, session])
         else:
             follower.writer_left(session)
 

@@ -6,7 +6,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import pytest
 from looking import EVERYTHING, RRBOT, Spawn, failure, standing, started, zstate
 from support import a_free_port, again_and_again
 
-from zstate import StatePublisher, connect, load_model
+from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
 from zstate.wire.keys import Stream
 
@@ -243,6 +243,39 @@ def test_frames_that_hang_together_with_nothing_are_a_warning(spawn: Spawn):
     child.line()
     with standing():
         assert "in 2 trees" in warnings("rrbot")["poses"]
+
+
+@pytest.mark.parametrize("model_first", [True, False])
+def test_a_static_edge_that_would_hide_the_robot_is_a_warning_with_its_writer(model_first: bool):
+    with ExitStack() as opened:
+        session = opened.enter_context(connect())
+        wrong = StaticPublisher(session, "rrbot", "mix-up", program="rigger", takeover=True)
+        steps = [
+            lambda: opened.enter_context(standing()),
+            lambda: wrong.set(Transform("lower", "world", (1, 0, 0), (0, 0, 0, 1))),
+        ]
+        opened.enter_context(wrong)
+        for step in steps if model_first else reversed(steps):
+            step()
+        said = warnings("rrbot")
+        assert json.loads(zstate("tf", "world", "tool", "--once", "--json").stdout)["source"] == "tool"
+        assert "tool" in zstate("tree", "rrbot").stdout.decode()
+    assert list(said) == ["tf_static"]
+    assert said["tf_static"].startswith("static edge of 'mix-up' (rigger@")
+    assert "would close the loop" in said["tf_static"]
+
+
+def test_a_static_edge_that_places_another_robots_frames_is_a_warning():
+    with (
+        standing("r1"),
+        standing("r2"),
+        connect() as session,
+        StaticPublisher(session, "r2", "thief", takeover=True) as thief,
+    ):
+        thief.set(Transform("r1/base", "r1/camera", (1, 0, 0), (0, 0, 0, 1)))
+        said = diagnosed(code=0)["checks"]
+    (text,) = {check["text"] for check in said if check["name"] == "tf_static" and check["robot"] == "r2"}
+    assert "'r1/camera' is a frame of robot 'r1'" in text
 
 
 @pytest.mark.parametrize("mode", ["client", "peer"])

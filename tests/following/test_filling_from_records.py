@@ -12,6 +12,7 @@ from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, swing, swing_ra
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Disconnected, InvalidInput, RecordingError, UnknownFrame
 from zstate.following.joints import JointFollower
+from zstate.following.ownership import FrameOwnership
 from zstate.following.tally import Tally
 from zstate.model.kinematics import Kinematics
 from zstate.transform import Transform
@@ -27,7 +28,7 @@ def description(model=RRBOT, session: int = 1) -> RobotDescription:
 
 def test_answers_are_bit_for_bit_those_of_a_live_buffer(tmp_path: Path):
     live = TransformBuffer()
-    follower = JointFollower("arm", live, Tally())
+    follower = JointFollower("arm", FrameOwnership(live, Tally()))
     follower.describe(description())
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
@@ -91,7 +92,7 @@ def test_a_new_writer_whose_clock_is_back_begins_anew(tmp_path: Path):
 
 def test_a_clock_that_is_set_back_begins_anew_with_the_second_sample_as_live(tmp_path: Path):
     live = TransformBuffer()
-    follower = JointFollower("arm", live, Tally())
+    follower = JointFollower("arm", FrameOwnership(live, Tally()))
     follower.describe(description())
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")

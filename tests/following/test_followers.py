@@ -10,6 +10,7 @@ from zstate.errors import LookupFailed
 from zstate.following.edges import EdgeFollower
 from zstate.following.follower import Follower
 from zstate.following.joints import JointFollower
+from zstate.following.ownership import FrameOwnership
 from zstate.following.tally import Tally
 from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
@@ -42,12 +43,12 @@ def description(model: RobotModel = RRBOT, urdf: str | None = None, digest: str 
 class Following:
     """A follower with its buffer and its counts."""
 
-    def __init__(self, make: type[Follower], buffer: TransformBuffer | None = None) -> None:
-        self.buffer = buffer or TransformBuffer()
-        self.tally = Tally()
-        self.live: dict[int, str] = {}
-        live = (self.live,) if make is EdgeFollower else ()
-        self.follower: Follower = make("r1", self.buffer, self.tally, *live)
+    def __init__(
+        self, make: type[Follower], buffer: TransformBuffer | None = None, beside: Following | None = None
+    ) -> None:
+        self.ownership = beside.ownership if beside else FrameOwnership(buffer or TransformBuffer(), Tally())
+        self.buffer, self.tally, self.live = self.ownership.buffer, self.ownership.tally, self.ownership.live
+        self.follower: Follower = make("r1", self.ownership)
 
     def take(self, *samples: Sample) -> None:
         for sample in samples:
@@ -129,17 +130,17 @@ def test_a_held_up_sample_does_not_end_the_epoch(following: Following):
 
 def test_a_writer_whose_clock_is_behind_does_not_take_the_edges_of_one_that_lives():
     ahead = Following(EdgeFollower, TransformBuffer(history_s=1e-6))
-    behind = Following(EdgeFollower, ahead.buffer)
-    behind.live |= {7: "ahead", 8: "behind"}
+    behind = Following(EdgeFollower, beside=ahead)
+    ahead.live |= {("r1", 7): "ahead", ("r1", 8): "behind"}
     for following, session in ((ahead, 7), (behind, 8)):
         following.follower.describe(description())
-        following.follower.name_writer(session, behind.live[session])
+        following.follower.name_writer(session, behind.live["r1", session])
     ahead.take(ahead.sample(0, [0, 0.5], stamp=9000))
     late = [behind.sample(seq, [0, 0], session=8, stamp=1000 + seq) for seq in range(3)]
     behind.take(*late)
     assert behind.tally.stats().late == 3
     assert ahead.elbow_is([0, 0.5])
-    del behind.live[7]
+    del behind.live["r1", 7]
     behind.take(behind.sample(3, [0, 0], session=8, stamp=1003))
     assert behind.elbow_is([0, 0], 1003)
 

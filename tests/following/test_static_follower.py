@@ -2,6 +2,7 @@ import pytest
 from live import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.following.ownership import FrameOwnership
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Tally
 from zstate.wire.messages import StaticTransforms, to_block
@@ -12,9 +13,10 @@ class Following:
 
     def __init__(self) -> None:
         self.buffer, self.tally = TransformBuffer(), Tally()
+        self.ownership = FrameOwnership(self.buffer, self.tally)
 
     def writer(self, name: str) -> StaticFollower:
-        return StaticFollower("r1", name, self.buffer, self.tally)
+        return StaticFollower("r1", name, self.ownership)
 
     def edges(self) -> dict[str, tuple[str, str | None]]:
         return {f.name: (f.parent, f.writer) for f in self.buffer.frames() if f.parent is not None}
@@ -25,8 +27,10 @@ def following() -> Following:
     return Following()
 
 
-def statics(*edges: tuple[str, str], pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) -> StaticTransforms:
-    return StaticTransforms(3, edges, to_block([pose] * len(edges)))
+def statics(
+    *edges: tuple[str, str], pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), session: int = 3
+) -> StaticTransforms:
+    return StaticTransforms(session, edges, to_block([pose] * len(edges)))
 
 
 def test_the_buffer_holds_what_the_writer_says_now_no_more_and_no_less(following: Following):
@@ -113,12 +117,12 @@ def test_in_ros_a_writer_may_move_its_child_to_another_parent(following: Followi
 
 def test_in_ros_a_child_of_another_writer_is_moved_only_when_that_one_has_left(following: Following):
     old, new = following.writer("old"), following.writer("new")
-    old.add(statics(("tool", "camera"), ("tool", "laser")))
-    new.add(statics(("base", "camera")))
+    old.add(statics(("tool", "camera"), ("tool", "laser"), session=3))
+    new.add(statics(("base", "camera"), session=4))
     assert following.tally.stats().refused == {"second parent": 1}
-    new.add(statics(("base", "camera")), [old])
+    following.ownership.remove_writer("r1", 3)
     assert following.edges() == {"r1/camera": ("r1/base", "new"), "r1/laser": ("r1/tool", "old")}
-    assert following.tally.stats().refused == {"second parent": 1}
+    assert following.tally.stats().refused == {"second parent": 2}
 
 
 def test_a_name_that_is_learned_late_is_put_on_what_is_still_this_writers(following: Following):

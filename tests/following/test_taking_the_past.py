@@ -6,6 +6,7 @@ from live import RRBOT, STAMP
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.following.joints import JointFollower
+from zstate.following.ownership import FrameOwnership
 from zstate.following.tally import Tally
 from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
 
@@ -28,7 +29,7 @@ class World:
     def __init__(self, *, described: bool = True, history_s: float = 10.0) -> None:
         self.buffer = TransformBuffer(history_s)
         self.tally = Tally()
-        self.follower = JointFollower("r1", self.buffer, self.tally)
+        self.follower = JointFollower("r1", FrameOwnership(self.buffer, self.tally))
         if described:
             self.follower.describe(DESCRIPTION)
 

@@ -80,7 +80,7 @@ def test_the_model_places_its_links_and_another_writer_that_did_gives_way(sessio
             assert listener.stats.refused == {"second writer": 1}
             statics.set(Transform("base", "upper", (8.0, 0.0, 0.0), UPRIGHT))
             until(lambda: listener.stats.refused == {"second writer": 2})
-        assert "'mistake' placed 'r1/upper', a link of the model" in caplog.text
+        assert "'r1/upper' is written by the model of 'rrbot' already; refused: mistake" in caplog.text
 
 
 def test_a_writer_without_a_model_is_mapped_by_the_names_it_gives(sessions):

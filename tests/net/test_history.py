@@ -109,7 +109,7 @@ class Heard:
         self._most = most
         self.reader = PastReader(session, self._take, lambda _, error: self.errors.append(error))
 
-    def _take(self, arrivals: list[Arrival]) -> bool:
+    def _take(self, arrivals: list[Arrival], writer: int) -> bool:
         self.pages.append(arrivals)
         return len(self.pages) < self._most
 

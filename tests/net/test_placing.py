@@ -34,7 +34,7 @@ ROUNDS = 10
 
 
 def edge(parent: str, x: float) -> Transform:
-    return Transform(parent, "r1/camera", [x, 0, 0], [0, 0, 0, 1])
+    return Transform(parent, "fleet/camera", [x, 0, 0], [0, 0, 0, 1])
 
 
 @pytest.fixture(params=["peers", "clients", "one peer", "one client"])
@@ -81,14 +81,14 @@ def test_of_two_who_place_a_frame_at_once_one_is_told_of_the_other_whose_edge_ho
             for session in pair:
                 until(lambda s=session: len(tokens_now(s, "zstate/*/@writer/tf_static/*", 1.0)) == 2)
             errors = at_once(
-                lambda mount=mount: mount.set(edge("r1/base", 1.0)),
-                lambda room=room: room.set(edge("r1/base", 2.0)),
+                lambda mount=mount: mount.set(edge("fleet/base", 1.0)),
+                lambda room=room: room.set(edge("fleet/base", 2.0)),
             )
             place, error = the_one_told(errors)
             assert error.first.program == ("room", "mount")[place]
-            assert error.edge == ("r1/base", "r1/camera")
-            listener.buffer.wait("r1/base", "r1/camera", timeout_s=5.0)
-            assert listener.buffer.lookup("r1/base", "r1/camera").translation[0] == (2.0, 1.0)[place]
+            assert error.edge == ("fleet/base", "fleet/camera")
+            listener.buffer.wait("fleet/base", "fleet/camera", timeout_s=5.0)
+            assert listener.buffer.lookup("fleet/base", "fleet/camera").translation[0] == (2.0, 1.0)[place]
 
 
 # Peers do not wait for an answer that may never come: of a hundred times they miss each other once.
@@ -98,7 +98,7 @@ def test_of_two_who_open_under_one_name_at_once_one_is_told_of_the_other(pair):
         with ExitStack() as opened:
 
             def open_on(session: Session, opened: ExitStack = opened) -> None:
-                opened.enter_context(StaticPublisher(session, "r1", "mount")).set(edge("r1/base", 1.0))
+                opened.enter_context(StaticPublisher(session, "r1", "mount")).set(edge("fleet/base", 1.0))
 
             _, error = the_one_told(at_once(*(partial(open_on, session) for session in pair)))
         assert (error.stream, error.edge) == ("tf_static", None)
@@ -115,10 +115,10 @@ def test_what_somebody_was_about_to_place_who_left_may_be_placed(sessions):
     ours, theirs = sessions
     early = Announced("r2", "tf_static", Writer("room", "laptop", 9, 1, 8), "room")
     with StaticPublisher(ours, "r1", "mount") as mount:
-        with announce(theirs, edge_key("r2", ("r1/base", "r1/camera"), early.identity)):
+        with announce(theirs, edge_key("r2", ("fleet/base", "fleet/camera"), early.identity)):
             until(lambda: tokens_now(ours, "zstate/*/@edge/**", 1.0))
-            with pytest.raises(SecondWriter, match="is placing 'r1/camera' on 'r1/base'") as raised:
-                mount.set(edge("base", 1.0))
+            with pytest.raises(SecondWriter, match="is placing 'fleet/camera' on 'fleet/base'") as raised:
+                mount.set(edge("fleet/base", 1.0))
             assert raised.value.first == early.writer
         until(lambda: not tokens_now(ours, "zstate/*/@edge/**", 1.0))
-        mount.set(edge("base", 1.0))
+        mount.set(edge("fleet/base", 1.0))

@@ -7,6 +7,7 @@ from contextlib import suppress
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
+from zstate.following.ownership import FrameOwnership
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
@@ -34,6 +35,7 @@ class StaticCarrier(Closing):
         self._tally = tally
         self._buffer = _PublishedBuffer(publisher)
         self._buffer.add_robot(model, self._robot)
+        self._ownership = FrameOwnership(self._buffer, tally, is_shared=True)
         self._followers: dict[str, StaticFollower] = {}
         self._wire = wire_named(wire)
         key = self._wire.expression(self._robot, "tf_static")
@@ -51,7 +53,7 @@ class StaticCarrier(Closing):
             return
         if writer == MODEL_WRITER:
             return
-        make = StaticFollower(self._robot, writer or self._wire.name, self._buffer, self._tally)
+        make = StaticFollower(self._robot, writer or self._wire.name, self._ownership)
         follower = self._followers.setdefault(arrival.key, make)
         try:
             messages = self._wire.decode("tf_static", arrival, self._robot) if arrival.payload else ()

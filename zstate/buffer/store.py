@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,6 +106,18 @@ class Store:
         """Let frames called ``prefix/...`` answer to their bare names in inserts, as a robot's do."""
         with self._lock:
             self._tree.robots.setdefault(prefix, None)
+
+    def add_frames(self, names: Iterable[str]) -> None:
+        """Know frames by their full names, so that no robot's frame is meant by them."""
+        with self._lock:
+            for name in names:
+                self._tree.add_frame(name)
+
+    def edge_named(self, names: EdgeNames) -> EdgeNames:
+        """The edge that an insert of these names means; one that is not unique stays as it is."""
+        with self._lock, suppress(InsertRefused):
+            return self._tree.named_for_insert(names[0]), self._tree.named_for_insert(names[1])
+        return names
 
     def insert_joints(
         self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.frames import FrameInfo
-from zstate.errors import InvalidInput
+from zstate.errors import InsertRefused, InvalidInput
+from zstate.following.bounded import remember
+from zstate.following.edge_claims import CONTESTED, Admitted, EdgeSource
 from zstate.following.follower import Follower
-from zstate.following.tally import Tally
+from zstate.following.ownership import FrameOwnership
 from zstate.wire.keys import full_name
 from zstate.wire.messages import (
     Edges,
@@ -19,14 +19,19 @@ from zstate.wire.messages import (
 
 
 class EdgeFollower(Follower):
-    """Follows ready transforms, without a model. ``live`` names the writers there are, by session."""
+    """Follows ready transforms, without a model."""
 
-    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally, live: dict[int, str]) -> None:
-        super().__init__(robot, buffer, tally)
-        self._live = live
+    def __init__(self, robot: str, ownership: FrameOwnership) -> None:
+        super().__init__(robot, ownership)
         self._edges: Edges = ()
         self._order = b""
-        self._undescribed: set[str] = set()
+        self._described = EdgeSource(robot, "", is_model=True)
+        self._undescribed = EdgeSource(robot, "")
+        # The edges that samples name, in full; and which of them count.
+        self._full_names: dict[Edges, Edges] = {}
+        self._admitted: dict[Edges, Admitted] = {}
+        self._last: tuple[Edges, Admitted] = (), Admitted()
+        self._version = -1
 
     def describe(self, description: RobotDescription) -> None:
         self.heard = True
@@ -41,8 +46,7 @@ class EdgeFollower(Follower):
             except InvalidInput as error:
                 self._tally.refuse("robot description", str(error))
                 return
-            # What samples named in full stands for itself.
-            self._withdraw({child for _, child in self._edges} - self._undescribed)
+            self._release(self._described)
             self._edges, self._order = edges, order
             self._insert_early()
 
@@ -51,53 +55,74 @@ class EdgeFollower(Follower):
 
     def _insert(self, sample: Sample) -> bool:
         assert isinstance(sample, TransformSample)
-        edges = self._edges
+        edges, source = self._edges, self._described
         if sample.edges is not None:
-            edges = self._named(sample.edges)
-            self._take_over({child for _, child in edges} - self._undescribed)
+            edges, source = self._edges_named_by(sample.edges), self._undescribed
         if not edges:
             return True  # a robot without moving parts
+        admitted = self._admit(source, edges)
+        try:
+            return self._insert_admitted(sample, edges, admitted)
+        except InsertRefused as error:
+            if error is admitted.refusal or error.reason not in CONTESTED:
+                raise
+        # Something in the buffer stands against them that was not weighed yet.
+        self._ownership.weigh()
+        return self._insert_admitted(sample, edges, self._admit(source, edges))
+
+    def _edges_named_by(self, said: Edges) -> Edges:
+        edges = self._full_names.get(said)
+        if edges is None:
+            edges = self._named(said)
+            remember(self._full_names, said, edges)
+            new = {child for _, child in edges} - {child for _, child in self._undescribed.claims}
+            self._ownership.take_over(self._undescribed, new)
+        return edges
+
+    def _admit(self, source: EdgeSource, edges: Edges) -> Admitted:
+        """Which of ``edges`` count, asked anew when that may have changed."""
+        if self._version == self._ownership.version:
+            if edges is self._last[0]:
+                return self._last[1]
+            known = self._admitted.get(edges)
+            if known is not None:
+                self._last = edges, known
+                return known
+        source.name, source.session = self.writer or "", self._session or 0
+        admitted = self._ownership.admit(source, edges)
+        if self._version != self._ownership.version:
+            self._admitted.clear()
+            self._version = self._ownership.version
+        remember(self._admitted, edges, admitted)
+        self._last = edges, admitted
+        return admitted
+
+    def _insert_admitted(self, sample: TransformSample, edges: Edges, admitted: Admitted) -> bool:
         poses = poses_from_block(sample.poses)
-        return self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+        if admitted.refusal is None:
+            return self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+        if not admitted.rows:
+            raise admitted.refusal.with_traceback(None)  # it is raised for each sample
+        self._refuse(admitted.refusal)
+        chosen = [edges[row] for row in admitted.rows]
+        return self._buffer.insert_many(chosen, sample.stamp, poses[list(admitted.rows)], writer=self.writer)
 
     def _can_read(self, sample: Sample) -> bool:
         assert isinstance(sample, TransformSample)
         return sample.edges is not None or sample.order == self._order
 
     def _restart(self) -> None:
-        self._withdraw(self._children())
-        self._undescribed = set()
+        self._release(self._described)
+        self._release(self._undescribed)
 
-    def _withdraw(self, children: set[str]) -> None:
-        for frame in self._placed(children):
-            self._buffer.withdraw(frame.name)
-
-    def _take_over(self, children: set[str]) -> None:
-        """Edges that this writer has not said before: what one said of them that is gone is another epoch."""
-        if children:
-            others = self._others()
-            for frame in self._buffer.frames(children):
-                if frame.kind == "pose" and frame.writer not in others:
-                    self._buffer.withdraw(frame.name)
-            self._undescribed |= children
+    def _release(self, source: EdgeSource) -> None:
+        self._ownership.release(source)
+        self._full_names.clear()
+        self._admitted.clear()
+        self._last = (), Admitted()
 
     def _may_begin_again(self) -> bool:
-        others = self._others()
-        return all(frame.writer not in others for frame in self._placed(self._children()))
-
-    def _others(self) -> set[str]:
-        """The names of the other writers there are."""
-        # Ours may not be known yet; and what else our program writes goes by the same name.
-        others = {name for session, name in self._live.copy().items() if session != self._session}
-        return others - {self.writer or ""}
-
-    def _children(self) -> set[str]:
-        """The frames that we place."""
-        return {child for _, child in self._edges} | self._undescribed
-
-    def _placed(self, children: set[str]) -> list[FrameInfo]:
-        """Their edges, without those that a model or a static writer places by now."""
-        return [frame for frame in self._buffer.frames(children) if frame.kind == "pose"]
+        return not any(map(self._ownership.others_move, (self._described, self._undescribed)))
 
     def _writer_changed(self) -> None:
         pass  # each sample is inserted under its writer's name

@@ -7,12 +7,11 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 
-from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM
 from zstate.errors import InsertRefused, InvalidInput, MessageError, duration_text
 from zstate.following.absent import Absent
 from zstate.following.bounded import remember
-from zstate.following.tally import Tally
+from zstate.following.ownership import FrameOwnership
 from zstate.locks import outlive_fork
 from zstate.wire.messages import RobotDescription, Sample
 
@@ -27,11 +26,12 @@ _SET_BACK_NS = 100_000_000
 class Follower(ABC):
     """One robot's samples on their way into a buffer, whatever they are made of."""
 
-    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally) -> None:
+    def __init__(self, robot: str, ownership: FrameOwnership) -> None:
         self.robot = robot
         self.heard = False
-        self._buffer = buffer
-        self._tally = tally
+        self._ownership = ownership
+        self._buffer = ownership.buffer
+        self._tally = ownership.tally
         self._writers: dict[int, str] = {}
         self._session: int | None = None
         self._ended_sessions: dict[int, None] = {}
@@ -44,7 +44,7 @@ class Follower(ABC):
         self._is_simulated = False
         self._newest: int | None = None
         self._lock = outlive_fork(threading.RLock())
-        buffer.name_robot(robot)
+        self._buffer.name_robot(robot)
 
     @property
     def writer(self) -> str | None:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput
 from zstate.following.follower import Follower
+from zstate.following.ownership import FrameOwnership
 from zstate.following.recorded_followers import EdgeTimes, RecordedEdges, RecordedJoints
 from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
@@ -89,8 +90,8 @@ class RecordedRobots:
     """Takes what was said of robots, in the order of the recording, into ``buffer``."""
 
     def __init__(self, buffer: TransformBuffer, tally: Tally) -> None:
-        self._buffer = buffer
         self._tally = tally
+        self._ownership = FrameOwnership(buffer, tally)
         self._joints: dict[str, RecordedJoints] = {}
         self._edges: dict[tuple[str, int], RecordedEdges] = {}
         self._statics: dict[tuple[str, str | int], StaticFollower] = {}
@@ -104,7 +105,7 @@ class RecordedRobots:
         """Follow the joint states of a robot, whose ``model`` that is. Before anything is taken."""
         robot = description.speaker.robot
         self._unmodelled.learn(robot, model)
-        self._joints[robot] = RecordedJoints(robot, self._buffer, self._tally, self._unmodelled)
+        self._joints[robot] = RecordedJoints(robot, self._ownership, self._unmodelled)
         self.take(description)
 
     def take(self, said: Said) -> None:
@@ -136,7 +137,7 @@ class RecordedRobots:
         self._make_way(speaker.robot, rest.edges)
         key = speaker.robot, speaker.session
         if key not in self._edges:
-            self._edges[key] = RecordedEdges(speaker.robot, self._buffer, self._tally, self._times)
+            self._edges[key] = RecordedEdges(speaker.robot, self._ownership, self._times)
         self._name(self._edges[key], speaker)
         self._edges[key].take(rest, overflowed=False)
 
@@ -154,7 +155,7 @@ class RecordedRobots:
         if before is not None and writer is not None:
             self._withdrawn |= _children(robot, before.edges) - _children(robot, statics.edges)
         name = writer or speaker.program or _UNNAMED
-        make = StaticFollower(robot, name, self._buffer, self._tally)
+        make = StaticFollower(robot, name, self._ownership)
         self._statics.setdefault(key, make).add(rest)
 
     def _name(self, follower: Follower, speaker: Speaker) -> None:
@@ -167,8 +168,7 @@ class RecordedRobots:
         if self._withdrawn:
             for child in self._withdrawn & _children(robot, edges):
                 self._withdrawn.discard(child)
-                with suppress(InvalidInput):  # a model may place it by now
-                    self._buffer.withdraw(child)
+                self._ownership.forget(child)
 
 
 def _children(robot: str, edges: tuple[tuple[str, str], ...]) -> set[str]:

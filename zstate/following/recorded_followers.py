@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from zstate.buffer.buffer import TransformBuffer
 from zstate.following.edges import EdgeFollower
 from zstate.following.joints import JointFollower
-from zstate.following.tally import Tally
+from zstate.following.ownership import FrameOwnership
 from zstate.following.unmodelled import Unmodelled
 from zstate.model.robot import RobotModel
 from zstate.wire.messages import Sample, TransformSample, poses_from_block
@@ -17,8 +16,8 @@ _HELD_UP_NS = 10_000_000_000
 class RecordedJoints(JointFollower):
     """Keeps what earlier writers said, as long as time went on."""
 
-    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally, unmodelled: Unmodelled) -> None:
-        super().__init__(robot, buffer, tally)
+    def __init__(self, robot: str, ownership: FrameOwnership, unmodelled: Unmodelled) -> None:
+        super().__init__(robot, ownership)
         self._newest: int | None = None
         self._unmodelled = unmodelled
 
@@ -45,8 +44,8 @@ class RecordedJoints(JointFollower):
 class RecordedEdges(EdgeFollower):
     """The edges of one writer, or of all that share a topic; each edge has epochs of its own."""
 
-    def __init__(self, robot: str, buffer: TransformBuffer, tally: Tally, times: EdgeTimes) -> None:
-        super().__init__(robot, buffer, tally, {})
+    def __init__(self, robot: str, ownership: FrameOwnership, times: EdgeTimes) -> None:
+        super().__init__(robot, ownership)
         self._times = times
 
     def _insert(self, sample: Sample) -> bool:

@@ -162,9 +162,9 @@ class _Asked:
 class PastReader(Closing):
     """Asks writers what they said before, all of them from one thread.
 
-    ``on_page(arrivals)`` is called from that thread, page by page from the newest to the oldest; the
-    arrivals of a page are oldest first. It says whether older ones are wanted. Who does not answer is
-    asked a few times more; a page that cannot be read goes to ``on_error``. Each key has its turn, so that
+    ``on_page(arrivals, writer)`` is called from that thread, page by page from the newest to the oldest; the
+    arrivals of a page are oldest first, and ``writer`` is the session that was asked. It says whether older
+    ones are wanted. Who does not answer is asked a few times more; a page that cannot be read goes to ``on_error``. Each key has its turn, so that
     many silent writers of one robot do not delay those of another. An exception of ``on_page`` ends the
     asking of that writer, and goes to ``threading.excepthook``, the first of all.
     """
@@ -172,7 +172,7 @@ class PastReader(Closing):
     def __init__(
         self,
         session: Session,
-        on_page: Callable[[list[Arrival]], bool],
+        on_page: Callable[[list[Arrival], int], bool],
         on_error: Callable[[str, MessageError], None],
     ) -> None:
         self._session = session
@@ -269,7 +269,7 @@ class PastReader(Closing):
             self._on_error(page.key, error)
             return None
         arrivals = [Arrival(page.key, sample, past.encoding) for sample in past.samples]
-        is_wanted = bool(arrivals) and self._on_page(arrivals)
+        is_wanted = bool(arrivals) and self._on_page(arrivals, asked.writer)
         asked.pages += 1
         goes_back = past.before is not None and (asked.before is None or past.before < asked.before)
         asked.before = past.before

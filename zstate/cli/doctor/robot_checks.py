@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
+from zstate.buffer.frames import FrameInfo
 from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
@@ -11,6 +12,7 @@ from zstate.cli.doctor.ear import Ear
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text
+from zstate.following.edge_claims import foreign_objection
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import RobotInfo
@@ -50,7 +52,10 @@ def robot_checks(ear: Ear, session: Session) -> Iterator[Check]:
 
 def _writers_check(ear: Ear) -> Check:
     for event in ear.events:
-        if event.kind == "conflict":
+        if event.kind == "conflict" and event.stream == "tf_static":
+            if _refused_static(ear) is None:  # which says more
+                return warning("writers", event.text, "zstate ls  # shows both; end one of them")
+        elif event.kind == "conflict":
             then = (
                 f"zstate ls  # shows both; end one of them, or give it --name, another than {ear.info.name}"
             )
@@ -219,13 +224,34 @@ def statics_check(ear: Ear) -> Check:
     heard = {frame.writer for frame in owned}
     others = {name: writer for name, writer in ear.info.static_names if name != MODEL_WRITER}
     silent = [name for name in others if name not in heard]
-    for text in ear.listener.refusals.values():
-        if text.startswith(_OF_STATICS):
-            return warning("tf_static", text, f"zstate tree {ear.info.name}")
+    refused = _refused_static(ear) or _foreign_static(ear, owned)
+    if refused is not None:
+        then = f"zstate tree {ear.info.name}  # the frames without that edge; end its writer, or correct it"
+        return warning("tf_static", refused, then)
     if silent:
         text = f"{others[silent[0]]} announces static edges as {silent[0]!r}, and places no frame"
         return warning("tf_static", text, f"zstate tree {ear.info.name}")
     return ok("tf_static", f"{count_text(len(owned), 'fixed edge')}")
+
+
+def _refused_static(ear: Ear) -> str | None:
+    """Why a static edge is not used, and whose it is."""
+    found = (text for text in ear.listener.refusals.values() if text.startswith(_OF_STATICS))
+    refused = next(found, None)
+    for name, writer in ear.info.static_names:
+        if refused is not None and refused.startswith(f"{_OF_STATICS} {name!r}:"):
+            return refused.replace(f"{name!r}:", f"{name!r} ({writer}):", 1)
+    return refused
+
+
+def _foreign_static(ear: Ear, owned: Iterable[FrameInfo]) -> str | None:
+    """Which static edge of this robot is refused by readers of all robots."""
+    robots = {info.name for info in ear.neighbours}
+    for frame in owned:
+        text = foreign_objection(ear.info.name, (frame.parent or "", frame.name), robots)
+        if text and not ear.nodes:  # in ROS all writers share all frames
+            return f"{_OF_STATICS} {frame.writer!r}: {text}"
+    return None
 
 
 def poses_check(ear: Ear, model: RobotModel | None) -> Check:
