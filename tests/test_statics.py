@@ -2,6 +2,7 @@ import sys
 import time
 
 import pytest
+from live import RRBOT
 from support import SOON_S, until
 
 from zstate.buffer.buffer import TransformBuffer
@@ -9,6 +10,7 @@ from zstate.errors import Closed, InsertRefused, InvalidInput
 from zstate.listener import TransformListener
 from zstate.net.presence import discover
 from zstate.net.session import connect
+from zstate.publisher import StatePublisher
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 
@@ -136,6 +138,81 @@ def test_an_edge_that_readers_would_refuse_is_refused_where_it_is_set(sessions, 
         with pytest.raises(InsertRefused) as caught:
             statics.set(edge(parent, child))
         assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "reason"),
+    [
+        ("tool", "world", "loop"),
+        ("plate", "world", "loop"),
+        ("base", "lower", "second parent"),
+        ("upper", "lower", "second writer"),
+        ("map", "tool", "second parent"),
+        ("r2/base", "r2/camera", "foreign frame"),
+        ("r2/base", "fleet/map", ""),
+        ("map", "r2/world", ""),
+        ("map", "world", ""),
+    ],
+)
+def test_an_edge_that_every_reader_would_refuse_is_refused_where_it_is_set(sessions, parent, child, reason):
+    with (
+        StatePublisher(sessions[1], RRBOT, "r1"),
+        StatePublisher(sessions[1], RRBOT, "r2"),
+        StaticPublisher(sessions[1], "r1", "plate") as plate,
+        StaticPublisher(sessions[0], "r1", "mount") as statics,
+        TransformListener(sessions[1]) as listener,
+    ):
+        plate.set(edge("tool", "plate"))
+        until(lambda: len(discover(sessions[0])) == 2)
+        full = [name if "/" in name else f"r1/{name}" for name in (parent, child)]
+        if reason:
+            with pytest.raises(InsertRefused) as caught:
+                statics.set(edge(parent, child))
+            assert caught.value.reason == reason
+            assert caught.value.edge == tuple(full)
+        else:
+            statics.set(edge(parent, child))
+            assert listener.buffer.wait(*full, timeout_s=5.0).kind == "static"
+            assert listener.stats.refused == {}
+
+
+def test_what_another_robot_says_of_a_frame_does_not_keep_its_own_writer_out(sessions):
+    with (
+        StaticPublisher(sessions[0], "r2", "thief") as thief,
+        StaticPublisher(sessions[1], "r1", "mount") as mount,
+        TransformListener(sessions[1]) as listener,
+    ):
+        thief.set(edge("r2/map", "r1/camera", 9.0))
+        listener.buffer.wait("r2/map", "r1/camera", timeout_s=5.0)
+        mount.set(edge("base", "camera", 1.0))
+        assert listener.buffer.wait("r1/base", "r1/camera", timeout_s=5.0).translation[0] == 1.0
+        assert not listener.buffer.can_lookup("r2/map", "r1/camera")
+        assert listener.stats.refused == {"foreign frame": 1}
+        mount.withdraw("camera")
+        assert listener.buffer.wait("r2/map", "r1/camera", timeout_s=5.0).translation[0] == 9.0
+
+
+def test_one_map_for_two_robots_is_a_frame_that_belongs_to_neither(sessions):
+    with (
+        StatePublisher(sessions[0], RRBOT, "a") as one,
+        StatePublisher(sessions[1], RRBOT, "b") as other,
+        StaticPublisher(sessions[0], "a") as statics_of_a,
+        StaticPublisher(sessions[1], "b") as statics_of_b,
+        TransformListener(sessions[0]) as everything,
+        TransformListener(sessions[1], "a") as only_a,
+    ):
+        statics_of_a.set(edge("fleet/map", "a/world"))
+        statics_of_b.set(edge("fleet/map", "b/world", 2.0))
+
+        def publish() -> bool:
+            one.publish([0.0, 0.0])
+            other.publish([0.0, 0.0])
+            return x_of(everything.buffer, "a/tool", "b/tool") is not None
+
+        until(publish)
+        assert x_of(everything.buffer, "a/tool", "b/tool") == pytest.approx(2.0)
+        until(lambda: one.publish([0.0, 0.0]) or x_of(only_a.buffer, "fleet/map", "tool") is not None)
+        assert everything.stats.refused == only_a.stats.refused == {}
 
 
 @pytest.mark.parametrize("name", ["/camera", "camera/", ""])

@@ -13,7 +13,7 @@ from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock
 from zstate.net.claims import Claim
 from zstate.net.outlets import Outlets
-from zstate.net.placing import placing
+from zstate.net.placing import check_readers, placing
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named, wire_names
@@ -78,8 +78,10 @@ class StaticPublisher(Closing):
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
 
-        Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges,
-        InvalidInput for names that cannot be frames, SecondWriter and Closed.
+        Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges, and on
+        the native wire for an edge that contradicts a model that is announced or places a frame of another
+        robot where that robot, or a third one, has a say; InvalidInput for names that cannot be frames,
+        SecondWriter and Closed.
         """
         parent = full_name(self.robot, transform.target)
         child = full_name(self.robot, transform.source)
@@ -87,6 +89,7 @@ class StaticPublisher(Closing):
             self._check_open()
             if self._claim is not None:
                 if child not in self._edges:
+                    check_readers(self._session, self._announced, [(parent, child)])
                     placed.enter_context(placing(self._session, self._announced, [(parent, child)]))
                 # Now: of those who have answered we have heard, too, if they came before.
                 self._yield_to_the_first(self._claim)

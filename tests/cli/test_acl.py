@@ -57,6 +57,13 @@ def test_the_names_are_checked():
     assert "name somebody" in failure("acl", code=2)
 
 
+def test_a_placer_writes_static_edges_under_its_own_name():
+    printed = zstate("acl", "--robot", "r1", "--placer", "site").stdout.decode()
+    assert "placers:     site" in printed
+    assert '"zstate/site/tf_static/*"' in printed
+    assert '"zstate/site/**"' not in printed
+
+
 def test_a_file_without_access_control_is_not_taken_for_one(tmp_path: Path):
     file = tmp_path / "acl.json5"
     file.write_text("{}")

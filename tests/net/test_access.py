@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -16,12 +17,15 @@ from support import a_free_port, until
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import InvalidInput
 from zstate.net.access import Fleet, access_control, access_text
-from zstate.net.presence import discover_readers
+from zstate.net.presence import announce, discover_readers
 from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher
 from zstate.publisher import STREAMS
 from zstate.wire import keys
+from zstate.wire.messages import TransformSample, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
 
-FLEET = Fleet(("r1", "r2"), ("desk",), ("hand",), ("simulator",))
+FLEET = Fleet(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
 USERS = (*FLEET.names, "stranger")
 
 
@@ -84,6 +88,9 @@ WRITES = [
     ("simulator", "zstate/clock", True),
     ("simulator", "zstate/r1/joint_states", False),
     ("stranger", "zstate/r1/joint_states", False),
+    ("site", "zstate/site/tf_static/map", True),
+    ("site", "zstate/site/joint_states", False),
+    ("site", "zstate/r1/tf_static/map", False),
 ]
 
 
@@ -147,6 +154,56 @@ def test_a_robot_sees_who_the_others_are_and_their_static_edges(site: Site):
     ):
         assert [info.name for info in discover(site.join("r2"))] == ["r1"]
         assert listener.buffer.wait("world", "base", timeout_s=5.0).kind == "static"
+
+
+def test_a_placer_places_the_roots_of_robots_and_robots_none_but_their_own_where_it_is_named(site: Site):
+    robot, thief, placer = site.join("r1"), site.join("r2"), site.join("site")
+    with (
+        StatePublisher(robot, RRBOT, "r1") as publisher,
+        StaticPublisher(thief, "r2", "thief", takeover=True) as stolen,
+        StaticPublisher(placer, "site", "map", takeover=True) as placed,
+        TransformListener(site.join("desk"), "*", placers=["site"]) as listener,
+        TransformListener(site.join("desk"), "*", follow="tf", placers=["site"]) as poses,
+    ):
+        stolen.set(Transform("r2/base", "r1/world", (9.0, 0.0, 0.0), UPRIGHT))
+        stolen.set(Transform("r2/base", "r1/camera", (9.0, 0.0, 0.0), UPRIGHT))
+        for reader in (listener, poses):
+            until(lambda reader=reader: reader.stats.refused.get("foreign frame", 0) >= 2)
+        placed.set(Transform("map", "r1/world", (1.0, 0.0, 0.0), UPRIGHT))
+        with StaticPublisher(robot, "r1", "mount") as mount:
+            mount.set(Transform("base", "camera", (2.0, 0.0, 0.0), UPRIGHT))
+            for reader in (listener, poses):
+                until(lambda reader=reader: publish_and_look(publisher, reader))
+                reader.buffer.wait("site/map", "r1/camera", timeout_s=5.0)
+                assert {frame.writer for frame in reader.buffer.frames(("r1/camera",))} == {"mount"}
+                assert "not among the placers ('site')" in reader.refusals["foreign frame"]
+
+
+def test_a_robot_that_announces_itself_as_another_takes_nothing_over(site: Site):
+    robot, thief = site.join("r1"), site.join("r2")
+    edges = (("r1/upper", "r1/lower"),)
+    with (
+        StatePublisher(robot, RRBOT, "r1") as publisher,
+        TransformListener(site.join("desk"), "*", follow="tf") as listener,
+        StreamPublisher(thief, "zstate/r2/tf", ENCODINGS[TransformSample]) as stream,
+    ):
+        until(lambda: publish_and_look(publisher, listener))
+        (info,) = discover(site.join("desk"))
+        (theirs,) = {writer for stream_of, writer in info.writers if stream_of == "tf"}
+        until(lambda: listener.buffer.frames(("r1/lower",))[0].writer == str(theirs))
+        with announce(thief, f"zstate/r2/@writer/tf/{theirs.identity}"):
+            until(lambda: [one.robot for one in listener.events() if one.robot == "r2"])
+            before = listener.buffer.frames(("r1/lower",))[0].count
+            for seq in range(3):
+                sample = (time.time_ns(), seq, theirs.session, order_digest(edges))
+                pose = to_block([[9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+                stream.put(encode(TransformSample(*sample, pose, edges)))
+            until(lambda: listener.stats.refused == {"foreign frame": 3})
+        until(lambda: [one.kind for one in listener.events() if one.robot == "r2"][-1] == "left")
+        publisher.publish([0.5, 0.25])
+        until(lambda: listener.buffer.frames(("r1/lower",))[0].count > before)
+        assert listener.stats.refused == {"foreign frame": 3}
+        assert listener.buffer.lookup("upper", "lower").translation[0] != 9.0
 
 
 def test_whoever_reads_is_known_to_viewers(site: Site):

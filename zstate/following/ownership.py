@@ -32,19 +32,16 @@ from zstate.errors import InsertRefused
 from zstate.following.bounded import remember
 from zstate.following.edge_claims import (
     CONTESTED,
-    FOREIGN,
     Admitted,
     EdgeClaim,
-    EdgeNames,
     EdgeSource,
     are_same,
-    foreign_objection,
-    robot_in,
 )
 from zstate.following.tally import Tally
 from zstate.locks import outlive_fork
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
+from zstate.wire.keys import FOREIGN, EdgeNames, foreign_objection, robot_in
 
 _MODEL, _OWN, _OTHERS = range(3)
 

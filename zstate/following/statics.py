@@ -5,10 +5,10 @@ from __future__ import annotations
 from numpy.typing import ArrayLike
 
 from zstate.errors import InvalidInput
-from zstate.following.edge_claims import EdgeNames, EdgeSource
+from zstate.following.edge_claims import EdgeSource
 from zstate.following.ownership import FrameOwnership
 from zstate.transform import Transform
-from zstate.wire.keys import full_name
+from zstate.wire.keys import EdgeNames, full_name
 from zstate.wire.messages import StaticTransforms, poses_from_block
 
 

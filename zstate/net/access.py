@@ -34,7 +34,9 @@ class Fleet:
 
     A robot writes its own keys and reads these; of others it reads who they are, their static edges,
     which it must not contradict, and the simulated time. A viewer reads everything and writes nothing; an
-    operator, moreover, commands joints. A timekeeper, moreover, writes the simulated time.
+    operator, moreover, commands joints. A timekeeper, moreover, writes the simulated time. A placer writes
+    static edges under its own name and nothing else, and reads those of the robots: it places their roots,
+    as in ``fleet/map -> r1/odom``; readers that are given ``placers=`` take such edges from these alone.
     Somebody may be several of these. ``namespace`` is that of the sessions behind the router, if they
     have one. ``wires`` are what they speak: "native", and "ros2" with its options, for which see RosAccess.
     Raises InvalidInput for names that cannot be names of identities.
@@ -46,6 +48,7 @@ class Fleet:
     timekeepers: tuple[str, ...] = ()
     namespace: str = ""
     wires: tuple[str, ...] = ("native",)
+    placers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -57,7 +60,8 @@ class Fleet:
     @property
     def names(self) -> tuple[str, ...]:
         """Everybody, each once."""
-        return tuple(dict.fromkeys((*self.robots, *self.viewers, *self.operators, *self.timekeepers)))
+        names = (*self.robots, *self.viewers, *self.operators, *self.timekeepers, *self.placers)
+        return tuple(dict.fromkeys(names))
 
 
 def _check_identity(name: str) -> None:
@@ -87,6 +91,7 @@ def access_text(fleet: Fleet) -> str:
         "viewers": fleet.viewers,
         "operators": fleet.operators,
         "timekeepers": fleet.timekeepers,
+        "placers": fleet.placers,
     }
     if fleet.wires != ("native",):
         roles["wires"] = fleet.wires

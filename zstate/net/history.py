@@ -164,9 +164,10 @@ class PastReader(Closing):
 
     ``on_page(arrivals, writer)`` is called from that thread, page by page from the newest to the oldest; the
     arrivals of a page are oldest first, and ``writer`` is the session that was asked. It says whether older
-    ones are wanted. Who does not answer is asked a few times more; a page that cannot be read goes to ``on_error``. Each key has its turn, so that
-    many silent writers of one robot do not delay those of another. An exception of ``on_page`` ends the
-    asking of that writer, and goes to ``threading.excepthook``, the first of all.
+    ones are wanted. Who does not answer is asked a few times more; a page that cannot be read goes to
+    ``on_error``. Each key has its turn, so that many silent writers of one robot do not delay those of
+    another. An exception of ``on_page`` ends the asking of that writer, and goes to
+    ``threading.excepthook``, the first of all.
     """
 
     def __init__(

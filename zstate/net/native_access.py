@@ -31,6 +31,8 @@ class NativeAccess:
         if name in fleet.robots:
             yield from (f"{name} writes", f"{name} reads", f"{name} is given")
             yield from ("robots read", "robots are given", "robots are asked")
+        elif name in fleet.placers:
+            yield from (f"{name} places", "robots read", "robots are given", "robots are asked")
         yield "readers are known"
         if name in (*fleet.viewers, *fleet.operators, *fleet.timekeepers):
             yield from ("viewers read", "viewers are given")
@@ -51,6 +53,10 @@ class NativeAccess:
             yield ingress(f"{robot} writes", SAYS, own)
             yield ingress(f"{robot} reads", ASKS, own)
             yield egress(f"{robot} is given", SAYS, own)
+        for placer in dict.fromkeys(fleet.placers):
+            own = f"{root}/{check_robot(placer)}"
+            edges = (f"{own}/tf_static/*", f"{own}/tf_static/*/@adv/**")
+            yield ingress(f"{placer} places", SAYS, (*edges, f"{own}/@writer/tf_static/*", f"{own}/@edge/**"))
         yield ingress("robots read", ASKS, shared)
         yield egress("robots are given", SAYS, shared)
         # What is asked of all robots at once is asked of each; only its own is in what it answers.

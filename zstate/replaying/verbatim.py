@@ -123,7 +123,7 @@ class Verbatim(Closing):
     @contextmanager
     def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:
         """While edges of ``writer`` are said, some of them for the first time."""
-        edges = set(named_edges(self._robot, statics))
+        edges = set(named_edges(self._robot, statics.edges))
         new = sorted(edges - self._placed.get(writer, set())) if self._is_alone else []
         with ExitStack() as placed:
             if new:

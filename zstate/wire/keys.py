@@ -18,6 +18,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Literal, get_args
 from urllib.parse import quote, unquote
@@ -243,3 +244,39 @@ def full_name(robot: str, frame: str) -> str:
 def wire_name(robot: str, link: str) -> str:
     """How a link of ``robot`` is named in its own messages: bare, unless a slash in it would mislead."""
     return f"{robot}/{link}" if "/" in link else link
+
+
+EdgeNames = tuple[str, str]
+"""Parent and child, named in full."""
+
+FOREIGN = "foreign frame"
+"""The reason of refusals of edges that place another robot's frames."""
+
+
+def robot_in(frame: str) -> str:
+    """The first part of a full name: the robot whose frame that is, if there is such a robot."""
+    return frame.partition("/")[0]
+
+
+def foreign_objection(
+    robot: str, edge: EdgeNames, robots: Collection[str], placers: Collection[str] | None = None
+) -> str:
+    """Why a writer of ``robot`` may not publish ``edge`` at all; empty where it may.
+
+    ``robots`` are those on the network. Of those that place other robots' roots only ``placers`` count,
+    unless that is None.
+    """
+    parent, child = edge
+    owner, other = robot_in(child), robot_in(parent)
+    if owner == robot or owner not in robots:
+        return ""
+    whose = f"{child!r} is a frame of robot {owner!r}, and the edge from {parent!r} came from robot {robot!r}"
+    if placers is not None and robot not in placers:
+        allowed = ", ".join(map(repr, sorted(placers))) or "no robot"
+        return f"{whose}, which is not among the placers ({allowed}); publish it as robot {owner!r}"
+    if other != robot and other in robots:
+        return (
+            f"{whose}, which may place the root of {owner!r} in frames of its own, and {parent!r} is a frame "
+            f"of {other!r}; publish it as robot {owner!r} (--robot {owner})"
+        )
+    return ""

@@ -19,6 +19,7 @@ def _named(option: str, what: str) -> Callable[[Command], Command]:
 @_named("--viewer", "Somebody who reads everything, and writes nothing")
 @_named("--operator", "A viewer who also commands joints")
 @_named("--timekeeper", "A viewer who also writes the simulated time")
+@_named("--placer", "Writes static edges as robot NAME, and nothing else: where robots' roots are, in a map")
 @click.option(
     "--namespace", default="", metavar="KEY", help="The namespace of their sessions, if they have one."
 )
@@ -38,27 +39,34 @@ def acl_command(
     viewer: tuple[str, ...],
     operator: tuple[str, ...],
     timekeeper: tuple[str, ...],
+    placer: tuple[str, ...],
     namespace: str,
     wires: tuple[str, ...],
 ) -> None:
     """Print who may do what in a fleet, as a router's configuration (JSON5).
 
     What is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`), or a
-    user; that of a robot is also its name in the keys. Somebody may be several of these: a robot that
-    looks at the others is a viewer, too.
+    user; that of a robot or a placer is also its name in the keys. Somebody may be several of these: a
+    robot that looks at the others is a viewer, too.
+
+    A router checks keys, readers check frames: r1 writes under zstate/r1/ alone, and readers take a frame
+    r1/... from those keys alone, but for the root of r1, which others may place in frames of theirs. With
+    TransformListener(session, placers=["site"]) only the placer `site` may.
 
     Robots that speak ROS 2 (rmw_zenoh_cpp) have a namespace each: topics, services and nodes in it are
     theirs, /tf and /tf_static everybody's unless tf=namespace. There an operator may call services.
 
     \b
     zstate acl --robot r1 --robot r2 --viewer desk >acl.json5
+    zstate acl --robot r1 --robot r2 --viewer desk --placer site >acl.json5
     zstate acl --robot r1 --robot r2 --viewer rviz --wire 'ros2:namespace=*,tf=namespace' >acl.json5
     zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
     """
     from zstate.net.access import Fleet, access_text
 
-    if not any((robot, viewer, operator, timekeeper)):
+    if not any((robot, viewer, operator, timekeeper, placer)):
         raise click.UsageError(
-            "name somebody: --robot NAME, --viewer NAME, --operator NAME or --timekeeper NAME"
+            "name somebody: --robot NAME, --viewer NAME, --operator NAME, --timekeeper NAME or --placer NAME"
         )
-    say(access_text(Fleet(robot, viewer, operator, timekeeper, namespace, wires)).rstrip("\n"))
+    fleet = Fleet(robot, viewer, operator, timekeeper, namespace, wires, placer)
+    say(access_text(fleet).rstrip("\n"))

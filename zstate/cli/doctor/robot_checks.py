@@ -12,12 +12,11 @@ from zstate.cli.doctor.ear import Ear
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text
-from zstate.following.edge_claims import foreign_objection
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
-from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.keys import MODEL_WRITER, foreign_objection
 from zstate.wire.messages import Status
 
 _FEWER = 0.8
