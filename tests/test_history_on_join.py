@@ -14,15 +14,17 @@ from support import Child, until
 from zstate.errors import InPast, InvalidInput
 from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
-from zstate.net.history import PastReader
+from zstate.net.history import Memory, PastReader, answer_past
+from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
-from zstate.wire.messages import JointState
-from zstate.wire.native import ENCODINGS
+from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.wire import Arrival
+from zstate.wire.writer import Announced, Writer
 
 MS = 1_000_000
 PERIOD = 10 * MS
@@ -311,3 +313,20 @@ def test_statics_and_the_past_answer_together_at_an_instant_before_joining(
             expected[:3, 3] += 0.25 * expected[:3, 2]
             pose = listener.buffer.lookup("world", "hook", asked)
             assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
+
+
+def test_a_past_of_another_session_than_was_asked_is_refused(sessions):
+    writer, reader = sessions
+    memory = Memory(10.0, 2, 8)
+    order = order_digest(RRBOT.joint_names)
+    memory.keep(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
+    said = Announced("r1", "joint_states", Writer("driver", "nuc", 1, 2, 8))
+    with (
+        StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
+        answer_past(writer, "r1", "joint_states", memory, encode),
+        announce(writer, f"zstate/r1/@writer/joint_states/{said.identity}"),
+        TransformListener(reader, "r1") as listener,
+    ):
+        until(lambda: listener.stats.refused == {"foreign answer": 1})
+        listener.buffer.wait("lower", "tool", timeout_s=5.0)
+        assert not listener.buffer.can_lookup("world", "tool")

@@ -16,6 +16,7 @@ from zstate.net.service import ask_lookup
 from zstate.net.session import Session, connect
 from zstate.publisher import StatePublisher
 from zstate.transform import Transform
+from zstate.wire.json import to_json
 
 PERIOD = 10_000_000
 KEY = "zstate/r1/lookup"
@@ -52,6 +53,16 @@ def two_robots() -> TransformBuffer:
     buffer.name_robot("r1")
     buffer.name_robot("r2")
     return buffer
+
+
+def test_an_answer_that_does_not_come_on_the_robots_key_is_none(sessions: tuple[Session, Session]):
+    pose = to_json(Transform("world", "tool", (9.0, 0.0, 0.0), UPRIGHT))
+    wide = "zstate/*/lookup"
+    forged = sessions[0].zenoh.declare_queryable(wide, lambda query: query.reply(wide, pose))
+    until(lambda: [reply.ok for reply in sessions[1].zenoh.get(KEY, timeout=5.0)])
+    with pytest.raises(Unreachable):
+        ask_lookup(sessions[1], "r1", "world", "tool")
+    forged.undeclare()
 
 
 def test_each_answer_is_that_of_the_buffer(sessions: tuple[Session, Session]):

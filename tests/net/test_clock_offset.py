@@ -92,6 +92,18 @@ def test_who_answers_nonsense_or_not_at_all_is_passed_over(sessions):
     assert measure_offsets(reader, "r9", timeout_s=0.1) == ()
 
 
+@pytest.mark.parametrize("session", [5, 6])
+def test_an_answer_counts_on_the_key_and_with_the_session_of_the_writer_that_was_asked(sessions, session):
+    ours = Writer("driver", "nuc", 3, 1, 5)
+    key = clock_key("r1", ours.identity)
+    said = encode(Clock(time.time_ns(), 0, session))
+    answer = lambda query: query.reply(key, said, encoding=ENCODINGS[Clock])  # noqa: E731
+    queryable = sessions[0].zenoh.declare_queryable(key, answer)
+    found = measure_offsets(sessions[1], "r1", timeout_s=0.5)
+    assert [one.writer for one in found] == ([ours] if session == 5 else [])
+    queryable.undeclare()
+
+
 def test_what_cannot_be_asked_is_refused(sessions):
     for wrong in ({"rounds": 0}, {"timeout_s": 0.0}):
         with pytest.raises(InvalidInput, match="rounds is 1 or more"):

@@ -163,6 +163,28 @@ def test_a_writer_that_has_said_nothing_says_so_and_is_not_asked_again(sessions)
     assert (heard.pages, heard.errors) == ([], [])
 
 
+def test_an_answer_on_another_key_than_was_asked_is_none(sessions: tuple[Session, Session]):
+    writer, reader = sessions
+    past = encode(Past(ENCODINGS[JointState], (encode(state(0)),), None))
+    asked = threading.Semaphore(0)
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply("zstate/*/joint_states", past, encoding=ENCODINGS[Past])
+        query.drop()
+        asked.release()
+
+    forged = writer.zenoh.declare_queryable("zstate/*/joint_states", answer)
+    await_answers(reader)
+    while asked.acquire(blocking=False):
+        pass
+    heard = Heard(reader)
+    with heard.reader:
+        heard.reader.ask(KEY, 7)
+        assert all(asked.acquire(timeout=5.0) for _ in range(2)), "no answer is asked for again"
+    assert (heard.pages, heard.errors) == ([], [])
+    forged.undeclare()
+
+
 def test_each_writer_of_a_key_is_asked_for_itself(sessions: tuple[Session, Session]):
     writer, reader = sessions
     one, other = remembering(3, session=7), remembering(5, session=8)

@@ -130,8 +130,8 @@ def _told(sample: zenoh.Sample) -> tuple[str, Writer, int] | None:
     """Who says what time it is; None for what is no answer of ours."""
     try:
         robot, identity = parse_clock_key(str(sample.key_expr))
-        time_there = decode(sample.payload.to_bytes(), str(sample.encoding), Time)
         writer = Writer.parse(identity)
+        time_there = decode(sample.payload.to_bytes(), str(sample.encoding), Time)
     except (InvalidInput, MessageError):
         return None
     return (robot, writer, time_there.stamp) if time_there.session == writer.session else None

@@ -121,7 +121,8 @@ def ask_lookup(
         endpoints=(key,),
     )
     for reply in query(session.zenoh, selector, timeout_s):
-        if reply.ok is not None:
+        # On another key, such as one with a wildcard, it is no answer of this robot.
+        if reply.ok is not None and str(reply.ok.key_expr) == key:
             return from_json(reply.ok.payload.to_bytes())
         if reply.err is not None and str(reply.err.encoding) == "application/json":
             error = error_from_json(reply.err.payload.to_bytes())
