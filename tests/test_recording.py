@@ -104,6 +104,22 @@ def test_frames_that_are_unknown_or_apart_are_errors(tmp_path: Path):
             recording.lookup_many("world", "tool", [0.5])
 
 
+def test_what_other_robots_and_wrong_edges_say_of_a_robot_counts_as_little_as_it_did_live(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap") as tale:
+        tale.statics("thief", START, {("thief/map", "arm/camera"): pose(x=9.0)})
+        tale.statics("thief", START, {("arm/base", "arm/laser"): pose(x=9.0)}, writer="laser")
+        tale.statics("arm", START + MS, {("lower", "world"): pose(x=9.0)}, writer="mix-up")
+        tale.statics("arm", START + 2 * MS, {("tool", "camera"): pose(x=1.0)})
+        tale.describe("arm", at=START + 3 * MS)
+        tale.joints("arm", START + 4 * MS, swing(0))
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffer = recording.buffer()
+    placed = {frame.name: frame.parent for frame in buffer.frames() if frame.parent is not None}
+    assert placed["arm/camera"] == "arm/tool"
+    assert not {"arm/world", "arm/laser"} & placed.keys()
+    assert buffer.can_lookup("world", "camera")
+
+
 def test_a_bag_is_a_recording_too(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n in range(20):

@@ -16,6 +16,7 @@ a static edge is withdrawn                  it holds until something else places
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from contextlib import suppress
 
 import numpy as np
@@ -64,7 +65,8 @@ def fill(
     tally = Tally()
     transcript = Transcript(reader, tally.refuse)
     robots = None if robot is None else (check_recorded(transcript, robot),)
-    followed = RecordedRobots(buffer, tally)
+    shares_frames = any(speaker.foreign or _is_of_ros(speaker) for speaker in transcript.speakers)
+    followed = RecordedRobots(buffer, tally, () if shares_frames else transcript.robots)
     for description in first_descriptions(transcript, robots).values():
         model = model_of(transcript, description, tally.refuse)
         if model is not None:
@@ -86,12 +88,21 @@ def check_recorded(transcript: Transcript, robot: str) -> str:
     return robot
 
 
-class RecordedRobots:
-    """Takes what was said of robots, in the order of the recording, into ``buffer``."""
+def _is_of_ros(speaker: Speaker) -> bool:
+    return speaker.stream == "tf_static" and speaker.static_writer is None
 
-    def __init__(self, buffer: TransformBuffer, tally: Tally) -> None:
+
+class RecordedRobots:
+    """Takes what was said of robots, in the order of the recording, into ``buffer``.
+
+    Frames of ``robots`` are placed as a listener has it, see ``FrameOwnership``; without any all share all.
+    """
+
+    def __init__(self, buffer: TransformBuffer, tally: Tally, robots: Collection[str]) -> None:
         self._tally = tally
-        self._ownership = FrameOwnership(buffer, tally)
+        self._ownership = FrameOwnership(buffer, tally, is_shared=not robots)
+        for robot in robots:
+            self._ownership.add_robot(robot)
         self._joints: dict[str, RecordedJoints] = {}
         self._edges: dict[tuple[str, int], RecordedEdges] = {}
         self._statics: dict[tuple[str, str | int], StaticFollower] = {}
