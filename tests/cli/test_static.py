@@ -61,6 +61,17 @@ def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
     assert lens.translation.tolist() == [1.0, 0.0, 2.0]
 
 
+def test_with_a_robot_that_is_named_the_edge_is_that_robots(spawn: Spawn):
+    with standing(), connect() as session, TransformListener(session, placers=["site"]) as listener:
+        child = started(spawn, "static", "site/map", "rrbot/world", "--xyz", "1", "0", "0", "--robot", "site")
+        assert "(robot 'site'" in child.line()
+        assert listener.buffer.wait("site/map", "rrbot/base", timeout_s=10.0).kind == "static"
+        edge = ("rrbot/base", "rrbot/camera", "--xyz", "1", "0", "0", "--robot", "site")
+        assert "'rrbot/camera' is a frame of robot 'rrbot'" in failure("static", *edge)
+        edge = ("lower", "world", "--xyz", "1", "0", "0", "--robot", "rrbot")
+        assert "would close the loop" in failure("static", *edge)
+
+
 def test_without_a_robot_to_belong_to_it_asks_which():
     message = failure("static", "a", "b", *POSE)
     assert "--robot NAME (no robot is announced" in message

@@ -42,7 +42,11 @@ if TYPE_CHECKING:
     help="All [[static]] of a file of `zstate up`, or a calibration in YAML or JSON.",
 )
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter of --file.")
-@click.option("--robot", metavar="NAME", help="Whose edge it is; default: the only robot announced.")
+@click.option(
+    "--robot",
+    metavar="NAME",
+    help="Whose edge it is; default: that of a full name, or the only one there is.",
+)
 @click.option("--writer", metavar="NAME", help="Under which name; default: this program and its process id.")
 @takeover_option
 @wire_option
@@ -88,7 +92,8 @@ def static_command(
         from zstate.cli.up.edges import OwnedEdge
         from zstate.cli.up.sections import StaticSection
 
-        edges = [OwnedEdge(StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform())]
+        edge = StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform()
+        edges = [OwnedEdge(edge, robot)]
     spoken = {wire_of for edge in edges for wire_of in edge.wires or (wire,)}
     with open_session(network, tuple(sorted(spoken))) as session, ExitStack() as publishers:
         for (owner, wires), owned in _by_owner(session, edges, robot, wire).items():
