@@ -1,0 +1,72 @@
+"""Commands beside more robots than Zenoh's default channel holds tokens of (256)."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from looking import RRBOT, Spawn, started, zstate
+from support import again_and_again
+
+from zstate import StatePublisher, connect, load_model
+from zstate.net.presence import writer_here
+from zstate.wire.keys import reader_key, writer_key
+
+ROBOTS = 300
+
+
+@pytest.fixture
+def fleet() -> Iterator[None]:
+    """A robot that publishes, and the tokens of the writers and readers of 300 others."""
+    with ExitStack() as opened:
+        session = opened.enter_context(connect())
+        for number in range(ROBOTS):
+            identity = writer_here(number, "driver").identity
+            for token in (
+                writer_key(f"r{number}", "joint_states", identity),
+                reader_key(f"r{number}", "joint_states", identity),
+            ):
+                opened.callback(session.zenoh.liveliness().declare_token(token).undeclare)
+        publisher = opened.enter_context(StatePublisher(session, load_model(RRBOT), robot="rrbot"))
+        opened.enter_context(again_and_again(lambda: publisher.publish([0.0, 0.0])))
+        yield
+
+
+@pytest.mark.processes
+def test_all_robots_are_listed(fleet: None):
+    ended = zstate("ls", "--json")
+    assert ended.returncode == 0
+    assert len(json.loads(ended.stdout)) == ROBOTS + 1
+    assert f"r{ROBOTS - 1}" in zstate("ls").stdout.decode()
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    "command",
+    [("graph",), ("tree", "rrbot"), ("doctor", "rrbot"), ("tf", "rrbot/world", "rrbot/tool", "--once")],
+    ids=lambda command: command[0],
+)
+def test_a_command_answers(fleet: None, command: tuple[str, ...]):
+    ended = zstate(*command)
+    assert ended.returncode == 0, ended.stderr.decode()
+    assert "rrbot" in ended.stdout.decode()
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    "command",
+    [("ls", "--watch"), ("listen", "rrbot"), ("record", "FILE", "rrbot"), ("view", "--port", "PORT")],
+    ids=lambda command: command[0],
+)
+def test_ctrl_c_ends_a_command(
+    fleet: None, spawn: Spawn, tmp_path: Path, free_port: int, command: tuple[str, ...]
+):
+    values = {"FILE": str(tmp_path / "fleet.mcap"), "PORT": str(free_port)}
+    child = started(spawn, *(values.get(word, word) for word in command))
+    child.line(timeout_s=30.0)
+    child.process.send_signal(signal.SIGINT)
+    child.wait()
