@@ -46,7 +46,7 @@ def test_a_writer_is_said_as_program_host_and_pid():
     assert str(Writer("zstate-publish", "jetson", 412, 0, 0)) == "zstate-publish@jetson pid 412"
 
 
-NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=6)
 WRITERS = st.builds(Writer, *[NAMES] * 2, *[st.integers(0, 2**63 - 1)] * 2, st.integers(0, 2**64 - 1))
 
 
@@ -72,7 +72,7 @@ def test_an_identity_that_is_not_ours_is_refused(identity: str):
         Writer.parse(identity)
 
 
-@given(st.from_regex(r"[\w.,-]{0,20}", fullmatch=True))
+@given(st.from_regex(r"[\w.,-]{0,6}", fullmatch=True))
 def test_the_name_of_static_edges_stands_in_the_token_and_without_one_it_is_as_before(name: str):
     announced = Announced("r1", "tf_static", DRIVER, name)
     assert Announced.parse("r1", "tf_static", check_writer(announced.identity)) == announced
