@@ -346,7 +346,7 @@ def test_a_page_that_cannot_be_taken_does_not_end_the_asking_of_others(sessions,
     writer, reader = sessions
     pages: list[list[Arrival]] = []
 
-    def take(arrivals: list[Arrival]) -> bool:
+    def take(arrivals: list[Arrival], _: int) -> bool:
         pages.append(arrivals)
         if len(pages) == 1:
             raise InvalidInput("the first")

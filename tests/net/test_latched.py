@@ -1,7 +1,4 @@
-import threading
-
 import pytest
-import zenoh
 from support import Child, until
 
 from zstate.errors import Closed, InvalidInput
@@ -53,27 +50,6 @@ def test_who_joins_late_receives_the_present_value_once():
             inbox = Inbox(reader)
             until(lambda: inbox.values)
             assert inbox.heard == [(key("a"), b"new", ENCODING)]
-
-
-def test_a_late_joiner_takes_values_on_the_keys_that_it_asked_for_alone(sessions):
-    asked = threading.Event()
-
-    def answer(query: zenoh.Query) -> None:
-        query.reply("zstate/r/tf_static/forged", b"x", encoding=ENCODING)
-        asked.set()
-
-    forged = sessions[0].zenoh.declare_queryable("zstate/other/tf_static/a/@adv/**", answer)
-    heard: list[str] = []
-    with LatchedPublisher(sessions[0], "zstate/other/tf_static/b", ENCODING) as value:
-        value.set(b"y")
-        expression = "zstate/other/tf_static/*"
-        with LatchedSubscriber(sessions[1], expression, lambda one: heard.append(one.key)):
-            until(lambda: heard)
-            assert asked.wait(10.0)
-            value.set(b"z")
-            until(lambda: heard.count("zstate/other/tf_static/b") == 2)
-    assert set(heard) == {"zstate/other/tf_static/b"}
-    forged.undeclare()
 
 
 def test_a_change_reaches_everybody():
