@@ -7,7 +7,7 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
-from drawing import at, drawn, handles, moment, told, tree  # noqa: E402
+from drawing import at, drawn, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
 from zstate.model.shapes import Box, MeshFile, Shape, Sphere  # noqa: E402
@@ -153,3 +153,134 @@ def test_what_is_missing_is_listed_for_each_robot_of_a_fleet(server):
         ((uri, why),) = scene.missing_meshes(name)
         assert uri == "package://nowhere/a.stl"
         assert "no package 'nowhere'" in why
+
+
+def test_a_sixth_robot_joins_five_of_a_fleet(server):
+    """Six need no more places than five: the nodes stay, and the arrays grow."""
+    names = [f"r{k}" for k in range(6)]
+    grown = tree({"map": None} | {f"{name}/base": "map" for name in names})
+    scene = fleet_of(server, NAMES)
+    scene.set_robot("r5", CART, SHAPES)
+    drawn(scene, moment(grown, POSES | {"r5/base": at(9, 9)}))
+    place = se3.compose(se3.compose(at(9, 9), ORIGIN), (1, 1, 1, 0, 0, 0, 1))[:3]
+    assert seen(server) == corners_of(NAMES) | {tuple(np.round(place, 4).tolist())}
+
+
+def test_a_fleet_survives_another_tree_of_the_same_frames(server):
+    """As after a restart of one publisher, or a static edge that is set again."""
+    scene = fleet_of(server, NAMES)
+    again = tree({"map": None} | {f"{name}/base": "map" for name in NAMES})
+    scene.show(moment(again, POSES), "map")
+    assert seen(server) == corners_of(NAMES)
+
+
+KINDS = [SHAPES, (*SHAPES, Shape("base", "visual", at(2), Box((1, 1, 1)))), SHAPES[:1], ()]
+ROBOTS = [f"r{k}" for k in range(9)]
+
+
+class Hall:
+    """Robots that come and go at random in a scene, and where each of their shapes has to be."""
+
+    def __init__(self, server, seed: int) -> None:
+        self.random = np.random.default_rng(seed)
+        self.server = server
+        self.scene = Scene(server)
+        self.kinds: dict[str, tuple[Shape, ...]] = {}
+        self.parents = dict.fromkeys(ROBOTS, "map")
+        self.poses = {f"{name}/base": at(k, -k, 0, 0.3 * k) for k, name in enumerate(ROBOTS)}
+        self.poses["dock"] = at(0, 0, 7, 1.0)
+        self.absent: set[str] = set()
+        self.unknown: set[str] = set()
+        self.tree = self._tree()
+
+    def step(self) -> None:
+        """Do something that a network does to a view, and draw."""
+        name = ROBOTS[self.random.integers(len(ROBOTS))]
+        actions = [self._come, self._come, self._go, self._renew, self._move, self._stand_elsewhere]
+        actions += [self._lose_frames, self._lose_samples, self._fall_silent, self._switch, self._follow]
+        actions[self.random.integers(len(actions))](name)
+        drawn(self.scene, self.moment())
+
+    def moment(self):
+        stamp = int(self.random.integers(3)) * 400_000_000
+        return moment(self.tree, self.poses, stamp, [f"{name}/base" for name in self.unknown])
+
+    def expected(self) -> list[tuple[float, ...]]:
+        """The pose of every visual, by the definition of the poses."""
+        places: list[tuple[float, ...]] = []
+        for name, shapes in self.kinds.items():
+            if not self.scene.visuals or name in self.absent | self.unknown:
+                continue
+            base = self.poses[f"{name}/base"]
+            base = se3.compose(self.poses["dock"], base) if self.parents[name] == "dock" else base
+            places += [se3.compose(base, shape.origin) for shape in shapes if shape.role == "visual"]
+        return sorted(corner_of(place) for place in places)
+
+    def found(self) -> list[tuple[float, ...]]:
+        """The pose of every visual that the browser was told of."""
+        alone = [
+            in_fixed(self.server, path)
+            for path in handles(self.server, viser.GlbHandle)
+            if not path.rpartition("/")[2].startswith("c") and is_seen(self.server, path)
+        ]
+        batches = handles(self.server, viser.BatchedGlbHandle).items()
+        for node in [node for path, node in batches if not path.rpartition("/")[2].startswith("c")]:
+            poses = zip(node.batched_positions, node.batched_wxyzs, node.batched_scales, strict=True)
+            alone += [(*xyz, *wxyz[1:], wxyz[0]) for xyz, wxyz, scale in poses if scale.any()]
+        return sorted(corner_of(place) for place in alone)
+
+    def _tree(self):
+        frames = {"map": None, "dock": "map"}
+        frames |= {f"{one}/base": self.parents[one] for one in ROBOTS if one not in self.absent}
+        return tree(frames)
+
+    def _come(self, name: str) -> None:
+        self.kinds[name] = KINDS[min(self.random.geometric(0.6), len(KINDS)) - 1]
+        self.scene.set_robot(name, CART, self.kinds[name])
+        self.absent.discard(name)
+        self.tree = self._tree()
+
+    def _go(self, name: str) -> None:
+        self.kinds.pop(name, None)
+        self.scene.remove_robot(name)
+
+    def _renew(self, _: str) -> None:
+        self.tree = self._tree()
+
+    def _move(self, name: str) -> None:
+        self.poses[f"{name}/base"] = at(*self.random.normal(size=4))
+
+    def _stand_elsewhere(self, name: str) -> None:
+        self.parents[name] = "dock" if self.parents[name] == "map" else "map"
+        self.tree = self._tree()
+
+    def _lose_frames(self, name: str) -> None:
+        self.absent ^= {name}
+        self.tree = self._tree()
+
+    def _lose_samples(self, name: str) -> None:
+        self.unknown ^= {name}
+
+    def _fall_silent(self, name: str) -> None:
+        self.scene.grey(name, "silent" if self.random.random() < 0.5 else None)
+
+    def _switch(self, _: str) -> None:
+        for what in ("visuals", "collisions", "axes", "names", "parent_lines"):
+            setattr(self.scene, what, bool(self.random.random() < 0.7))
+
+    def _follow(self, name: str) -> None:
+        self.scene.trail(f"{name}/base", bool(self.random.random() < 0.5))
+
+
+def corner_of(pose) -> tuple[float, ...]:
+    """Of the pose, the image of (1, 1, 1): the same for both signs of a quaternion."""
+    corner = se3.compose(tuple(map(float, pose)), (1, 1, 1, 0, 0, 0, 1))[:3]
+    return tuple((np.round(corner, 3) + 0.0).tolist())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_whatever_robots_do_each_is_drawn_once_and_where_it_is(server, seed: int):
+    hall = Hall(server, seed)
+    for step in range(150):
+        hall.step()
+        np.testing.assert_allclose(hall.found(), hall.expected(), atol=2e-3, err_msg=f"step {step}")

@@ -21,10 +21,11 @@ Mask: TypeAlias = NDArray[np.bool_]
 _STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tree:
     """Which frame is placed on which. Frame i is called ``names[i]``; parents stand before children.
 
+    Trees are compared by identity: each change of the buffer makes another one.
     ``parents[i]`` is the row of its parent, -1 for a root. ``kinds`` are those of ``FrameInfo``: joint,
     pose, static or root; ``writers`` say who gives each edge, as far as that is known.
     """
@@ -57,7 +58,7 @@ class Tree:
             raise UnknownFrame(name, name, name=name, near_misses=near, frame_count=len(self.names)) from None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Moment:
     """The pose of every frame in its parent, at one instant.
 

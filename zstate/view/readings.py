@@ -32,7 +32,7 @@ class Use(NamedTuple):
     edges: Rows
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Readings:
     """All of a buffer as it was laid out at ``version``, by ``writers``: one for each of ``uses``."""
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +23,8 @@ from zstate.view.panels.board import Board
 from zstate.view.scene.scene import Scene
 from zstate.view.sliders import Sliders
 from zstate.view.world import World
+
+_LOG = logging.getLogger("zstate")
 
 # Numbers that change faster cannot be read, and cost more than the picture.
 _PANELS_PERIOD_S = 0.2
@@ -53,6 +57,7 @@ class View(Closing):
         self._drawn: dict[str, RobotModel] = {}
         self._framed: tuple[str, tuple[str, ...]] | None = None
         self._panels_due_s = 0.0
+        self._logged: set[str] = set()
         server = page.server
         server.initial_camera.fov = FIELD_OF_VIEW
         _light(server.scene)
@@ -68,36 +73,65 @@ class View(Closing):
         )
 
     def run(self, stop: threading.Event) -> None:
-        """Draw until ``stop`` is set."""
+        """Draw until ``stop`` is set. A picture that raises is logged, shown on the page and tried again."""
         while not stop.is_set():
             if not self._page.connected.wait(_IDLE_S):
                 # Whoever opens the page next finds everything there.
-                self.draw()
+                self._try_to_draw()
                 continue
             for _ in Rate(self._rate_hz, SystemClock(), stop):
-                self.draw()
+                self._try_to_draw()
                 if not self._page.connected.is_set():
                     break
 
     def draw(self) -> Moment:
         """Show the world as it is now, or at the instant that was chosen on the page."""
-        if self._version != self._world.version:
-            self._version = self._world.version
+        version = self._world.version
+        if self._version != version:
             self._renew_robots()
+            self._version = version
         moment = self._world.moment(self._board.stamp)
         fixed = self._board.fixed(moment)
         with self._page.server.atomic():
-            if fixed:
-                self.scene.show(moment, fixed)
-                self._frame(moment, fixed)
-            if time.monotonic() >= self._panels_due_s:
-                self._board.update(moment)
-                self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
+            try:
+                if fixed:
+                    self.scene.show(moment, fixed)
+                    self._frame(moment, fixed)
+            finally:
+                if time.monotonic() >= self._panels_due_s:
+                    self._board.update(moment)
+                    self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
         return moment
+
+    @property
+    def fault(self) -> str:
+        """Why the last picture could not be drawn; empty when it could."""
+        return self._board.fault
 
     def close(self) -> None:
         """Draw no more. A second call does nothing."""
         self._board.close()
+
+    def _try_to_draw(self) -> None:
+        try:
+            self.draw()
+        except Exception as error:  # the next picture may succeed, and the other robots are still moving
+            self._report(error)
+        else:
+            self._board.fault = ""
+
+    def _report(self, error: Exception) -> None:
+        """Show the error on the page. Log it once for each line of code that raises it."""
+        self._board.fault = f"{type(error).__name__}: {error}"
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}, line {place.lineno}"
+        if where not in self._logged:
+            self._logged.add(where)
+            _LOG.warning(
+                "the view failed to draw a picture (%s, in %s); it continues and tries again",
+                self._board.fault,
+                where,
+            )
 
     def _renew_robots(self) -> None:
         models = self._world.models

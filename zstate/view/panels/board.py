@@ -13,6 +13,7 @@ from zstate.view.fixed_frame import FixedFrame
 from zstate.view.frame_facts import FrameFacts
 from zstate.view.graph_watch import GraphWatch
 from zstate.view.moment import Moment
+from zstate.view.panels import html
 from zstate.view.panels.between_panel import BetweenPanel
 from zstate.view.panels.display_panel import DisplayPanel, Switches
 from zstate.view.panels.frames_panel import FramesPanel, Trails
@@ -48,6 +49,8 @@ class Board(Closing):
         self._fixed = FixedFrame()
         self._opened = ExitStack()
         self.clock = ReplayClock(live=world.session is not None)
+        self._fault = gui.add_html("")
+        self._fault_text = ""
         tabs = gui.add_tab_group()
         self._panels: list[Panel] = []
         with tabs.add_tab("View"):
@@ -71,6 +74,18 @@ class Board(Closing):
                 self._panels.append(SlidersPanel(gui, one))
         with gui.add_folder("Plot"):
             self._panels.append(PlotsPanel(gui, self._world))
+
+    @property
+    def fault(self) -> str:
+        """Why the last picture could not be drawn; empty when it could."""
+        return self._fault_text
+
+    @fault.setter
+    def fault(self, text: str) -> None:
+        if text != self._fault_text:
+            self._fault_text = text
+            said = f"The last picture could not be drawn, so what is shown is older: {text}"
+            self._fault.content = html.paragraph(said, color=html.ALARM) if text else ""
 
     @property
     def stamp(self) -> int | None:

@@ -57,7 +57,9 @@ class Fleet:
         self._path = path
         self._wardrobes = [_Wardrobe(dress, shapes, path) for dress in OVER]
         self._orders: dict[Order, _Batch] = {}
-        self._placed_in: tuple[Tree, tuple[str, ...]] | None = None
+        # What the rows of the links were found in.
+        self._tree: Tree | None = None
+        self._lined_up: tuple[str, ...] = ()
         self._capacity = 0
         self.robots: dict[str, None] = {}
         self.missing: list[Missing] = []
@@ -77,9 +79,10 @@ class Fleet:
         """Draw each robot in what it wears, at the poses of its links in the fixed frame."""
         if not self.robots:
             return
-        if self._placed_in != (tree, tuple(self.robots)):
-            self._placed_in = (tree, tuple(self.robots))
+        robots = tuple(self.robots)
+        if tree is not self._tree or robots != self._lined_up:
             self._line_up(tree)
+            self._tree, self._lined_up = tree, robots
         for wardrobe in self._wardrobes:
             wears = np.array([wardrobe.dress in worn[robot] for robot in self.robots])
             if wears.any() or wardrobe.ordered:
@@ -135,7 +138,11 @@ class Fleet:
             scales[: len(worn)] = worn[:, None] * sizes
             batch.handle.batched_scales = scales
         turned = _in_mirror(poses, mirrored).astype(np.float32)
-        if batch.sent is None or np.abs(turned - batch.sent).max() > _UNSEEN:
+        if (
+            batch.sent is None
+            or batch.sent.shape != turned.shape
+            or np.abs(turned - batch.sent).max() > _UNSEEN
+        ):
             batch.sent = turned
             wxyzs = self._all(turned[:, [6, 3, 4, 5]], (1.0, 0.0, 0.0, 0.0))
             place(batch.handle, self._all(turned[:, :3], (0.0, 0.0, 0.0)), wxyzs)

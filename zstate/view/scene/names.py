@@ -46,7 +46,10 @@ class Names:
 
     def _show(self, frame: str, path: str, text: str | None, size: Literal["screen", "scene"]) -> None:
         there, label = self._labels.get(frame, ("", None))
-        if label is not None and there == path:
+        if label is not None and there != path:
+            del self._labels[frame]  # it went with the node that it hung on
+            label = None
+        if label is not None:
             label.visible = text is not None
             label.text = label.text if text is None else text
             label.font_size_mode = size

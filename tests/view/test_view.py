@@ -1,0 +1,98 @@
+"""The view goes on drawing, whatever happens to the robots that it draws."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+from live import RRBOT
+from support import until
+
+pytest.importorskip("viser")
+
+from zstate import StatePublisher, StaticPublisher, Transform, load_model
+from zstate.buffer.buffer import TransformBuffer
+from zstate.view.moment import Moment
+from zstate.view.page import Page
+from zstate.view.view import View
+from zstate.view.world import World
+
+CART = load_model("diffbot")
+STILL = [0.0, 0.0, 0.0, 1.0]
+
+
+@contextmanager
+def drawing(view: View, page: Page) -> Iterator[threading.Thread]:
+    """``view.run`` in a thread of its own, at full rate as if a browser showed the page."""
+    page.connected.set()
+    stop = threading.Event()
+    thread = threading.Thread(target=view.run, args=(stop,), daemon=True)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        stop.set()
+        thread.join(5.0)
+        page.connected.clear()
+
+
+class FailingWorld(World):
+    """A world that cannot be read while ``fails``."""
+
+    fails = False
+    tries = 0
+
+    def moment(self, at: int | None = None) -> Moment:
+        self.tries += 1
+        if self.fails:
+            raise ValueError(f"try number {self.tries}")
+        return super().moment(at)
+
+
+def test_a_picture_that_fails_is_logged_once_shown_on_the_page_and_tried_again(page, caplog):
+    buffer = TransformBuffer()
+    buffer.insert_static(Transform("map", "camera", [1, 0, 0], STILL))
+    with FailingWorld(None, buffer=buffer) as world, View(world, page) as view, drawing(view, page) as thread:
+        until(lambda: world.tries > 3)
+        assert not view.fault
+        world.fails = True
+        until(lambda: "ValueError: try number" in view.fault)
+        tried = world.tries
+        until(lambda: world.tries > tried + 3)
+        world.fails = False
+        until(lambda: not view.fault)
+        assert thread.is_alive()
+    (logged,) = [record.getMessage() for record in caplog.records]
+    assert "failed to draw a picture (ValueError: try number" in logged
+    assert "test_view.py, line" in logged
+
+
+def test_robots_of_a_fleet_restart_come_and_go_while_they_are_drawn(page, sessions, caplog):
+    """At random: publishers of two models, and static edges that are set again and elsewhere."""
+    random = np.random.default_rng(7)
+    publishers: dict[str, StatePublisher] = {}
+    with ExitStack() as opened:
+        world = opened.enter_context(FailingWorld(sessions[1]))
+        view = opened.enter_context(View(world, page))
+        opened.enter_context(drawing(view, page))
+        hall = opened.enter_context(StaticPublisher(sessions[0], "hall"))
+        opened.callback(lambda: [one.close() for one in publishers.values()])
+        for step in range(40):
+            name = f"r{random.integers(6)}"
+            ended = publishers.pop(name, None)
+            if ended is not None:
+                ended.close()
+            if ended is None or random.random() < 0.7:
+                model = RRBOT if random.random() < 0.8 else CART
+                publisher = publishers[name] = StatePublisher(sessions[0], model, name)
+                publisher.publish(model.neutral)
+                hall.set(Transform("hall/map", f"{name}/{model.root}", [step, 0, 0], STILL))
+            for one in publishers.values():
+                one.publish(one.model.neutral)
+            until(lambda since=world.tries: world.tries > since + 1)
+        until(lambda: publishers.keys() <= world.models.keys())
+        until(lambda since=world.tries: world.tries > since + 1)
+    assert [record.getMessage() for record in caplog.records if "picture" in record.getMessage()] == []
