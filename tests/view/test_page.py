@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ import pytest
 pytest.importorskip("viser")
 
 import viser
-from support import a_free_port, until
+from support import SOON_S, a_free_port, until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -67,6 +68,36 @@ def test_a_websocket_comes_through_the_same_door():
         assert caught.value.response.status_code == 403
 
 
+def raw_status(port: int, *headers: str) -> int:
+    """Of an answer to a request with just these headers."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as connection:
+        lines = ["GET / HTTP/1.1", *headers, "", ""]
+        connection.sendall("\r\n".join(lines).encode())
+        return int(connection.makefile("rb").readline().split()[1])
+
+
+WEBSOCKET = (
+    "Connection: Upgrade",
+    "Upgrade: websocket",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+    f"Sec-WebSocket-Protocol: {PROTOCOL[0]}",
+)
+
+
+@pytest.mark.parametrize("upgrade", [(), WEBSOCKET])
+def test_a_name_that_leads_to_loopback_is_not_answered_and_no_request_is_an_error_here(upgrade):
+    with Page(port=0) as page:
+        here, evil = (f"{name}:{page.port}" for name in ("127.0.0.1", "127.0.0.1.evil.example"))
+        expected = 101 if upgrade else 200
+        assert raw_status(page.port, f"Host: {here}", f"Origin: http://{here}", *upgrade) == expected
+        assert raw_status(page.port, f"Host: {evil}", f"Origin: http://{evil}", *upgrade) == 403
+        assert raw_status(page.port, f"Host: {here}", f"Host: {evil}", *upgrade) == 400
+        assert raw_status(page.port, f"Host: {here}", f"Host: {here}", *upgrade) == 400
+        assert raw_status(page.port, "Host: [::1", *upgrade) == 403
+        assert raw_status(page.port, *upgrade) == 403
+
+
 def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
     with Page("0.0.0.0", 0) as page:
         here = f"127.0.0.1:{page.port}"
@@ -80,6 +111,17 @@ def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
         cookie = {"Cookie": f"zstate_view_{page.port}={page.door.token}"}
         with connect(f"ws://{here}", subprotocols=PROTOCOL, additional_headers=cookie) as socket:
             assert socket.recv(timeout=10)
+
+
+def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
+    page = Page(port=0)
+    with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as vanished:
+        host = f"Host: 127.0.0.1:{page.port}"
+        vanished.sendall("\r\n".join(["GET / HTTP/1.1", host, *WEBSOCKET, "", ""]).encode())
+        assert vanished.recv(1).startswith(b"H")
+        started = time.monotonic()
+        page.close()
+        assert time.monotonic() - started < SOON_S
 
 
 def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():

@@ -3,20 +3,25 @@
 A browser lets any page on the internet open a websocket to a port of the machine it runs on. So:
 
 - a websocket is opened only for a page that came from here (its Origin is the Host it asks);
-- on loopback, Host must be a name of loopback, or a page elsewhere could have its name lead here;
+- on loopback, Host must be a loopback address or ``localhost``, with the port of this server; otherwise
+  another site could let its own name resolve to 127.0.0.1 (DNS rebinding);
+- a header that decides is refused if a request has it twice;
 - beyond loopback everything, the page as well as the websocket, wants the token.
 """
 
 from __future__ import annotations
 
 import http
+import ipaddress
 import secrets
-from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
-LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
+from websockets.datastructures import Headers
+
+_HTTP_PORT = 80
+_ONCE = ("Host", "Origin", "Upgrade", "Cookie")
 
 # The page is one file with everything in it: whatever it were made to ask for elsewhere, it does not get.
 _HEADERS = {
@@ -37,27 +42,32 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Door:
-    """Who may come in at ``host``; ``token`` is what they have to know, None where nothing."""
+    """Who may come in at ``host`` and ``port``; ``token`` is what they have to know, None where nothing."""
 
     host: str
+    port: int
     token: str | None = None
 
     @classmethod
-    def at(cls, host: str) -> Door:
+    def at(cls, host: str, port: int) -> Door:
         """Open on loopback, else with a token that nobody guesses."""
-        return cls(host, None if is_loopback(host) else secrets.token_urlsafe(16))
+        return cls(host, port, None if is_loopback(host) else secrets.token_urlsafe(16))
 
-    def objection(self, path: str, headers: Mapping[str, str]) -> Refused | None:
+    def objection(self, path: str, headers: Headers) -> Refused | None:
         """Why a request for ``path``, query included, stays outside; None when it may come in."""
+        repeated = [name for name in _ONCE if len(headers.get_all(name)) > 1]
+        if repeated:
+            return Refused(http.HTTPStatus.BAD_REQUEST, f"a request has one {repeated[0]} header at most")
         host = headers.get("Host", "")
-        if is_loopback(self.host) and not is_loopback(urlsplit(f"//{host}").hostname or ""):
+        if is_loopback(self.host) and not self._is_here(host):
             return Refused(
                 http.HTTPStatus.FORBIDDEN,
-                f"this view is for this machine only and was asked for as {host!r}; "
-                "`zstate view --host` opens it to others",
+                f"this view is for this machine only, at port {self.port}, and was asked for as {host!r}; "
+                f"forward the same port (ssh -L {self.port}:127.0.0.1:{self.port} HOST), or open the view to "
+                "others with `zstate view --host`",
             )
         origin = headers.get("Origin")
-        if is_websocket(headers) and origin is not None and urlsplit(origin).netloc != host:
+        if is_websocket(headers) and origin is not None and not _is_same_place(origin, host):
             return Refused(http.HTTPStatus.FORBIDDEN, f"a page of {origin!r} may not use this view")
         if not self._is_known(path, headers):
             return Refused(
@@ -66,38 +76,67 @@ class Door:
             )
         return None
 
-    def headers(self, port: int) -> dict[str, str]:
+    def headers(self) -> dict[str, str]:
         """What every answer says besides itself: nothing from elsewhere, and the token kept for later."""
         if self.token is None:
             return _HEADERS
         # The page opens its websocket without the query it was asked with: a cookie goes along by itself.
         # A host has the same cookies at all its ports.
-        cookie = f"{_cookie_name(port)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        cookie = f"{_cookie_name(self.port)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
         return {**_HEADERS, "Set-Cookie": cookie}
 
-    def _is_known(self, path: str, headers: Mapping[str, str]) -> bool:
+    def _is_here(self, host: str) -> bool:
+        """Whether a Host header names loopback and this server's port."""
+        name, port = _name_and_port(host)
+        return is_loopback(name) and port == self.port
+
+    def _is_known(self, path: str, headers: Headers) -> bool:
         if self.token is None:
             return True
-        asked = parse_qs(urlsplit(path).query).get("token", [])
-        said = [*asked, *_cookies(headers)]
-        return any(secrets.compare_digest(self.token.encode(), one.encode()) for one in said)
+        asked = parse_qs(path.partition("?")[2]).get("token", [])
+        said = [one.encode(errors="surrogateescape") for one in (*asked, *_cookies(headers))]
+        return any(secrets.compare_digest(self.token.encode(), one) for one in said)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether ``host`` is reached from this machine only."""
-    return host in LOOPBACK or host.startswith("127.")
+    """Whether ``host``, an address or a name, is reached from this machine only."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
-def is_websocket(headers: Mapping[str, str]) -> bool:
+def is_websocket(headers: Headers) -> bool:
     """Whether a request asks for a websocket."""
     return headers.get("Upgrade", "").lower() == "websocket"
+
+
+def _name_and_port(host: str) -> tuple[str, int]:
+    """The parts of a Host header, in lower case; an empty name if it is none."""
+    try:
+        parts = urlsplit(f"//{host}")
+        port = _HTTP_PORT if parts.port is None else parts.port
+    except ValueError:
+        return "", 0
+    # What else stands there (a user, a path) has no place in a Host header.
+    has_more = parts.netloc != host or "@" in host
+    return "" if has_more or parts.hostname is None else parts.hostname, port
+
+
+def _is_same_place(origin: str, host: str) -> bool:
+    """Whether an Origin header names the same host and port as a Host header."""
+    try:
+        place = urlsplit(origin).netloc.lower()
+    except ValueError:
+        return False
+    return place != "" and place == host.lower()
 
 
 def _cookie_name(port: int) -> str:
     return f"zstate_view_{port}"
 
 
-def _cookies(headers: Mapping[str, str]) -> list[str]:
+def _cookies(headers: Headers) -> list[str]:
     """The tokens that a browser kept, whichever port's they are."""
     try:
         jar = SimpleCookie(headers.get("Cookie", ""))

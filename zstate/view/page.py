@@ -22,6 +22,8 @@ from zstate.view.door import Door, is_websocket
 
 PORT = 8080
 _PORTS_TRIED = 100
+# A browser that has vanished (a laptop that sleeps, a network that is gone) does not say goodbye.
+_CLOSES_WITHIN_S = 0.3
 
 # It tells of every browser that opens a connection and thinks better of it, with a traceback.
 _SILENT = logging.getLogger("zstate.view.http")
@@ -41,9 +43,9 @@ class Page(Closing):
 
     def __init__(self, host: str = "127.0.0.1", port: int | None = None, *, title: str = "zstate") -> None:
         self.host = host
-        self.door = Door.at(host)
         self._listening = _listen(host, port)
         self.port: int = self._listening.getsockname()[1]
+        self.door = Door.at(host, self.port)
         self.connected = threading.Event()
         """Set while at least one browser shows the page."""
         try:
@@ -94,7 +96,14 @@ class Page(Closing):
         ) -> websockets.asyncio.server.serve:
             opened.append(port)
             guarded = functools.partial(self._answer, process_request)
-            return opens(handler, sock=self._listening, process_request=guarded, logger=_SILENT, **options)
+            return opens(
+                handler,
+                sock=self._listening,
+                process_request=guarded,
+                logger=_SILENT,
+                close_timeout=_CLOSES_WITHIN_S,
+                **options,
+            )
 
         websockets.asyncio.server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
         try:
@@ -112,7 +121,7 @@ class Page(Closing):
             return None
         else:
             response = of_viser(connection, request)
-            response.headers.update(self.door.headers(self.port))
+            response.headers.update(self.door.headers())
         return response
 
 
