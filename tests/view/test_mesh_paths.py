@@ -47,11 +47,95 @@ def test_a_relative_name_starts_at_the_urdf(package):
     assert "means nothing without the folder of its URDF" in missing.reason
 
 
-def test_a_file_is_found_by_its_uri_and_by_its_path(package):
+def test_a_file_is_found_by_its_uri_and_by_its_path_for_a_urdf_that_the_user_named(package, tmp_path):
     file = package / "meshes" / "a b.stl"
-    assert MeshPaths().find(file.as_uri()) == file
-    assert MeshPaths().find(f"file://{file}") == file
+    for uri in (file.as_uri(), f"file://{file}", str(file)):
+        assert MeshPaths(tmp_path / "urdf").find(uri) == file
+
+
+def test_a_relative_folder_of_a_urdf_has_the_folders_above_it(package, monkeypatch):
+    monkeypatch.chdir(package)
+    file = package / "meshes" / "a b.stl"
+    assert MeshPaths(Path("urdf")).find("package://arm/meshes/a b.stl") == file
+    assert MeshPaths(Path()).find("package://arm/meshes/a b.stl") == file
+    assert MeshPaths(Path()).find("meshes/a b.stl") == file
+    monkeypatch.setenv("ROS_PACKAGE_PATH", ".")
+    assert MeshPaths().find("package://arm/meshes/a b.stl") == file
+
+
+@pytest.fixture
+def outside(package: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file in none of the packages that the search path finds."""
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
+    share = package.parents[2] / "install" / "share"
+    (share / "leg").mkdir(parents=True)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(share.parent))
+    secret = package.parents[2] / "private" / "secret.png"
+    secret.parent.mkdir()
+    secret.touch()
+    (package / "link").symlink_to(secret.parent)
+    (package / "loop").symlink_to(package / "loop")
+    (package / "secret.png").symlink_to(secret)
+    (share / "leg" / "link").symlink_to(secret.parent)
+    return secret
+
+
+def test_a_description_that_was_received_gets_no_file_outside_packages_nor_learns_which_exist(outside):
+    private, package = outside.parent, outside.parents[1] / "src" / "repository" / "arm"
+
+    def answers(file: str) -> list[Path | tuple[str, tuple[str, ...]]]:
+        up = "../" * 30
+        uris = [
+            f"file://{private}/{file}",
+            f"{private}/{file}",
+            f"file://localhost{private}/{file}",
+            f"file://{package}/../../../private/{file}",
+            f"package://arm/../../../private/{file}",
+            f"package://arm/%2e%2e/../../private/{file}",
+            f"package://arm/meshes/{up}{private}/{file}",
+            f"package://arm/{private}/{file}",
+            f"package:////{private}/{file}",
+            f"package://../{private.name}/{file}",
+            f"package://./private/{file}",
+            f"package://..{private}/{file}",
+            f"package://arm/link/{file}",
+            f"package://leg/link/{file}",
+            f"package://arm/loop/{file}",
+            f"file://{package}/link/{file}",
+            f"model://arm/link/{file}",
+            f"../private/{file}",
+            file,
+        ]
+        found = [MeshPaths().find(uri) for uri in uris]
+        return [(one.reason, one.looked) if isinstance(one, Missing) else one for one in found]
+
+    present, absent = answers("secret.png"), answers("nothing.png")
+    assert [one for one in present if isinstance(one, Path)] == []
+    assert present == absent
+    linked = MeshPaths().find("package://arm/secret.png")
+    assert isinstance(linked, Missing)
+    assert linked.reason == "it leads out of the package 'arm'"
+
+
+def test_a_description_that_was_received_may_name_a_file_of_a_package_by_its_path(package, outside):
+    file = package / "meshes" / "a b.stl"
     assert MeshPaths().find(str(file)) == file
+    assert MeshPaths().find(file.as_uri()) == file
+
+
+def test_links_to_the_sources_of_the_same_package_are_followed(package, monkeypatch):
+    """As colcon installs them with --symlink-install."""
+    file = package / "meshes" / "a b.stl"
+    installed = package.parents[2] / "install" / "share" / "arm" / "meshes" / "a b.stl"
+    installed.parent.mkdir(parents=True)
+    installed.symlink_to(file)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(installed.parents[3]))
+    assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), Missing)
+    (package / "package.xml").write_text("<package><name>leg</name></package>")
+    assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), Missing)
+    (package / "package.xml").write_text("<package><name> arm </name></package>")
+    assert MeshPaths().find("package://arm/meshes/a b.stl") == installed
+    assert MeshPaths().find(str(installed)) == installed
 
 
 def test_nothing_is_fetched_from_elsewhere():

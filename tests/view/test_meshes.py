@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import io
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ from zstate.view.geometry.paths import Missing  # noqa: E402
 from zstate.view.geometry.smoothing import smooth  # noqa: E402
 from zstate.view.meshes import Drawing, Meshes  # noqa: E402
 
+HERE = Path(__file__).parent
+"""Of a URDF file that the user named: every file that it names is found."""
 TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n{}f 1/1 2/2 3/3\n"
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
@@ -46,7 +50,7 @@ def shape(geometry: object, color: tuple[float, ...] | None = None, texture: str
 
 
 def drawn(one: Shape, meshes: Meshes | None = None, **options: object) -> Drawing:
-    drawing = (meshes or Meshes()).draw(one, **options)
+    drawing = (meshes or Meshes()).draw(one, **{"base": HERE, **options})
     assert isinstance(drawing, Drawing), str(drawing)
     return drawing
 
@@ -191,7 +195,7 @@ def test_an_image_goes_over_a_primitive_too_and_a_missing_one_is_told(tmp_path):
     assert the_mesh(drawn(shape(Box((1, 1, 1)), None, str(image)))).visual.material.baseColorTexture
     gone = shape(Box((1, 1, 1)), (1, 0, 0, 1), str(tmp_path / "gone.png"))
     assert color_of(drawn(gone)) == as_read((1, 0, 0, 1))
-    missing = Meshes().missing_texture(gone)
+    missing = Meshes().missing_texture(gone, HERE)
     assert missing is not None
     assert missing.looked == (str(tmp_path),)
 
@@ -220,7 +224,7 @@ def test_equal_shapes_are_one_object_and_each_file_is_read_once(tmp_path):
 def test_a_file_that_is_no_mesh_is_missing_and_not_an_error(tmp_path, ending, content):
     path = tmp_path / f"bad.{ending}"
     path.write_bytes(content)
-    missing = Meshes().draw(shape(MeshFile(str(path))))
+    missing = Meshes().draw(shape(MeshFile(str(path))), base=HERE)
     assert isinstance(missing, Missing)
     assert missing.reason
 
@@ -234,7 +238,7 @@ def test_a_primitive_that_nobody_can_see_is_missing(geometry):
 
 def test_a_format_nobody_reads_says_which_are_read(tmp_path):
     (tmp_path / "old.mesh").write_bytes(b"ogre")
-    missing = Meshes().draw(shape(MeshFile(str(tmp_path / "old.mesh"))))
+    missing = Meshes().draw(shape(MeshFile(str(tmp_path / "old.mesh"))), base=HERE)
     assert isinstance(missing, Missing)
     assert "'.mesh' are not read; .dae, .glb" in missing.reason
 
@@ -246,3 +250,46 @@ def test_nothing_of_a_known_robot_is_missing(name):
     for one in shapes_of(load_model(name)):
         assert not isinstance(meshes.draw(one), Missing)
         assert meshes.missing_texture(one) is None
+
+
+def painted(tmp_path: Path, meshes: Meshes, shade: float) -> Drawing:
+    """A mesh of some kilobytes in one of many colours."""
+    path = tmp_path / "ball.stl"
+    if not path.exists():
+        trimesh.creation.icosphere(3).export(path)
+    return drawn(shape(MeshFile(str(path)), (shade, shade, shade, 1.0)), meshes)
+
+
+def test_colours_that_are_not_drawn_any_more_take_no_memory(tmp_path):
+    meshes = Meshes()
+    gone = [weakref.ref(painted(tmp_path, meshes, k / 100).copy) for k in range(100)]
+    gc.collect()
+    assert [one() for one in gone if one() is not None] == []
+
+
+def test_many_colours_of_one_mesh_are_drawn_up_to_a_limit_and_then_in_one(tmp_path):
+    size = len(painted(tmp_path, Meshes(), 0.0).glb)
+    meshes = Meshes(drawn_bytes=10 * size)
+    drawings = [painted(tmp_path, meshes, k / 100) for k in range(100)]
+    copies = {one.copy for one in drawings}
+    assert 5 <= len(copies) <= 11
+    lacks = [one.lack for one in drawings if one.lack is not None]
+    assert len(lacks) == 100 - len(copies)
+    assert "in the colour of another" in lacks[0].reason
+    # A mesh that is not drawn yet is drawn all the same, and there is room again when others are gone.
+    assert drawn(shape(Box((1, 1, 1))), meshes).lack is None
+    del drawings, copies
+    gc.collect()
+    assert painted(tmp_path, meshes, 0.995).lack is None
+
+
+def test_geometry_is_kept_up_to_a_limit_the_latest_first(tmp_path):
+    size = len(painted(tmp_path, Meshes(), 0.0).glb)
+    meshes = Meshes(kept_bytes=2 * size)
+    for k in range(20):
+        for solid in (Box((1, 1, k)), Sphere(1.0 + k), Cylinder(1.0 + k, 1.0)):
+            meshes.draw(shape(solid))
+        painted(tmp_path, meshes, 0.5)
+    assert meshes.kept_byte_count <= 2 * size
+    (tmp_path / "ball.stl").write_bytes(b"nothing")
+    assert painted(tmp_path, meshes, 0.7).lack is None

@@ -22,10 +22,10 @@ TREE = tree({"map": None} | {f"{name}/base": "map" for name in NAMES})
 POSES = {f"{name}/base": at(k, -k, 0, 0.3 * k) for k, name in enumerate(NAMES)}
 
 
-def fleet_of(server, names, shapes=SHAPES) -> Scene:
+def fleet_of(server, names, shapes=SHAPES, base=None) -> Scene:
     scene = Scene(server)
     for name in names:
-        scene.set_robot(name, CART, shapes)
+        scene.set_robot(name, CART, shapes, base)
     drawn(scene, moment(TREE, POSES))
     return scene
 
@@ -78,7 +78,8 @@ def test_a_mirrored_mesh_is_mirrored_in_a_fleet_too(server, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     trimesh.creation.box().export(tmp_path / "box.stl")
     scale = (1.0, -2.0, 0.5)
-    fleet_of(server, NAMES, (Shape("base", "visual", ORIGIN, MeshFile(str(tmp_path / "box.stl"), scale)),))
+    mesh = Shape("base", "visual", ORIGIN, MeshFile("box.stl", scale))
+    fleet_of(server, NAMES, (mesh,), tmp_path)
     assert seen(server) == corners_of(NAMES, scale)
 
 

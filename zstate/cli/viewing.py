@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
 from zstate.cli.console import fail, note, say
 from zstate.cli.options import load_robot
 from zstate.cli.worker import Worker
+from zstate.model.catalog import is_path
+from zstate.model.known import find
 from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
 from zstate.net.session import Session
@@ -40,25 +43,56 @@ def recording_among(robots: Sequence[str]) -> Path | None:
     return files[0] if files else None
 
 
-def chosen_sliders(session: Session, robots: Sequence[str], wire: str) -> Iterator[Sliders]:
-    """Sliders of each robot that is named, or of all that are announced."""
-    within_s = _MEETING_S if robots else _ANNOUNCED_WITHIN_S
+class Named(NamedTuple):
+    """A ROBOT argument: the robot's name, with its model and the folder of its file where it is local."""
+
+    robot: str
+    model: RobotModel | None = None
+    folder: Path | None = None
+
+
+def named_robots(arguments: Sequence[str]) -> list[Named]:
+    """The robots behind ROBOT arguments: URDF files that are read now, and names."""
+    return [_local(one)[0] if is_path(one) else Named(one) for one in arguments]
+
+
+def folders_of(named: Iterable[Named]) -> dict[str, Path]:
+    """The folders of local robots by the text of their URDF."""
+    return {one.model.urdf: one.folder for one in named if one.model is not None and one.folder is not None}
+
+
+def _local(argument: str) -> tuple[Named, RobotModel]:
+    model, robot = load_robot(argument, None)
+    path = Path(argument) if is_path(argument) else find(argument).path
+    return Named(robot, model, path.parent), model
+
+
+def chosen_sliders(session: Session, named: Sequence[Named], wire: str) -> Iterator[tuple[Named, Sliders]]:
+    """Each robot that is named, or all that are announced, with its sliders.
+
+    A name is an announced robot's; only where nobody announces it, it is one of the catalog.
+    """
+    within_s = _MEETING_S if named else _ANNOUNCED_WITHIN_S
     announced = [info.name for info in discover(session, within_s, wire=wire)]
-    if not robots and not announced:
+    if not named and not announced:
         fail("no robot is announced that could be moved; name one, as in `zstate view panda --sliders`")
-    for one in robots or announced:
-        model, name = _announced_model(session, one, wire) if one in announced else load_robot(one, None)
-        sliders = Sliders(session, model, name, wires=(wire,))
+    for one in named or map(Named, announced):
+        chosen, model = one, one.model
+        if model is None and one.robot in announced:
+            model = _announced_model(session, one.robot, wire)
+        elif model is None:
+            chosen, model = _local(one.robot)
+        sliders = Sliders(session, model, chosen.robot, wires=(wire,))
         if sliders.refusal:
-            note(f"{name!r} is not moved: {sliders.refusal}", robot=name)
-        yield sliders
+            note(f"{chosen.robot!r} is not moved: {sliders.refusal}", robot=chosen.robot)
+        yield chosen, sliders
 
 
-def _announced_model(session: Session, robot: str, wire: str) -> tuple[RobotModel, str]:
+def _announced_model(session: Session, robot: str, wire: str) -> RobotModel:
     with World(session, (robot,), wire=wire) as world:
         if not _until(lambda: robot in world.models, _ANNOUNCED_WITHIN_S):
             fail(f"{robot!r} is announced, but not what it looks like; `zstate doctor {robot}` says more")
-        return world.models[robot], robot
+        return world.models[robot]
 
 
 @contextmanager

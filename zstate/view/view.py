@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import viser
@@ -16,7 +16,6 @@ from zstate.closing import Closing
 from zstate.model.robot import RobotModel
 from zstate.rate import Rate
 from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of
-from zstate.view.meshes import Meshes
 from zstate.view.moment import Moment
 from zstate.view.page import Page
 from zstate.view.panels.board import Board
@@ -35,7 +34,8 @@ class View(Closing):
     """Draws ``world`` on ``page`` at most ``rate_hz`` times a second; twice a second while nobody looks.
 
     ``sliders`` are of robots that are moved from the page; they and the world are the caller's to close.
-    ``folder`` is where the relative paths of meshes begin, which only those know who have the URDF's file.
+    ``folders`` are those of the URDF files that the user named, by the text of the URDF: a robot with
+    such a URDF is drawn with every file that it names, any other with files in packages only.
     One thread calls ``run`` or ``draw``.
     """
 
@@ -46,12 +46,13 @@ class View(Closing):
         *,
         sliders: Sequence[Sliders] = (),
         rate_hz: float = 30.0,
-        folder: Path | None = None,
+        folders: Mapping[str, Path] | None = None,
     ) -> None:
         self._world = world
         self._page = page
         self._rate_hz = rate_hz
-        self.scene = Scene(page.server, Meshes(folder))
+        self._folders = dict(folders or {})
+        self.scene = Scene(page.server)
         self._board = Board(page.server, world, self.scene, sliders)
         self._version = -1
         self._drawn: dict[str, RobotModel] = {}
@@ -141,7 +142,7 @@ class View(Closing):
         for name, model in models.items():
             known = self._drawn.get(name)
             if known is None or known.digest != model.digest:
-                self.scene.set_robot(name, model)
+                self.scene.set_robot(name, model, base=self._folders.get(model.urdf))
                 self._drawn[name] = model
 
     def _frame(self, moment: Moment, fixed: str) -> None:

@@ -86,31 +86,41 @@ def view_command(
     """
     import_module("zstate.view.library")  # told before anything is heard when it is missing
 
-    from zstate.cli.viewing import chosen_sliders, recording_among, running, show_address, take_snapshot
+    from zstate.cli.viewing import (
+        chosen_sliders,
+        folders_of,
+        named_robots,
+        recording_among,
+        running,
+        show_address,
+        take_snapshot,
+    )
     from zstate.view.page import Page
     from zstate.view.view import View
     from zstate.view.world import World
 
-    said, recording = robots, recording_among(robots)
+    recording = recording_among(robots)
     if recording is not None and sliders:
         raise click.UsageError("--sliders moves robots that are here, not those of a recording")
+    named = [] if recording is not None else named_robots(robots)
     with ExitStack() as opened:
         moved: list[Sliders] = []
         if recording is None:
             session = opened.enter_context(open_session(network, (wire,)))
             if sliders:
-                moved = [opened.enter_context(one) for one in chosen_sliders(session, robots, wire)]
-            robots = tuple(one.robot for one in moved) or robots
-            world = opened.enter_context(World(session, robots, wire=wire))
+                chosen = [
+                    (one, opened.enter_context(its)) for one, its in chosen_sliders(session, named, wire)
+                ]
+                named, moved = [one for one, _ in chosen], [its for _, its in chosen]
+            world = opened.enter_context(World(session, [one.robot for one in named], wire=wire))
         else:
-            robots = ()
             world = opened.enter_context(World.of_recording(recording))
         page = opened.enter_context(Page(port=0) if snapshot else Page(host, port))
-        folder = next((Path(one).parent for one in said if Path(one).is_file()), None)
-        view = opened.enter_context(View(world, page, sliders=moved, rate_hz=rate, folder=folder))
+        view = opened.enter_context(View(world, page, sliders=moved, rate_hz=rate, folders=folders_of(named)))
         with running(view) as worker:
             if snapshot is None:
                 show_address(page)
                 worker.result()
             else:
+                robots = tuple(one.robot for one in named)
                 take_snapshot(world, view, page, robots, path=snapshot, size=size)

@@ -57,6 +57,12 @@ class Glb:
         """How many triangles are drawn."""
         return self._corner_count // 3
 
+    @property
+    def byte_count(self) -> int:
+        """How much memory it takes, and what is painted of it at least."""
+        images = {look.image for look, _ in self._looks if look is not None and look.image is not None}
+        return len(self._binary) + sum(map(len, images))
+
     def painted(self, paint: Paint) -> bytes:
         """The file, ready to be drawn."""
         looks = [_look(*own, paint) for own in self._looks]

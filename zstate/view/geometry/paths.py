@@ -1,8 +1,14 @@
-"""MeshPaths: the files that robots name as package://, file:// or plain paths. Never the network."""
+"""MeshPaths: the files that robots name as package://, file:// or plain paths. Never the network.
+
+A description that was received may be anybody's, and what it names is shown to everybody who opens the
+page. So it gets files in packages that the search path finds, and an answer that does not depend on any
+other file. The description in a file that the user named gets every file, as its owner does.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +21,12 @@ _DEEPEST = 4  # repositories hold packages in folders of folders
 _NOT_PACKAGES = {"meshes", "urdf"}  # inside one, and large
 _IN_PACKAGES = {"package", "model"}
 _HOW = "put the folder of the package into ROS_PACKAGE_PATH"
+_NAME = re.compile(rb"<name>([^<]*)</name>")
+_MOST_OF_PACKAGE_XML = 65536
+_ONLY_PACKAGES = (
+    "a description that was received gets files in packages only: write package://NAME/PATH, or name the "
+    "URDF file, as in `zstate view arm.urdf`"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +50,14 @@ class MeshPaths:
     """Finds files as they are named in a URDF.
 
     ``package://NAME/PATH`` and ``package:///NAME/PATH`` are looked for in, by turns: the folders around
-    ``base``, the folder of the URDF where that is known; ROS_PACKAGE_PATH; AMENT_PREFIX_PATH; and what
-    example-robot-data and robot_descriptions have installed. A relative path starts at ``base``.
+    ``base``; ROS_PACKAGE_PATH; AMENT_PREFIX_PATH; and what example-robot-data and robot_descriptions have
+    installed. ``base`` is the folder of a URDF file that the user named: relative paths start there, and
+    every file can be found. With None, the description was received: files in packages only, and no ``..``
+    or symbolic link leads out of one.
     """
 
     def __init__(self, base: Path | None = None) -> None:
-        self._base = base
+        self._base = None if base is None else _absolute(base)
 
     def find(self, uri: str) -> Path | Missing:
         """The file of that name, or why there is none."""
@@ -57,22 +71,34 @@ class MeshPaths:
         return Missing(uri, f"{scheme}:// is not fetched; name it as package://NAME/PATH or file:///PATH")
 
     def _plain(self, uri: str, path: Path) -> Path | Missing:
-        if path.is_absolute():
-            return path if _is_file(path) else Missing(uri, "there is no such file", (str(path.parent),))
         if self._base is None:
+            return self._on_search_path(uri, path)
+        found = self._base / path
+        return found if _is_file(found) else Missing(uri, "there is no such file", (str(found.parent),))
+
+    def _on_search_path(self, uri: str, path: Path) -> Path | Missing:
+        """A path that a received description names: only what it could have named as package://."""
+        if not path.is_absolute():
             reason = "a relative path means nothing without the folder of its URDF; write package://NAME/PATH"
             return Missing(uri, reason)
-        found = self._base / path
-        return found if _is_file(found) else Missing(uri, "there is no such file", (str(self._base),))
+        for folder in (*self._shares, *self._forests):
+            if folder in path.parents and _is_within(path, folder, path.parts[len(folder.parts)]):
+                return path if _is_file(path) else Missing(uri, "there is no such file", (str(path.parent),))
+        return Missing(uri, _ONLY_PACKAGES)
 
     def _in_package(self, uri: str, path: str) -> Path | Missing:
         package, _, rest = path.partition("/")
+        if package in ("", ".", ".."):
+            return Missing(uri, f"{package!r} is no name of a package")
         folders = list(dict.fromkeys(self._packages(package)))
-        for folder in folders:
+        allowed = [one for one in folders if self._base or _is_within(one / rest, one, package)]
+        for folder in allowed:
             if _is_file(folder / rest):
                 return folder / rest
+        if allowed:
+            return Missing(uri, f"the package {package!r} has no such file", tuple(map(str, allowed)))
         if folders:
-            return Missing(uri, f"the package {package!r} has no such file", tuple(map(str, folders)))
+            return Missing(uri, f"it leads out of the package {package!r}", tuple(map(str, folders)))
         looked = tuple(str(folder) for folder in (*self._around, *self._shares, *self._forests))
         return Missing(uri, f"there is no package {package!r}; {_HOW}", looked)
 
@@ -130,7 +156,35 @@ def _may_be_package(entry: os.DirEntry[str]) -> bool:
 
 def _listed(variable: str) -> list[Path]:
     parts = os.environ.get(variable, "").split(os.pathsep)
-    return [Path(part) for part in parts if part]
+    return [_absolute(Path(part)) for part in parts if part]
+
+
+def _absolute(path: Path) -> Path:
+    """A path with a name and with folders above it, which ``.`` has not."""
+    return Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would follow links, which have names too
+
+
+def _is_within(path: Path, folder: Path, package: str = "") -> bool:
+    """Whether ``path``, which need not exist, is in ``folder`` once every link in it has been followed.
+
+    ``colcon build --symlink-install`` installs links to the sources of a package, so a link may also lead
+    to a folder whose package.xml names the same ``package``.
+    """
+    try:
+        end, top = path.resolve(), folder.resolve()
+    except (OSError, ValueError, RuntimeError):  # a loop of links, or a name that no file can have
+        return False
+    return end.is_relative_to(top) or (package != "" and any(_is_named(package, one) for one in end.parents))
+
+
+def _is_named(package: str, folder: Path) -> bool:
+    """Whether a folder holds the package of that name, by its package.xml."""
+    try:
+        with (folder / "package.xml").open("rb") as file:
+            found = _NAME.search(file.read(_MOST_OF_PACKAGE_XML))
+    except OSError:
+        return False
+    return found is not None and found[1].decode(errors="replace").strip() == package
 
 
 def _is_file(path: Path) -> bool:

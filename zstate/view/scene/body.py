@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import viser
 
@@ -40,6 +41,7 @@ class _Wardrobe:
 class Body:
     """Draws the shapes of ``robot`` in up to three dresses: as they are, for collisions, or all grey.
 
+    ``base`` is the folder of its URDF file, if the user named that.
     What hangs on a node goes with it, so that all is looked through whenever the nodes are others.
     """
 
@@ -47,6 +49,7 @@ class Body:
     workshop: Workshop
     robot: str
     shapes: Sequence[Shape]
+    base: Path | None = None
     missing: list[Missing] = field(default_factory=list[Missing])
 
     def __post_init__(self) -> None:
@@ -74,8 +77,8 @@ class Body:
         else:
             piece.drawing = made.drawing
             self._nodes_version = -1
-        if made.texture is not None:
-            self._miss(made.texture)
+        for lack in made.lacks:
+            self._miss(lack)
         return True
 
     def hang(self, nodes: Nodes) -> None:
@@ -94,6 +97,7 @@ class Body:
             for piece in wardrobe.pieces:
                 if piece.handle is not None and nodes.paths.get(piece.frame) == piece.path:
                     piece.handle.remove()
+        self.workshop.cancel(self._orders)
         self._orders.clear()
 
     @property
@@ -107,7 +111,7 @@ class Body:
         return _Wardrobe([_Piece(shape, frame, f"{dress[0]}{k}") for k, (shape, frame) in enumerate(named)])
 
     def _order(self, dress: Dress, wardrobe: _Wardrobe) -> None:
-        orders = {Order(piece.shape, OVER[dress]): piece for piece in wardrobe.pieces}
+        orders = {Order(piece.shape, OVER[dress], self.base): piece for piece in wardrobe.pieces}
         self._orders |= orders
         self.workshop.order(list(orders))
 

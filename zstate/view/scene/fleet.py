@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -49,12 +50,19 @@ class _Wardrobe:
 
 
 class Fleet:
-    """Draws the shapes of ``robots``, which come and go."""
+    """Draws the shapes of ``robots``, which come and go; ``base`` is as for a Body."""
 
-    def __init__(self, scene: viser.SceneApi, workshop: Workshop, shapes: Sequence[Shape], path: str) -> None:
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        workshop: Workshop,
+        shapes: Sequence[Shape],
+        path: str,
+        base: Path | None = None,
+    ) -> None:
         self._scene = scene
         self._workshop = workshop
-        self._path = path
+        self._base = base
         self._wardrobes = [_Wardrobe(dress, shapes, path) for dress in OVER]
         self._orders: dict[Order, _Batch] = {}
         # What the rows of the links were found in.
@@ -69,7 +77,7 @@ class Fleet:
         batch = self._orders.pop(made.order, None)
         if batch is None:
             return False
-        lost = [one for one in (made.drawing, made.texture) if isinstance(one, Missing)]
+        lost = [one for one in (made.drawing, *made.lacks) if isinstance(one, Missing)]
         self.missing += [one for one in lost if one not in self.missing]
         if isinstance(made.drawing, Drawing):
             batch.drawing = made.drawing
@@ -91,6 +99,7 @@ class Fleet:
     def remove(self) -> None:
         """Draw none of them any more."""
         self._remove_nodes()
+        self._workshop.cancel(self._orders)
         self._orders.clear()
 
     def _line_up(self, tree: Tree) -> None:
@@ -113,7 +122,7 @@ class Fleet:
     def _show(self, wardrobe: _Wardrobe, placed: Poses, wears: Mask) -> None:
         if not wardrobe.ordered:
             wardrobe.ordered = True
-            orders = [Order(shape, OVER[wardrobe.dress]) for shape in wardrobe.shapes]
+            orders = [Order(shape, OVER[wardrobe.dress], self._base) for shape in wardrobe.shapes]
             self._orders |= dict(zip(orders, wardrobe.batches, strict=True))
             self._workshop.order(orders)
         if not wardrobe.shapes:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import chain
+from pathlib import Path
+from typing import TypeAlias
 
 import viser
 
@@ -16,6 +18,9 @@ from zstate.view.scene.fleet import Fleet
 from zstate.view.scene.nodes import Nodes
 from zstate.view.scene.workshop import Workshop
 
+# What the robots of a fleet share: shapes, and the folder of the URDF file, if the user named that.
+_Kind: TypeAlias = tuple[tuple[Shape, ...], Path | None]
+
 _FLEET = 4  # so many robots that look the same are one
 
 
@@ -26,20 +31,21 @@ class Robots:
         self._scene = scene
         self._workshop = workshop
         self._bodies: dict[str, Body] = {}
-        self._fleets: dict[tuple[Shape, ...], Fleet] = {}
+        self._fleets: dict[_Kind, Fleet] = {}
         self._made = 0
         self.frames: frozenset[str] = frozenset()
 
-    def set(self, name: str, shapes: tuple[Shape, ...], nodes: Nodes) -> None:
-        """Draw a robot, in place of an earlier one of that name."""
+    def set(self, name: str, shapes: tuple[Shape, ...], nodes: Nodes, base: Path | None = None) -> None:
+        """Draw a robot, in place of an earlier one of that name; ``base`` as for a Body."""
         self.remove(name, nodes)
-        alike = [robot for robot, body in self._bodies.items() if body.shapes == shapes]
-        if shapes in self._fleets or len(alike) + 1 >= _FLEET:
+        kind = shapes, base
+        alike = [robot for robot, body in self._bodies.items() if (body.shapes, body.base) == kind]
+        if kind in self._fleets or len(alike) + 1 >= _FLEET:
             for robot in alike:
                 self._bodies.pop(robot).remove(nodes)
-            self._fleet(shapes).robots |= dict.fromkeys([*alike, name])
+            self._fleet(kind).robots |= dict.fromkeys([*alike, name])
         else:
-            self._bodies[name] = Body(self._scene, self._workshop, name, shapes)
+            self._bodies[name] = Body(self._scene, self._workshop, name, shapes, base)
         self._look_at_frames()
 
     def remove(self, name: str, nodes: Nodes) -> None:
@@ -47,11 +53,11 @@ class Robots:
         body = self._bodies.pop(name, None)
         if body is not None:
             body.remove(nodes)
-        for shapes, fleet in list(self._fleets.items()):
+        for kind, fleet in list(self._fleets.items()):
             fleet.robots.pop(name, None)
             if not fleet.robots:
                 fleet.remove()
-                del self._fleets[shapes]
+                del self._fleets[kind]
         self._look_at_frames()
 
     def missing(self, name: str) -> Sequence[Missing]:
@@ -71,12 +77,13 @@ class Robots:
         for fleet in self._fleets.values():
             fleet.show(tree, placed, {name: dresses(name) for name in fleet.robots})
 
-    def _fleet(self, shapes: tuple[Shape, ...]) -> Fleet:
-        fleet = self._fleets.get(shapes)
+    def _fleet(self, kind: _Kind) -> Fleet:
+        fleet = self._fleets.get(kind)
         if fleet is None:
             self._made += 1
-            fleet = Fleet(self._scene, self._workshop, shapes, f"/fleets/{self._made}")
-            self._fleets[shapes] = fleet
+            shapes, base = kind
+            fleet = Fleet(self._scene, self._workshop, shapes, f"/fleets/{self._made}", base)
+            self._fleets[kind] = fleet
         return fleet
 
     def _look_at_frames(self) -> None:

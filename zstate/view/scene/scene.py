@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import viser
 
@@ -52,16 +53,23 @@ class Scene:
         """Whether files are still being read for what is to be drawn."""
         return self._workshop.busy
 
-    def set_robot(self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None) -> None:
+    def set_robot(
+        self,
+        name: str,
+        model: RobotModel,
+        shapes: Sequence[Shape] | None = None,
+        base: Path | None = None,
+    ) -> None:
         """Draw a robot, in place of an earlier one of that name; its links are the frames ``name/link``.
 
-        ``shapes`` are those of its model when they are not given.
+        ``shapes`` are those of its model when they are not given. ``base`` is the folder of its URDF file,
+        if the user named that: then every file that it names can be drawn, otherwise those in packages.
         """
         faults: tuple[Finding, ...] = ()
         if shapes is None:
             shapes, faults = read_shapes(model)
         self._faults[name] = tuple((f"{name}, line {one.line}", one.message) for one in faults)
-        self._robots.set(name, tuple(shapes), self._nodes)
+        self._robots.set(name, tuple(shapes), self._nodes, base)
 
     def remove_robot(self, name: str) -> None:
         """Draw a robot no more; without one of that name, do nothing."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from zstate.model.shapes import Color, Shape
 from zstate.view.geometry.paths import Missing
@@ -14,19 +15,23 @@ from zstate.view.meshes import Drawing, Meshes
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """A shape to be drawn in its own colours, or ``over`` all in one. Two orders are never the same."""
+    """A shape to be drawn in its own colours, or ``over`` all in one. Two orders are never the same.
+
+    ``base`` is the folder of its URDF file, if the user named that.
+    """
 
     shape: Shape
     over: Color | None = None
+    base: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What has become of an order; ``texture`` is an image that is missing from it."""
+    """What has become of an order; ``lacks`` are an image or a colour that are missing from it."""
 
     order: Order
     drawing: Drawing | Missing
-    texture: Missing | None = None
+    lacks: tuple[Missing, ...] = ()
 
 
 class Workshop:
@@ -54,6 +59,14 @@ class Workshop:
                 self._works = True
                 threading.Thread(target=self._work, name="zstate-meshes", daemon=True).start()
 
+    def cancel(self, orders: Iterable[Order]) -> None:
+        """Do not make those of the orders that are still waiting: the robot is gone."""
+        unwanted = set(orders)
+        with self._lock:
+            kept = [order for order in self._orders if order not in unwanted]
+            self._open -= len(self._orders) - len(kept)
+            self._orders = kept
+
     def fetch(self) -> Iterator[Made]:
         """What has been made since."""
         while not self._made.empty():
@@ -71,8 +84,9 @@ class Workshop:
 
     def _make(self, order: Order) -> Made:
         try:
-            drawing = self._meshes.draw(order.shape, order.over)
-            texture = self._meshes.missing_texture(order.shape) if order.over is None else None
+            drawing = self._meshes.draw(order.shape, order.over, order.base)
+            texture = self._meshes.missing_texture(order.shape, order.base) if order.over is None else None
         except Exception as error:  # a file nobody foresaw must not end the drawing of all others
             return Made(order, Missing(str(order.shape.geometry), f"{type(error).__name__}: {error}"))
-        return Made(order, drawing, texture)
+        lack = drawing.lack if isinstance(drawing, Drawing) else None
+        return Made(order, drawing, tuple(one for one in (texture, lack) if one is not None))

@@ -67,7 +67,7 @@ def test_a_picture_that_fails_is_logged_once_shown_on_the_page_and_tried_again(p
         assert thread.is_alive()
     (logged,) = [record.getMessage() for record in caplog.records]
     assert "failed to draw a picture (ValueError: try number" in logged
-    assert "test_view.py, line" in logged
+    assert "test_redrawing.py, line" in logged
 
 
 def test_robots_of_a_fleet_restart_come_and_go_while_they_are_drawn(page, sessions, caplog):
