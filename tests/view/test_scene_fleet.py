@@ -187,7 +187,7 @@ class Hall:
         self.server = server
         self.scene = Scene(server)
         self.kinds: dict[str, tuple[Shape, ...]] = {}
-        self.parents = dict.fromkeys(ROBOTS, "map")
+        self.parents: dict[str, str | None] = dict.fromkeys(ROBOTS, "map")
         self.poses = {f"{name}/base": at(k, -k, 0, 0.3 * k) for k, name in enumerate(ROBOTS)}
         self.poses["dock"] = at(0, 0, 7, 1.0)
         self.absent: set[str] = set()
@@ -201,6 +201,7 @@ class Hall:
         actions += [self._lose_frames, self._lose_samples, self._fall_silent, self._switch, self._follow]
         actions[self.random.integers(len(actions))](name)
         drawn(self.scene, self.moment())
+        self.placed = self.scene.show(self.moment(), "map")
 
     def moment(self):
         stamp = int(self.random.integers(3)) * 400_000_000
@@ -210,9 +211,12 @@ class Hall:
         """The pose of every visual, by the definition of the poses."""
         places: list[tuple[float, ...]] = []
         for name, shapes in self.kinds.items():
-            if not self.scene.visuals or name in self.absent | self.unknown:
+            unknown = name in self.unknown and self.parents[name] is not None
+            if not self.scene.visuals or name in self.absent or unknown:
                 continue
             base = self.poses[f"{name}/base"]
+            if self.parents[name] is None:
+                base = tuple(self.placed[self.tree.index[f"{name}/base"]].tolist())
             base = se3.compose(self.poses["dock"], base) if self.parents[name] == "dock" else base
             places += [se3.compose(base, shape.origin) for shape in shapes if shape.role == "visual"]
         return sorted(corner_of(place) for place in places)
@@ -252,7 +256,7 @@ class Hall:
         self.poses[f"{name}/base"] = at(*self.random.normal(size=4))
 
     def _stand_elsewhere(self, name: str) -> None:
-        self.parents[name] = "dock" if self.parents[name] == "map" else "map"
+        self.parents[name] = (None, "map", "dock")[self.random.integers(3)]
         self.tree = self._tree()
 
     def _lose_frames(self, name: str) -> None:

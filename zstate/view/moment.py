@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
@@ -82,6 +82,28 @@ class Moment:
         if done is None:
             done = self._placed[fixed] = self._place(self.tree.row(fixed))
         return done
+
+    @property
+    def tops(self) -> tuple[Rows, Poses]:
+        """The highest frame that known edges lead up to from each one, by row, and its pose in that."""
+        tops, top_from_frame = self._from_top
+        return tops, poses_of(top_from_frame)
+
+    def beside(self, fixed: str, offsets: Mapping[int, Sequence[float]]) -> Poses:
+        """As ``placed``, with other trees too, where somebody wants them: their edges do not say.
+
+        ``offsets`` are by the rows of their roots: x, y, z [m] in the root of the fixed frame's tree.
+        """
+        row = self.tree.row(fixed)
+        tops, poses = self.tops
+        shifts = np.full((len(poses), 3), np.nan)
+        for root, offset in offsets.items():
+            shifts[root] = offset
+        shifts[tops[row]] = 0.0
+        poses[:, :3] += shifts[tops]
+        placed = poses_of(compose(invert(self._from_top[1][row : row + 1]), duals_of(poses)))
+        placed[np.isnan(shifts[tops, 0])] = np.nan
+        return placed
 
     def _place(self, fixed: int) -> Poses:
         tops, top_from_frame = self._from_top

@@ -44,20 +44,15 @@ class Nodes:
         self.shown: Mask = np.empty(0, dtype=np.bool_)
         self.version = 0
 
-    def show(self, moment: Moment, fixed: str, wanted: frozenset[str]) -> Poses:
-        """Move every frame to its place, with nodes for those that are ``wanted``.
-
-        Returns the places, as ``moment.placed(fixed)``.
-        """
+    def show(self, moment: Moment, placed: Poses, wanted: frozenset[str]) -> None:
+        """Move every frame to its place in the fixed one (N, 7), with nodes for those ``wanted``."""
         if moment.tree is not self.tree or wanted != self._wanted:
             self._wanted = wanted
             self._grow(moment.tree)
-        placed = moment.placed(fixed)
         shown = np.isfinite(placed[:, 0])
         if not np.array_equal(shown, self.shown):
             self._reveal(moment.tree, shown)
         self._move(_on_parents(moment, placed, shown)[self._rows])
-        return placed
 
     def is_shown(self, frame: str) -> bool:
         """Whether the frame has a place in the fixed one."""

@@ -11,7 +11,8 @@ from zstate.model.findings import Finding
 from zstate.model.robot import RobotModel
 from zstate.model.shapes import Shape, read_shapes
 from zstate.view.meshes import Meshes
-from zstate.view.moment import Moment, Tree
+from zstate.view.moment import Moment, Poses, Tree
+from zstate.view.scene.apart import Apart
 from zstate.view.scene.axes import Axes
 from zstate.view.scene.dress import Dress
 from zstate.view.scene.lines import Lines
@@ -47,11 +48,17 @@ class Scene:
         self._lines = Lines(server.scene)
         self._trails = Trails(server.scene)
         self._silences = Silences(server.scene)
+        self._apart = Apart(server.scene)
 
     @property
     def busy(self) -> bool:
         """Whether files are still being read for what is to be drawn."""
         return self._workshop.busy
+
+    @property
+    def arrangement(self) -> int:
+        """A number that changes when trees that nothing joins to the fixed frame are placed elsewhere."""
+        return self._apart.version
 
     def set_robot(
         self,
@@ -90,9 +97,14 @@ class Scene:
         missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
         return self._faults.get(robot, ()) + missing
 
-    def show(self, moment: Moment, fixed: str) -> None:
-        """Draw everything as it was at a moment, seen from the frame ``fixed``. Raises UnknownFrame."""
-        placed = self._nodes.show(moment, fixed, self._wanted(moment.tree))
+    def show(self, moment: Moment, fixed: str) -> Poses:
+        """Draw everything as it was at a moment, seen from the frame ``fixed``.
+
+        Returns the place of each frame, as ``moment.placed(fixed)``, and of trees that nothing joins to the
+        fixed frame as they are drawn beside it. Raises UnknownFrame.
+        """
+        placed = self._apart.placed(moment, fixed)
+        self._nodes.show(moment, placed, self._wanted(moment.tree))
         shown = self._nodes.shown
         self._robots.show(self._nodes, moment.tree, placed, self._dresses)
         self._axes.show(self.axes, placed, shown)
@@ -100,10 +112,14 @@ class Scene:
         self._names.show(self.names, moment, self._nodes)
         self._trails.show(moment, fixed, placed)
         self._silences.show(self._nodes)
+        self._apart.show(self._nodes)
+        return placed
 
     def _wanted(self, tree: Tree) -> frozenset[str]:
         """The frames on which something hangs."""
-        return frozenset(tree.names) if self.names else self._robots.frames | self._silences.frames(tree)
+        if self.names:
+            return frozenset(tree.names)
+        return self._robots.frames | self._silences.frames(tree) | self._apart.frames
 
     def _dresses(self, robot: str) -> set[Dress]:
         dresses: set[Dress] = {"collision"} if self.collisions else set()
