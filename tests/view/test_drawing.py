@@ -95,7 +95,7 @@ def test_a_robot_is_drawn_with_its_meshes_where_its_links_are(robot: str, look, 
         moment = shown.world.moment()
         fixed = f"{robot}/{load_model(robot).root}"
         placed = moment.placed(fixed)
-        framing = framing_of(moment, placed)
+        framing = framing_of(moment, placed, 1.0, shown.view.scene.corners(moment.tree, placed))
         assert framing is not None
         height, width = surface.shape
         drawn = {shape.link for shape in shapes_of(shown.world.models[robot]) if shape.role == "visual"}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from zstate.view.framing import FIELD_OF_VIEW, framing_of
+from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of, sights
 from zstate.view.moment import Moment, Tree
 
 
@@ -25,17 +26,65 @@ coordinates = st.floats(-20.0, 20.0)
 places = st.tuples(coordinates, coordinates, coordinates)
 
 
-@given(st.lists(places, min_size=1, max_size=12))
-def test_every_frame_of_a_robot_is_in_the_picture(points: list[tuple[float, float, float]]):
+def in_picture(framing: Framing, points: Sequence[tuple[float, float, float]], aspect: float) -> list[bool]:
+    """Whether a camera that stands and looks so, with z up, sees each point."""
+    ahead = np.subtract(framing.look_at, framing.position)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    seen: list[bool] = []
+    for point in points:
+        ray = np.subtract(point, framing.position)
+        up = math.atan2(ray @ np.cross(right, ahead), ray @ ahead)
+        aside = math.atan2(ray @ right, ray @ ahead)
+        widest = math.atan(aspect * math.tan(0.5 * FIELD_OF_VIEW))
+        seen.append(abs(up) < 0.5 * FIELD_OF_VIEW and abs(aside) < widest)
+    return seen
+
+
+@given(st.lists(places, min_size=1, max_size=12), st.lists(places, max_size=8), st.floats(0.25, 4.0))
+def test_every_frame_of_a_robot_and_all_that_is_drawn_is_in_the_picture(points, corners, aspect: float):
     origin = ("a/root", (0.0, 0.0, 0.0))
     moment = moment_of(origin, *((f"a/l{n}", point) for n, point in enumerate(points)))
-    framing = framing_of(moment, moment.placed("a/root"))
+    framing = framing_of(moment, moment.placed("a/root"), aspect, np.reshape(corners, (-1, 3)))
     assert framing is not None
-    view = np.subtract(framing.look_at, framing.position)
-    for point in [(0.0, 0.0, 0.0), *points]:
-        ray = np.subtract(point, framing.position)
-        angle = math.acos(np.clip(view @ ray / np.linalg.norm(view) / np.linalg.norm(ray), -1.0, 1.0))
-        assert angle < 0.5 * FIELD_OF_VIEW
+    assert all(in_picture(framing, [(0.0, 0.0, 0.0), *points, *corners], aspect))
+
+
+@given(st.lists(places, min_size=1, max_size=12), places, places, st.floats(0.25, 4.0))
+def test_a_robot_is_in_a_picture_where_one_of_its_frames_is(points, position, look_at, aspect: float):
+    ahead = np.subtract(look_at, position)
+    assume(np.linalg.norm(np.cross(ahead, (0.0, 0.0, 1.0))) > 1e-3)
+    framing = Framing(position, look_at, 0.0, 3)
+    assume(all(np.linalg.norm(np.subtract(point, position)) > 1e-3 for point in points))
+    robots = [f"r{n}" for n in range(len(points))]
+    bases = ((f"{robot}/base", point) for robot, point in zip(robots, points, strict=True))
+    moment = moment_of(("map", (0.0, 0.0, 0.0)), *bases)
+    found = sights(moment, moment.placed("map"), framing, aspect, robots)
+    assert [one.is_seen for one in found] == in_picture(framing, points, aspect)
+
+
+def test_a_robot_that_is_not_in_a_picture_has_a_reason():
+    names = ("map", "a/base", "a/tip", "b/base", "c/base")
+    tree = Tree(names, np.array([-1, 0, 1, 0, 0]), ("root",) + ("static",) * 4, (None,) * 5)
+    known = np.array([True, True, False, False, True])
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (5, 1))
+    poses[4, :3] = (-50.0, 0.0, 0.0)
+    moment = Moment(None, tree, poses, known, {2: "no joint sample of 'a'", 3: "no sample of 'b'"})
+    camera = Framing((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 3)
+    found = list(sights(moment, moment.placed("map"), camera, 1.0, ["a", "b", "c", "d"]))
+    assert [(one.robot, one.is_seen, one.root) for one in found] == [
+        ("a", True, "map"),
+        ("b", False, "map"),
+        ("c", False, "map"),
+        ("d", False, ""),
+    ]
+    assert [one.reason for one in found] == [
+        "no joint sample of 'a'",
+        "no sample of 'b'",
+        "it is outside of what the camera sees",
+        "its description has not been received",
+    ]
 
 
 def test_it_looks_from_in_front_and_above():

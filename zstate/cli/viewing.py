@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import click
 
-from zstate.cli.console import fail, note, say
+from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.options import load_robot
 from zstate.cli.worker import Worker
 from zstate.model.catalog import is_path
@@ -21,6 +21,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.view.door import is_loopback
+from zstate.view.framing import Sight
 from zstate.view.page import Page
 from zstate.view.picture import take_picture
 from zstate.view.sliders import Sliders
@@ -32,7 +33,9 @@ _MEETING_S = 0.3
 _ANNOUNCED_WITHIN_S = 5.0
 # Several robots are rarely announced at once.
 _OTHERS_WITHIN_S = 0.5
+_SAMPLES_WITHIN_S = 1.0
 _ENDS_WITHIN_S = 0.8
+_MOST_NAMED = 3
 
 
 def recording_among(robots: Sequence[str]) -> Path | None:
@@ -118,17 +121,60 @@ def show_address(page: Page) -> None:
 
 
 def take_snapshot(
-    world: World, view: View, page: Page, robots: Sequence[str], *, path: Path, size: tuple[int, int]
+    world: World,
+    view: View,
+    page: Page,
+    robots: Sequence[str],
+    *,
+    path: Path,
+    size: tuple[int, int],
+    fixed_frame: str = "",
 ) -> None:
-    """Write one picture, once the robots are there."""
+    """Write one picture, once the robots are there, and name those that are in it, and not, and why."""
     if not _until(lambda: _is_there(world, robots), _ANNOUNCED_WITHIN_S):
         there = ", ".join(map(repr, world.robots())) or "none"
         whom = " and ".join(map(repr, robots)) or "any robot"
         fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {whom}; robots that were heard: {there}")
+    if fixed_frame and not _until(lambda: fixed_frame in world.moment().tree.index, _ANNOUNCED_WITHIN_S):
+        world.moment().tree.row(fixed_frame)  # raises, with near misses
     if not robots and world.session is not None:
         time.sleep(_OTHERS_WITHIN_S)
-    take_picture(page, path, width=size[0], height=size[1], is_ready=lambda: not view.scene.busy)
-    say(f"wrote {path}: {', '.join(world.models)}, {size[0]} x {size[1]} pixels")
+    _until(lambda: not world.moment().reasons, _SAMPLES_WITHIN_S)
+    width, height = size
+    take_picture(page, path, width=width, height=height, is_ready=lambda: not view.scene.busy, hold=view.hold)
+    sights = view.sights()
+    seen = ", ".join(one.robot for one in sights if one.is_seen) or "no robot"
+    say(f"wrote {path}: {seen}, {width} x {height} pixels")
+    _note_what_is_missing(view, sights)
+
+
+def _note_what_is_missing(view: View, sights: Sequence[Sight]) -> None:
+    """Notes on robots that are not in a picture, on those without a place of their own, and on meshes."""
+    for one in sights:
+        if one.reason:
+            part = "in the picture in part" if one.is_seen else "not in the picture"
+            note(f"{one.robot!r} is {part}: {one.reason}", robot=one.robot)
+    roots = sorted({one.root for one in sights if one.is_seen})
+    if len(roots) > 1:
+        joined = f"zstate static {roots[0]} {roots[1]} --xyz 1 0 0"
+        note(
+            f"the frames are in {len(roots)} trees ({_first_few(roots)}), drawn beside each other: their "
+            f"relative place is not known; join them, for instance with: {joined}"
+        )
+    missing = {uri: why for one in sights for uri, why in view.scene.missing_meshes(one.robot)}
+    if missing:
+        count = count_text(len(missing), "file")
+        named = _first_few([f"{uri} ({why})" for uri, why in missing.items()])
+        note(f"{count} of the robots cannot be drawn: {named}")
+        note(
+            "packages are found below ROS_PACKAGE_PATH and in share/ of AMENT_PREFIX_PATH; a URDF file that "
+            "is named, as in `zstate view arm.urdf`, is drawn with the files around it"
+        )
+
+
+def _first_few(lines: Sequence[str]) -> str:
+    more = len(lines) - _MOST_NAMED
+    return "; ".join(lines[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _is_there(world: World, robots: Sequence[str]) -> bool:

@@ -10,8 +10,8 @@ from zstate.view.moment import Tree
 class FixedFrame:
     """The frame that was chosen, while it is there; else the root that carries the most frames."""
 
-    def __init__(self) -> None:
-        self.chosen = ""
+    def __init__(self, chosen: str = "") -> None:
+        self.chosen = chosen
         """What was asked for; empty for nothing in particular."""
         self._tree: Tree | None = None
         self._default = ""

@@ -7,9 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakValueDictionary, finalize
 
+import numpy as np
+from numpy.typing import NDArray
+
 from zstate.model.shapes import Box, Color, Cylinder, MeshFile, Shape, Sphere
 from zstate.view.geometry.files import UnreadableFile, read_image, read_mesh
-from zstate.view.geometry.glb import GREY, Glb, Paint
+from zstate.view.geometry.glb import GREY, Corner, Glb, Paint
 from zstate.view.geometry.paths import MeshPaths, Missing
 from zstate.view.geometry.primitives import primitive
 from zstate.view.geometry.surface import Look
@@ -25,9 +28,14 @@ _DRAWN_BYTES = 512 * 1024 * 1024
 
 @dataclass(frozen=True, eq=False)
 class Copy:
-    """A mesh in one colour, as binary glTF. It is kept while something that looks so is drawn."""
+    """A mesh in one colour, as binary glTF, and between which coordinates [m] it is.
+
+    It is kept while something that looks so is drawn.
+    """
 
     glb: bytes
+    low: Corner
+    high: Corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +48,11 @@ class Drawing:
     copy: Copy
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     lack: Missing | None = None
+
+    def corners(self) -> NDArray[np.float64]:
+        """The corners of the box around it, scaled: (8, 3) [m]."""
+        ends = np.array([self.copy.low, self.copy.high]) * self.scale
+        return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
 
     @property
     def glb(self) -> bytes:
@@ -106,7 +119,7 @@ class Meshes:
                 f"in the colour of another: the meshes drawn take {_megabytes(self._drawn_bytes)} already"
             )
             return Drawing(another, lack=Missing(name, reason))
-        done = self._copies[source, paint] = Copy(packed.painted(paint))
+        done = self._copies[source, paint] = Copy(packed.painted(paint), *packed.bounds)
         if another is None:
             self._firsts[source] = done
         self._copied_bytes += len(done.glb)

@@ -9,14 +9,15 @@ import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import viser
 
-from zstate.clock import SystemClock
+from zstate.clock import SystemClock, wait_in_slices
 from zstate.closing import Closing
 from zstate.model.robot import RobotModel
 from zstate.rate import Rate
-from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of
-from zstate.view.moment import Moment
+from zstate.view.framing import FIELD_OF_VIEW, Camera, Framing, Sight, framing_of, sights
+from zstate.view.moment import Moment, Poses
 from zstate.view.page import Page
 from zstate.view.panels.board import Board
 from zstate.view.scene.scene import Scene
@@ -36,7 +37,9 @@ class View(Closing):
     ``sliders`` are of robots that are moved from the page; they and the world are the caller's to close.
     ``folders`` are those of the URDF files that the user named, by the text of the URDF: a robot with
     such a URDF is drawn with every file that it names, any other with files in packages only.
-    One thread calls ``run`` or ``draw``.
+    ``fixed_frame`` and ``camera`` are how a page begins: the frame that everything is seen from, if it is
+    there, and from where; None shows all robots, in a picture that is ``aspect`` times as wide as high.
+    One thread calls ``run`` or ``draw``; ``hold`` and what it leads to are for another.
     """
 
     def __init__(
@@ -47,16 +50,28 @@ class View(Closing):
         sliders: Sequence[Sliders] = (),
         rate_hz: float = 30.0,
         folders: Mapping[str, Path] | None = None,
+        fixed_frame: str = "",
+        camera: Camera | None = None,
+        aspect: float = 1.0,
     ) -> None:
         self._world = world
         self._page = page
         self._rate_hz = rate_hz
         self._folders = dict(folders or {})
         self.scene = Scene(page.server)
-        self._board = Board(page.server, world, self.scene, sliders)
+        self._board = Board(page.server, world, self.scene, sliders, fixed_frame)
+        self._camera = camera
+        self._aspect = aspect
         self._version = -1
         self._drawn: dict[str, RobotModel] = {}
-        self._framed: tuple[str, tuple[str, ...]] | None = None
+        self._framed: tuple[str, tuple[str, ...], int] | None = None
+        self._framed_without = 0  # so many frames had no pose then
+        self._framed_busy = False  # and meshes were still to come
+        self._framing: Framing | None = None
+        self._is_to_hold = False
+        self._held: Moment | None = None
+        self._placed: Poses | None = None
+        self._holds = threading.Event()
         self._panels_due_s = 0.0
         self._logged: set[str] = set()
         server = page.server
@@ -87,22 +102,42 @@ class View(Closing):
 
     def draw(self) -> Moment:
         """Show the world as it is now, or at the instant that was chosen on the page."""
-        version = self._world.version
-        if self._version != version:
-            self._renew_robots()
-            self._version = version
-        moment = self._world.moment(self._board.stamp)
+        moment = self._held
+        if moment is None:
+            version = self._world.version
+            if self._version != version:
+                self._renew_robots()
+                self._version = version
+            moment = self._world.moment(self._board.stamp)
+            if self._is_to_hold:
+                self._held, self._framed = moment, None
         fixed = self._board.fixed(moment)
         with self._page.server.atomic():
             try:
                 if fixed:
-                    self.scene.show(moment, fixed)
-                    self._frame(moment, fixed)
+                    placed = self.scene.show(moment, fixed)
+                    self._frame(moment, fixed, placed)
+                    if self._held is not None:
+                        self._placed = placed
+                        self._holds.set()
             finally:
-                if time.monotonic() >= self._panels_due_s:
+                # Panels turn robots grey that have been silent since: not in a picture of an earlier instant.
+                if self._held is None and time.monotonic() >= self._panels_due_s:
                     self._board.update(moment)
                     self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
         return moment
+
+    def hold(self, timeout_s: float) -> bool:
+        """Draw one instant from now on, with the camera where it shows that. Whether it is drawn in time."""
+        self._is_to_hold = True
+        return wait_in_slices(self._holds, timeout_s)
+
+    def sights(self) -> tuple[Sight, ...]:
+        """Which robots are in the picture that is held, and why others are not."""
+        if self._held is None or self._placed is None or self._framing is None:
+            return tuple(Sight(robot, False, "no robot has a pose yet") for robot in self._world.robots())
+        robots = self._world.robots()
+        return tuple(sights(self._held, self._placed, self._framing, self._aspect, robots))
 
     @property
     def fault(self) -> str:
@@ -145,20 +180,31 @@ class View(Closing):
                 self.scene.set_robot(name, model, base=self._folders.get(model.urdf))
                 self._drawn[name] = model
 
-    def _frame(self, moment: Moment, fixed: str) -> None:
-        """Look at all robots when there are others than before, or they are seen from another frame."""
-        subject = fixed, tuple(self._drawn)
-        if subject == self._framed or not self._drawn:
+    def _frame(self, moment: Moment, fixed: str, placed: Poses) -> None:
+        """Look at all robots when there are others than before, or when they stand or are seen otherwise."""
+        subject = fixed, tuple(self._drawn), self.scene.arrangement
+        unknown = int(np.count_nonzero(~moment.known))
+        had_less = unknown < self._framed_without or (self._framed_busy and not self.scene.busy)
+        if not self._drawn or (subject == self._framed and not had_less):
             return
-        framing = framing_of(moment, moment.placed(fixed))
-        if framing is not None:
-            self._framed = subject
-            self._aim(framing)
+        framing = framing_of(moment, placed, self._aspect, self.scene.corners(moment.tree, placed))
+        if framing is None:
+            return
+        self._framed, self._framed_without, self._framed_busy = subject, unknown, self.scene.busy
+        moves = self._camera is None or self._framing is None or self._held is not None
+        camera = self._camera
+        if camera is not None:
+            framing = framing._replace(position=camera.position, look_at=camera.look_at or framing.look_at)
+        self._framing = framing
+        self._aim(framing, moves=moves)
 
-    def _aim(self, framing: Framing) -> None:
+    def _aim(self, framing: Framing, *, moves: bool) -> None:
+        """Put the floor, and unless the user has put it the camera, where the framing says."""
         server = self._page.server
         self._floor.position = (0.0, 0.0, framing.floor)
         self._floor.width = self._floor.height = 2.0 * framing.reach
+        if not moves:
+            return
         server.initial_camera.position = framing.position
         server.initial_camera.look_at = framing.look_at
         for client in server.get_clients().values():

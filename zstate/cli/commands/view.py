@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
@@ -13,6 +14,7 @@ from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_rate, session_options, wire_option
 
 if TYPE_CHECKING:
+    from zstate.view.framing import Camera
     from zstate.view.sliders import Sliders
 
 
@@ -20,6 +22,28 @@ def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) ->
     if file is not None and Path(file).suffix.lower() != ".png":
         raise click.BadParameter(f"{file!r} does not end with .png")
     return None if file is None else Path(file)
+
+
+def _checked_camera(_: click.Context, __: click.Parameter, text: str | None) -> Camera | None:
+    if text is None:
+        return None
+    from zstate.view.framing import Camera
+
+    eye, separator, target = text.partition(":")
+    camera = Camera(_point(eye), _point(target) if separator else None)
+    if camera.look_at == camera.position:
+        raise click.BadParameter(f"a camera at {eye} cannot look at the same point")
+    return camera
+
+
+def _point(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise click.BadParameter(f"{text!r} is not three numbers with commas between, such as 2,1.5,1")
+    return x, y, z
 
 
 @click.command("view")
@@ -51,6 +75,14 @@ def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) ->
     metavar="WIDTH HEIGHT",
     help="Of that picture, in pixels.",
 )
+@click.option("--fixed-frame", default="", metavar="FRAME", help="See everything from this frame at first.")
+@click.option(
+    "--camera",
+    callback=_checked_camera,
+    metavar="X,Y,Z[:X,Y,Z]",
+    help="Where the camera stands at first, and after a colon the point it looks at, in the fixed frame [m]; "
+    "default: so that all robots are seen.",
+)
 @wire_option
 @session_options
 def view_command(
@@ -63,6 +95,8 @@ def view_command(
     rate: float,
     snapshot: Path | None,
     size: tuple[int, int],
+    fixed_frame: str,
+    camera: Camera | None,
     wire: str,
 ) -> None:
     """Draw the announced robots, or those that are named, in a browser.
@@ -76,12 +110,18 @@ def view_command(
     recording. --snapshot draws with an installed Chromium, without a screen.
     Needs viser: pip install 'zstate[view]'.
 
+    Meshes named package://NAME/... are found below the folders in ROS_PACKAGE_PATH, in share/ of those in
+    AMENT_PREFIX_PATH, and in example-robot-data. Other files are drawn only for a robot whose URDF file is
+    given as ROBOT: then also relative paths, and packages around the file. Robots that share no frame are
+    drawn beside each other.
+
     \b
     zstate view
     zstate view panda --sliders
     zstate view run.mcap
     zstate view --wire ros2                 # robots of ROS 2 nodes that run rmw_zenoh
-    zstate view panda --snapshot panda.png
+    zstate view panda --snapshot panda.png --camera 2,1,1:0,0,0.5
+    zstate view urdf/arm.urdf               # 'arm' on the network, with the meshes beside this file
     zstate view --host 0.0.0.0 --port 9000
     """
     import_module("zstate.view.library")  # told before anything is heard when it is missing
@@ -116,11 +156,22 @@ def view_command(
         else:
             world = opened.enter_context(World.of_recording(recording))
         page = opened.enter_context(Page(port=0) if snapshot else Page(host, port))
-        view = opened.enter_context(View(world, page, sliders=moved, rate_hz=rate, folders=folders_of(named)))
+        view = opened.enter_context(
+            View(
+                world,
+                page,
+                sliders=moved,
+                rate_hz=rate,
+                folders=folders_of(named),
+                fixed_frame=fixed_frame,
+                camera=camera,
+                aspect=size[0] / size[1] if snapshot else 1.0,
+            )
+        )
         with running(view) as worker:
             if snapshot is None:
                 show_address(page)
                 worker.result()
             else:
                 robots = tuple(one.robot for one in named)
-                take_snapshot(world, view, page, robots, path=snapshot, size=size)
+                take_snapshot(world, view, page, robots, path=snapshot, size=size, fixed_frame=fixed_frame)

@@ -29,6 +29,7 @@ _ROUGHNESS = 0.65
 
 
 _PLAIN = Look(GREY)
+Corner = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,14 @@ class Glb:
     def triangle_count(self) -> int:
         """How many triangles are drawn."""
         return self._corner_count // 3
+
+    @property
+    def bounds(self) -> tuple[Corner, Corner]:
+        """The lowest and the highest coordinates of its points [m]; there have to be some."""
+        boxes = [one for one in self._accessors if "min" in one]
+        low = np.min([one["min"] for one in boxes], axis=0).tolist()
+        high = np.max([one["max"] for one in boxes], axis=0).tolist()
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     @property
     def byte_count(self) -> int:

@@ -34,6 +34,7 @@ class Shown(Switches, Painter, Trails, Protocol):
 
 class Board(Closing):
     """Puts the panels on the page of ``server``; ``sliders`` are of the robots that are moved here.
+    ``fixed_frame`` is chosen at first.
 
     Whoever draws asks for each picture ``stamp``, the instant to show, and ``fixed``, the frame to see it
     from; and tells it the moment that is shown, with ``update``, a few times a second. One thread does all
@@ -41,12 +42,17 @@ class Board(Closing):
     """
 
     def __init__(
-        self, server: viser.ViserServer, world: World, scene: Shown, sliders: Sequence[Sliders] = ()
+        self,
+        server: viser.ViserServer,
+        world: World,
+        scene: Shown,
+        sliders: Sequence[Sliders] = (),
+        fixed_frame: str = "",
     ) -> None:
         gui = server.gui
         self._world = world
         self._facts = FrameFacts(world.buffer)
-        self._fixed = FixedFrame()
+        self._fixed = FixedFrame(fixed_frame)
         self._opened = ExitStack()
         self.clock = ReplayClock(live=world.session is not None)
         self._fault = gui.add_html("")

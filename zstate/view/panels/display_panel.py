@@ -8,6 +8,7 @@ import viser
 
 from zstate.view.fixed_frame import FixedFrame
 from zstate.view.moment import Tree
+from zstate.view.panels import html
 from zstate.view.panels.choice import FrameChoice
 from zstate.view.panels.look import Look
 
@@ -33,6 +34,7 @@ class DisplayPanel:
         self._tree: Tree | None = None
         hint = "Everything is seen from this frame. Click and type to search."
         self._frames = FrameChoice(gui, "Fixed frame", _NO_FRAME, hint)
+        self._unknown = gui.add_html("")
         self._visuals = gui.add_checkbox("Visuals", scene.visuals)
         self._collisions = gui.add_checkbox("Collisions", scene.collisions)
         self._axes = gui.add_checkbox("Axes", scene.axes)
@@ -50,6 +52,9 @@ class DisplayPanel:
             self._frames.offer(tree.names, fixed or None)
         elif fixed:
             self._frames.show(fixed)
+        wanted = self._fixed.chosen
+        said = f"{wanted!r} is not a known frame; everything is seen from {fixed!r}"
+        self._unknown.content = html.paragraph(said, color=html.WARNING) if wanted not in ("", fixed) else ""
         self._switch(self._scene)
 
     def _switch(self, scene: Switches) -> None:

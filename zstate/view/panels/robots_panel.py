@@ -73,7 +73,7 @@ class RobotsPanel:
 
 
 def apart_html(tree: Tree, fixed: str) -> str:
-    """The roots that nothing joins to the fixed frame, so that nothing on them is drawn."""
+    """The roots that nothing joins to the fixed frame, so that they are drawn beside it, anywhere."""
     if fixed not in tree.index:
         return ""
     root = int(tree.roots[tree.index[fixed]])
@@ -86,7 +86,8 @@ def apart_html(tree: Tree, fixed: str) -> str:
     listing = _listing(
         "frames are not joined to the fixed frame", "frame is not joined to the fixed frame", lines
     )
-    return listing + html.paragraph(f"Join them, for instance with: {advice}", muted=True)
+    said = f"They are drawn beside it: their place is not known. Join them, for instance with: {advice}"
+    return listing + html.paragraph(said, muted=True)
 
 
 def unplaced_html(moment: Moment) -> str:

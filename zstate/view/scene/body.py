@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from zstate.model.shapes import Shape
 from zstate.view.geometry.paths import Missing
 from zstate.view.meshes import Drawing
 from zstate.view.scene.dress import OVER, Dress, role_of
-from zstate.view.scene.nodes import Nodes
+from zstate.view.scene.nodes import Nodes, in_frame
 from zstate.view.scene.workshop import Made, Order, Workshop
 
 
@@ -99,6 +101,12 @@ class Body:
                     piece.handle.remove()
         self.workshop.cancel(self._orders)
         self._orders.clear()
+
+    def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        """The frames of all visuals that are known, each with the corners of the box around it (8, 3)."""
+        for piece in self._wardrobes["visual"].pieces:
+            if piece.drawing is not None:
+                yield piece.frame, in_frame(piece.shape.origin, piece.drawing.corners())
 
     @property
     def frames(self) -> set[str]:

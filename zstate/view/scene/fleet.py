@@ -6,7 +6,7 @@ nodes is cheaper, because there most shapes need no message at all.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from zstate.view.geometry.paths import Missing
 from zstate.view.meshes import Drawing
 from zstate.view.moment import Mask, Poses, Rows, Tree
 from zstate.view.scene.dress import OVER, Dress, role_of
+from zstate.view.scene.nodes import in_frame
 from zstate.view.scene.posing import place
 from zstate.view.scene.workshop import Made, Order, Workshop
 
@@ -95,6 +96,14 @@ class Fleet:
             wears = np.array([wardrobe.dress in worn[robot] for robot in self.robots])
             if wears.any() or wardrobe.ordered:
                 self._show(wardrobe, placed, wears)
+
+    def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        """As of a Body, for every robot."""
+        (wardrobe,) = (one for one in self._wardrobes if one.dress == "visual")
+        for shape, batch in zip(wardrobe.shapes, wardrobe.batches, strict=True):
+            if batch.drawing is not None:
+                corners = in_frame(shape.origin, batch.drawing.corners())
+                yield from ((f"{robot}/{shape.link}", corners) for robot in self.robots)
 
     def remove(self) -> None:
         """Draw none of them any more."""

@@ -5,14 +5,14 @@ A joint that turns is one message, whatever hangs on its link; another fixed fra
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.se3 import IDENTITY
+from zstate.se3 import IDENTITY, to_matrix
 from zstate.view.moment import Mask, Moment, Poses, Rows, Tree
 from zstate.view.scene.posing import move, turn
 
@@ -120,6 +120,12 @@ class Nodes:
 def wxyzs(poses: NDArray[_Float]) -> NDArray[_Float]:
     """The quaternions of poses (..., 7) in viser's order (..., 4)."""
     return poses[..., [6, 3, 4, 5]]
+
+
+def in_frame(pose: Sequence[float], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``points`` (N, 3) of something at a pose, in the frame that the pose is in."""
+    matrix = to_matrix(pose)
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _on_parents(moment: Moment, placed: Poses, shown: Mask) -> Poses:

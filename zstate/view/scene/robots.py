@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from zstate.model.shapes import Shape
 from zstate.view.geometry.paths import Missing
@@ -76,6 +78,10 @@ class Robots:
             body.hang(nodes)
         for fleet in self._fleets.values():
             fleet.show(tree, placed, {name: dresses(name) for name in fleet.robots})
+
+    def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        """The frames of all visuals that are known, each with the corners of the box around it (8, 3)."""
+        return chain.from_iterable(one.corners() for one in (*self._bodies.values(), *self._fleets.values()))
 
     def _fleet(self, kind: _Kind) -> Fleet:
         fleet = self._fleets.get(kind)

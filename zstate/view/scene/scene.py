@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from zstate.model.findings import Finding
 from zstate.model.robot import RobotModel
@@ -17,7 +19,7 @@ from zstate.view.scene.axes import Axes
 from zstate.view.scene.dress import Dress
 from zstate.view.scene.lines import Lines
 from zstate.view.scene.names import Names
-from zstate.view.scene.nodes import Nodes
+from zstate.view.scene.nodes import Nodes, in_frame
 from zstate.view.scene.robots import Robots
 from zstate.view.scene.silences import Silences
 from zstate.view.scene.trails import Trails
@@ -114,6 +116,15 @@ class Scene:
         self._silences.show(self._nodes)
         self._apart.show(self._nodes)
         return placed
+
+    def corners(self, tree: Tree, placed: Poses) -> NDArray[np.float64]:
+        """The corners of the boxes around all visuals that are there and have a place: (N, 3) [m]."""
+        boxes = [np.empty((0, 3))]
+        for frame, corners in self._robots.corners():
+            row = tree.index.get(frame)
+            if row is not None and np.isfinite(placed[row, 0]):
+                boxes.append(in_frame(placed[row].tolist(), corners))
+        return np.concatenate(boxes)
 
     def _wanted(self, tree: Tree) -> frozenset[str]:
         """The frames on which something hangs."""
