@@ -13,6 +13,8 @@ import pytest
 from looking import RRBOT, failure, interrupted, standing, started, zstate
 from support import until
 
+from zstate import StatePublisher, connect, load_model
+
 pytestmark = [pytest.mark.processes]
 
 
@@ -76,6 +78,9 @@ def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
         (["--host", "nowhere.invalid"], 1, "nobody can listen at 'nowhere.invalid'"),
         (["pandda", "--sliders"], 1, "panda"),
         (["--port", "99999"], 2, "99999"),
+        (["--camera", "1,2"], 2, "'1,2' is not three numbers with commas between"),
+        (["--camera", "1,2,nan"], 2, "'1,2,nan' is not three numbers"),
+        (["--camera", "-1,2,3:-1,2,3"], 2, "a camera at -1,2,3 cannot look at the same point"),
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments: list[str], code: int, said: str):
@@ -106,6 +111,46 @@ def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
     assert pixels.shape == (240, 320, 3)
     middle = pixels[80:160, 120:200]
     assert (middle.min(axis=2) < 200).mean() > 0.02
+
+
+MINE = """<robot name="mine"><link name="base"><visual><geometry>
+<mesh filename="package://mine/meshes/base.stl"/></geometry></visual></link></robot>"""
+
+
+@pytest.mark.browser
+def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_path: Path):
+    trimesh = pytest.importorskip("trimesh")
+    urdf = tmp_path / "mine" / "urdf" / "mine.urdf"
+    mesh = tmp_path / "mine" / "meshes" / "base.stl"
+    for file in (urdf, mesh):
+        file.parent.mkdir(parents=True)
+    urdf.write_text(MINE)
+    trimesh.creation.box().export(mesh)
+    picture = tmp_path / "picture.png"
+
+    def snapshot(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "zstate", "view", *arguments, "--snapshot", str(picture)]
+        command += ["--size", "320", "240"]
+        ended = subprocess.run(
+            command, capture_output=True, text=True, timeout=100.0, check=False, cwd=urdf.parents[1]
+        )
+        assert ended.returncode == 0, ended.stderr
+        return ended
+
+    with connect() as session, StatePublisher(session, load_model(urdf)) as mine, standing():
+        mine.publish([])
+        both = snapshot()
+        assert both.stdout == f"wrote {picture}: mine, rrbot, 320 x 240 pixels\n"
+        assert "the frames are in 2 trees (mine/base; rrbot/world)" in both.stderr
+        assert "1 file of the robots cannot be drawn: package://mine/meshes/base.stl" in both.stderr
+        assert "ROS_PACKAGE_PATH" in both.stderr
+        one = snapshot("--fixed-frame", "mine/base", "--camera", "0,0,9:0,0,10")
+        assert one.stdout == f"wrote {picture}: no robot, 320 x 240 pixels\n"
+        assert "'rrbot' is not in the picture: it is outside of what the camera sees" in one.stderr
+        # The file is named by a relative path, and its package is found around it.
+        own = snapshot("urdf/mine.urdf")
+        assert own.stdout == f"wrote {picture}: mine, 320 x 240 pixels\n"
+        assert own.stderr == ""
 
 
 def test_a_snapshot_of_a_robot_that_is_not_there_says_who_is(tmp_path: Path):

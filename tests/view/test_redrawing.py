@@ -9,12 +9,13 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import pytest
 from live import RRBOT
-from support import until
+from support import DEADLINE_S, until
 
 pytest.importorskip("viser")
 
 from zstate import StatePublisher, StaticPublisher, Transform, load_model
 from zstate.buffer.buffer import TransformBuffer
+from zstate.view.framing import Camera, Sight, framing_of
 from zstate.view.moment import Moment
 from zstate.view.page import Page
 from zstate.view.view import View
@@ -96,3 +97,42 @@ def test_robots_of_a_fleet_restart_come_and_go_while_they_are_drawn(page, sessio
         until(lambda: publishers.keys() <= world.models.keys())
         until(lambda since=world.tries: world.tries > since + 1)
     assert [record.getMessage() for record in caplog.records if "picture" in record.getMessage()] == []
+
+
+def test_a_picture_that_is_held_is_of_one_instant_with_the_camera_fitted_to_it(page):
+    buffer = TransformBuffer()
+    track = buffer.add_robot(RRBOT, "r1")
+    lifted, lowered = [0.0, 0.0], [2.0, 2.0]
+    buffer.insert_joints(track, 1, lifted)
+    with World(None, buffer=buffer) as world, View(world, page) as view:
+        with drawing(view, page):
+            assert view.hold(DEADLINE_S)
+        moment = view.draw()
+        camera = page.server.initial_camera
+        before = np.array([camera.position, camera.look_at])
+        for tick in range(1, 20):
+            buffer.insert_joints(track, tick * 1_000_000_000, lowered)
+            assert view.draw() is moment
+        np.testing.assert_array_equal([camera.position, camera.look_at], before)
+        assert view.sights() == (Sight("r1", True, "", "r1/world"),)
+    placed = moment.placed("r1/world")
+    corners = view.scene.corners(moment.tree, placed)
+    framing = framing_of(moment, placed, 1.0, corners)
+    assert framing is not None
+    assert len(corners) > 8
+    np.testing.assert_allclose(before, [framing.position, framing.look_at])
+
+
+def test_a_page_begins_with_the_frame_and_the_camera_that_were_asked_for(page):
+    buffer = TransformBuffer()
+    buffer.insert_joints(buffer.add_robot(RRBOT, "r1"), 1, [0.0, 0.0])
+    camera = Camera((3.0, 2.0, 1.0), (0.0, 0.0, 0.5))
+    with World(None, buffer=buffer) as world:
+        with View(world, page, fixed_frame="r1/tool", camera=camera) as view:
+            view.draw()
+        at_tool = world.moment().placed("r1/tool")
+        handle = page.server.scene.get_handle_by_name("/frames/0")
+        assert handle is not None
+        np.testing.assert_allclose(handle.position, at_tool[0, :3], atol=1e-6)
+        np.testing.assert_allclose(page.server.initial_camera.position, camera.position)
+        np.testing.assert_allclose(page.server.initial_camera.look_at, camera.look_at)

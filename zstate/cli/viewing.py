@@ -141,7 +141,7 @@ def take_snapshot(
         time.sleep(_OTHERS_WITHIN_S)
     _until(lambda: not world.moment().reasons, _SAMPLES_WITHIN_S)
     width, height = size
-    take_picture(page, path, width=width, height=height, is_ready=lambda: not view.scene.busy, hold=view.hold)
+    take_picture(page, path, width=width, height=height, hold=view.hold)
     sights = view.sights()
     seen = ", ".join(one.robot for one in sights if one.is_seen) or "no robot"
     say(f"wrote {path}: {seen}, {width} x {height} pixels")

@@ -37,21 +37,16 @@ def take_picture(
     *,
     width: int = 1280,
     height: int = 800,
-    is_ready: Callable[[], bool] = lambda: True,
-    hold: Callable[[float], bool] = lambda timeout_s: True,
+    hold: Callable[[float], bool],
 ) -> None:
     """Write what ``page`` shows, without its panels, to ``path``.
 
-    The view that draws on the page has to be at work, in another thread; ``is_ready`` tells when all that it
-    draws has been sent, and ``hold`` makes it draw one instant from then on, see View. Raises LibraryMissing
-    where no browser is installed, NoPicture when it shows nothing in time, InvalidInput for a file that
-    cannot be.
+    The view that draws on the page has to be at work, in another thread; ``hold`` is its method. Raises
+    LibraryMissing where no browser is installed, NoPicture when it shows nothing in time, InvalidInput for a
+    file that cannot be.
     """
     with Browser(page.url, width, height) as browser:
         client = _client(page, browser)
-        deadline = time.monotonic() + _DRAWS_WITHIN_S
-        while not is_ready() and time.monotonic() < deadline:
-            time.sleep(0.05)
         if not hold(_DRAWS_WITHIN_S):
             raise NoPicture(f"no robot had a pose to be drawn within {_DRAWS_WITHIN_S:g} s")
         pixels = _settled(lambda: _drawn(client, width, height))

@@ -119,7 +119,8 @@ class View(Closing):
                     self._frame(moment, fixed, placed)
                     if self._held is not None:
                         self._placed = placed
-                        self._holds.set()
+                        if not self.scene.busy:
+                            self._holds.set()
             finally:
                 # Panels turn robots grey that have been silent since: not in a picture of an earlier instant.
                 if self._held is None and time.monotonic() >= self._panels_due_s:
@@ -128,9 +129,12 @@ class View(Closing):
         return moment
 
     def hold(self, timeout_s: float) -> bool:
-        """Draw one instant from now on, with the camera where it shows that. Whether it is drawn in time."""
+        """Draw one instant from now on, with the camera where it shows that.
+
+        Returns when all of it is drawn, or after ``timeout_s``; False if nothing of it is.
+        """
         self._is_to_hold = True
-        return wait_in_slices(self._holds, timeout_s)
+        return wait_in_slices(self._holds, timeout_s) or self._placed is not None
 
     def sights(self) -> tuple[Sight, ...]:
         """Which robots are in the picture that is held, and why others are not."""
