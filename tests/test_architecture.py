@@ -17,7 +17,8 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
     {"closing", "errors", "locks", "_kernel"},
-    {"clock", "extension"},
+    {"checks", "extension"},
+    {"clock"},
     {"se3", "rate", "facts"},
     {"transform", "twist"},
     {"model", "buffer", "wire"},

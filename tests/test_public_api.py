@@ -172,7 +172,8 @@ def test_values_cannot_be_changed():
     base_from_hand = zstate.Transform("base", "hand", [0, 0, 1], [0, 0, 0, 1])
     with pytest.raises(AttributeError):
         base_from_hand.target = "other"
-    base_from_hand.translation[0] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        base_from_hand.translation[0] = 1.0
     assert base_from_hand.translation.tolist() == [0, 0, 1]
 
 

@@ -11,7 +11,7 @@ from support import Child
 from tales import MS, START, Bag, S, Tale, pose, swing, swing_rates
 
 from zstate import Recording, TransformBuffer, UnknownFrame
-from zstate.errors import Disconnected, InvalidInput, RecordingError
+from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
 from zstate.transform import Transform
 
 
@@ -170,3 +170,19 @@ def test_the_buffer_keeps_what_it_is_asked_for():
     # The first, 10 and 11, 20, and the last, which is 99.
     assert (base.count, base.oldest, base.newest) == (5, 0, 99 * S)
     assert np.array_equal(buffer.lookup_many("odom", "base", wanted)[0], before)
+
+
+def test_before_a_recording_begins_nobody_is_told_to_start_a_listener(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        for n in range(3):
+            tale.joints("arm", START + n * S, swing(n))
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffers = recording.buffer(), TransformBuffer.from_recording(tmp_path / "r.mcap")
+    for buffer in buffers:
+        frames = [frame for frame in buffer.frames() if frame.kind == "joint"]
+        plan = buffer.plan(frames[0].parent, frames[0].name)
+        for call in (lambda plan=plan: plan.at(START - S), lambda plan=plan: plan.poses([START - S])):
+            with pytest.raises(InPast, match="the recording has nothing older of it") as caught:
+                call()
+            assert "listener" not in str(caught.value)

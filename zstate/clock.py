@@ -10,7 +10,9 @@ import time
 from typing import Any, Protocol, cast
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from zstate.checks import is_masked
 from zstate.errors import InvalidInput
 
 _STAMP_RANGE = 2**63
@@ -103,15 +105,53 @@ def wait_in_slices(event: threading.Event, timeout_s: float | None = None) -> bo
 
 
 def check_stamp(stamp: Any) -> int:
-    """A stamp as an int; integers of numpy are welcome, floats are not: they lose nanoseconds."""
+    """A stamp as an int; integers and datetime64[ns] of numpy are welcome.
+
+    Floats are not: they lose nanoseconds.
+    """
     if type(stamp) is int and -_STAMP_RANGE <= stamp < _STAMP_RANGE:
         return stamp
     if isinstance(stamp, np.integer):
         return check_stamp(int(cast("np.integer[Any]", stamp)))
+    if isinstance(stamp, np.datetime64):
+        return int(check_stamps(np.atleast_1d(stamp))[0])
     raise InvalidInput(
         f"a stamp is a 64-bit integer count of nanoseconds since the Unix epoch, not {stamp!r}; "
         "use time.time_ns(), or round(seconds * 1e9) when seconds is all there is"
     )
+
+
+def check_stamps(stamps: ArrayLike) -> NDArray[np.int64]:
+    """Stamps as an int64 array (T,): of integers [ns], or of datetime64[ns], both exact.
+
+    Raises InvalidInput for floats, other units of datetime64, NaT, masked arrays and other shapes.
+    """
+    try:
+        array: NDArray[Any] = np.asarray(stamps)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"stamps are a flat array of integer nanoseconds: {error}") from None
+    if array.dtype.kind == "M":
+        return _stamps_of_dates(array)
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu") or is_masked(stamps):
+        raise InvalidInput(
+            f"stamps are a flat array of integer nanoseconds, or of datetime64[ns]; got shape {array.shape} "
+            f"of {'masked ' * is_masked(stamps)}{array.dtype}"
+        )
+    if array.size and array.dtype.kind == "u" and int(array.max()) >= _STAMP_RANGE:
+        raise InvalidInput(f"stamps must fit 64-bit signed integers; got {array.max()}")
+    return array.astype(np.int64)
+
+
+def _stamps_of_dates(dates: NDArray[np.datetime64]) -> NDArray[np.int64]:
+    unit, _ = np.datetime_data(dates.dtype)
+    if dates.ndim != 1 or dates.dtype != np.dtype("datetime64[ns]"):
+        raise InvalidInput(
+            f"dates as stamps are a flat array of datetime64[ns]; got shape {dates.shape} in units of "
+            f"{unit!r}: convert with .astype('datetime64[ns]')"
+        )
+    if np.isnat(dates).any():
+        raise InvalidInput("a stamp is NaT, which is no instant")
+    return dates.astype(np.int64)
 
 
 def stamp_text(stamp: int) -> str:

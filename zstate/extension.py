@@ -12,7 +12,7 @@ from typing import Literal
 from zstate.errors import InvalidInput
 
 VARIABLE = "ZSTATE_KERNEL"
-REVISION = 4
+REVISION = 5
 """What the extension's own REVISION has to be; see there."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.plan import check_stamps
+from zstate.clock import check_stamps
 from zstate.closing import Closing
 from zstate.following.recorded import HISTORY_S, check_recorded, fill
 from zstate.following.tally import Tally

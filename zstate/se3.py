@@ -41,7 +41,16 @@ def _select(condition: bool, chosen: float, otherwise: float) -> float:
     return chosen if condition else otherwise
 
 
-SCALARS = Functions(math.sin, math.cos, math.sqrt, math.atan2, _select)
+def _sin(angle: float) -> float:
+    return math.sin(angle) if math.isfinite(angle) else math.nan
+
+
+def _cos(angle: float) -> float:
+    return math.cos(angle) if math.isfinite(angle) else math.nan
+
+
+# ``math`` raises ValueError for infinite angles, where numpy and C answer NaN.
+SCALARS = Functions(_sin, _cos, math.sqrt, math.atan2, _select)
 ARRAYS = Functions(np.sin, np.cos, np.sqrt, np.arctan2, np.where)
 
 

@@ -7,13 +7,14 @@ is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate import se3
+from zstate.checks import check_names, real_numbers
 from zstate.clock import Clock, check_stamp, stamp_text
 from zstate.errors import FrameMismatch, InvalidInput, duration_text
 from zstate.facts import Facts, Kind
@@ -37,10 +38,7 @@ def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
 
     Lengths within 1e-3 of one are normalised. Raises InvalidInput saying which number is at fault.
     """
-    try:
-        array = np.asarray(numbers, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidInput(f"{what} must be numbers: {error}") from None
+    array = real_numbers(numbers, what)
     if array.shape != (7,):
         raise InvalidInput(f"{what} takes 7 numbers x y z qx qy qz qw; got shape {array.shape}")
     values = array.tolist()
@@ -61,7 +59,10 @@ class Transform(Facts):
     ``translation`` is x y z [m] in target axes, ``rotation`` the unit quaternion x y z w, ``stamp``
     nanoseconds since the Unix epoch or None for what holds at any time. ``kind`` tells how a buffer
     made it: "static", "exact", "interpolated" or "predicted", the last ``predicted_s`` seconds beyond
-    the newest sample. Immutable. Raises InvalidInput for numbers that are no pose.
+    the newest sample. Immutable, and so are its arrays. Raises InvalidInput for numbers that are no pose
+    and for names that are no frame names.
+
+    ``transform @ points`` is ``apply``: ``p_a = a_from_b @ p_b``.
     """
 
     __slots__ = ()
@@ -78,7 +79,9 @@ class Transform(Facts):
         *,
         kind: Kind | None = None,
     ) -> None:
-        position, quaternion = np.asarray(translation), np.asarray(rotation)
+        check_names(target, source)
+        position = real_numbers(translation, "a translation")
+        quaternion = real_numbers(rotation, "a rotation")
         if position.shape != (3,) or quaternion.shape != (4,):
             raise InvalidInput(
                 f"a transform takes a translation x y z and a rotation x y z w; got shapes "
@@ -99,7 +102,7 @@ class Transform(Facts):
     @classmethod
     def from_matrix(cls, target: str, source: str, matrix: ArrayLike, stamp: int | None = None) -> Transform:
         """From a homogeneous (4, 4) matrix whose rotation is orthonormal within 1e-3."""
-        array = np.asarray(matrix, dtype=np.float64)
+        array = real_numbers(matrix, "a transform's matrix")
         if array.shape != (4, 4) or not np.isfinite(array).all():
             raise InvalidInput(f"a transform's matrix is (4, 4) and finite; got {array!r}")
         rotation = array[:3, :3]
@@ -117,10 +120,20 @@ class Transform(Facts):
     def from_rpy(
         cls, target: str, source: str, translation: ArrayLike, rpy: ArrayLike, stamp: int | None = None
     ) -> Transform:
-        """From x y z [m] and roll pitch yaw [rad] as in URDF: about the fixed x, then y, then z."""
-        angles = np.asarray(rpy, dtype=np.float64)
+        """From x y z [m] and roll pitch yaw [rad] as in URDF: about the fixed x, then y, then z.
+
+        Raises InvalidInput for an angle beyond 2 pi, which is degrees more often than a full turn.
+        """
+        angles = real_numbers(rpy, "rpy")
         if angles.shape != (3,) or not np.isfinite(angles).all():
             raise InvalidInput(f"rpy is three finite angles [rad]; got {angles!r}")
+        if np.abs(angles).max() > math.tau:
+            given = ", ".join(f"{angle:g}" for angle in angles.tolist())
+            radians = ", ".join(f"{angle:.6g}" for angle in np.radians(angles).tolist())
+            raise InvalidInput(
+                f"rpy is three angles in radians, none beyond 2 pi; got {given}. If these are degrees, "
+                f"they are {radians} rad"
+            )
         return cls(target, source, translation, se3.quaternion_of_rpy(*angles.tolist()), stamp)
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -132,46 +145,57 @@ class Transform(Facts):
     @property
     def translation(self) -> Array:
         """x y z [m] of the source's origin, in target axes: (3,)."""
-        return np.array(self._pose[:3])
+        return _frozen(self._pose[:3])
 
     @property
     def rotation(self) -> Array:
         """The unit quaternion x y z w: (4,)."""
-        return np.array(self._pose[3:])
+        return _frozen(self._pose[3:])
 
     @property
     def pose7(self) -> Array:
         """x y z qx qy qz qw: (7,)."""
-        return np.array(self._pose)
+        return _frozen(self._pose)
 
     @property
     def matrix(self) -> Array:
         """The homogeneous matrix: (4, 4)."""
-        return se3.to_matrix(self._pose)
+        matrix = se3.to_matrix(self._pose)
+        matrix.flags.writeable = False
+        return matrix
 
     @property
     def rpy(self) -> Array:
         """Roll pitch yaw [rad] as in URDF: (3,)."""
-        return np.array(se3.rpy_of_quaternion(self._pose[3:]))  # type: ignore[arg-type]
+        return _frozen(se3.rpy_of_quaternion(self._pose[3:]))  # type: ignore[arg-type]
 
     def inverse(self) -> Transform:
         """source_from_target at the same instant."""
         pose = se3.invert(self._pose)  # type: ignore[arg-type]
+        if not all(map(math.isfinite, pose)):
+            raise InvalidInput(f"the inverse of {self!r} is not finite: its numbers are too large")
         return Transform.trusted(self.source, self.target, pose, self.stamp, self.kind, self.predicted_s)
 
-    def __matmul__(self, other: Transform) -> Transform:
-        """``a_from_b @ b_from_c`` is a_from_c; FrameMismatch when the inner frames differ.
+    @overload
+    def __matmul__(self, other: Transform) -> Transform: ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> Array: ...
+    def __matmul__(self, other: Transform | ArrayLike) -> Transform | Array:
+        """``a_from_b @ b_from_c`` is a_from_c, and ``a_from_b @ p_b`` is p_a: points (3,) or (..., 3).
 
-        The stamp is the one both share or the only one there is; of two instants, None.
+        FrameMismatch when the inner frames differ. The stamp is the one both share or the only one there
+        is; of two instants, None.
         """
-        if not isinstance(other, Transform):  # pyright: ignore[reportUnnecessaryIsInstance]
-            return NotImplemented
+        if not isinstance(other, Transform):
+            return self._apply_to_points(other)
         if self.source != other.target:
             raise FrameMismatch(
                 f"{self.target!r} from {self.source!r} @ {other.target!r} from {other.source!r}: the inner "
                 f"frames differ; invert one, or look up {self.source!r} from {other.target!r} between them"
             )
         pose = se3.compose(self._pose, other._pose)  # type: ignore[arg-type]
+        if not all(map(math.isfinite, pose)):
+            raise InvalidInput(f"the product of {self!r} and {other!r} is not finite: numbers are too large")
         stamps = {stamp for stamp in (self.stamp, other.stamp) if stamp is not None}
         return Transform.trusted(
             self.target,
@@ -182,9 +206,21 @@ class Transform(Facts):
             max(self.predicted_s, other.predicted_s),
         )
 
+    def _apply_to_points(self, points: ArrayLike) -> Array:
+        if not (isinstance(points, (list, tuple)) or hasattr(points, "__array__")):
+            return NotImplemented
+        array = real_numbers(points, "points")
+        if array.ndim == 0 or array.shape[-1] != 3:
+            # Four columns could be homogeneous points, each in a row, or a matrix.
+            raise InvalidInput(
+                f"transform @ points takes points of shape (3,) or (N, 3); got shape {array.shape}. Of "
+                "homogeneous points use transform.apply(points), of a matrix transform.matrix @ matrix"
+            )
+        return self.apply(array)
+
     def apply(self, points: ArrayLike) -> Array:
         """Points given in ``source``, in ``target``: (3,), (..., 3), or homogeneous (4,), (..., 4)."""
-        array = np.asarray(points, dtype=np.float64)
+        array = real_numbers(points, "points")
         if array.ndim == 0 or array.shape[-1] not in (3, 4):
             raise InvalidInput(f"points have 3 or 4 (homogeneous) columns; got shape {array.shape}")
         matrix = self.matrix
@@ -241,3 +277,10 @@ class Transform(Facts):
             f"<pose of {self.source} in {self.target} {when}: xyz [{x:.4f}, {y:.4f}, {z:.4f}] m, "
             f"quaternion xyzw [{quaternion}], {how or self.kind}>"
         )
+
+
+def _frozen(numbers: Sequence[float]) -> Array:
+    """A copy that cannot be written to, as that would change nothing."""
+    array = np.array(numbers)
+    array.flags.writeable = False
+    return array

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tf2_worlds import S, a_scenario, ask_tf2, ask_us, kind_of_ours, kind_of_theirs, why_no_tf2
+from tf2_worlds import Answer, S, a_scenario, ask_tf2, ask_us, kind_of_ours, kind_of_theirs, why_no_tf2
 
-from zstate.errors import LookupFailed, NoData
+from zstate.errors import NoData
 from zstate.transform import Transform
 
 pytestmark = [pytest.mark.tf2, pytest.mark.skipif(bool(why_no_tf2()), reason=why_no_tf2())]
@@ -30,7 +30,7 @@ ZERO = "stamp 0 is an ordinary instant to us; tf2 takes it for 'the newest'"
 SAME = "tf2 answers identity for a name in itself, known or not; we know no such frame"
 TREES = "two trees and a bad time: we report the missing connection, tf2 the time"
 EMPTY = "an edge whose samples are all gone is NoData to us; tf2 takes it for no edge"
-ORDER = "of several frames that cannot be, in the advanced form, either may be named first"
+ORDER = "of several frames that cannot be, either may be named first: what can be no name, to us"
 
 # (ours, tf2's) -> why. What is asked at stamp 0 is another question to tf2, whatever comes of it.
 DISAGREEMENTS = {
@@ -45,7 +45,7 @@ DISAGREEMENTS = {
 }
 
 
-def reason_for(question: list[Any], ours: Transform | LookupFailed, pair: tuple[str, str]) -> str | None:
+def reason_for(question: list[Any], ours: Answer, pair: tuple[str, str]) -> str | None:
     """Why the kinds differ, provided that the reason in the table holds for this question."""
     if 0 in question:
         return ZERO
@@ -55,7 +55,7 @@ def reason_for(question: list[Any], ours: Transform | LookupFailed, pair: tuple[
         TREES: True,
         # In the advanced form the other half may be the one without samples.
         EMPTY: isinstance(ours, NoData) or (len(question) == 5 and None in question),
-        ORDER: len(question) == 5,
+        ORDER: len(question) == 5 or pair == ("name", "unknown"),
     }
     return reason if holds.get(reason) else None
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from support import until
 from worlds import MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
-from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, Stale, UnknownFrame
+from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, NotFinite, Stale, UnknownFrame
+from zstate.transform import Transform
 
 
 def test_a_lookup_is_the_pose_of_the_source_in_the_target() -> None:
@@ -134,7 +138,64 @@ def test_where_past_and_future_both_hold_the_past_is_blamed() -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 20 * S))
     error = failure(buffer, "a", "c", 10 * S)
     assert (type(error), error.edge) == (InPast, ("b", "c"))
-    assert (type(failure(buffer, "a", "c")), failure(buffer, "a", "c").oldest) == (InPast, 20 * S)
+
+
+def silent() -> TransformBuffer:
+    """odom -> base stopped after 1 s; base -> arm goes on until 40 s."""
+    buffer = TransformBuffer()
+    for tick in range(11):
+        buffer.insert(moving("odom", "base", tick * S // 10), writer="odometry")
+    for tick in range(410):
+        buffer.insert(moving("base", "arm", tick * S // 10), writer="driver")
+    return buffer
+
+
+@pytest.mark.parametrize(("target", "source"), [("odom", "arm"), ("arm", "odom")])
+def test_of_an_edge_silent_for_longer_than_the_history_the_silent_one_is_blamed(target, source) -> None:
+    buffer = silent()
+    calls = (
+        lambda: buffer.lookup(target, source),
+        lambda: buffer.lookup(target, source, timeout_s=0.01),
+        lambda: buffer.lookup(target, source, max_age_s=1.0),
+        lambda: buffer.lookup_between(target, None, source, None, "odom"),
+        lambda: buffer.twist(target, source),
+        lambda: buffer.plan(target, source).at(),
+        lambda: buffer.wait(target, source, timeout_s=0.01),
+        lambda: buffer.latest(target, source),
+    )
+    for call in calls:
+        with pytest.raises(Stale) as caught:
+            call()
+        reason = caught.value
+        assert (reason.edge, reason.writer, reason.newest) == (("odom", "base"), "odometry", S)
+        assert (reason.other, reason.other_newest) == (("base", "arm"), 40 * S + 9 * S // 10)
+        assert reason.age_s == pytest.approx(39.9)
+        text = str(reason)
+        assert "'odom' -> 'base' (writer odometry, 10 Hz) has been silent since 1.000 s" in text
+        assert "39.9 s older than that of 'base' -> 'arm'" in text
+        assert str(pickle.loads(pickle.dumps(reason))) == text
+    assert type(failure(buffer, target, source)) is Stale
+
+
+def test_an_edge_whose_last_sample_the_others_still_know_is_answered_there() -> None:
+    buffer = filled(moving("a", "b", 0), *(moving("b", "c", n * S) for n in range(11)))
+    assert buffer.lookup("a", "c").stamp == buffer.latest("a", "c") == 0
+
+
+def test_edges_of_two_times_have_no_instant_in_common_and_the_reason_says_so() -> None:
+    buffer = filled(moving("a", "b", NOW // 1_000_000), moving("b", "c", NOW))
+    reason = failure(buffer, "a", "c")
+    assert (type(reason), reason.edge) == (Stale, ("a", "b"))
+    assert "their writer gives milliseconds where nanoseconds are meant" in str(reason)
+
+
+def test_a_wait_for_an_edge_that_is_silent_ends_with_its_next_sample() -> None:
+    buffer = silent()
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(buffer.wait, "odom", "arm", timeout_s=20.0)
+        until(lambda: buffer._room._waiters)
+        buffer.insert(moving("odom", "base", 40 * S, x=4.0))
+        assert x_of(answer.result(20.0)) == 4.0
 
 
 def test_no_data_names_the_edge_without_a_sample() -> None:
@@ -154,7 +215,9 @@ def test_explain_tells_the_reason_and_never_raises_it() -> None:
         ("a", "b", -1, InPast),
         ("a", "y", 0, Disconnected),
         ("a", "q", 0, UnknownFrame),
-        ("", "/q", None, UnknownFrame),
+        ("", "/q", None, InvalidInput),
+        (None, ["q"], None, InvalidInput),
+        ("a", "b", 1.5, InvalidInput),
     ):
         assert type(buffer.explain(target, source, stamp)) is reason
 
@@ -284,3 +347,91 @@ def test_prediction_is_only_on_request_and_never_by_a_plan() -> None:
     with pytest.raises(InFuture):
         buffer.plan("a", "b").at(S + MS)
     assert not buffer.lookup_many("a", "b", [S + MS])[1].any()
+
+
+HUGE = 1.7e308
+
+
+def huge_static() -> TransformBuffer:
+    return filled(static("a", "b", x=HUGE), static("b", "c", x=HUGE), static("c", "d", x=-HUGE))
+
+
+def huge_moving() -> TransformBuffer:
+    return filled(*(moving(*edge, n * S, x=HUGE) for n in range(3) for edge in (("a", "b"), ("b", "c"))))
+
+
+@pytest.mark.parametrize("buffer", [huge_static(), huge_moving()], ids=["static", "moving"])
+def test_a_result_that_is_not_finite_is_raised_and_never_returned(buffer: TransformBuffer) -> None:
+    calls = (
+        lambda: buffer.lookup("a", "c", S),
+        lambda: buffer.lookup("c", "a", S),
+        lambda: buffer.lookup("a", "c"),
+        lambda: buffer.lookup("a", "c", S, timeout_s=20.0),
+        lambda: buffer.lookup("a", "c", S // 3),
+        lambda: buffer.plan("a", "c").at(S),
+        lambda: buffer.plan("a", "c").poses([0, S]),
+        lambda: buffer.wait("a", "c", S, timeout_s=20.0),
+        lambda: buffer.lookup_between("a", S, "c", 0, "b"),
+    )
+    for call in calls:
+        with pytest.raises(NotFinite) as caught:
+            call()
+        assert "too large" in str(caught.value)
+        assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    assert type(buffer.explain("a", "c", S)) is NotFinite
+    assert not buffer.can_lookup("a", "c", S)
+    poses, valid = buffer.lookup_many("a", "c", [0, S, S // 2])
+    assert np.isnan(poses).all()
+    assert not valid.any()
+    assert x_of(buffer.lookup("a", "b", S)) == HUGE
+
+
+def test_numbers_whose_sum_overflows_are_answered_while_each_of_them_is_finite() -> None:
+    buffer = filled(*(Transform("a", "b", (HUGE, HUGE, -HUGE), (0, 0, 0, 1), n * S) for n in range(2)))
+    assert buffer.lookup("a", "b", S // 2).translation.tolist() == [HUGE, HUGE, -HUGE]
+    poses, valid = buffer.lookup_many("a", "b", [0, S // 2])
+    assert valid.all()
+    assert poses[1, :3].tolist() == [HUGE, HUGE, -HUGE]
+
+
+def test_a_wait_for_a_finite_result_ends_with_a_newer_sample() -> None:
+    buffer = huge_moving()
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(buffer.wait, "a", "c", timeout_s=20.0)
+        until(lambda: buffer._room._waiters)
+        for edge in (("a", "b"), ("b", "c")):
+            buffer.insert(moving(*edge, 3 * S, x=1.0))
+        assert x_of(answer.result(20.0)) == 2.0
+
+
+def test_joints_between_huge_positions_are_not_finite_and_no_error_of_python() -> None:
+    buffer, track = every_joint()
+    for stamp, sign in ((0, 1.0), (S, -1.0)):
+        buffer.insert_joints(track, stamp, pose_of_every(track, bend=sign * HUGE, lift=sign * HUGE))
+    for call in (
+        lambda: buffer.lookup("body", "arm", S // 2),
+        lambda: buffer.lookup("body", "follower", 0),
+        lambda: buffer.lookup("body", "lift", S // 2),
+        lambda: buffer.twist("follower", "body", S // 2),
+        lambda: buffer.twist("lift", "body", S // 2),
+        lambda: buffer.joint_positions(track, S // 2),
+        lambda: buffer.link_poses(track, S // 2),
+    ):
+        with pytest.raises(NotFinite) as caught:
+            call()
+        assert caught.value.edge is not None
+    assert not buffer.lookup_many("body", "follower", [0, S // 2, S])[1].any()
+
+
+@pytest.mark.parametrize("seconds", [1e300, 1e10 * 3, math.inf, math.nan, -1.0, "1", None, 1j, 10**400])
+def test_a_length_of_time_that_cannot_be_is_refused(seconds) -> None:
+    buffer = filled(moving("a", "b", 0), moving("a", "b", S, x=1.0))
+    with pytest.raises(InvalidInput, match="predict_s"):
+        buffer.lookup("a", "b", 2 * S, predict_s=seconds)
+
+
+def test_a_prediction_that_overflows_is_not_finite() -> None:
+    buffer = filled(moving("a", "b", 0, x=-1e308), moving("a", "b", S, x=1.0))
+    with pytest.raises(NotFinite):
+        buffer.lookup("a", "b", 2**62, predict_s=1e10)
+    assert x_of(buffer.lookup("a", "b", 2 * S, predict_s=1e10)) == pytest.approx(1e308)

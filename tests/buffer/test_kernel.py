@@ -24,7 +24,7 @@ from zstate.errors import LookupFailed
 from zstate.extension import kernel
 from zstate.model.catalog import load_model
 from zstate.moving_edges import block_of
-from zstate.se3 import ARRAYS, columns, conjugate, multiply
+from zstate.se3 import ARRAYS, columns, conjugate, multiply, quaternion_of_rpy
 from zstate.transform import Transform
 from zstate.wire.messages import to_block
 
@@ -138,7 +138,7 @@ def a_robot(samples: list[list[float]]) -> tuple[TransformBuffer, JointTrack]:
         q[free + 3 : free + 7] = turn / length if length > 1e-3 else (0.0, 0.0, 0.0, 1.0)
         buffer.insert_joints(track, NOW + second * S, q)
         at = NOW + second * S + S // 3
-        buffer.insert(Transform.from_rpy("hall", "root", q[:3], q[:3], at))
+        buffer.insert(Transform("hall", "root", q[:3], quaternion_of_rpy(*q[:3]), at))
     return buffer, track
 
 

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 import pytest
-from worlds import NOW, S, failure, filled, moving, static, x_of
+from worlds import NOW, S, every_joint, failure, filled, moving, static, x_of
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.errors import AmbiguousFrame, Disconnected, InsertRefused, InvalidInput, NoData, UnknownFrame
+from zstate.buffer.tracks import JointTrack
+from zstate.errors import (
+    AmbiguousFrame,
+    Disconnected,
+    InFuture,
+    InsertRefused,
+    InvalidInput,
+    NoData,
+    UnknownFrame,
+)
 from zstate.model.catalog import load_model
+from zstate.transform import Transform
 
 
 def refusal(buffer: TransformBuffer, parent: str, child: str, writer: str | None = None) -> InsertRefused:
@@ -24,17 +40,90 @@ def refusal(buffer: TransformBuffer, parent: str, child: str, writer: str | None
 
 @pytest.mark.parametrize(("parent", "child"), [("", "b"), ("a", ""), ("/a", "b"), ("a", "/b"), ("a", "/")])
 def test_empty_names_and_leading_slashes_are_refused_at_insert(parent: str, child: str) -> None:
-    assert refusal(TransformBuffer(), parent, child).reason == "frame name"
+    buffer = TransformBuffer()
+    with pytest.raises(InsertRefused) as caught:
+        buffer.insert_many([(parent, child)], 0, [[0, 0, 0, 0, 0, 0, 1]])
+    assert (caught.value.reason, caught.value.edge) == ("frame name", (parent, child))
+    assert buffer.frames() == ()
 
 
-@pytest.mark.parametrize("name", ["", "/a", "/"])
-def test_empty_names_and_leading_slashes_are_unknown_to_questions(name: str) -> None:
-    buffer = filled(static("a", "b"), static("r/", "x"), static("r//a", "y"))
-    for target, source in ((name, "b"), ("b", name), (name, name)):
-        error = failure(buffer, target, source)
-        assert isinstance(error, UnknownFrame)
-        assert error.name == name
-        assert "slash" in str(error) or "empty" in str(error)
+NO_NAMES = ["", "/a", "/", None, 5, 1.5, b"a", ("a",), ["a"], {}, np.array(["a"])]
+
+
+def doors(buffer: TransformBuffer, track: JointTrack, name: Any) -> dict[str, Callable[[], object]]:
+    """Every call that takes a frame name, with ``name`` in each of its places."""
+    pose7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    return {
+        "lookup target": lambda: buffer.lookup(name, "a"),
+        "lookup source": lambda: buffer.lookup("a", name),
+        "lookup at": lambda: buffer.lookup("a", name, 5),
+        "lookup waiting": lambda: buffer.lookup("a", name, timeout_s=10.0),
+        "lookup_many": lambda: buffer.lookup_many("a", name, [5]),
+        "lookup_between target": lambda: buffer.lookup_between(name, 0, "a", 0, "b"),
+        "lookup_between source": lambda: buffer.lookup_between("a", 0, name, 0, "b"),
+        "lookup_between fixed": lambda: buffer.lookup_between("a", 0, "b", 0, name),
+        "plan": lambda: buffer.plan(name, "a"),
+        "twist frame": lambda: buffer.twist(name, "a"),
+        "twist reference": lambda: buffer.twist("a", name),
+        "latest": lambda: buffer.latest("a", name),
+        "can_lookup": lambda: buffer.can_lookup("a", name),
+        "wait": lambda: buffer.wait(name, "a", timeout_s=10.0),
+        "wait_async": lambda: asyncio.run(buffer.wait_async("a", name, timeout_s=10.0)),
+        "watch": lambda: buffer.watch(name, "a", print),
+        "join": lambda: buffer.join(None, name),
+        "insert_many parent": lambda: buffer.insert_many([(name, "q")], 0, [pose7]),
+        "insert_many child": lambda: buffer.insert_many([("q", name)], 0, [pose7]),
+        "withdraw": lambda: buffer.withdraw(name),
+        "Transform target": lambda: Transform(name, "a", pose7[:3], pose7[3:]),
+        "Transform source": lambda: Transform("a", name, pose7[:3], pose7[3:]),
+        "from_pose7": lambda: Transform.from_pose7(name, "a", pose7),
+        "from_matrix": lambda: Transform.from_matrix(name, "a", np.eye(4)),
+        "from_rpy": lambda: Transform.from_rpy("a", name, pose7[:3], (0, 0, 0)),
+    }
+
+
+@pytest.mark.parametrize("name", NO_NAMES, ids=repr)
+def test_what_can_be_no_frame_name_is_refused_at_every_door(name) -> None:
+    buffer, track = every_joint()
+    buffer.insert_static(static("a", "b"))
+    frames = buffer.frames()
+    for door, call in doors(buffer, track, name).items():
+        with pytest.raises(InvalidInput) as caught:
+            call()
+        assert "frame name" in str(caught.value), door
+        assert str(caught.value) == str(pickle.loads(pickle.dumps(caught.value)))
+    explained = buffer.explain("a", name)
+    assert isinstance(explained, InvalidInput)
+    assert buffer.frames() == frames
+    if not isinstance(name, str) or name:
+        with pytest.raises(InvalidInput, match="prefix"):
+            buffer.add_robot(track.model, name)
+
+
+def test_edges_that_are_no_pairs_of_names_are_refused() -> None:
+    buffer = TransformBuffer()
+    for edges in (["ab", "c"], [("a",)], [("a", "b", "c")], [5], 5):
+        with pytest.raises(InvalidInput):
+            buffer.insert_many(edges, 0, [[0, 0, 0, 0, 0, 0, 1]])  # type: ignore[arg-type]
+
+
+def test_names_are_checked_before_connections_and_connections_before_times() -> None:
+    buffer = filled(moving("a", "b", 0), moving("x", "y", 0))
+    for target, source, fixed, at_fault in (
+        ("nobody", "y", "a", "nobody"),
+        ("a", "nobody", "y", "nobody"),
+        ("a", "y", "nobody", "nobody"),
+        ("first", "second", "third", "first"),
+        ("a", "second", "third", "second"),
+    ):
+        with pytest.raises(UnknownFrame) as caught:
+            buffer.lookup_between(target, 99 * S, source, 99 * S, fixed)
+        assert caught.value.name == at_fault
+    for target, source, fixed in (("b", "y", "a"), ("y", "b", "a")):
+        with pytest.raises(Disconnected):
+            buffer.lookup_between(target, 99 * S, source, 99 * S, fixed)
+    with pytest.raises(InFuture):
+        buffer.lookup_between("b", 99 * S, "a", 0, "a")
 
 
 def test_a_frame_cannot_be_placed_on_itself() -> None:

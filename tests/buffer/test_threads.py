@@ -21,13 +21,13 @@ from support import until
 from worlds import NOW, S, every_joint, moving, pose_of_every, static
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.errors import Disconnected, InFuture, InPast, LookupFailed, NoData
+from zstate.errors import Disconnected, InFuture, InPast, LookupFailed, NoData, Stale
 from zstate.transform import Transform
 
 SECONDS = 20.0 if os.environ.get("ZSTATE_LONG") == "1" else 2.0
 STEP = 1_000_000
 TURN = (0.0, 0.0, 0.0, 1.0)
-TIME = (InFuture, InPast, NoData)
+TIME = (InFuture, InPast, NoData, Stale)
 
 
 def line(stamp: int) -> float:
@@ -124,6 +124,8 @@ def is_consistent(reason: LookupFailed) -> bool:
         return reason.requested > reason.newest
     if isinstance(reason, InPast):
         return reason.requested < reason.oldest
+    if isinstance(reason, Stale):
+        return reason.newest < reason.other_newest
     return not isinstance(reason, NoData) or reason.newest is None
 
 

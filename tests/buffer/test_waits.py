@@ -16,6 +16,7 @@ from zstate.errors import (
     Disconnected,
     InFuture,
     InPast,
+    InvalidInput,
     LookupFailed,
     NoData,
     Stale,
@@ -99,9 +100,60 @@ def test_a_wait_for_a_robot_ends_with_its_first_sample(waiting) -> None:
     assert wait.result().rpy[2] == pytest.approx(0.5)
 
 
-def test_a_wait_for_what_lies_before_all_samples_fails_at_once(waiting) -> None:
-    outcome = waiting(filled(moving("a", "b", S)), "a", "b", 0).result()
+def test_a_wait_for_what_lies_before_all_that_is_kept_fails_at_once(waiting) -> None:
+    outcome = waiting(filled(moving("a", "b", 10 * S + 1)), "a", "b", 0).result()
     assert type(outcome) is InPast
+
+
+def test_a_wait_for_what_lies_before_the_only_sample_ends_with_the_history_behind_it(waiting) -> None:
+    """As a listener that joins hears it: a live sample first, then the past, newest first."""
+    buffer = filled(moving("a", "b", 10 * S, x=10.0))
+    wait = waiting(buffer, "a", "b", 9 * S + S // 2)
+    buffer.insert(moving("a", "b", 9 * S, x=9.0))
+    buffer.insert(moving("a", "b", 8 * S, x=8.0))
+    assert x_of(wait.result()) == 9.5
+
+
+def test_a_wait_for_the_past_ends_when_the_last_of_the_edges_knows_it(waiting) -> None:
+    buffer, track = every_joint()
+    buffer.insert(moving("map", "root", 10 * S, x=1.0))
+    buffer.insert_joints(track, 10 * S, pose_of_every(track))
+    wait = waiting(buffer, "map", "lift", 9 * S)
+    buffer.insert(moving("map", "root", 8 * S, x=1.0))
+    assert wait.outcome is None
+    buffer.insert_joints(track, 9 * S, pose_of_every(track, lift=0.5))
+    assert wait.result().translation.tolist() == [1.0, 0.0, 1.5]
+
+
+def test_a_wait_for_the_past_is_woken_once_however_many_samples_come(waiting) -> None:
+    buffer = filled(moving("a", "b", 10 * S))
+    wait = waiting(buffer, "a", "b", 5 * S)
+    (waiter,) = buffer._room._waiters
+    wakes, wake = [], waiter.wake
+    waiter.wake = lambda: wakes.append(None) or wake()
+    for n in range(95, 49, -1):
+        buffer.insert(moving("a", "b", n * S // 10, x=n))
+        buffer.insert(moving("a", "b", 10 * S + n, x=n))
+    assert x_of(wait.result()) == 50.0
+    assert len(wakes) <= 2  # the late sample that makes the answer, and the one behind it
+
+
+def test_a_wait_for_the_past_that_nobody_fills_runs_out_with_its_reason() -> None:
+    buffer = filled(moving("a", "b", 10 * S))
+    with pytest.raises(InPast) as caught:
+        buffer.lookup("a", "b", 5 * S, timeout_s=0.01)
+    assert isinstance(caught.value, TimeoutError)
+
+
+def test_a_wait_for_the_past_ends_as_soon_as_the_history_has_moved_on(waiting) -> None:
+    buffer = filled(moving("a", "b", 10 * S))
+    wait = waiting(buffer, "a", "b", 9 * S)
+    buffer.insert(moving("a", "b", 19 * S))
+    assert wait.outcome is None
+    buffer.insert(moving("a", "b", 19 * S + 1))
+    outcome = wait.result()
+    assert type(outcome) is InPast
+    assert not isinstance(outcome, TimeoutError)
 
 
 def test_a_wait_fails_at_once_when_a_jump_makes_it_hopeless(waiting) -> None:
@@ -119,9 +171,16 @@ def test_a_wait_for_the_newest_instant_outlasts_an_edge_that_lags_behind_the_oth
     assert x_of(wait.result()) == 6.0
 
 
-@pytest.mark.parametrize("name", ["", "/a"])
-def test_a_wait_for_a_name_that_can_never_be_fails_at_once(waiting, name: str) -> None:
-    assert type(waiting(TransformBuffer(), name, "b").result()) is UnknownFrame
+@pytest.mark.parametrize("name", ["", "/a", None, 5, b"a", ["a"]])
+def test_a_wait_for_a_name_that_can_never_be_fails_at_once(name) -> None:
+    buffer = TransformBuffer()
+    for call in (
+        lambda: buffer.wait(name, "b", timeout_s=LONG_S),
+        lambda: buffer.lookup("b", name, timeout_s=LONG_S),
+        lambda: asyncio.run(buffer.wait_async(name, "b", timeout_s=LONG_S)),
+    ):
+        with pytest.raises(InvalidInput, match="frame name"):
+            call()
 
 
 def cases() -> list:

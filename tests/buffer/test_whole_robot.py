@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from zstate import InFuture, InPast, Kinematics, NoData, Stale, Transform, TransformBuffer, load_model
+from zstate.buffer.tracks import JointTrack, PoseTrack
+from zstate.errors import InsertRefused, InvalidInput
 
 MS = 1_000_000
 
@@ -68,3 +72,52 @@ def test_an_error_names_the_track_at_fault() -> None:
     with pytest.raises(Stale) as stale:
         buffer.lookup("base", "tool", max_age_s=1.0)
     assert stale.value.track == "left"
+
+
+def calls_on(buffer: TransformBuffer, track: JointTrack) -> dict[str, Callable[[], object]]:
+    """Every call that takes a track."""
+    zeros = np.zeros(2)
+    return {
+        "insert_joints": lambda: buffer.insert_joints(track, 5, zeros),
+        "insert_joints of a list": lambda: buffer.insert_joints(track, 5, [0.0, 0.0]),
+        "insert_joints of a block": lambda: buffer.insert_joints(track, 5, zeros.tobytes()),
+        "insert_joints with velocities": lambda: buffer.insert_joints(track, 5, zeros, zeros),
+        "restart": lambda: buffer.restart(track),
+        "joint_positions": lambda: buffer.joint_positions(track),
+        "link_poses": lambda: buffer.link_poses(track),
+        "remove_robot": lambda: buffer.remove_robot(track),
+    }
+
+
+def test_the_track_of_a_removed_robot_takes_and_gives_nothing_and_says_so() -> None:
+    buffer = TransformBuffer()
+    track = buffer.add_robot(load_model("rrbot"), "r1")
+    buffer.insert_joints(track, 0, np.zeros(2))
+    buffer.remove_robot(track)
+    for name, call in calls_on(buffer, track).items():
+        with pytest.raises(InsertRefused, match=r"'r1' was removed .* add_robot") as caught:
+            call()
+        assert (caught.value.reason, caught.value.edge) == ("removed robot", ("r1", "r1/world")), name
+    again = buffer.add_robot(load_model("rrbot"), "r1")
+    assert buffer.insert_joints(again, 7, np.zeros(2))
+    assert buffer.lookup("r1/world", "r1/tool").stamp == 7
+
+
+def test_the_track_of_another_buffer_is_refused_and_left_alone() -> None:
+    ours, theirs = TransformBuffer(), TransformBuffer()
+    ours.add_robot(load_model("rrbot"))
+    track = theirs.add_robot(load_model("rrbot"))
+    theirs.insert_joints(track, 3, np.zeros(2))
+    for name, call in calls_on(ours, track).items():
+        with pytest.raises(InsertRefused, match="belongs to another buffer") as caught:
+            call()
+        assert caught.value.reason == "another buffer", name
+    assert theirs.lookup("world", "tool").stamp == 3
+    poses = PoseTrack((("a", "b"),), 10, None)
+    with pytest.raises(InsertRefused, match="'?a -> b'? belongs to another buffer"):
+        ours.restart(poses)
+
+
+def test_an_interpolation_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="linear, hermite; got 'cubic'"):
+        TransformBuffer().add_robot(load_model("rrbot"), interpolation="cubic")  # type: ignore[arg-type]

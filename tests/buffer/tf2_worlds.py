@@ -7,12 +7,21 @@ import random
 import subprocess
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.errors import Disconnected, InFuture, InPast, InsertRefused, LookupFailed, NoData, UnknownFrame
+from zstate.errors import (
+    Disconnected,
+    InFuture,
+    InPast,
+    InvalidInput,
+    LookupFailed,
+    NoData,
+    Stale,
+    UnknownFrame,
+)
 from zstate.transform import Transform
 
 MS = 1_000_000
@@ -54,18 +63,28 @@ def kind_of_theirs(answer: dict[str, Any]) -> str:
     return THEIR_KINDS[answer["error"]] if "error" in answer else "answer"
 
 
-def kind_of_ours(answer: Transform | LookupFailed) -> str:
-    if isinstance(answer, UnknownFrame):
-        return "name" if not answer.name or answer.name.startswith("/") else "unknown"
-    if isinstance(answer, LookupFailed):
-        return {Disconnected: "disconnected", InFuture: "time", InPast: "time", NoData: "time"}[type(answer)]
-    return "answer"
+Answer: TypeAlias = Transform | LookupFailed | InvalidInput
+
+_KINDS = {
+    UnknownFrame: "unknown",
+    InvalidInput: "name",
+    Disconnected: "disconnected",
+    InFuture: "time",
+    InPast: "time",
+    NoData: "time",
+    Stale: "time",
+    Transform: "answer",
+}
 
 
-def ask_us(scenario: dict[str, Any]) -> list[Transform | LookupFailed]:
+def kind_of_ours(answer: Answer) -> str:
+    return _KINDS[type(answer)]
+
+
+def ask_us(scenario: dict[str, Any]) -> list[Answer]:
     """Our answers to every question of one scenario; what is refused at insert is left out."""
     buffer = TransformBuffer(scenario["history"] / S)
-    answers: list[Transform | LookupFailed] = []
+    answers: list[Answer] = []
     for name, *values in scenario["steps"]:
         if name == "ask":
             answers.append(_answer(buffer, values))
@@ -84,14 +103,14 @@ def _insert(buffer: TransformBuffer, name: str, values: list[Any]) -> None:
         else:
             parent, child, pose = values
             buffer.insert_static(Transform.from_pose7(parent, child, pose))
-    except InsertRefused:
+    except InvalidInput:
         pass
 
 
-def _answer(buffer: TransformBuffer, question: list[Any]) -> Transform | LookupFailed:
+def _answer(buffer: TransformBuffer, question: list[Any]) -> Answer:
     try:
         return buffer.lookup(*question) if len(question) == 3 else buffer.lookup_between(*question)
-    except LookupFailed as reason:
+    except (LookupFailed, InvalidInput) as reason:
         return reason
 
 

@@ -8,6 +8,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
 from zstate.model.catalog import load_model
+from zstate.se3 import quaternion_of_rpy
 from zstate.transform import Transform
 
 MS = 1_000_000
@@ -16,12 +17,17 @@ NOW = 1_790_000_000_123_456_789
 """A stamp of these years, with digits that float seconds would lose."""
 
 
+def turned(yaw: float) -> tuple[float, float, float, float]:
+    """The quaternion of a yaw, which may be any number of turns."""
+    return quaternion_of_rpy(0.0, 0.0, yaw)
+
+
 def moving(parent: str, child: str, stamp: int, x: float = 0.0, yaw: float = 0.0) -> Transform:
-    return Transform.from_rpy(parent, child, (x, 0.0, 0.0), (0.0, 0.0, yaw), stamp)
+    return Transform(parent, child, (x, 0.0, 0.0), turned(yaw), stamp)
 
 
 def static(parent: str, child: str, x: float = 0.0, yaw: float = 0.0) -> Transform:
-    return Transform.from_rpy(parent, child, (x, 0.0, 0.0), (0.0, 0.0, yaw))
+    return Transform(parent, child, (x, 0.0, 0.0), turned(yaw))
 
 
 def x_of(transform: Transform) -> float:

@@ -34,13 +34,14 @@
 
 /* Grows with every change of what Python sees of these files, so that a library built from an older
  * source (an editable install that was not built again) is recognised and not used. */
-#define REVISION 4
+#define REVISION 5
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
      "insert_together(histories, stamp, rows): one instant of several histories, at one moment."},
     {"block_of", (PyCFunction)(void (*)(void))block_of, METH_FASTCALL,
-     "block_of(numbers, count): the block of so many finite doubles; None for anything else."},
+     "block_of(numbers, count): the block of an array of so many finite doubles; None for anything "
+     "else."},
     {NULL},
 };
 

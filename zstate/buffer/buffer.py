@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.join import Join, frame_of, stamp_of
-from zstate.buffer.plan import Plan, check_stamps, joints_path
+from zstate.buffer.plan import Plan, joints_path
 from zstate.buffer.questions import Question, Questions, seconds
 from zstate.buffer.tracks import JointTrack
 from zstate.buffer.watch import Watch
-from zstate.clock import Clock, check_stamp, wait_in_slices
-from zstate.errors import Closed, LookupFailed, timed_out
+from zstate.checks import check_names
+from zstate.clock import Clock, check_stamp, check_stamps, wait_in_slices
+from zstate.errors import Closed, InvalidInput, LookupFailed, NotFinite, timed_out
 from zstate.transform import Transform
 from zstate.twist import Twist
 
@@ -70,11 +71,15 @@ class TransformBuffer(Questions):
         yet. ``max_age_s`` refuses an older answer. ``predict_s`` allows instants up to so far beyond
         the newest sample, from published velocities; such an answer is of kind "predicted".
 
-        Raises UnknownFrame, AmbiguousFrame, Disconnected, NoData, InPast, InFuture or Stale, all of
-        them LookupFailed; after a wait also a TimeoutError.
+        Raises UnknownFrame, AmbiguousFrame, Disconnected, NoData, InPast, InFuture, Stale or NotFinite,
+        all of them LookupFailed; after a wait also a TimeoutError. Raises InvalidInput for names that are
+        no frame names.
         """
         if max_age_s is None and timeout_s == 0.0 and predict_s == 0.0:
-            known = self._paths.get((target, source))
+            try:
+                known = self._paths.get((target, source))
+            except TypeError:  # of a list, which has no hash and is no name
+                known = None
             if known is not None and known[0] == self._tree.version:
                 transform = known[1].at(at)
                 if transform is not None:
@@ -94,10 +99,17 @@ class TransformBuffer(Questions):
         Both are joined through ``fixed``, which is taken not to have moved meanwhile (tf2's advanced
         form). None for an instant is the newest of that side. The answer has the target side's stamp.
         """
+        check_names(target, source, fixed)
+        for name in (target, source, fixed):
+            self._tree.resolve(name, target, source)
         # A missing connection is blamed before a bad time, on either side.
         self._path(fixed, source)
         target_from_fixed = self.lookup(target, fixed, target_at)
-        both = target_from_fixed @ self.lookup(fixed, source, source_at)
+        fixed_from_source = self.lookup(fixed, source, source_at)
+        try:
+            both = target_from_fixed @ fixed_from_source
+        except InvalidInput:  # a product of large numbers
+            raise NotFinite(target, source, requested=target_at) from None
         pose = tuple(both.pose7.tolist())
         return Transform.trusted(target, source, pose, target_from_fixed.stamp, both.kind)
 
@@ -106,7 +118,8 @@ class TransformBuffer(Questions):
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """pose7 of ``source`` in ``target`` at each stamp: (T, 7), and which are valid: (T,).
 
-        Rows that have no answer are NaN. Raises UnknownFrame, AmbiguousFrame and Disconnected.
+        Rows that have no answer are NaN. Stamps are integers [ns] or datetime64[ns]. Raises UnknownFrame,
+        AmbiguousFrame and Disconnected.
         """
         return self._path(target, source).poses(check_stamps(stamps))
 
@@ -128,28 +141,37 @@ class TransformBuffer(Questions):
     def latest(self, target: str, source: str) -> int:
         """The newest stamp [ns] that every moving edge between the frames knows.
 
-        Raises NoData when every edge is static, for then there is no such instant.
+        Raises NoData when every edge is static, for then there is no such instant, and Stale when the
+        history of one edge begins after the last sample of another, which is silent.
         """
         return self._path(target, source).latest()
 
     def can_lookup(self, target: str, source: str, at: int | None = None) -> bool:
-        """Whether ``lookup`` would answer now."""
-        return self.explain(target, source, at) is None
+        """Whether ``lookup`` would answer now. Raises InvalidInput for what can be no name or stamp."""
+        reason = self.explain(target, source, at)
+        if isinstance(reason, InvalidInput):
+            raise reason
+        return reason is None
 
-    def explain(self, target: str, source: str, at: int | None = None) -> LookupFailed | None:
-        """The error ``lookup`` would raise now, or None when it would answer. Never raises one."""
+    def explain(self, target: str, source: str, at: int | None = None) -> LookupFailed | InvalidInput | None:
+        """The error ``lookup`` would raise now, or None when it would answer. Never raises one.
+
+        InvalidInput is returned for what can be no name or stamp.
+        """
         try:
             self._answer(self._question(target, source, at))
-        except LookupFailed as reason:
+        except (LookupFailed, InvalidInput) as reason:
             return reason
         return None
 
     def wait(self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0) -> Transform:
         """``lookup`` as soon as it has an answer; unknown and unconnected frames are waited for, too.
 
-        Raises at once what waiting cannot mend: InPast for an ``at`` before all samples kept, and anything
-        in a process forked from that of the listener which fills this buffer. After
-        ``timeout_s`` raises the reason of the last try, as an error that is also a TimeoutError.
+        Raises at once what waiting cannot mend: InPast for an ``at`` more than ``history_s`` before the
+        newest sample of an edge, and anything in a process forked from that of the listener which fills
+        this buffer. Anything later may still come: late samples are sorted in, and a listener that has
+        just opened requests the past from the writers. After ``timeout_s`` raises the reason of the last
+        try, as an error that is also a TimeoutError.
         """
         question, timeout_s = self._question(target, source, at), seconds("timeout_s", timeout_s)
         return self._answer(question) if self._ended else self._wait(question, timeout_s)
@@ -227,8 +249,10 @@ class TransformBuffer(Questions):
 
         ``transform`` is ``target_from_frame`` at the sample's stamp; ``frame`` and ``stamp`` say where to
         find both (default: the attributes of those names). A sample that gets no transform within
-        ``timeout_s`` is left out, counted by its reason in ``dropped``.
+        ``timeout_s`` is left out, counted by its reason in ``dropped``; one whose frame or stamp cannot be
+        any raises InvalidInput.
         """
+        check_names(target)
         seconds("timeout_s", timeout_s)
         return Join(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
 
@@ -236,11 +260,15 @@ class TransformBuffer(Questions):
         """All joints of one robot at a stamp, and that stamp: (nq,) as ``track.model.joint_names``.
 
         ``at=None`` is the robot's newest sample. Between samples joints are interpolated as in lookups.
-        Raises NoData, InPast or InFuture.
+        Raises NoData, InPast, InFuture or NotFinite, and InsertRefused as ``insert_joints``.
         """
+        self._check_ours(track)
         path = joints_path(track, self._take_views)
         reading = path.read(None if at is None else check_stamp(at))
-        return np.hstack([np.empty(0), *reading.values[0]]), reading.stamp
+        positions = np.hstack([np.empty(0), *reading.values[0]])
+        if not np.isfinite(positions).all():
+            raise path.not_finite(reading.values, reading.stamp)
+        return positions, reading.stamp
 
     def link_poses(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of one robot at a stamp, and that stamp: (L, 7), rows as ``track.model.links``.

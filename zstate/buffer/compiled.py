@@ -79,6 +79,9 @@ class CompiledPath(Path):
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         poses, valid = np.empty((len(stamps), 7)), np.empty(len(stamps), np.bool_)
         self._compiled.poses(stamps, poses, valid)
+        if not valid.all():
+            # Its order of operations may overflow where that of the reference, which raises, does not.
+            poses[~valid], valid[~valid] = super().poses(stamps[~valid])
         return poses, valid
 
 

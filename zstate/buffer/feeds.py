@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from zstate.buffer.edge import Edge
-from zstate.buffer.tracks import ClockOffsets, PoseTrack
+from zstate.buffer.tracks import Home, PoseTrack
 from zstate.buffer.tree import Tree
 from zstate.errors import InsertRefused
 
@@ -25,9 +25,9 @@ class TooOld(Exception):
 class Feeds:
     """The tracks behind the edges that are inserted as poses. Used under the buffer's lock."""
 
-    def __init__(self, tree: Tree, span_ns: int, clock_offsets: ClockOffsets) -> None:
+    def __init__(self, tree: Tree, span_ns: int, home: Home) -> None:
         self._tree = tree
-        self._clock_offsets = clock_offsets
+        self._home = home
         self._span_ns = span_ns
         self._known: dict[tuple[EdgeNames, ...], Feed] = {}
         self._version = -1
@@ -39,7 +39,10 @@ class Feeds:
         """
         if self._version != self._tree.version:
             self._known.clear()
-        feed = self._known.get(names)
+        try:
+            feed = self._known.get(names)
+        except TypeError:  # of a list, which has no hash and is no name
+            feed = None
         if feed is None:
             with self._tree.untouched_on_error():
                 feed = self._make(names, stamp, writer)
@@ -70,6 +73,7 @@ class Feeds:
 
     def admit(self, parent: str, child: str, writer: str | None) -> EdgeNames:
         """The edge that these names mean, once it is known to be possible. Raises InsertRefused."""
+        self._tree.check_names(parent, child)
         parent, child = self._tree.named_for_insert(parent), self._tree.named_for_insert(child)
         existing = self._tree.frames.get(child)
         if existing is not None and existing.robot is not None and existing.parent == parent:
@@ -98,7 +102,7 @@ class Feeds:
         return track
 
     def _attach(self, track: PoseTrack) -> None:
-        track.clock_offsets = self._clock_offsets
+        track.home = self._home
         for index, (parent, child) in enumerate(track.edges):
             self._tree.attach(Edge(parent, child, "pose", track=track, index=index))
 

@@ -69,6 +69,12 @@ class History:
         view = self.view
         return view.newest if view.size else None
 
+    @property
+    def oldest(self) -> int | None:
+        """The first stamp [ns]; None without any."""
+        view = self.view
+        return view.oldest if view.size else None
+
     def replace(self, stamps: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
         """Hold a copy of these samples, ascending and already within the span, and no others."""
         fresh = self._empty(max(_SMALLEST_CAPACITY, len(stamps)))

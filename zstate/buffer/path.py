@@ -5,6 +5,7 @@ A lookup searches once in each track it passes, reads only the joints on its way
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -16,7 +17,7 @@ from zstate.buffer.cells import Between, Cell
 from zstate.buffer.history import View
 from zstate.buffer.steps import Motion, Step, Values, chain_motion, chain_pose
 from zstate.buffer.tracks import JointTrack, Track, coverage, of_track
-from zstate.errors import InFuture, InPast, LookupFailed, NoData, Stale
+from zstate.errors import InFuture, InPast, LookupFailed, NoData, NotFinite, Stale
 from zstate.transform import Kind, Transform
 
 Stamps: TypeAlias = NDArray[np.int64]
@@ -74,17 +75,20 @@ class Path:
         """Raise the reason where it is known at once that there is no answer at this moment."""
 
     def latest(self) -> int:
-        """The newest instant that every moving edge knows [ns]. Raises NoData."""
+        """The newest instant that every moving edge knows [ns]. Raises NoData or Stale."""
         if not self.uses:
             raise NoData(self.target, self.source)
         return self._latest(self._take_views(self.uses))
 
     def answer(self, stamp: int | None, predict_ns: int = 0) -> Answer:
-        """The pose at ``stamp``, or at the latest instant. Raises NoData, InPast or InFuture."""
+        """The pose at ``stamp``, or at the latest instant.
+
+        Raises NoData, InPast, InFuture, Stale or NotFinite.
+        """
         if not self.uses:
-            return Answer(self._pose((), se3.SCALARS), stamp, "static")
+            return Answer(self._finite_pose((), stamp), stamp, "static")
         reading = self.read(stamp, predict_ns)
-        pose = se3.normalize(self._pose(reading.values, se3.SCALARS), se3.SCALARS)
+        pose = se3.normalize(self._finite_pose(reading.values, reading.stamp), se3.SCALARS)
         return Answer(pose, reading.stamp, reading.kind, reading.predicted_ns * 1e-9)
 
     def read(self, stamp: int | None, predict_ns: int = 0) -> Reading:
@@ -119,10 +123,12 @@ class Path:
                 raise self.blame(at or 0, views)
             values.append([cell.value(now) for cell in use.cells])
             rates.append([cell.rate(now) for cell in use.cells])
+        if any(np.isnan(_numbers(cells)).any() for cells in rates):
+            raise self._no_rate(views)
         above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
         motion = above_target.inverse().then(chain_motion(self.steps_to_source, values, rates, se3.SCALARS))
         if not np.isfinite((*motion.linear, *motion.angular)).all():
-            raise self._no_rate(views)
+            raise self.not_finite(values, at)
         return motion, at
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -132,14 +138,19 @@ class Path:
         for view in views:
             valid &= _within(view, stamps)
         known = stamps[valid]
-        values = [
-            [cell.value(now) for cell in use.cells]
-            for use, now in zip(self.uses, (_between_many(view, known) for view in views), strict=True)
-        ]
         poses = np.full((len(stamps), 7), np.nan)
-        if len(known):
+        if not len(known):
+            return poses, valid
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = [
+                [cell.value(now) for cell in use.cells]
+                for use, now in zip(self.uses, (_between_many(view, known) for view in views), strict=True)
+            ]
             pose = se3.normalize(self._pose(values, se3.ARRAYS), se3.ARRAYS)
-            poses[valid] = np.stack(np.broadcast_arrays(*pose, known)[:7], axis=-1)
+        found = np.stack(np.broadcast_arrays(*pose, known)[:7], axis=-1)
+        found[~np.isfinite(found).all(axis=1)] = np.nan
+        poses[valid] = found
+        valid[valid] = ~np.isnan(found[:, 0])
         return poses, valid
 
     def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
@@ -153,6 +164,25 @@ class Path:
             max_age_s=max_age_s,
             edge=use.edge,
             requested=stamp,
+            oldest=facts.oldest,
+            newest=facts.newest,
+            rate_hz=facts.rate_hz,
+            writer=use.track.writer,
+        )
+        return of_track(failure, use.track)
+
+    def _silent(self, views: Sequence[View]) -> Stale:
+        """The error for an edge whose last sample is older than all that another one keeps."""
+        number = min(range(len(views)), key=lambda n: views[n].newest)
+        other = max(range(len(views)), key=lambda n: views[n].oldest)
+        use, facts = self.uses[number], coverage(views[number])
+        failure = Stale(
+            self.target,
+            self.source,
+            age_s=(views[other].newest - views[number].newest) * 1e-9,
+            other=self.uses[other].edge,
+            other_newest=views[other].newest,
+            edge=use.edge,
             oldest=facts.oldest,
             newest=facts.newest,
             rate_hz=facts.rate_hz,
@@ -217,7 +247,26 @@ class Path:
         for number, view in enumerate(views):
             if not view.size:
                 raise self._failure(NoData, number, views, None)
-        return min(view.newest for view in views)
+        newest = min(view.newest for view in views)
+        if any(view.oldest > newest for view in views):
+            raise self._silent(views)
+        return newest
+
+    def _finite_pose(self, values: Values, at: int | None) -> se3.Pose:
+        pose = self._pose(values, se3.SCALARS)
+        if not all(map(math.isfinite, pose)):
+            raise self.not_finite(values, at)
+        return pose
+
+    def not_finite(self, values: Values, at: int | None) -> NotFinite:
+        """The error for numbers that are too large, naming the edge with the largest."""
+        if not self.uses:
+            return NotFinite(self.target, self.source, requested=at)
+        sizes = [np.abs(_numbers(cells)).max(initial=0.0) for cells in values]
+        views = [use.track.history.view for use in self.uses[: len(sizes)]]
+        failure = self._failure(NotFinite, int(np.argmax(sizes)), views, at)
+        assert isinstance(failure, NotFinite)
+        return failure
 
     def _pose(self, values: Values, f: se3.Functions) -> se3.Pose:
         target_from_top = chain_pose(self.steps_to_target, values, f)
@@ -228,16 +277,23 @@ class Path:
 
     @staticmethod
     def _ahead(use: TrackUse, view: View, at: int, predict_ns: int) -> list[se3.Component] | None:
-        """The cells' values beyond the newest sample, at their last rates; None where not allowed."""
+        """The cells' values beyond the newest sample, at their last rates; None where that cannot be."""
         if not view.size or not view.newest < at <= view.newest + predict_ns:
             return None
         now = _last_stretch(view, use)
+        rates = [cell.rate(now) for cell in use.cells]
+        if np.isnan(_numbers(rates)).any():
+            return None
         seconds = (at - view.newest) * 1e-9
-        values: list[se3.Component] = [
-            cell.ahead(now.b, cell.rate(now), seconds, se3.SCALARS)  # type: ignore[arg-type]
-            for cell in use.cells
+        return [
+            cell.ahead(now.b, rate, seconds, se3.SCALARS)  # type: ignore[arg-type]
+            for cell, rate in zip(use.cells, rates, strict=True)
         ]
-        return values if np.isfinite(np.hstack(values)).all() else None
+
+
+def _numbers(cells: Sequence[se3.Component]) -> NDArray[np.float64]:
+    """The values or rates of the cells of one track, all in one array; there may be none."""
+    return np.concatenate([np.empty(0), *(np.ravel(cell) for cell in cells)])
 
 
 def _row(view: View, index: int) -> list[float]:

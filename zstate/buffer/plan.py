@@ -11,11 +11,11 @@ from zstate import se3
 from zstate.buffer.cells import Cell, Line, Pose7, Turn
 from zstate.buffer.compiled import make_path
 from zstate.buffer.edge import Edge
-from zstate.buffer.path import Path, Stamps, TrackUse, ViewTaker
+from zstate.buffer.path import Path, TrackUse, ViewTaker
 from zstate.buffer.steps import Fixed, Given, Hinge, Planar, Slide, Step
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
 from zstate.buffer.tree import Tree
-from zstate.clock import check_stamp
+from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput
 from zstate.transform import Transform
 
@@ -70,18 +70,6 @@ class Plan:
             return poses
         out[...] = poses
         return out
-
-
-def check_stamps(stamps: ArrayLike) -> Stamps:
-    """Stamps as an int64 array (T,). InvalidInput for floats and other shapes."""
-    array = np.asarray(stamps)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
-        raise InvalidInput(
-            f"stamps are a flat array of integer nanoseconds; got shape {array.shape} of {array.dtype}"
-        )
-    if array.size and array.dtype.kind == "u" and int(array.max()) >= 2**63:
-        raise InvalidInput(f"stamps must fit 64-bit signed integers; got {array.max()}")
-    return array.astype(np.int64)
 
 
 def transform_of(path: Path, at: int | None, predict_ns: int = 0) -> Transform:

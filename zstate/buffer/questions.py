@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import NamedTuple
 
 from zstate.buffer.footing import Footing
@@ -11,6 +12,7 @@ from zstate.buffer.plan import compile_path, transform_of
 from zstate.buffer.store import Store
 from zstate.buffer.tracks import Track
 from zstate.buffer.waiting import Expected, Marks, Waiter
+from zstate.checks import check_names
 from zstate.clock import Clock, check_stamp
 from zstate.errors import (
     AmbiguousFrame,
@@ -20,6 +22,7 @@ from zstate.errors import (
     InPast,
     InvalidInput,
     LookupFailed,
+    NotFinite,
     Stale,
     UnknownFrame,
 )
@@ -27,6 +30,9 @@ from zstate.transform import Transform
 
 # So many pairs of frames are remembered compiled; more than any program asks for on purpose.
 _MOST_PATHS = 4096
+
+# No stamp of 64 bits is further away.
+_LONGEST_PREDICTION_S = 2e10
 
 # What only a change of the tree can mend.
 _NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected)
@@ -86,8 +92,9 @@ class Questions(Store):
         self, question: Question, reason: LookupFailed, waiter: Waiter, version: int
     ) -> LookupFailed:
         """Tell ``waiter`` what may turn the reason into an answer. Raises a reason that nothing mends."""
-        waiter.expect(self._mending(question, reason), version)
-        if _is_final(question, reason):
+        expected = self._mending(question, reason)
+        waiter.expect(expected, version)
+        if _is_final(question, reason, expected):
             raise reason
         return reason
 
@@ -110,9 +117,10 @@ class Questions(Store):
         predict_s: float = 0.0,
         max_age_s: float | None = None,
     ) -> Question:
+        check_names(target, source)
         if max_age_s is not None:
             seconds("max_age_s", max_age_s)
-        predict_ns = round(seconds("predict_s", predict_s) * 1e9)
+        predict_ns = round(seconds("predict_s", predict_s, _LONGEST_PREDICTION_S) * 1e9)
         return Question(target, source, None if at is None else check_stamp(at), predict_ns, max_age_s)
 
     def _answer(self, question: Question) -> Transform:
@@ -149,7 +157,10 @@ class Questions(Store):
 
     def _known_path(self, target: str, source: str) -> KnownPath:
         version = self._tree.version
-        known = self._paths.get((target, source))
+        try:
+            known = self._paths.get((target, source))
+        except TypeError:  # of a list, which has no hash and is no name
+            known = None
         if known is not None and known.version == version:
             return known
         if known is not None and self._tree.holds(known.footing):
@@ -162,6 +173,7 @@ class Questions(Store):
         return known
 
     def _compiled(self, target: str, source: str) -> KnownPath:
+        check_names(target, source)
         with self._lock:
             path = compile_path(self._tree, target, source, self._take_views)
             return KnownPath(self._tree.version, path, self._tree.footing(target, source))
@@ -170,10 +182,9 @@ class Questions(Store):
 def _marks(question: Question, reason: LookupFailed, path: Path) -> Marks:
     """How new each track of the path must be before asking again may help."""
     at = None if question.at is None else question.at - question.predict_ns
-    if isinstance(reason, InPast):
-        at = reason.oldest
-    if isinstance(reason, Stale):
-        at = _after(reason.requested)
+    if isinstance(reason, Stale | NotFinite):
+        # Where an edge has been silent for too long, the question had no instant: a newer sample helps.
+        at = _after(reason.newest if reason.requested is None else reason.requested)
     marks: dict[Track, int | None] = {use.track: at for use in path.uses}
     if isinstance(reason, InFuture) and at is not None and reason.newest is not None:
         # Where prediction is not possible from the samples there are, only a newer one helps.
@@ -190,11 +201,12 @@ def _mismatch(kept: str, clock: Clock, occasion: str) -> ClockMismatch:
     )
 
 
-def _is_final(question: Question, reason: LookupFailed) -> bool:
+def _is_final(question: Question, reason: LookupFailed, expected: Expected) -> bool:
     """Whether no amount of waiting would turn the reason into an answer."""
-    if isinstance(reason, UnknownFrame):
-        return not reason.name or reason.name.startswith("/")
-    if isinstance(reason, InPast | Stale):
+    if isinstance(reason, InPast):
+        # Before that, late samples are sorted in, and the history of a listener that joins is filled.
+        return expected.is_hopeless()
+    if isinstance(reason, Stale | NotFinite):
         return question.at is not None
     return isinstance(reason, AmbiguousFrame)
 
@@ -204,8 +216,10 @@ def _after(stamp: int | None) -> int | None:
     return None if stamp is None else stamp + 1
 
 
-def seconds(name: str, value: float) -> float:
-    """``value`` if it is a length of time; InvalidInput otherwise."""
-    if not (math.isfinite(value) and value >= 0.0):
+def seconds(name: str, value: float, most: float = 1e300) -> float:
+    """``value`` if it is a length of time of at most ``most``; InvalidInput otherwise."""
+    if not isinstance(value, Real) or not 0.0 <= value < math.inf:
         raise InvalidInput(f"{name} is a number of seconds, zero or more; got {value!r}")
+    if value > most:
+        raise InvalidInput(f"{name} is at most {most:g} seconds; got {value!r}")
     return value

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,9 +19,10 @@ from zstate.buffer.history import View, thin
 from zstate.buffer.kernel import insert_together
 from zstate.buffer.layout import Layout
 from zstate.buffer.path import TrackUse
-from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack, Track
+from zstate.buffer.tracks import ClockOffsets, Home, Interpolation, JointTrack, PoseTrack, Track
 from zstate.buffer.tree import Tree
 from zstate.buffer.waiting import WaitingRoom
+from zstate.checks import check_names, name_problem, real_numbers
 from zstate.clock import Clock, SystemClock, check_stamp
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.locks import outlive_fork
@@ -43,7 +45,9 @@ class Store:
         self.clock: Clock = clock or SystemClock()
         self.domain = Domain(None if clock is None else clock.domain)
         """Whose time its stamps are."""
-        self.clock_offsets: ClockOffsets = {}
+        self.home = Home()
+        """What its tracks know of it."""
+        self.clock_offsets: ClockOffsets = self.home.clock_offsets
         """By writer: what tells how far its clock is ahead of this one. Filled by whoever measures that."""
         self.ignored = 0
         """How many samples were older than the history reaches."""
@@ -52,7 +56,7 @@ class Store:
         self._writes = 0
         self._tree = Tree()
         self._room = WaitingRoom(self._tree)
-        self._feeds = Feeds(self._tree, self._span_ns, self.clock_offsets)
+        self._feeds = Feeds(self._tree, self._span_ns, self.home)
 
     def add_robot(
         self, model: RobotModel, prefix: str = "", *, interpolation: Interpolation = "linear"
@@ -61,11 +65,15 @@ class Store:
 
         With a ``prefix`` the links are called ``prefix/link``. ``interpolation="hermite"`` joins
         samples that have velocities by cubic curves. Raises InsertRefused when one of the links has a
-        parent already.
+        parent already, InvalidInput for a prefix that cannot begin a frame name.
         """
-        prefix = prefix.removesuffix("/")
+        prefix = _check_prefix(prefix)
+        if interpolation not in get_args(Interpolation):
+            raise InvalidInput(
+                f"interpolation is one of {', '.join(get_args(Interpolation))}; got {interpolation!r}"
+            )
         track = JointTrack(model, prefix, self._span_ns, interpolation)
-        track.clock_offsets = self.clock_offsets
+        track.home = self.home
         with self._lock, self._tree.untouched_on_error():
             if prefix and self._tree.robots.get(prefix) is not None:
                 raise InsertRefused(
@@ -94,8 +102,13 @@ class Store:
         self._tree.attach(edge)
 
     def remove_robot(self, track: JointTrack) -> None:
-        """Take a robot's edges and history away. Its frames stay known, without a parent."""
+        """Take a robot's edges and history away. Its frames stay known, without a parent.
+
+        Its track takes no more samples. Raises InsertRefused for a track that is not of this buffer.
+        """
         with self._lock:
+            self._check_ours(track)
+            track.home = None
             for name, edge in list(self._tree.frames.items()):
                 if edge is not None and edge.robot is track:
                     self._tree.detach(name)
@@ -127,9 +140,12 @@ class Store:
         ``positions`` may also be a block: the same as float64, little-endian, in bytes.
         True, or False when it is older than the history reaches, which ``ignored`` counts. A second
         sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity,
-        and for a floating joint's quaternion that is not of length one.
+        and for a floating joint's quaternion that is not of length one; InsertRefused for the track of a
+        robot that was removed, or of another buffer.
         """
         with self._lock:
+            if track.home is not self.home:
+                raise _not_ours(track)
             taken = track.take(stamp, positions, velocities)
         if taken:
             # The way of nearly every sample, without the call in between.
@@ -141,15 +157,24 @@ class Store:
         numbers = track.check_positions(positions)
         rates = None if velocities is None else track.model.check_velocities(velocities)
         with self._lock:
+            self._check_ours(track)  # again: it may have been removed meanwhile
             had_velocities = track.has_velocities
             taken = track.insert(stamp, numbers, rates)
             if track.has_velocities != had_velocities:
                 self._tree.renew(track)
         return self._count(track, taken=taken)
 
+    def _check_ours(self, track: Track) -> None:
+        if track.home is not self.home:
+            raise _not_ours(track)
+
     def restart(self, track: JointTrack | PoseTrack) -> None:
-        """A new epoch: forget the samples of one track, because its writer or its clock began anew."""
+        """A new epoch: forget the samples of one track, because its writer or its clock began anew.
+
+        Raises InsertRefused for a track that is not of this buffer.
+        """
         with self._lock:
+            self._check_ours(track)
             track.history.clear()
         self._room.begin_anew(track)
 
@@ -175,7 +200,10 @@ class Store:
 
         ``poses`` is (N, 7), x y z [m], qx qy qz qw. Otherwise as ``insert``.
         """
-        names = tuple((parent, child) for parent, child in edges)
+        try:
+            names = tuple((parent, child) for parent, child in edges)
+        except (TypeError, ValueError):
+            raise InvalidInput(f"edges are pairs (parent, child) of frame names; got {edges!r}") from None
         return self._insert_poses(names, check_stamp(stamp), _check_poses(names, poses), writer)
 
     def _insert_poses(
@@ -225,6 +253,7 @@ class Store:
 
         Raises InvalidInput for a frame nobody named, InsertRefused for a link of a robot's model.
         """
+        check_names(child)
         with self._lock:
             name = self._tree.named_for_insert(child)
             if name not in self._tree.frames:
@@ -288,8 +317,27 @@ class Store:
             return [use.track.history.view for use in uses]
 
 
+def _check_prefix(prefix: object) -> str:
+    if isinstance(prefix, str) and not prefix:
+        return ""
+    if problem := name_problem(prefix):
+        raise InvalidInput(f"the prefix of a robot stands before its frames' names; {problem}")
+    return str(prefix).removesuffix("/")
+
+
+def _not_ours(track: Track) -> InsertRefused:
+    if isinstance(track, JointTrack) and track.home is None:
+        what = f"the robot {track.name!r} was removed from its buffer; add_robot gives a new track"
+        reason = "removed robot"
+    else:
+        what = f"the track {track.name!r} belongs to another buffer; use the buffer that made it"
+        reason = "another buffer"
+    edge = (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
+    return InsertRefused(what, reason=reason, edge=edge)
+
+
 def _check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
-    array = np.array(poses, dtype=np.float64)
+    array = real_numbers(poses, "poses")
     if not edges or array.shape != (len(edges), 7):
         raise InvalidInput(
             f"{len(edges)} edges take poses of shape ({len(edges)}, 7), at least one; got {array.shape}"
@@ -306,5 +354,4 @@ def _check_poses(edges: Sequence[EdgeNames], poses: ArrayLike) -> Poses:
             reason="not a pose",
             edge=(parent, child),
         )
-    array[:, 3:] /= norms[:, None]
-    return array
+    return np.hstack((array[:, :3], array[:, 3:] / norms[:, None]))

@@ -30,12 +30,25 @@ class Offset(NamedTuple):
 ClockOffsets: TypeAlias = dict[str, Callable[[], Offset | None]]
 
 
+class Home:
+    """The buffer that a track belongs to, as far as its tracks and their errors know it."""
+
+    __slots__ = ("clock_offsets", "is_recording")
+
+    def __init__(self) -> None:
+        self.clock_offsets: ClockOffsets = {}
+        """By writer: how far its clock is ahead of the one here."""
+        self.is_recording = False
+        """Whether its samples come from a file: nothing is added to the history later."""
+
+
 class JointTrack:
     """The joint positions of one robot, and velocities from the first sample on that has them.
 
     A row is the positions in the order of ``model.joint_names``, then the velocities; velocities
     that were not published are NaN. ``prefix`` stands before the names of all links. ``writer`` is who
-    publishes the positions and ``model_writer`` who publishes the model, where that is known.
+    publishes the positions and ``model_writer`` who publishes the model, where that is known. ``home`` is
+    None once the robot was removed from its buffer.
     """
 
     def __init__(
@@ -48,7 +61,7 @@ class JointTrack:
         self.interpolation = interpolation
         self.writer: str | None = None
         self.model_writer: str | None = None
-        self.clock_offsets: ClockOffsets = {}
+        self.home: Home | None = None
         self.history = History(model.position_count, span_ns)
         # Quaternions of floating joints have to be looked at and normalised.
         self._plain = all(form.kind != "floating" for form in self.forms)
@@ -126,7 +139,7 @@ class PoseTrack:
     def __init__(self, edges: tuple[tuple[str, str], ...], span_ns: int, writer: str | None) -> None:
         self.edges = edges
         self.writer = writer
-        self.clock_offsets: ClockOffsets = {}
+        self.home: Home | None = None
         self.history = History(7 * len(edges), span_ns)
 
     def __repr__(self) -> str:
@@ -159,7 +172,11 @@ F = TypeVar("F", bound=LookupFailed)
 def of_track(failure: F, track: Track) -> F:
     """The same failure, with what is known of the track behind it and its writer's clock."""
     failure.track = track.name
-    ask = None if track.writer is None else track.clock_offsets.get(track.writer)
+    home = track.home
+    if home is None:
+        return failure
+    failure.is_recorded = home.is_recording
+    ask = None if track.writer is None else home.clock_offsets.get(track.writer)
     offset = None if ask is None else ask()
     if offset is not None:
         failure.clock_offset_ns, failure.clock_uncertainty_ns = offset

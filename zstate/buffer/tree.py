@@ -12,6 +12,7 @@ from zstate.buffer.edge import Edge
 from zstate.buffer.footing import Footing
 from zstate.buffer.names import Names
 from zstate.buffer.tracks import JointTrack, Track
+from zstate.checks import name_problem
 from zstate.errors import AmbiguousFrame, Disconnected, InsertRefused, UnknownFrame
 
 
@@ -91,12 +92,7 @@ class Tree:
 
     def check_edge(self, parent: str, child: str, writer: str | None) -> None:
         """InsertRefused when the edge cannot be: names, self edge, second parent, loop."""
-        for name in (parent, child):
-            problem = _name_problem(name)
-            if problem:
-                raise InsertRefused(
-                    f"{parent!r} -> {child!r}: {problem}", reason="frame name", edge=(parent, child)
-                )
+        self.check_names(parent, child)
         if parent == child:
             raise InsertRefused(
                 f"{parent!r} -> {child!r}: a frame cannot be placed on itself",
@@ -113,6 +109,15 @@ class Tree:
             )
         if existing is None and child in self.frames:
             self._refuse_loop(parent, child, writer)
+
+    @staticmethod
+    def check_names(parent: str, child: str) -> None:
+        """InsertRefused for an edge between what cannot be frame names."""
+        for name in (parent, child):
+            if problem := name_problem(name):
+                raise InsertRefused(
+                    f"{parent!r} -> {child!r}: {problem}", reason="frame name", edge=(parent, child)
+                )
 
     def _refuse_loop(self, parent: str, child: str, writer: str | None) -> None:
         chain = list(self.upwards(parent))
@@ -235,14 +240,6 @@ class Tree:
             return name
         candidates = self.names.with_bare(name)
         return candidates[0] if len(candidates) == 1 else None
-
-
-def _name_problem(name: str) -> str:
-    if not name:
-        return "a frame name is empty"
-    if name.startswith("/"):
-        return f"the frame name {name!r} begins with a slash; write {name.lstrip('/')!r}"
-    return ""
 
 
 def _by(writer: str | None) -> str:

@@ -17,9 +17,9 @@ Marks: TypeAlias = Mapping[Track, int | None]
 
 
 class Expected(NamedTuple):
-    """What ends a sleep: another footing in the tree, or each track at its mark.
+    """What ends a wait: another footing in the tree, or each track at its mark and around ``instant``.
 
-    A track whose samples all lie after ``instant`` ends it too, for then there will never be an answer.
+    A track that accepts no more samples as old as ``instant`` ends it too: no answer can come any more.
     """
 
     footing: Footing = Footing()
@@ -27,16 +27,23 @@ class Expected(NamedTuple):
     instant: int | None = None
 
     def has_come(self) -> bool:
-        """Whether samples have, or can never."""
+        """Whether samples have, or can never. Runs with each insert into one of the tracks."""
+        instant, missing = self.instant, not self.marks
         for track, stamp in self.marks.items():
-            newest = track.history.newest
-            if newest is None or (stamp is not None and newest < stamp):
-                return self.instant is not None and self._is_hopeless(self.instant)
-        return bool(self.marks)
+            history = track.history
+            newest, oldest = history.newest, history.oldest
+            if newest is None or oldest is None:
+                missing = True
+            elif (stamp is not None and newest < stamp) or (instant is not None and instant < oldest):
+                missing = True
+                if instant is not None and not history.reaches(instant):
+                    return True
+        return not missing
 
-    def _is_hopeless(self, instant: int) -> bool:
-        views = [track.history.view for track in self.marks]
-        return any(view.size and view.oldest > instant for view in views)
+    def is_hopeless(self) -> bool:
+        """Whether a track accepts no more samples as old as ``instant``."""
+        instant = self.instant
+        return instant is not None and not all(track.history.reaches(instant) for track in self.marks)
 
 
 class Waiter:

@@ -54,8 +54,10 @@ class AwaitedPose:
         transform = self._listener.buffer.lookup(*self._frames)
         assert transform.stamp is not None
         reason = self._listener.buffer.explain(*self._frames, transform.stamp + 1)
-        edge = "" if reason is None or reason.edge is None else f" of {' -> '.join(map(repr, reason.edge))}"
-        writer = "" if reason is None or reason.writer is None else f", which {reason.writer} wrote"
+        edge = writer = ""
+        if isinstance(reason, LookupFailed):
+            edge = "" if reason.edge is None else f" of {' -> '.join(map(repr, reason.edge))}"
+            writer = "" if reason.writer is None else f", which {reason.writer} wrote"
         age_s = self.age_s(transform)
         old = "" if age_s is None else f": the newest is {duration_text(round(age_s * 1e9))} old"
         return self._words.explained(f"no new sample{edge}{writer}{old}")

@@ -25,7 +25,8 @@ ZStateError
     ├── NoData                         an edge without any sample
     ├── InFuture                       asked after the newest sample of an edge
     ├── InPast                         asked before the oldest sample of an edge
-    └── Stale                          newer data was demanded by ``max_age_s``   .age_s .max_age_s
+    ├── Stale                          too old for ``max_age_s``, or silent       .age_s .max_age_s .other
+    └── NotFinite                      numbers too large to compute with
 
 A wait that ran out raises the reason it was still waiting for, as a subclass that is also
 ``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.
@@ -54,7 +55,7 @@ from zstate.errors.base import (
     ZStateError,
     printable,
 )
-from zstate.errors.instants import InFuture, InPast, NoData, Stale
+from zstate.errors.instants import InFuture, InPast, NoData, NotFinite, Stale
 from zstate.errors.lookup import AmbiguousFrame, Disconnected, LookupFailed, UnknownFrame
 from zstate.errors.timeouts import WaitTimeout, timed_out
 from zstate.errors.times import duration_text
@@ -79,6 +80,7 @@ __all__ = [
     "NetworkError",
     "NoClock",
     "NoData",
+    "NotFinite",
     "PortBusy",
     "RecordingError",
     "SecondWriter",

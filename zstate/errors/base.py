@@ -19,6 +19,9 @@ def printable(text: str) -> str:
 class ZStateError(Exception):
     """What every error of zstate is. Survives pickling, so that it can cross processes."""
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self)!r})"
+
     def facts(self) -> dict[str, Any]:
         """Everything it knows, by the names of its attributes."""
         return self.__dict__

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from zstate.errors.lookup import LookupFailed
-from zstate.errors.times import difference_text, duration_text
+from zstate.errors.times import difference_text, duration_text, instant_text
 
 _IN_THEIR_TIME = (
     "; ask in the time that they keep, or for the newest instant (at=None), and let all writers keep one time"
@@ -82,6 +82,8 @@ class InPast(_OutsideHistory):
         )
 
     def _advice(self) -> str:
+        if self.is_recorded:
+            return f"; the recording has nothing older of it, and {_span(self.newest, self.oldest)} in all"
         if self._has_one_sample:
             return (
                 " so far; ask for the newest instant (at=None), or start the listener earlier; what never "
@@ -94,7 +96,12 @@ class InPast(_OutsideHistory):
 
 
 class Stale(LookupFailed):
-    """The answer is older than ``max_age_s`` allows."""
+    """The answer is older than ``max_age_s`` allows, or ``edge`` is silent for so long that there is none.
+
+    An edge without new samples has no instant in common with ``other`` once the history of that one begins
+    after its last sample; ``other_newest`` [ns] is the newest sample of ``other``, and ``max_age_s`` None.
+    ``age_s`` is the age of the answer by the buffer's clock, or how much later ``other_newest`` is.
+    """
 
     def __init__(
         self,
@@ -102,7 +109,9 @@ class Stale(LookupFailed):
         source: str,
         *,
         age_s: float,
-        max_age_s: float,
+        max_age_s: float | None = None,
+        other: tuple[str, str] | None = None,
+        other_newest: int | None = None,
         edge: tuple[str, str] | None = None,
         requested: int | None = None,
         oldest: int | None = None,
@@ -122,8 +131,12 @@ class Stale(LookupFailed):
         )
         self.age_s = age_s
         self.max_age_s = max_age_s
+        self.other = other
+        self.other_newest = other_newest
 
     def explanation(self) -> str:
+        if self.max_age_s is None:
+            return self._silence()
         if self.clock_offset_ns is None:
             clocks = ", and do the clocks of both machines agree?"
         else:
@@ -131,6 +144,30 @@ class Stale(LookupFailed):
         return (
             f"the newest answer is {duration_text(round(self.age_s * 1e9))} old, {self.max_age_s:g} s are "
             f"allowed; the oldest link is {self._edge_text()}: is its writer alive (`zstate ls`){clocks}"
+        )
+
+    def _silence(self) -> str:
+        newest, other_newest = self.newest or 0, self.other_newest or 0
+        other = "the others" if self.other is None else f"{self.other[0]!r} -> {self.other[1]!r}"
+        if difference := difference_text(other_newest, newest):
+            return (
+                f"{self._edge_text()} and {other} have no instant in common: {difference}; let all writers "
+                "keep one time"
+            )
+        return (
+            f"{self._edge_text()} has been silent since {instant_text(newest)}: its newest sample is "
+            f"{duration_text(other_newest - newest)} older than that of {other}, whose history does not "
+            f"reach back so far; is its writer alive (`zstate ls`)?{_also(self._clock_text())}"
+        )
+
+
+class NotFinite(LookupFailed):
+    """The numbers on the path are so large that the result is infinite or NaN."""
+
+    def explanation(self) -> str:
+        return (
+            f"the result is not finite: numbers on the path are too large, {self._edge_text()} has the "
+            "largest; check the units and the positions that its writer publishes"
         )
 
 

@@ -22,12 +22,14 @@ class LookupFailed(ZStateError):
     read: a failed lookup in a control loop costs little. ``note`` says what else there is to know, ``ended``
     why no more data comes, where that is so.
     ``clock_offset_ns`` is how far the clock of the edge's writer is ahead of the one here, where that was
-    measured, and ``clock_uncertainty_ns`` how far off that may be.
+    measured, and ``clock_uncertainty_ns`` how far off that may be. ``is_recorded`` says that the samples
+    come from a recording.
     """
 
     clock_offset_ns: int | None = None
     clock_uncertainty_ns: int | None = None
     ended: str = ""
+    is_recorded: bool = False
 
     def __init__(
         self,
@@ -115,10 +117,6 @@ class UnknownFrame(LookupFailed):
         return facts
 
     def explanation(self) -> str:
-        if self.name.startswith("/"):
-            return f"the frame name {self.name!r} begins with a slash; write {self.name.lstrip('/')!r}"
-        if not self.name:
-            return "a frame name is empty; name both frames"
         if not self.frame_count:
             return (
                 f"the frame {self.name!r} is unknown: this buffer has not heard of any frame yet; "

@@ -63,6 +63,7 @@ def fill(
     Raises InvalidInput when it tells nothing of ``robot``.
     """
     tally = Tally()
+    buffer.home.is_recording = True
     transcript = Transcript(reader, tally.refuse)
     robots = None if robot is None else (check_recorded(transcript, robot),)
     shares_frames = any(speaker.foreign or _is_of_ros(speaker) for speaker in transcript.speakers)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
-from zstate.model.robot import Joint, JointType, RobotModel
+from zstate.model.robot import NORM_TOLERANCE, Joint, JointType, RobotModel
 from zstate.se3 import multiply, rotate, to_matrix
 
 if TYPE_CHECKING or kernel == "c":
@@ -29,9 +29,6 @@ EdgeKind = Literal["fixed", "hinge", "slide", "planar", "floating"]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Floats = NDArray[np.float64]
-
-NORM_TOLERANCE = 1e-3
-"""A floating joint's quaternion this close to unit length is normalised; beyond, it is refused."""
 
 _KINDS: dict[JointType, EdgeKind] = {
     "fixed": "fixed",

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -31,6 +32,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate.checks import real_numbers
 from zstate.errors import Found, InvalidInput
 
 JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
@@ -44,6 +46,11 @@ POSITION_COUNTS: dict[JointType, int] = {
     "floating": 7,
 }
 VELOCITY_COUNTS: dict[JointType, int] = {**POSITION_COUNTS, "floating": 6}
+
+NORM_TOLERANCE = 1e-3
+"""A floating joint's quaternion this close to unit length is normalised; beyond, it is refused."""
+
+_SEPARATORS = re.compile(r"[^a-z0-9]+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,15 +182,15 @@ class RobotModel:
 
         Raises InvalidInput naming the joints that are unknown (with near misses) or missing.
         """
-        problems = [self._unknown_joint(name) for name in values if name not in self.columns]
         missing = [name for name in self.joint_names if name not in values]
+        problems = [self._unknown_joint(name, missing) for name in values if name not in self.columns]
         if missing:
             problems.append(f"missing: {', '.join(repr(name) for name in missing)}")
         if problems:
             raise InvalidInput(f"joint positions of {self.name!r}: {'; '.join(problems)}")
         numbers: list[float] = []
         for joint in self.driven_joints:
-            given = np.atleast_1d(np.asarray(values[joint.name], dtype=np.float64))
+            given = np.atleast_1d(real_numbers(values[joint.name], f"the position of {joint.name!r}"))
             if given.size != POSITION_COUNTS[joint.type]:
                 raise InvalidInput(
                     f"joint {joint.name!r} is {joint.type} and takes {POSITION_COUNTS[joint.type]} "
@@ -195,9 +202,23 @@ class RobotModel:
     def check_positions(self, positions: ArrayLike) -> NDArray[np.float64]:
         """``positions`` as a contiguous float64 vector of the right length without NaN or infinity.
 
-        Raises InvalidInput saying how many numbers are wanted, or which joint is not finite.
+        Raises InvalidInput saying how many numbers are wanted, or which joint is not finite, or is floating
+        and has a quaternion whose length is more than 1e-3 from 1.
         """
-        return self._check(positions, self.position_count, "positions", POSITION_COUNTS)
+        vector = self._check(positions, self.position_count, "positions", POSITION_COUNTS)
+        for joint in self._floating_joints:
+            column = self.columns[joint.name] + 3
+            length = math.hypot(*vector[column : column + 4].tolist())
+            if abs(length - 1.0) > NORM_TOLERANCE:
+                raise InvalidInput(
+                    f"the floating joint {joint.name!r} of {joint.parent!r} -> {joint.child!r} was given a "
+                    f"quaternion of length {length:.6g}; its last four numbers are qx qy qz qw of length 1"
+                )
+        return vector
+
+    @cached_property
+    def _floating_joints(self) -> tuple[Joint, ...]:
+        return tuple(joint for joint in self.driven_joints if joint.type == "floating")
 
     def check_velocities(self, velocities: ArrayLike) -> NDArray[np.float64]:
         """The same for velocities."""
@@ -210,10 +231,7 @@ class RobotModel:
     def _check(
         self, values: ArrayLike, count: int, what: str, counts: Mapping[JointType, int]
     ) -> NDArray[np.float64]:
-        try:
-            vector = np.ascontiguousarray(values, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InvalidInput(f"{what} of {self.name!r} must be numbers: {error}") from None
+        vector = np.ascontiguousarray(real_numbers(values, f"{what} of {self.name!r}"))
         if vector.shape != (count,):
             raise InvalidInput(
                 f"{self.name!r} takes {count} {what}, shape ({count},), in the order of its "
@@ -235,13 +253,29 @@ class RobotModel:
         ]
         raise InvalidInput(f"{what} of {self.name!r} must be finite; not so: {', '.join(bad)}")
 
-    def _unknown_joint(self, name: str) -> str:
+    def _unknown_joint(self, name: str, missing: Sequence[str]) -> str:
         joint = self._joints_by_name.get(name)
         if joint is not None:
             kind = "fixed" if joint.mimic is None else f"a mimic of {joint.mimic.joint!r}"
             return f"{name!r} is {kind} and takes no position"
-        near = get_close_matches(name, self.joint_names, n=1)
-        return f"unknown joint {name!r}" + (f", did you mean {near[0]!r}?" if near else "")
+        near = near_joint(name, missing) or near_joint(name, self.joint_names)
+        return f"unknown joint {name!r}" + (f", did you mean {near!r}?" if near else "")
+
+
+def near_joint(name: object, known: Sequence[str]) -> str | None:
+    """The joint that was probably meant: one of nearly that name, or the only one that shares a word."""
+    words = _words(str(name))
+    by_words = {_words(one): one for one in reversed(known)}
+    near = get_close_matches("_".join(words), map("_".join, by_words), n=1)
+    if near:
+        return next(one for parts, one in by_words.items() if "_".join(parts) == near[0])
+    sharing = [one for parts, one in by_words.items() if set(parts).intersection(words)]
+    return sharing[0] if len(sharing) == 1 else None
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """What tells a joint's name from others: its words in small letters, without "joint"."""
+    return tuple(word for word in _SEPARATORS.split(name.lower()) if word not in ("", "joint"))
 
 
 def _starts(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[str, int]:

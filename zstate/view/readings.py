@@ -15,7 +15,7 @@ from zstate.buffer.edge import Edge
 from zstate.buffer.history import View
 from zstate.buffer.layout import Layout
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
-from zstate.errors import InPast, duration_text
+from zstate.errors import InPast, InvalidInput, duration_text
 from zstate.view.moment import Moment, Poses, Rows, Tree
 
 HELD_NS = 500_000_000
@@ -128,7 +128,7 @@ def _read(buffer: TransformBuffer, track: Track, view: View, stamp: int | None) 
         return _between(view, stamp)
     try:
         positions, _ = buffer.joint_positions(track, stamp)
-    except InPast:  # the history has moved on meanwhile
+    except (InPast, InvalidInput):  # the history has moved on meanwhile, or the robot was removed
         positions = view.rows[view.first, : track.model.position_count]
     return track.kinematics.edge_poses(positions)
 

@@ -393,6 +393,14 @@ history_newest_stamp(History *self, void *Py_UNUSED(closure))
     return PyLong_FromLongLong(self->block->stamps[self->end - 1]);
 }
 
+static PyObject *
+history_oldest_stamp(History *self, void *Py_UNUSED(closure))
+{
+    if (self->first == self->end)
+        Py_RETURN_NONE;
+    return PyLong_FromLongLong(self->block->stamps[self->first]);
+}
+
 static PyMethodDef history_methods[] = {
     {"insert", (PyCFunction)(void (*)(void))history_insert, METH_FASTCALL,
      "insert(stamp, row): False when the stamp is older than the history reaches."},
@@ -416,6 +424,7 @@ static PyMemberDef history_members[] = {
 static PyGetSetDef history_getset[] = {
     {"window", (getter)history_window, NULL, "(block, first, end): where the samples are.", NULL},
     {"newest", (getter)history_newest_stamp, NULL, "The last stamp [ns]; None without any.", NULL},
+    {"oldest", (getter)history_oldest_stamp, NULL, "The first stamp [ns]; None without any.", NULL},
     {NULL},
 };
 

@@ -64,11 +64,23 @@ all_finite(const double *numbers, Py_ssize_t count)
     return sum == 0.0;
 }
 
-/* So many finite doubles in a flat buffer. False, without an error, for anything else. */
+/* Whether its memory is all there is to it. Subclasses of numpy's array are left to the reference: a
+ * masked one offers its memory, not its mask. Types go by name: numpy's headers are not needed here. */
+static bool
+plain_array(PyObject *object)
+{
+    const char *type = Py_TYPE(object)->tp_name;
+    return strcmp(type, "numpy.ndarray") == 0 || PyMemoryView_Check(object) ||
+           strcmp(type, "array.array") == 0;
+}
+
+/* So many finite doubles in a flat array. False, without an error, for anything else. */
 static bool
 plain_numbers(PyObject *object, Py_buffer *view, Py_ssize_t count)
 {
-    if (!PyObject_CheckBuffer(object) || get_doubles(object, view, 0) < 0) {
+    if (!plain_array(object))
+        return false;
+    if (get_doubles(object, view, 0) < 0) {
         PyErr_Clear();
         return false;
     }
@@ -91,7 +103,7 @@ plain_block(PyObject *object, Py_buffer *view, Py_ssize_t count)
     return false;
 }
 
-/* The block of a flat buffer of so many finite doubles; None for anything else. */
+/* The block of a flat array of so many finite doubles; None for anything else. */
 static PyObject *
 block_of(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t count)
 {

@@ -52,6 +52,14 @@ normalized(Pose a)
     return (Pose){a.x, a.y, a.z, a.qx * scale, a.qy * scale, a.qz * scale, a.qw * scale};
 }
 
+static bool
+is_finite(Pose p)
+{
+    /* x * 0 is 0 for finite x and NaN otherwise: no branch for each number. */
+    double position = p.x * 0.0 + p.y * 0.0 + p.z * 0.0;
+    return position + (p.qx * 0.0 + p.qy * 0.0 + p.qz * 0.0 + p.qw * 0.0) == 0.0;
+}
+
 /* sin(r * angle) / sin(angle), as a series in cos(angle) - 1 = -less / 2, where less is the squared
  * chord between two unit quaternions: D. Eberly, "A Fast and Accurate Algorithm for Computing
  * SLERP" (2011). Each factor is below 0.005 for less < SMALL_CHORD, so that eight leave nothing to

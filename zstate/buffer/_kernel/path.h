@@ -87,8 +87,10 @@ newest_common(const Path *self, int64_t *at)
 static PyObject *
 answer_static(const Path *self, PyObject *stamp)
 {
-    return facts_new(self->type, self->target, self->source, pose_at(self, NULL), stamp,
-                     kind_static);
+    Pose pose = pose_at(self, NULL);
+    if (!is_finite(pose))
+        Py_RETURN_NONE;
+    return facts_new(self->type, self->target, self->source, pose, stamp, kind_static);
 }
 
 /* The answer at an instant, or None; `stamp` is NULL or the very object it was asked with. */
@@ -104,6 +106,8 @@ answer_at(const Path *self, int64_t at, PyObject *stamp, Between *nows)
             kind = kind_interpolated;
     }
     Pose pose = normalized(pose_at(self, nows));
+    if (!is_finite(pose))
+        Py_RETURN_NONE;
     if (stamp != NULL)
         return facts_new(self->type, self->target, self->source, pose, stamp, kind);
     stamp = PyLong_FromLongLong(at);
@@ -255,9 +259,12 @@ batch_pose(const Path *self, const Batch *batch, int64_t at, Pose *pose)
     for (Py_ssize_t i = 0; i < batch->tracks; i++)
         if (!rows_around(&batch->windows[i], at, &batch->nows[i]))
             return false;
-    *pose = pose_at(self, batch->nows);
+    Pose found = pose_at(self, batch->nows);
     if (batch->tracks != 0)
-        *pose = normalized(*pose);
+        found = normalized(found);
+    if (!is_finite(found))
+        return false;
+    *pose = found;
     return true;
 }
 

@@ -148,7 +148,9 @@ class StaticSection(_Section, frozen=True):
     def _angles(self) -> Vector3:
         if self.rpy is not None:
             return self.rpy
-        roll, pitch, yaw = self.rpy_deg or (0.0, 0.0, 0.0)
+        # Without full turns, which are plain in degrees; in radians they would be taken for a mistake.
+        degrees = self.rpy_deg or (0.0, 0.0, 0.0)
+        roll, pitch, yaw = (angle if abs(angle) <= 360.0 else angle % 360.0 for angle in degrees)
         return radians(roll), radians(pitch), radians(yaw)
 
 

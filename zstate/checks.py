@@ -1,0 +1,66 @@
+"""Checks of arguments: what is no frame name and what are no real numbers is refused where it comes in.
+
+numpy converts a good deal that is not meant: a string of digits is parsed, the imaginary part of a complex
+number is dropped, and so is the mask of a masked array. A silent conversion of a pose is a wrong pose.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zstate.errors import InvalidInput
+
+_KINDS = {
+    "b": "bool",
+    "c": "complex numbers",
+    "S": "text",
+    "U": "text",
+    "O": "objects",
+    "M": "dates",
+    "m": "durations",
+}
+
+
+def name_problem(name: object) -> str:
+    """Why ``name`` cannot be the name of a frame; empty if it can."""
+    if not isinstance(name, str):
+        return f"a frame name is text; got {name!r} of type {type(name).__name__}"
+    if not name:
+        return "a frame name is empty"
+    if name.startswith("/"):
+        return f"the frame name {name!r} begins with a slash; write {name.lstrip('/')!r}"
+    return ""
+
+
+def check_names(*names: object) -> None:
+    """Raises InvalidInput for what cannot be a frame name: anything but text, "", a leading slash."""
+    for name in names:
+        if problem := name_problem(name):
+            raise InvalidInput(problem)
+
+
+def real_numbers(values: ArrayLike, what: str) -> NDArray[np.float64]:
+    """``values`` as an array of float64, of any shape.
+
+    Raises InvalidInput for ragged lists and for arrays of anything but integers and floats: complex numbers,
+    bool, text, objects, and masked arrays.
+    """
+    try:
+        array: NDArray[Any] = np.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{what} must be numbers: {error}") from None
+    kind = array.dtype.kind
+    if kind not in "fiu":
+        raise InvalidInput(f"{what} must be real numbers, not {_KINDS.get(kind, str(array.dtype))}")
+    if is_masked(values):
+        raise InvalidInput(f"{what} must be a plain array; fill or leave out what this one masks")
+    return np.asarray(array, dtype=np.float64)
+
+
+def is_masked(values: object) -> bool:
+    """Whether it is a masked array of numpy, whose numbers are not all meant."""
+    # numpy.ma itself is not imported for this: it takes a hundredth of a second.
+    return isinstance(values, np.ndarray) and hasattr(values, "mask")
