@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from live import RRBOT, STAMP, Tap, kinematic_pose, settle
-from support import Child, until
+from support import DEADLINE_S, Child, until
 
+from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InPast, InvalidInput
 from zstate.listener import TransformListener
+from zstate.lookup_service import RecentBuffer
 from zstate.model.catalog import load_model
 from zstate.net.history import Memory, PastReader, answer_past
 from zstate.net.presence import announce
@@ -28,6 +32,7 @@ from zstate.wire.writer import Announced, Writer
 
 MS = 1_000_000
 PERIOD = 10 * MS
+PAST_NS = 500 * MS
 JOINTS = "zstate/r1/joint_states"
 ROUTER = """
     import sys
@@ -117,6 +122,51 @@ def test_what_was_before_and_what_is_live_join_without_a_gap(sessions: tuple[Ses
                 assert answers[0] == answers[1]
             assert late.stats.missed == late.stats.dropped == late.stats.late == 0
             assert late.stats.recalled >= 300
+
+
+@pytest.mark.parametrize("how", ["lookup", "wait", "wait_async", "join"])
+def test_a_wait_for_the_recent_past_right_after_joining_ends_with_the_exact_pose(
+    sessions: tuple[Session, Session], how: str
+):
+    """A publisher at 200 Hz, and one listener after the other; each asks for half a second ago at once."""
+    writer, reader = sessions
+    sine = SineSource(RRBOT)
+    with StatePublisher(writer, RRBOT, "r1") as publisher:
+        runner = threading.Thread(target=publisher.run, args=(sine, 200.0))
+        runner.start()
+        try:
+            began = time.time_ns()
+            until(lambda: time.time_ns() - began > PAST_NS + 100 * MS)
+            assert publisher.memory is not None
+            sent = RecentBuffer(RRBOT, "r1", publisher.memory)
+            for _ in range(5):
+                with TransformListener(reader, "r1") as listener:
+                    asked = time.time_ns() - PAST_NS
+                    # Bit for bit: no neighbour of that instant was still missing.
+                    assert waited(how, listener.buffer, asked) == sent.filled().lookup("world", "tool", asked)
+        finally:
+            publisher.close()
+            runner.join()
+
+
+def waited(how: str, buffer: TransformBuffer, at: int) -> Transform:
+    """The pose of the tool at ``at``, by one of the calls that wait."""
+    if how == "lookup":
+        return buffer.lookup("world", "tool", at, timeout_s=DEADLINE_S)
+    if how == "wait":
+        return buffer.wait("world", "tool", at, DEADLINE_S)
+    if how == "wait_async":
+        return asyncio.run(buffer.wait_async("world", "tool", at, DEADLINE_S))
+    return asyncio.run(joined(buffer, at))
+
+
+async def joined(buffer: TransformBuffer, at: int) -> Transform:
+    async def samples() -> AsyncIterator[SimpleNamespace]:
+        yield SimpleNamespace(frame="tool", stamp=at)
+
+    async for _, transform in buffer.join(samples(), "world", timeout_s=DEADLINE_S):
+        return transform
+    raise AssertionError("the sample was dropped")
 
 
 def test_a_robot_of_many_samples_is_learned_page_by_page_through_a_router(

@@ -1,23 +1,36 @@
 """The public surface, pinned: a change here is a change for every user, and belongs in CHANGELOG.md."""
 
 import inspect
+import subprocess
+import sys
 from importlib import metadata, resources
 
 import pytest
+from live import settle
+from support import DEADLINE_S
+from tales import START, S, Tale, swing
 
 import zstate
 
 NAMES = [
+    "AccessDenied",
+    "AmbiguousFrame",
+    "Closed",
     "Disconnected",
     "InFuture",
     "InPast",
     "InsertRefused",
+    "InvalidInput",
+    "JointReading",
     "Kinematics",
     "LookupFailed",
     "ModelError",
     "NoData",
     "Recording",
+    "RecordingError",
     "RobotModel",
+    "SecondWriter",
+    "SimulatedClock",
     "SineSource",
     "Stale",
     "StatePublisher",
@@ -27,6 +40,7 @@ NAMES = [
     "TransformListener",
     "Twist",
     "UnknownFrame",
+    "Unreachable",
     "ZStateError",
     "connect",
     "discover",
@@ -42,6 +56,11 @@ SIGNATURES = {
     "Kinematics.edge_poses": "(positions, out=None)",
     "Kinematics.link_poses": "(positions, out=None)",
     "Kinematics.twist": "(link, positions, velocities, reference=None)",
+    "JointReading": "(positions, velocities=None, efforts=None, stamp=None)",
+    "SimulatedClock": "(session, wire='native', *, timeout_s=5.0)",
+    "SimulatedClock.now": "()",
+    "SimulatedClock.wait": "(timeout_s=None)",
+    "SimulatedClock.close": "()",
     "SineSource": "(model, period_s=6.0)",
     "SineSource.read": "(stamp)",
     "StatePublisher": (
@@ -98,9 +117,16 @@ SIGNATURES = {
 
 ERRORS = {
     "ZStateError": Exception,
-    "InsertRefused": ValueError,
+    "AccessDenied": zstate.ZStateError,
+    "Closed": zstate.ZStateError,
+    "InvalidInput": ValueError,
+    "InsertRefused": zstate.InvalidInput,
+    "RecordingError": zstate.ZStateError,
+    "SecondWriter": zstate.ZStateError,
+    "Unreachable": TimeoutError,
     "ModelError": ValueError,
     "LookupFailed": zstate.ZStateError,
+    "AmbiguousFrame": zstate.LookupFailed,
     "Disconnected": zstate.LookupFailed,
     "InFuture": zstate.LookupFailed,
     "InPast": zstate.LookupFailed,
@@ -128,9 +154,9 @@ def signature_of(path: str) -> str:
     return str(inspect.Signature(parameters))
 
 
-def test_the_front_door_has_these_names_and_at_most_24():
+def test_the_front_door_has_these_names_and_at_most_34():
     assert sorted(zstate.__all__) == NAMES
-    assert len(NAMES) <= 24
+    assert len(NAMES) <= 34
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -168,6 +194,12 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
         zstate.Publisher  # noqa: B018
 
 
+def test_every_error_is_reached_by_importing_the_package_alone():
+    program = "import zstate; print(issubclass(zstate.errors.FrameMismatch, zstate.InvalidInput))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
+
+
 def test_values_cannot_be_changed():
     base_from_hand = zstate.Transform("base", "hand", [0, 0, 1], [0, 0, 0, 1])
     with pytest.raises(AttributeError):
@@ -175,6 +207,48 @@ def test_values_cannot_be_changed():
     with pytest.raises(ValueError, match="read-only"):
         base_from_hand.translation[0] = 1.0
     assert base_from_hand.translation.tolist() == [0, 0, 1]
+
+
+def test_a_repr_is_one_short_line_that_tells_one_object_from_another(sessions, tmp_path):
+    model = zstate.load_model("rrbot")
+    with (
+        zstate.StatePublisher(sessions[0], model, "r1") as publisher,
+        zstate.StaticPublisher(sessions[0], "r1", "mount") as statics,
+        zstate.TransformListener(sessions[1], "r1") as listener,
+    ):
+        statics.set(zstate.Transform("tool", "camera", (0, 0, 1), (0, 0, 0, 1)))
+        settle(sessions[0], "r1")
+        publisher.publish([0.0, 0.0])
+        listener.buffer.lookup("world", "camera", timeout_s=DEADLINE_S)
+        watch = listener.buffer.watch("world", "camera", lambda transform: None)
+        (robot,) = zstate.discover(sessions[1])
+        shown = {
+            publisher: "<StatePublisher of 'r1' on native: 1 samples>",
+            statics: "<StaticPublisher 'mount' of 'r1': 1 edges>",
+            listener: "<TransformListener of 'r1': 1 robots, 1 samples received>",
+            listener.buffer: "<TransformBuffer: 8 frames of 'r1', 10 s of history>",
+            watch: "<Watch of 'camera' in 'world'>",
+            listener.buffer.join(samples(), "world"): "<Join with 'world': 0 joined>",
+            zstate.Kinematics(model): "<Kinematics of 'rrbot', 7 links>",
+            model: "RobotModel('rrbot', 7 links, 2 driven joints)",
+        }
+        assert [repr(thing) for thing in shown] == list(shown.values())
+        assert repr(robot).startswith("<robot 'r1': ")
+        assert "writes joint_states, robot_description, tf, tf_static" in repr(robot)
+        watch.close()
+    assert repr(publisher) == "<StatePublisher of 'r1' on native: 1 samples, closed>"
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        tale.joints("arm", START + S, swing(0), heard=START + S)
+    with zstate.Recording(tmp_path / "r.mcap") as recording:
+        assert repr(recording) == f"<Recording '{tmp_path}/r.mcap': 1 s, robots 'arm'>"
+        assert repr(recording.buffer()).endswith("frames of 'arm', of a recording>")
+
+
+async def samples():
+    """None."""
+    for sample in ():
+        yield sample
 
 
 def test_the_version_is_that_of_the_package():

@@ -61,7 +61,7 @@ def test_positions_may_come_by_name_in_any_order(sessions):
     [
         (([1.0],), r"takes 2 positions, shape \(2,\).*got shape \(1,\)"),
         (([[1.0, 2.0]],), r"got shape \(1, 2\)"),
-        ((["a", "b"],), "must be numbers"),
+        ((["a", "b"],), "must be real numbers"),
         (([0.0, NAN],), r"must be finite; not so: 'elbow' \(nan\)"),
         (([-INF, 0.0],), r"'shoulder' \(-inf\)"),
         (({"elbow": 1.0},), "missing: 'shoulder'"),

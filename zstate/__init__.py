@@ -4,6 +4,7 @@
 into a. Quaternions are x y z w, units are SI, stamps are integer nanoseconds since the Unix epoch.
 
 Names are loaded when they are first used: a program that only reads transforms loads no kinematics.
+``zstate.errors`` has every exception; those that programs catch most stand here, too.
 """
 
 from __future__ import annotations
@@ -14,15 +15,22 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from zstate.buffer.buffer import TransformBuffer
     from zstate.errors import (
+        AccessDenied,
+        AmbiguousFrame,
+        Closed,
         Disconnected,
         InFuture,
         InPast,
         InsertRefused,
+        InvalidInput,
         LookupFailed,
         ModelError,
         NoData,
+        RecordingError,
+        SecondWriter,
         Stale,
         UnknownFrame,
+        Unreachable,
         ZStateError,
     )
     from zstate.extension import kernel
@@ -34,7 +42,8 @@ if TYPE_CHECKING:
     from zstate.net.session import connect
     from zstate.publisher import StatePublisher
     from zstate.recording import Recording
-    from zstate.sources import SineSource
+    from zstate.simulated_clock import SimulatedClock
+    from zstate.sources import JointReading, SineSource
     from zstate.statics import StaticPublisher
     from zstate.transform import Transform
     from zstate.twist import Twist
@@ -42,16 +51,24 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AccessDenied",
+    "AmbiguousFrame",
+    "Closed",
     "Disconnected",
     "InFuture",
     "InPast",
     "InsertRefused",
+    "InvalidInput",
+    "JointReading",
     "Kinematics",
     "LookupFailed",
     "ModelError",
     "NoData",
     "Recording",
+    "RecordingError",
     "RobotModel",
+    "SecondWriter",
+    "SimulatedClock",
     "SineSource",
     "Stale",
     "StatePublisher",
@@ -61,6 +78,7 @@ __all__ = [
     "TransformListener",
     "Twist",
     "UnknownFrame",
+    "Unreachable",
     "ZStateError",
     "connect",
     "discover",
@@ -69,9 +87,11 @@ __all__ = [
 ]
 
 _HOMES = {
+    "JointReading": "sources",
     "Kinematics": "model.kinematics",
     "Recording": "recording",
     "RobotModel": "model.robot",
+    "SimulatedClock": "simulated_clock",
     "SineSource": "sources",
     "StatePublisher": "publisher",
     "StaticPublisher": "statics",
@@ -87,6 +107,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "errors":
+        return import_module("zstate.errors")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value: object = getattr(import_module(f"{__name__}.{_HOMES.get(name, 'errors')}"), name)

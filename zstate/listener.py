@@ -127,6 +127,10 @@ class TransformListener(Closing):
         for announcement in announce_reader(session, self._wire, robot, self._heard):
             opening.enter_context(announcement)
 
+    def __repr__(self) -> str:
+        robots, received = len(self.robots()), self.stats.received
+        return f"<TransformListener of {self.robot!r}: {robots} robots, {received} samples received>"
+
     @property
     def stats(self) -> Stats:
         """What has been received, lost and refused so far."""

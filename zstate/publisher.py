@@ -106,6 +106,10 @@ class StatePublisher(Closing):
             self.memory = self._remembering(session, streams, cache_s, opening)
             self._opened = opening.pop_all()
 
+    def __repr__(self) -> str:
+        closed = ", closed" if self._stop.is_set() else ""
+        return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._seq} samples{closed}>"
+
     def _remembering(
         self, session: Session, streams: Sequence[Stream], cache_s: float, opening: ExitStack
     ) -> Memory | None:

@@ -37,6 +37,10 @@ class Recording(Closing):
             self.close()
             raise
 
+    def __repr__(self) -> str:
+        robots = ", ".join(map(repr, self.robots)) or "none"
+        return f"<Recording {str(self.info.path)!r}: {self.info.duration_s:g} s, robots {robots}>"
+
     def buffer(self) -> TransformBuffer:
         """All of it in a buffer, as ``TransformBuffer.from_recording`` makes one."""
         buffer = TransformBuffer(HISTORY_S)

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from urllib.parse import quote
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.checks import check_names
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock
@@ -75,6 +76,10 @@ class StaticPublisher(Closing):
                 self._claim.settle()
             self._opened = opening.pop_all()
 
+    def __repr__(self) -> str:
+        closed = ", closed" if self._closed else ""
+        return f"<StaticPublisher {self.writer!r} of {self.robot!r}: {len(self._edges)} edges{closed}>"
+
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
 
@@ -108,6 +113,7 @@ class StaticPublisher(Closing):
 
     def withdraw(self, child: str) -> None:
         """Take back the edge that places ``child``. Raises InvalidInput if it is not one of ours."""
+        check_names(child)
         name = full_name(self.robot, child)
         with self._lock:
             self._check_open()

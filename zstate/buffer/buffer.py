@@ -36,6 +36,13 @@ class TransformBuffer(Questions):
     from any thread.
     """
 
+    def __repr__(self) -> str:
+        robots = [repr(track.name) for track in list(self._tree.robots.values()) if track is not None]
+        more = f" and {len(robots) - 3} more" if len(robots) > 3 else ""
+        named = f" of {', '.join(robots[:3])}{more}" if robots else ""
+        kept = "of a recording" if self.home.is_recording else f"{self.history_s:g} s of history"
+        return f"<TransformBuffer: {len(self._tree.frames)} frames{named}, {kept}>"
+
     @classmethod
     def from_recording(
         cls, path: str | Path, robot: str | None = None, *, clock: Clock | None = None
@@ -234,7 +241,7 @@ class TransformBuffer(Questions):
         if self._ended:
             raise Closed(self._ended)
         look = partial(self._newest, self._question(target, source, None))
-        return Watch(self._room, look, callback, translation_m, rotation_rad)
+        return Watch(self._room, (target, source), look, callback, translation_m, rotation_rad)
 
     def join(
         self,

@@ -53,6 +53,11 @@ class Join(Generic[S]):
         self._stamp = stamp
         self._timeout_s = timeout_s
 
+    def __repr__(self) -> str:
+        reasons = ", ".join(f"{count} {name}" for name, count in self.dropped.items())
+        dropped = f", {self.dropped.total()} dropped ({reasons})" if reasons else ""
+        return f"<Join with {self.target!r}: {self.joined} joined{dropped}>"
+
     def __aiter__(self) -> AsyncIterator[tuple[S, Transform]]:
         return self
 

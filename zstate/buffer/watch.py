@@ -28,6 +28,7 @@ class Watch(Closing):
     def __init__(
         self,
         room: WaitingRoom,
+        names: tuple[str, str],
         look: Look,
         callback: Callable[[Transform], object],
         translation_m: float | None,
@@ -36,6 +37,7 @@ class Watch(Closing):
         for name, value in (("translation_m", translation_m), ("rotation_rad", rotation_rad)):
             if value is not None and not (math.isfinite(value) and value >= 0.0):
                 raise InvalidInput(f"{name} is zero or more; got {value!r}")
+        self.target, self.source = names
         self.failures = 0
         self.last_failure: Exception | None = None
         self._look_now = look
@@ -47,6 +49,10 @@ class Watch(Closing):
         self._seat = ExitStack()
         self._waiter = self._seat.enter_context(room.seat(self._look))
         self._look()
+
+    def __repr__(self) -> str:
+        failures = f", {self.failures} failures" if self.failures else ""
+        return f"<Watch of {self.source!r} in {self.target!r}{failures}>"
 
     def close(self) -> None:
         """No more calls. A second call does nothing."""

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 _GRACE_S = 0.5
 
 _LEAVE_OUT = "leave --at out for the newest pose"
+_NOT_RECEIVED = (
+    "this command knows what it receives while it runs, and what publishers still have of the last seconds: "
+    f"{_LEAVE_OUT}, or name an instant to come"
+)
 
 
 class AwaitedPose:
@@ -83,10 +87,7 @@ class AwaitedPose:
     def _refuse_past(self, reason: InPast) -> NoReturn:
         if reason.is_of_another_time:
             fail(f"{self._words.explained(reason.happening)}; {_LEAVE_OUT}")
-        fail(
-            f"{self._words.explained(reason.happening)}; this command knows only what comes while it runs: "
-            f"{_LEAVE_OUT}, or name an instant to come"
-        )
+        fail(f"{self._words.explained(reason.happening)}; {_NOT_RECEIVED}")
 
     def _give_up(self, reason: WaitTimeout, timeout_s: float) -> NoReturn:
         advice = ""
@@ -96,12 +97,14 @@ class AwaitedPose:
                 if reason.is_of_another_time
                 else f"; wait longer (--timeout), or {_LEAVE_OUT}"
             )
+        if isinstance(reason, InPast):
+            advice = f"; {_LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED}"
         fail(f"gave up after {timeout_s:g} s: {self._explained(reason, self._hint(reason))}{advice}")
 
     def _explained(self, reason: LookupFailed, hint: str) -> str:
         if isinstance(reason, UnknownFrame) and not reason.frame_count:
             return hint  # no frame at all is known: that is not about this one
-        if isinstance(reason, InFuture):
+        if isinstance(reason, InFuture | InPast):
             return self._words.explained(reason.happening)  # what a program would do is of no use here
         return f"{self._words.explained(reason.explanation())}{f' ({hint})' if hint else ''}"
 

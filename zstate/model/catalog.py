@@ -25,8 +25,9 @@ def load_model(
     """The robot in a file, in URDF text, or behind a catalog name such as "panda".
 
     A str that contains ``<`` is text; one that is the path of a file, contains a slash or ends in .urdf,
-    .xacro or .xml is a path; any other is a name in ``catalog()``. Xacro is
-    expanded, with ``xacro_args``, when ``zstate[xacro]`` is installed; that runs the expressions in the file.
+    .xacro or .xml is a path; any other is a name in ``zstate.model.catalog.catalog()``.
+    Xacro is expanded, with ``xacro_args``, when ``zstate[xacro]`` is installed; that runs the expressions
+    in the file.
 
     Raises ModelError with all ``findings`` and their lines; UnknownModel with near misses; InvalidInput
     when ``xacro_args`` are given for what is no xacro.

@@ -38,6 +38,9 @@ class Kinematics:
         self._table = EdgeTable(model)
         self._lock = new_lock()
 
+    def __repr__(self) -> str:
+        return f"<Kinematics of {self.model.name!r}, {len(self.model.links)} links>"
+
     def edge_poses(self, positions: ArrayLike, out: Floats | None = None) -> Floats:
         """The pose of every link but the root in its parent.
 

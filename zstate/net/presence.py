@@ -53,6 +53,13 @@ class RobotInfo:
     writers: tuple[tuple[Stream, Writer], ...]
     static_names: tuple[tuple[str, Writer], ...] = ()
 
+    def __repr__(self) -> str:
+        streams: dict[str, list[str]] = {}
+        for stream, writer in self.writers:
+            streams.setdefault(str(writer), []).append(stream)
+        written = "; ".join(f"{writer} writes {', '.join(what)}" for writer, what in streams.items())
+        return f"<robot {self.name!r}: {written or 'no writer'}>"
+
     def names_of(self, writer: Writer) -> tuple[str, ...]:
         """The names under which ``writer`` writes static edges, sorted."""
         return tuple(name for name, said_by in self.static_names if said_by == writer)
