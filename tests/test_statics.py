@@ -248,6 +248,16 @@ def test_withdrawing_what_is_not_ours_names_what_is(sessions):
             statics.withdraw("laser")
 
 
+@pytest.mark.parametrize("name", [None, 5, "", "/tool", ["tool"]], ids=repr)
+def test_what_can_be_no_frame_name_is_refused_by_a_static_publisher(sessions, name):
+    with StaticPublisher(sessions[0], "r1", "mount") as statics:
+        statics.set(edge("tool", "camera", 1.0))
+        with pytest.raises(InvalidInput, match="frame name"):
+            statics.withdraw(name)
+        with pytest.raises(InvalidInput, match="frame name"):
+            statics.set(edge("tool", name, 1.0))
+
+
 def test_full_names_join_two_robots_in_one_buffer(sessions):
     writer, reader = sessions
     with (

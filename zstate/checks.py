@@ -63,4 +63,4 @@ def real_numbers(values: ArrayLike, what: str) -> NDArray[np.float64]:
 def is_masked(values: object) -> bool:
     """Whether it is a masked array of numpy, whose numbers are not all meant."""
     # numpy.ma itself is not imported for this: it takes a hundredth of a second.
-    return isinstance(values, np.ndarray) and hasattr(values, "mask")
+    return hasattr(values, "mask") and isinstance(values, np.ndarray)

@@ -114,7 +114,7 @@ def check_stamp(stamp: Any) -> int:
     if isinstance(stamp, np.integer):
         return check_stamp(int(cast("np.integer[Any]", stamp)))
     if isinstance(stamp, np.datetime64):
-        return int(check_stamps(np.atleast_1d(stamp))[0])
+        return int(check_stamps(np.atleast_1d(cast("np.datetime64[Any]", stamp)))[0])
     raise InvalidInput(
         f"a stamp is a 64-bit integer count of nanoseconds since the Unix epoch, not {stamp!r}; "
         "use time.time_ns(), or round(seconds * 1e9) when seconds is all there is"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias, overload
+from typing import Any, TypeAlias, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -103,8 +103,10 @@ class Transform(Facts):
     def from_matrix(cls, target: str, source: str, matrix: ArrayLike, stamp: int | None = None) -> Transform:
         """From a homogeneous (4, 4) matrix whose rotation is orthonormal within 1e-3."""
         array = real_numbers(matrix, "a transform's matrix")
-        if array.shape != (4, 4) or not np.isfinite(array).all():
-            raise InvalidInput(f"a transform's matrix is (4, 4) and finite; got {array!r}")
+        if array.shape != (4, 4):
+            raise InvalidInput(f"a transform's matrix has shape (4, 4); got {array.shape}")
+        if not np.isfinite(array).all():
+            raise InvalidInput(f"a transform's matrix must be finite; got {array.tolist()}")
         rotation = array[:3, :3]
         error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
         if error > QUATERNION_TOLERANCE or np.linalg.det(rotation) < 0.0:
@@ -206,10 +208,10 @@ class Transform(Facts):
             max(self.predicted_s, other.predicted_s),
         )
 
-    def _apply_to_points(self, points: ArrayLike) -> Array:
+    def _apply_to_points(self, points: object) -> Array:
         if not (isinstance(points, (list, tuple)) or hasattr(points, "__array__")):
             return NotImplemented
-        array = real_numbers(points, "points")
+        array = real_numbers(cast("ArrayLike", points), "points")
         if array.ndim == 0 or array.shape[-1] != 3:
             # Four columns could be homogeneous points, each in a row, or a matrix.
             raise InvalidInput(

@@ -420,6 +420,8 @@ def test_joints_between_huge_positions_are_not_finite_and_no_error_of_python() -
         with pytest.raises(NotFinite) as caught:
             call()
         assert caught.value.edge is not None
+    with pytest.raises(NotFinite, match="pose of 'follower' in 'root'"):
+        buffer.link_poses(track, 0)
     assert not buffer.lookup_many("body", "follower", [0, S // 2, S])[1].any()
 
 

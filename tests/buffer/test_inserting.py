@@ -233,7 +233,7 @@ def test_a_static_edge_is_replaced_by_a_later_one_whatever_its_stamp() -> None:
 
 
 def test_the_history_given_must_be_a_positive_number_of_seconds() -> None:
-    for history_s in (0.0, -1.0, math.nan, math.inf):
+    for history_s in (0.0, -1.0, math.nan, math.inf, "10", None, 1j):
         with pytest.raises(InvalidInput, match="history_s"):
             TransformBuffer(history_s)
 

@@ -197,9 +197,14 @@ def test_unusual_input_is_left_to_the_reference() -> None:
         np.zeros((1, 3)),
         np.zeros(6)[::2],
         row * np.nan,
+        np.ma.masked_equal(row, 0.0),
+        row.astype(complex),
+        row.astype(bool),
+        row.astype(object),
         "abc",
     ):
         assert history.take(1, numbers, None, 3) is None
+        assert block_of(numbers, 3) is None
     for block in (b"", b"x" * 24 + b"y", row.tobytes()[8:], (row * np.nan).tobytes(), bytearray(24)):
         assert history.take(1, block, None, 3) is None
     assert history.take(1, row, None, 3) is True

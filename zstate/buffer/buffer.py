@@ -241,7 +241,8 @@ class TransformBuffer(Questions):
         if self._ended:
             raise Closed(self._ended)
         look = partial(self._newest, self._question(target, source, None))
-        return Watch(self._room, (target, source), look, callback, translation_m, rotation_rad)
+        limits = {"translation_m": translation_m, "rotation_rad": rotation_rad}
+        return Watch(self._room, (target, source), look, callback, **limits)
 
     def join(
         self,
@@ -283,4 +284,9 @@ class TransformBuffer(Questions):
         Row i is ``root_from_link``: x y z [m], qx qy qz qw. Raises as ``joint_positions``.
         """
         positions, stamp = self.joint_positions(track, at)
-        return track.kinematics.link_poses(positions), stamp
+        poses = track.kinematics.link_poses(positions)
+        unknown = ~np.isfinite(poses).all(axis=1)
+        if unknown.any():
+            link = track.model.links[int(unknown.argmax())]
+            raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
+        return poses, stamp

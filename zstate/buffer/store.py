@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from numbers import Real
 from typing import get_args
 
 import numpy as np
@@ -39,7 +39,7 @@ class Store:
     """
 
     def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
-        if not (math.isfinite(history_s) and 0.0 < history_s < 1e9):
+        if not isinstance(history_s, Real) or not 0.0 < history_s < 1e9:
             raise InvalidInput(f"history_s is a positive number of seconds, not {history_s!r}")
         self.history_s = history_s
         self.clock: Clock = clock or SystemClock()

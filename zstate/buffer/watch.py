@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
+from numbers import Real
 
 from zstate import se3
 from zstate.buffer.waiting import Waiter, WaitingRoom
@@ -31,11 +32,12 @@ class Watch(Closing):
         names: tuple[str, str],
         look: Look,
         callback: Callable[[Transform], object],
+        *,
         translation_m: float | None,
         rotation_rad: float | None,
     ) -> None:
         for name, value in (("translation_m", translation_m), ("rotation_rad", rotation_rad)):
-            if value is not None and not (math.isfinite(value) and value >= 0.0):
+            if value is not None and not (isinstance(value, Real) and 0.0 <= value < math.inf):
                 raise InvalidInput(f"{name} is zero or more; got {value!r}")
         self.target, self.source = names
         self.failures = 0

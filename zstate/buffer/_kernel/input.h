@@ -64,8 +64,9 @@ all_finite(const double *numbers, Py_ssize_t count)
     return sum == 0.0;
 }
 
-/* Whether its memory is all there is to it. Subclasses of numpy's array are left to the reference: a
- * masked one offers its memory, not its mask. Types go by name: numpy's headers are not needed here. */
+/* Whether its memory is all there is to it. Subclasses of numpy's array are left to the reference:
+ * a masked one offers its memory, not its mask. Types go by name: numpy's headers are not needed
+ * here. */
 static bool
 plain_array(PyObject *object)
 {
