@@ -1,3 +1,4 @@
+import logging
 import threading
 import time
 
@@ -229,3 +230,36 @@ def test_samples_of_several_threads_all_go_out_numbered_without_a_gap(sessions):
         for thread in threads:
             thread.join()
         assert [state.seq for state in tap.joint_states(200)] == list(range(200))
+
+
+ARM = load_model(
+    '<robot name="arm"><link name="base"/><link name="tip"/>'
+    '<joint name="lift" type="revolute"><parent link="base"/><child link="tip"/><axis xyz="0 0 1"/>'
+    '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>'
+)
+
+
+def test_positions_outside_limits_are_published_counted_and_logged_once(sessions, caplog):
+    tap = Tap(sessions[1], JOINTS)
+    with caplog.at_level(logging.WARNING, "zstate"), StatePublisher(sessions[0], ARM, "r1") as publisher:
+        await_reader(sessions[0], JOINTS)
+        for number in range(200):
+            # Every second sample is in degrees; one second holds all but the first and the last.
+            publisher.publish([45.0 * (number % 2)], stamp=STAMP + number * 1_000_000)
+        publisher.publish([45.0], stamp=STAMP + 2_000_000_000)
+        stats = publisher.stats
+        assert len(tap.payloads(201)) == 201
+    text = "'lift' at 45.0 rad is outside -2 to 2; this looks like degrees: convert with math.radians"
+    assert (stats.sent, stats.outside_limits, stats.last_excess) == (201, 101, text)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"r1: {text}; further samples outside limits are only counted"
+    ]
+    tap.close()
+
+
+def test_the_first_sample_outside_limits_is_logged_at_once(sessions, caplog):
+    with caplog.at_level(logging.WARNING, "zstate"), StatePublisher(sessions[0], ARM, "r1") as publisher:
+        publisher.publish({"lift": -3.5}, stamp=STAMP)
+        assert publisher.stats.outside_limits == 1
+    (record,) = caplog.records
+    assert "'lift' at -3.5 rad is outside -2 to 2; further" in record.getMessage()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from zstate.rate import RateReport
@@ -49,6 +51,14 @@ def test_ticks_that_were_late_or_skipped_since_the_last_time_are_a_warning():
     assert level == "warn"
     assert "40 ticks late and 20 skipped: 100 Hz" in text
     assert verdict(before, counts(200, rate_hz=100.0, late=3, skipped=1), quiet_ns=0) == OK
+
+
+def test_samples_outside_joint_limits_are_a_warning_that_names_the_joint():
+    before = replace(counts(5), outside_limits=2, last_excess="'lift' at 3.0 rad is outside -2 to 2")
+    now = replace(counts(9), outside_limits=5, last_excess="'lift' at 4.0 rad is outside -2 to 2")
+    text = "3 samples are outside joint limits: 'lift' at 4.0 rad is outside -2 to 2"
+    assert verdict(before, now, quiet_ns=0) == Verdict("warn", text)
+    assert verdict(now, replace(now, sent=12), quiet_ns=0) == OK
 
 
 def test_the_ticks_of_an_earlier_run_are_not_those_of_this_one():

@@ -14,6 +14,7 @@ from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock, outlive_fork
 from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.model.limits import JointLimits
 from zstate.model.robot import RobotModel
 from zstate.moving_edges import MovingEdges, Positions
 from zstate.net.claims import Claim
@@ -26,7 +27,7 @@ from zstate.net.status import StatusPublisher
 from zstate.net.wires import wire_named, wire_names
 from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
-from zstate.status import Beat, PublisherStats, StreamStats
+from zstate.status import Beat, LimitWatch, PublisherStats, StreamStats
 from zstate.wire.keys import MODEL_WRITER, Stream, check_robot
 from zstate.wire.messages import (
     JointState,
@@ -88,6 +89,8 @@ class StatePublisher(Closing):
         self._wires = wires = wire_names(wires)
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
+        limits = JointLimits(model)
+        self._limits = LimitWatch(limits, self.robot) if limits and wires else None
         sample_names = SampleNames(coordinate_names(model), velocity_slots(model), self._edges.names)
         writer = writer_here(self._session_id, program)
         with ExitStack() as opening:
@@ -168,7 +171,11 @@ class StatePublisher(Closing):
             for stream, outlet in output.outlets.items()
         }
         rate = None if self._rate is None else self._rate.report()
-        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate)
+        counts = (self._seq, self._refused, self._last_refusal, streams, rate)
+        limits = self._limits
+        return (
+            PublisherStats(*counts) if limits is None else PublisherStats(*counts, limits.count, limits.last)
+        )
 
     def publish(
         self,
@@ -181,9 +188,10 @@ class StatePublisher(Closing):
 
         ``positions`` [rad] or [m] are in the order of ``model.joint_names``, or a mapping of joint names
         that has all of them; ``velocities`` per second and ``efforts`` [Nm] or [N] likewise in that order
-        where they are known. Raises InvalidInput for wrong counts, unknown or missing names, NaN and
-        infinity, a floating joint without a unit quaternion, a stamp that a wire cannot say, and Closed
-        and SecondWriter; then nothing was sent.
+        where they are known. Positions outside joint limits are published, counted in ``stats``, and
+        logged once. Raises InvalidInput for wrong counts, unknown or missing names, NaN and infinity, a
+        floating joint without a unit quaternion, a stamp that a wire cannot say, and Closed and
+        SecondWriter; then nothing was sent.
         """
         try:
             self._publish(positions, velocities, efforts, stamp)
@@ -216,6 +224,8 @@ class StatePublisher(Closing):
                 self.memory.keep(state)
             for outlet, payload in said:
                 outlet.put(payload)
+            if self._limits is not None:
+                self._limits.add(stamp, block)
 
     def _yield_to_the_first(self) -> None:
         try:

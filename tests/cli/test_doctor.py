@@ -372,3 +372,35 @@ def test_robots_of_ros_are_found_where_there_are_no_others(spawn: Spawn, free_po
 def test_a_ros_wire_without_a_router_is_told_how_to_begin(free_port: int):
     found = broken_link("--wire", "ros2", "--connect", f"tcp/127.0.0.1:{free_port}")
     assert found["next"] == "zstate router --ros2"
+
+
+ARM = """<robot name="arm"><link name="base"/><link name="upper"/><link name="tip"/>
+  <joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="spin" type="continuous"><parent link="upper"/><child link="tip"/><axis xyz="0 0 1"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("positions", "text"),
+    [
+        (
+            (45.0, 60.0),
+            "'lift' at 45.0 rad is outside -2 to 2; this looks like degrees: convert with math.radians",
+        ),
+        ((2.5, 0.0), "'lift' at 2.5 rad is outside -2 to 2"),
+    ],
+)
+def test_positions_outside_joint_limits_are_a_warning_that_names_degrees(
+    positions: tuple[float, ...], text: str
+):
+    with standing("arm", positions, model=ARM):
+        said = diagnosed("arm", code=0)
+    (found,) = [check for check in said["checks"] if check["state"] == "warning"]
+    assert (found["name"], found["text"]) == ("limits", text)
+    assert found["next"].startswith("zstate echo arm --once  # ")
+
+
+def test_a_wheel_that_has_turned_often_is_sound():
+    with standing("arm", (2.0005, 900.0), model=ARM):
+        assert warnings("arm") == {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -138,3 +139,18 @@ def test_the_next_command_looks_where_doctor_has_looked():
     assert looking_there("zstate ls", Network(), "ros2:domain=5") == "zstate ls --wire ros2:domain=5"
     for whole in ("zstate check FILE", "ps -p 7", "zstate ls --wire ros2 --connect tcp/c:3"):
         assert looking_there(whole, network, "ros2") == whole
+
+
+@pytest.mark.processes
+def test_degrees_on_the_topic_are_named(ros_router: str, tmp_path: Path):
+    text = Path(RRBOT).read_text().replace('type="continuous"', 'type="revolute"')
+    limit = '<limit lower="-2" upper="2" effort="1" velocity="1"/>'
+    model = tmp_path / "limited.urdf"
+    model.write_text(re.sub(r"<limit [^>]*/>", "", text).replace("<axis", f"{limit}<axis"))
+    with standing(positions=(45.0, 0.0), model=str(model), wire="ros2", router=ros_router):
+        found = Found()
+    assert found.states["limits"] == "warning"
+    assert found.texts["limits"].endswith(
+        "is outside -2 to 2; this looks like degrees: convert with math.radians"
+    )
+    assert found.next["limits"].startswith("zstate echo --once --wire ros2")

@@ -6,6 +6,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+from zstate.cli.doctor.samples import Ranges
 from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.net.session import Session
@@ -23,6 +24,7 @@ class NodeHeard:
     count: int = 0
     last: int = 0
     names: dict[str, None] = field(default_factory=dict[str, None])
+    ranges: Ranges = field(default_factory=Ranges)
 
     @property
     def rate_hz(self) -> float | None:
@@ -47,12 +49,13 @@ class NodeSamples(Closing):
             with suppress(MessageError):  # the listener beside this counts and names those of tf
                 for said in self._wire.decode(self._stream, arrival, self._robot):
                     if isinstance(said, JointState):
-                        self._note(said.session, said.names or ())
+                        self._note(said.session, said.names or ()).ranges.add(said)
                     elif isinstance(said, TransformSample):
                         self._note(said.session, [child for _, child in said.edges or ()])
 
-    def _note(self, session: int, names: list[str] | tuple[str, ...]) -> None:
+    def _note(self, session: int, names: list[str] | tuple[str, ...]) -> NodeHeard:
         now = time.monotonic_ns()
         node = self.heard.setdefault(session, NodeHeard(now))
         node.count, node.last = node.count + 1, now
         node.names.update(dict.fromkeys(names))
+        return node

@@ -9,13 +9,16 @@ from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
 from zstate.cli.doctor.ear import Ear
+from zstate.cli.doctor.samples import Ranges
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text
+from zstate.model.limits import JointLimits
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
+from zstate.status import ARE_OUTSIDE
 from zstate.wire.keys import MODEL_WRITER, foreign_objection
 from zstate.wire.messages import Status
 
@@ -45,6 +48,8 @@ def robot_checks(ear: Ear, session: Session) -> Iterator[Check]:
     yield _samples_check(ear)
     yield clocks_check(ear)
     yield stamps_check(ear, session)
+    if model is not None:
+        yield from limits_check(ear, model, [ear.samples.ranges], f"zstate echo {ear.info.name}")
     yield statics_check(ear)
     yield poses_check(ear, model)
 
@@ -60,7 +65,7 @@ def _writers_check(ear: Ear) -> Check:
             )
             return warning("writers", event.text, then)
     for status in ear.statuses.values():
-        if status.level == "error" or (status.level == "warn" and not _keeps_its_rate(status)):
+        if status.level == "error" or (status.level == "warn" and not _is_elsewhere(status)):
             text = f"{status.program}@{status.host} pid {status.pid} says: {status.text}"
             return warning("writers", text, f"zstate listen {ear.info.name}")
     streams: dict[str, list[str]] = {}
@@ -70,8 +75,10 @@ def _writers_check(ear: Ear) -> Check:
     return ok("writers", "; ".join(said))
 
 
-def _keeps_its_rate(status: Status) -> bool:
-    """Whether it only was late now and then."""
+def _is_elsewhere(status: Status) -> bool:
+    """Whether another check has what the status says, or it only was late now and then."""
+    if ARE_OUTSIDE in status.text:
+        return True
     commanded = status.values.get("commanded", "").partition(" ")[0]
     return bool(commanded) and status.rate_hz >= _KEPT * float(commanded)
 
@@ -214,6 +221,15 @@ def _rate_check(ear: Ear, rate_hz: float, who: str) -> Check:
         text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
         return warning(stream, text, f"zstate listen {robot}")
     return ok(stream, f"{text}, newest {duration_text(ear.samples.silent_ns)} ago")
+
+
+def limits_check(ear: Ear, model: RobotModel, ranges: Iterable[Ranges], echo: str) -> Iterator[Check]:
+    """Warnings where joint positions of ``model`` are outside its limits; ``echo`` prints them."""
+    limits = JointLimits(model)
+    found = [limits.explanation(of_writer.positions(model)) for of_writer in ranges]
+    said = [status.text for status in ear.statuses.values() if ARE_OUTSIDE in status.text]
+    for text in list(filter(None, found)) or said[:1]:
+        yield warning("limits", text, f"{echo} --once  # `zstate check FILE --joints` shows the limits")
 
 
 def statics_check(ear: Ear) -> Check:

@@ -12,7 +12,13 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import stamps_check
 from zstate.cli.doctor.ear import Ear
 from zstate.cli.doctor.node_samples import NodeHeard, NodeSamples
-from zstate.cli.doctor.robot_checks import model_check, poses_check, refused_check, statics_check
+from zstate.cli.doctor.robot_checks import (
+    limits_check,
+    model_check,
+    poses_check,
+    refused_check,
+    statics_check,
+)
 from zstate.cli.words import RosWords
 from zstate.errors import duration_text
 from zstate.model.robot import RobotModel
@@ -38,6 +44,9 @@ def _checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterato
     yield _joints_check(ear, model, words)
     yield _transforms_check(ear, words)
     yield stamps_check(ear, session)
+    if model is not None:
+        ranges = [node.ranges for node in ear.nodes["joint_states"].heard.values()]
+        yield from limits_check(ear, model, ranges, f"zstate echo{_named(ear, words)}")
     yield statics_check(ear)
     yield poses_check(ear, model)
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 
+import numpy as np
+from numpy.typing import NDArray
+
 from zstate.closing import Closing
 from zstate.errors import MessageError
+from zstate.model.coordinates import coordinate_names
+from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import Stream
-from zstate.wire.messages import Sample
+from zstate.wire.messages import JointState, Sample, from_block, order_digest
 from zstate.wire.wire import Arrival, Wire
 
 
@@ -26,6 +31,8 @@ class Samples(Closing):
         """Whether all have the same stamp."""
         self.session: int | None = None
         """Of the writer of the newest."""
+        self.ranges = Ranges()
+        """Of the joint positions."""
         self._came: tuple[int, int] = (0, 0)
         self._robot, self._wire = robot, wire
         self._stream: Stream = stream
@@ -60,3 +67,38 @@ class Samples(Closing):
         self.stands_still = self.stands_still and self.last_stamp in (None, sample.stamp)
         self.last_stamp, self.session = sample.stamp, sample.session
         self.count += 1
+        if isinstance(sample, JointState):
+            self.ranges.add(sample)
+
+
+class Ranges:
+    """The least and greatest positions of the samples of one writer."""
+
+    def __init__(self) -> None:
+        self._kind: object = None
+        self._names: tuple[str, ...] | None = None
+        self._order = b""
+        self._extremes = np.empty((2, 0))
+
+    def add(self, state: JointState) -> None:
+        """Include the positions of ``state``; those of another writer or joint order replace all before."""
+        positions = from_block(state.positions)
+        kind = (state.session, state.order, positions.size)
+        if kind != self._kind:
+            self._kind, self._names, self._order = kind, state.names, state.order
+            self._extremes = np.stack((positions, positions))
+        np.fmin(self._extremes[0], positions, out=self._extremes[0])
+        np.fmax(self._extremes[1], positions, out=self._extremes[1])
+
+    def positions(self, model: RobotModel) -> NDArray[np.float64]:
+        """Two position vectors of ``model``, the least and the greatest; NaN for what the samples lack."""
+        wanted = coordinate_names(model)
+        names = self._names
+        if names is None:
+            names = wanted if self._order == order_digest(model.joint_names) else ()
+        places = {name: column for column, name in enumerate(names)}
+        found = np.full((2, len(wanted)), np.nan)
+        for column, name in enumerate(wanted):
+            if name in places:
+                found[:, column] = self._extremes[:, places[name]]
+        return found
