@@ -138,7 +138,9 @@ def test_loading_a_model_imports_neither_pinocchio_nor_zenoh():
 
 
 def test_xacro_arguments_for_what_is_no_xacro_are_refused():
-    with pytest.raises(InvalidInput, match="'URDF text' contains no xacro"):
+    with pytest.raises(
+        InvalidInput, match="'URDF text' contains no xacro, so it takes no xacro arguments; got length:=1"
+    ):
         load_model(TEXT, xacro_args={"length": "1"})
 
 

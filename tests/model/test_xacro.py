@@ -39,6 +39,36 @@ def test_a_xacro_file_is_expanded_with_its_includes_and_arguments(arm: Path):
     assert load_model(arm, xacro_args={"length": "3"}).joints[0].origin[0] == 6.0
 
 
+def test_each_distinct_warning_of_xacro_is_one_finding_and_nothing_is_printed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("xacro")
+    path = tmp_path / "warning.xacro"
+    macro = (
+        '<xacro:macro name="part" params="n">${xacro.warning("old macro")}<link name="l${n}"/></xacro:macro>'
+    )
+    uses = "".join(f'<xacro:part n="{number}"/>' for number in range(3))
+    redefined = '<xacro:property name="pi" value="3"/>'
+    joints = "".join(
+        f'<joint name="j{n}" type="fixed"><parent link="l0"/><child link="l{n}"/></joint>' for n in (1, 2)
+    )
+    path.write_text(f'<robot name="r" {NAMESPACE}>{macro}{redefined}{uses}{joints}</robot>')
+    model = load_model(path)
+    assert sorted(finding.message for finding in model.findings) == [
+        "xacro: old macro (warning.xacro), 3 times",
+        "xacro: redefining global symbol: pi (warning.xacro)",
+    ]
+    assert {finding.severity for finding in model.findings} == {"warning"}
+    assert capfd.readouterr() == ("", "")
+
+
+def test_an_argument_that_the_file_does_not_use_is_a_finding_with_its_near_miss(arm: Path):
+    pytest.importorskip("xacro")
+    assert load_model(arm, xacro_args={"length": "3"}).findings == ()
+    (finding,) = load_model(arm, xacro_args={"lenght": "3"}).findings
+    assert finding.message == "the xacro argument 'lenght' is not used by the file; did you mean 'length'?"
+
+
 def test_findings_of_an_expanded_file_say_that_lines_are_of_the_expansion(tmp_path: Path):
     pytest.importorskip("xacro")
     path = tmp_path / "empty.xacro"

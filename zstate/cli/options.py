@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -186,16 +186,51 @@ def named_robot(robot: str | None, wire: str) -> str:
     return meant
 
 
-def load_robot(source: str, name: str | None) -> tuple[RobotModel, str]:
+def parsed_xacro_args(words: Iterable[str]) -> dict[str, str]:
+    """``NAME:=VALUE`` arguments by name. Raises UsageError for any other."""
+    arguments: dict[str, str] = {}
+    for word in words:
+        name, sign, value = word.partition(":=")
+        if not (name and sign):
+            raise click.UsageError(f"Got unexpected extra argument ({word}).", click.get_current_context())
+        arguments[name] = value
+    return arguments
+
+
+def _parsed_xacro_args(_: click.Context, __: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:
+    return parsed_xacro_args(words)
+
+
+xacro_arguments = click.argument(
+    "xacro_args", nargs=-1, callback=_parsed_xacro_args, metavar="[NAME:=VALUE]..."
+)
+
+
+def named_models(words: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Models in their order, each with the xacro arguments that follow it."""
+    models: dict[str, dict[str, str]] = {}
+    for word in words:
+        if ":=" in word and models:
+            models[next(reversed(models))].update(parsed_xacro_args([word]))
+        else:
+            models.setdefault(word, {})
+    return models
+
+
+def load_robot(
+    source: str, name: str | None, xacro_args: Mapping[str, str] | None = None
+) -> tuple[RobotModel, str]:
     """The model behind a ROBOT argument, and the robot's name on the network.
 
-    That is ``name`` if given, else the catalog name that was asked for, else the model's own.
+    The name is ``name`` if given, else the catalog name that was asked for, else the model's own.
     """
     from zstate.model.catalog import is_path, load_model
     from zstate.model.known import find
     from zstate.wire.keys import check_robot
 
-    model = load_model(source)
+    if ":=" in source and not is_path(source):
+        raise click.UsageError(f"{source!r} is a xacro argument; name the model before it")
+    model = load_model(source, xacro_args=xacro_args or None)
     robot = name or (model.name if is_path(source) or "<" in source else find(source).name)
     try:
         return model, check_robot(robot)

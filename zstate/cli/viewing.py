@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -54,9 +54,12 @@ class Named(NamedTuple):
     folder: Path | None = None
 
 
-def named_robots(arguments: Sequence[str]) -> list[Named]:
-    """The robots behind ROBOT arguments: URDF files that are read now, and names."""
-    return [_local(one)[0] if is_path(one) else Named(one) for one in arguments]
+def named_robots(models: Mapping[str, Mapping[str, str]]) -> list[Named]:
+    """The robots behind ROBOT arguments and their xacro arguments: files that are read now, and names."""
+    return [
+        _local(one, xacro_args)[0] if xacro_args or is_path(one) else Named(one)
+        for one, xacro_args in models.items()
+    ]
 
 
 def folders_of(named: Iterable[Named]) -> dict[str, Path]:
@@ -64,8 +67,8 @@ def folders_of(named: Iterable[Named]) -> dict[str, Path]:
     return {one.model.urdf: one.folder for one in named if one.model is not None and one.folder is not None}
 
 
-def _local(argument: str) -> tuple[Named, RobotModel]:
-    model, robot = load_robot(argument, None)
+def _local(argument: str, xacro_args: Mapping[str, str] | None = None) -> tuple[Named, RobotModel]:
+    model, robot = load_robot(argument, None, xacro_args)
     path = Path(argument) if is_path(argument) else find(argument).path
     return Named(robot, model, path.parent), model
 

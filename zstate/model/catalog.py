@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from zstate.errors import InvalidInput, ModelError
@@ -47,10 +48,12 @@ def _parse(
     document = read_document(data, source)
     is_xacro = bool(xacro_elements(document.root)) or (path is not None and path.suffix == ".xacro")
     if is_xacro:
-        urdf = xacro.expand(document.text, source, path=path, args=xacro_args or {})
-        return parse_document(read_document(urdf, f"{source} (expanded)"), f"{source} (expanded)")
+        urdf, warnings = xacro.expand(document.text, source, path=path, args=xacro_args or {})
+        model = parse_document(read_document(urdf, f"{source} (expanded)"), f"{source} (expanded)")
+        return replace(model, findings=(*warnings, *model.findings)) if warnings else model
     if xacro_args:
-        raise InvalidInput(f"xacro_args {dict(xacro_args)} are given, but {source!r} contains no xacro")
+        given = " ".join(f"{name}:={value}" for name, value in xacro_args.items())
+        raise InvalidInput(f"{source!r} contains no xacro, so it takes no xacro arguments; got {given}")
     return parse_document(document, source)
 
 

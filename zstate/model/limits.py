@@ -35,7 +35,8 @@ class JointLimits:
     def are_exceeded(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
         """For each row of ``positions``, (n, position_count), whether any joint is outside its limits."""
         values = positions[:, self._columns]
-        return ((values < self._lower) | (values > self._upper)).any(axis=1)
+        exceeded: NDArray[np.bool_] = (values < self._lower) | (values > self._upper)
+        return np.logical_or.reduce(exceeded, axis=1)
 
     def explanation(self, positions: NDArray[np.float64]) -> str:
         """The joints outside their limits in any row, each with its worst value; empty if there are none.

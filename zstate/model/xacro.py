@@ -6,8 +6,10 @@ Expanding runs the Python expressions that the file holds: expand only files you
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,21 +18,79 @@ from zstate.errors import ModelError
 from zstate.model.findings import Finding
 
 
-def expand(text: str, source: str, *, path: Path | None, args: Mapping[str, str]) -> str:
-    """The URDF that ``text`` expands to with the xacro arguments ``args``.
+def expand(
+    text: str, source: str, *, path: Path | None, args: Mapping[str, str]
+) -> tuple[str, tuple[Finding, ...]]:
+    """The URDF that ``text`` expands to with the xacro arguments ``args``, and xacro's warnings.
 
-    ``path`` is the file of the text, if there is one: includes are relative to it, and packages are
-    looked for from there upwards (with xacrodoc) or where ROS has them. Raises ModelError with the
-    cause in one line.
+    Each distinct warning is one finding, and so is an argument that the file does not use. ``path`` is the
+    file of the text, if there is one: includes are relative to it, and packages are looked for from there
+    upwards (with xacrodoc) or where ROS has them. Raises ModelError with the cause in one line.
     """
     xacro = _import_expander(source, path)
+    mappings = _Arguments(args)
     try:
         xacro.init_stacks(None if path is None else os.fspath(path))  # what includes are relative to
         document = xacro.parse(text)
-        xacro.process_doc(document, mappings=dict(args), verbosity=0)
-        return document.toprettyxml(indent="  ")
+        with _warnings(xacro) as warnings:
+            xacro.process_doc(document, mappings=mappings, verbosity=0)
+        return document.toprettyxml(indent="  "), tuple(_findings(warnings, mappings, args))
     except Exception as error:  # anything: the file's own expressions are evaluated
         raise _refusal(source, _one_line(error)) from error
+
+
+class _Arguments(dict[str, str]):
+    """Xacro's arguments, and which of them the file has declared or read."""
+
+    def __init__(self, args: Mapping[str, str]) -> None:
+        super().__init__(args)
+        self.used: dict[str, None] = {}
+
+    def __contains__(self, name: object) -> bool:
+        self.used[str(name)] = None
+        return super().__contains__(name)
+
+    def __getitem__(self, name: str) -> str:
+        self.used[name] = None
+        return super().__getitem__(name)
+
+
+@contextmanager
+def _warnings(xacro: Any) -> Generator[Counter[str]]:
+    """Counts xacro's warnings, which it prints to standard error with three lines for each use of a macro."""
+    counts: Counter[str] = Counter()
+
+    color: Any = import_module("xacro.color")
+
+    def message(*parts: object, **options: Any) -> None:
+        if not options.get("alt_text"):
+            kept_message(*parts, **options)  # what the file itself prints with xacro.message()
+            return
+        file = next((name for name in reversed(xacro.filestack or []) if name), None)
+        where = "" if file is None else f" ({Path(file).name})"
+        counts[" ".join(map(str, parts)) + where] += 1
+
+    def print_location(*_: object, **__: object) -> None:
+        pass  # the warning names its file
+
+    # Every warning of xacro, and of the expressions in a file, goes through these two.
+    kept_message, kept_location = color.message, xacro.print_location
+    color.message, xacro.print_location = message, print_location
+    try:
+        yield counts
+    finally:
+        color.message, xacro.print_location = kept_message, kept_location
+
+
+def _findings(warnings: Counter[str], mappings: _Arguments, args: Mapping[str, str]) -> Generator[Finding]:
+    for text, count in warnings.items():
+        times = f", {count} times" if count > 1 else ""
+        yield Finding(None, f"xacro: {' '.join(text.split())}{times}", "warning")
+    for name in args:
+        if name not in mappings.used:
+            near = get_close_matches(name, list(mappings.used), n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            yield Finding(None, f"the xacro argument {name!r} is not used by the file{hint}", "warning")
 
 
 def _import_expander(source: str, path: Path | None) -> Any:

@@ -12,7 +12,7 @@ import click
 
 from zstate.cli.console import count_text, is_terminal, say_fitted, say_json, terminal_width
 from zstate.cli.layout import Guides, chain_lines, in_columns, narrowed, tree_lines
-from zstate.cli.options import json_option
+from zstate.cli.options import json_option, xacro_arguments
 from zstate.errors import Found, ModelError
 
 if TYPE_CHECKING:
@@ -25,19 +25,24 @@ _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "vel
 
 @click.command("check")
 @click.argument("file")
+@xacro_arguments
 @click.option("--fix-hints", is_flag=True, help="Below each finding, what to write instead.")
 @click.option("--joints", "joint_table", is_flag=True, help="The joints as a table, instead of the tree.")
 @json_option("One JSON object.")
-def check_command(file: str, fix_hints: bool, joint_table: bool, as_json: bool) -> None:
+def check_command(
+    file: str, xacro_args: dict[str, str], fix_hints: bool, joint_table: bool, as_json: bool
+) -> None:
     """Say what is right and wrong with the robot model in FILE.
 
-    FILE is URDF or xacro, "-" for standard input, or a name such as "panda". Prints every finding with
+    FILE is URDF or xacro, "-" for standard input, or a name such as "panda"; NAME:=VALUE are
+    xacro arguments. Prints every finding with
     its line, then the tree of links and joints. Exit code 1 when the model cannot be used; warnings do
     not count.
 
     \b
     zstate check arm.urdf --fix-hints
     zstate check panda --joints                        # the order of positions, limits, axes, mimics
+    zstate check arm.urdf.xacro prefix:=left_
     xacro arm.xacro | zstate check -
     """
     from zstate.model.catalog import load_model
@@ -45,7 +50,7 @@ def check_command(file: str, fix_hints: bool, joint_table: bool, as_json: bool) 
     name = _STDIN if file == "-" else file
     model, findings = None, ()
     try:
-        model = load_model(sys.stdin.buffer.read() if file == "-" else file)
+        model = load_model(sys.stdin.buffer.read() if file == "-" else file, xacro_args=xacro_args)
         findings = model.findings
     except ModelError as error:
         if not error.findings:

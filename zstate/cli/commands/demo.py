@@ -12,7 +12,7 @@ import click
 
 from zstate.cli.console import count_text, fail, note, say_fitted
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import load_robot, rate_option, seconds_option
+from zstate.cli.options import load_robot, rate_option, seconds_option, xacro_arguments
 from zstate.errors import UnknownModel
 
 if TYPE_CHECKING:
@@ -33,27 +33,35 @@ _USERS_NETWORK = (
 
 @click.command("demo")
 @click.argument("robot", required=False)
+@xacro_arguments
 @click.option("--robot", "robot_option", metavar="ROBOT", help="The same as the argument.")
 @rate_option
 @seconds_option
-def demo_command(robot: str | None, robot_option: str | None, rate: float, seconds: float | None) -> None:
+def demo_command(
+    robot: str | None,
+    xacro_args: dict[str, str],
+    robot_option: str | None,
+    rate: float,
+    seconds: float | None,
+) -> None:
     """Publish ROBOT (default: panda) in one process and look its transforms up in another, over Zenoh.
 
-    ROBOT is a name such as panda, or a URDF file; `zstate robots` lists the names. Where panda is not
-    installed, the default is rrbot, which comes with zstate. The two processes meet on a port of their
-    own and disturb nobody.
+    ROBOT is a name such as panda, which `zstate robots` lists, or a URDF or xacro file; NAME:=VALUE are
+    xacro arguments. Where panda is not installed, the default is rrbot, which comes with zstate. The two
+    processes meet on a port of their own and disturb nobody.
     """
     from zstate.cli.children import ChildCommand
 
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"which robot, {robot!r} or {robot_option!r}?")
     wanted = robot or robot_option or _default_robot()
-    model, called = _load(wanted)
+    model, called = _load(wanted, xacro_args)
     for variable in _USERS_NETWORK:
         os.environ.pop(variable, None)
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     ended = threading.Event()
-    arguments = ["publish", wanted, "--source", "sine", "--name", called, "--rate", repr(rate)]
+    words = [f"{name}:={value}" for name, value in xacro_args.items()]
+    arguments = ["publish", wanted, *words, "--source", "sine", "--name", called, "--rate", repr(rate)]
     with ChildCommand(
         "publisher", [*arguments, "--connect", endpoint], on_end=lambda _: ended.set()
     ) as publisher:
@@ -75,11 +83,11 @@ def _default_robot() -> str:
     return robot
 
 
-def _load(robot: str) -> tuple[RobotModel, str]:
+def _load(robot: str, xacro_args: dict[str, str]) -> tuple[RobotModel, str]:
     from zstate.cli.telling_links import telling_links
 
     try:
-        model, called = load_robot(robot, None)
+        model, called = load_robot(robot, None, xacro_args)
     except UnknownModel as error:
         fail(f"{error}; `zstate demo rrbot` works with what is here")
     if not telling_links(model):

@@ -9,31 +9,36 @@ from pathlib import Path
 import click
 
 from zstate.cli.console import fail, note, say
-from zstate.cli.options import load_robot, name_option
+from zstate.cli.options import load_robot, name_option, xacro_arguments
 
 
 @click.command("init")
 @click.argument("robot", default="rrbot", metavar="[ROBOT]")
+@xacro_arguments
 @click.option("-o", "--output", metavar="FILE", help="Where to; default: NAME.toml, - for standard output.")
 @click.option("--force", is_flag=True, help="Also where there is such a file already.")
 @name_option
-def init_command(robot: str, output: str | None, force: bool, name: str | None) -> None:
+def init_command(
+    robot: str, xacro_args: dict[str, str], output: str | None, force: bool, name: str | None
+) -> None:
     """Write a commented file for ROBOT, which `zstate up` runs as it is.
 
-    ROBOT is a name such as panda, or a URDF file; rrbot, which comes with zstate, unless given.
+    ROBOT is a name such as panda, or a URDF or xacro file; rrbot, which comes with zstate, unless given.
+    NAME:=VALUE are xacro arguments.
 
     \b
     zstate init panda
     zstate up panda.toml
     zstate init arm.urdf -o cell.toml
+    zstate init arm.urdf.xacro prefix:=left_
     """
     from zstate.cli.up.example import example_text
     from zstate.model.catalog import is_path
 
-    model, called = load_robot(robot, name)
+    model, called = load_robot(robot, name, xacro_args)
     file = Path(output if output not in (None, "-") else f"{called}.toml")
     source = os.path.relpath(robot, file.parent) if is_path(robot) else robot
-    text = example_text(shlex.quote(file.name), source, called, model)
+    text = example_text(shlex.quote(file.name), source, called, model, xacro_args)
     if output == "-":
         say(text.rstrip("\n"))
         return

@@ -19,6 +19,7 @@ from zstate.cli.options import (
     session_options,
     takeover_option,
     wire_option,
+    xacro_arguments,
 )
 from zstate.cli.words import words_of
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 @click.command("joints")
 @click.argument("robot")
+@xacro_arguments
 @rate_option
 @seconds_option
 @name_option
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 def joints_command(
     *,
     robot: str,
+    xacro_args: dict[str, str],
     rate: float,
     seconds: float | None,
     name: str | None,
@@ -50,7 +53,8 @@ def joints_command(
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
 
-    ROBOT is a name such as panda, or a URDF file. `zstate publish ROBOT` makes transforms of it.
+    ROBOT is a name such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. `zstate
+    publish ROBOT` makes transforms of it.
 
     \b
     zstate joints panda
@@ -62,7 +66,7 @@ def joints_command(
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
-    model, called = load_robot(robot, name)
+    model, called = load_robot(robot, name, xacro_args)
     with (
         open_session(network, (wire,)) as session,
         open_clock(session, clock, wire) as time,

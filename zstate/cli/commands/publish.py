@@ -21,6 +21,7 @@ from zstate.cli.options import (
     session_options,
     takeover_option,
     wires_option,
+    xacro_arguments,
 )
 from zstate.cli.words import is_ros, words_of
 
@@ -45,6 +46,7 @@ def _source(_: click.Context, __: click.Parameter, source: str) -> str:
 
 @click.command("publish")
 @click.argument("robot")
+@xacro_arguments
 @click.option(
     "--source",
     callback=_source,
@@ -71,6 +73,7 @@ def _source(_: click.Context, __: click.Parameter, source: str) -> str:
 def publish_command(
     *,
     robot: str,
+    xacro_args: dict[str, str],
     source: str,
     rate: float | None,
     wires: tuple[str, ...],
@@ -83,9 +86,9 @@ def publish_command(
 ) -> None:
     """Publish the state of ROBOT: its model, its fixed edges, and transforms.
 
-    ROBOT is a name such as panda, or a URDF file. By default follows its joint_states, which a driver
-    or `zstate joints ROBOT` writes, and publishes every sample. With another source writes joint_states
-    as well.
+    ROBOT is a name such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. By default
+    follows its joint_states, which a driver or `zstate joints ROBOT` writes, and publishes every sample.
+    With another source writes joint_states as well.
 
     On the native wire it remembers the last seconds for whoever joins, and answers lookups on
     zstate/ROBOT/lookup, for devices without a buffer.
@@ -97,6 +100,7 @@ def publish_command(
     \b
     zstate publish panda --source sine
     zstate publish arm.urdf --rate 250
+    zstate publish arm.urdf.xacro prefix:=left_
     zstate publish panda --source run.mcap
     zstate publish panda --source sine --clock sim     # as time goes on in a simulation or a replay
     zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
@@ -107,7 +111,7 @@ def publish_command(
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
-    model, called = load_robot(robot, name)
+    model, called = load_robot(robot, name, xacro_args)
     followed = wires[:1] if source == "joints" else ()
     with (
         open_session(network, wires) as session,

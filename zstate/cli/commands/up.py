@@ -59,7 +59,7 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     metrics = 9100                    # 9101 for the second robot of a loop
     restart = "on-failure"            # or "always"; else a failure ends all
     [[robot]]
-    model = "panda"
+    model = "panda"                   # xacro_args = {NAME = "VALUE"} for xacro
     count = 3                         # a robot each, "${number}" is 1, 2, 3
     name = "arm${number}"
     when = "${SITE:-lab} != lab"      # or "${SITE} == lab", true, false

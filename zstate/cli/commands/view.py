@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_rate, session_options, wire_option
+from zstate.cli.options import checked_rate, named_models, session_options, wire_option
 
 if TYPE_CHECKING:
     from zstate.view.framing import Camera
@@ -47,7 +47,7 @@ def _point(text: str) -> tuple[float, float, float]:
 
 
 @click.command("view")
-@click.argument("robots", nargs=-1, metavar="[ROBOT...]")
+@click.argument("robots", nargs=-1, metavar="[ROBOT [NAME:=VALUE]...]...")
 @click.option("--sliders", is_flag=True, help="Move the robots from the page, and publish what they do.")
 @click.option(
     "--host", default="127.0.0.1", show_default=True, help="Where to listen; 0.0.0.0 is everywhere."
@@ -105,9 +105,9 @@ def view_command(
     ssh -L 8080:127.0.0.1:8080 HOST. With --host others may open it too, who have the token in the
     address that is printed; what they see travels in the clear.
 
-    With --sliders each ROBOT is moved from the page. It is a robot that is announced, or a name or URDF
-    file as `zstate publish` takes it, and nobody else may write its joints. A ROBOT may also be a
-    recording. --snapshot draws with an installed Chromium, without a screen.
+    With --sliders each ROBOT is moved from the page. It is a robot that is announced, or a name or file
+    as `zstate publish` takes it, with NAME:=VALUE for xacro, and nobody else may write its joints. A ROBOT
+    may also be a recording. --snapshot draws with an installed Chromium, without a screen.
     Needs viser: pip install 'zstate[view]'.
 
     Meshes named package://NAME/... are found below the folders in ROS_PACKAGE_PATH, in share/ of those in
@@ -118,6 +118,7 @@ def view_command(
     \b
     zstate view
     zstate view panda --sliders
+    zstate view arm.urdf.xacro prefix:=left_ --sliders
     zstate view run.mcap
     zstate view --wire ros2                 # robots of ROS 2 nodes that run rmw_zenoh
     zstate view panda --snapshot panda.png --camera 2,1,1:0,0,0.5
@@ -139,10 +140,11 @@ def view_command(
     from zstate.view.view import View
     from zstate.view.world import World
 
-    recording = recording_among(robots)
+    models = named_models(robots)
+    recording = recording_among(tuple(models))
     if recording is not None and sliders:
         raise click.UsageError("--sliders moves robots that are here, not those of a recording")
-    named = [] if recording is not None else named_robots(robots)
+    named = [] if recording is not None else named_robots(models)
     with ExitStack() as opened:
         moved: list[Sliders] = []
         if recording is None:

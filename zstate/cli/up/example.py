@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from zstate.cli.layout import in_columns
 from zstate.model.coordinates import coordinate_names
 from zstate.model.robot import RobotModel
 
 
-def example_text(file: str, source: str, robot: str, model: RobotModel) -> str:
+def example_text(file: str, source: str, robot: str, model: RobotModel, xacro_args: Mapping[str, str]) -> str:
     """The text of ``file`` for one robot, whose model is found as ``source``."""
+    args = ", ".join(f"{json.dumps(name)} = {json.dumps(value)}" for name, value in xacro_args.items())
     return _TEMPLATE.format(
         file=file,
         model=json.dumps(source),
@@ -19,6 +20,7 @@ def example_text(file: str, source: str, robot: str, model: RobotModel) -> str:
         robot=robot,
         joints="\n".join(f"#   {row}" for row in _joint_rows(model)),
         tip=json.dumps(_tip(model)),
+        xacro_args=f"xacro_args = {{ {args} }}\n" * bool(args),
     )
 
 
@@ -54,10 +56,11 @@ rate = 100.0                        # samples a second
 
 [[robot]]
 model = {model}
-name = {name}
+{xacro_args}name = {name}
 source = "${{source}}"
 rate = "${{rate}}"
 #wires = ["native", "ros2"]          # also for rviz2 and other ROS 2 nodes; needs a [router] with ros2 = true
+# xacro_args = {{ NAME = "VALUE" }}  # where the model is a xacro file
 #metrics = 9100                      # http://127.0.0.1:9100/metrics for Prometheus
 #restart = "on-failure"              # else a failure ends everything
 

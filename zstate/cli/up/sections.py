@@ -66,6 +66,7 @@ class RobotSection(_Section, frozen=True):
     """``[[robot]]``: as the options of `zstate publish`."""
 
     model: str
+    xacro_args: dict[str, str | bool | int | float] = {}
     name: str | None = None
     source: str = "joints"
     rate: float | None = None

@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from zstate.cli.options import load_robot
+from zstate.cli.options import load_robot, parsed_xacro_args
 from zstate.cli.up.cell import Cell
 from zstate.cli.up.edges import check_edges
 from zstate.cli.up.joining import options, router_options, session_options, session_variables
@@ -90,7 +90,7 @@ def _robot_start(placed: Placed[RobotSection], cell: Cell, first: tuple[str, ...
     own = ("--name", name, "--source", _source(placed), *rate, *options("--wire", robot.wires), *clock)
     arguments = (*own, *(("--takeover",) if robot.takeover else ()), *_metrics(placed))
     _check_identity(placed, cell)
-    arguments = ("publish", model, *arguments, *session_options(cell, robot.identity))
+    arguments = ("publish", model, *_xacro_words(robot), *arguments, *session_options(cell, robot.identity))
     return Start(name, arguments, (*first, *in_a_list(robot.after)), robot.restart)
 
 
@@ -100,15 +100,23 @@ def _model_and_name(placed: Placed[RobotSection]) -> tuple[str, str]:
     beside = placed.beside(given)
     model = beside if is_path(given) or Path(beside).is_file() else given
     try:
-        default = _default_name(model, placed.section.name)
+        default = _default_name(model, placed.section.name, _xacro_words(placed.section))
         return model, check_robot(placed.section.name or default)
     except (ModelError, InvalidInput) as error:
         raise placed.error(str(error)) from None
 
 
 @lru_cache(maxsize=256)
-def _default_name(model: str, name: str | None) -> str:
-    return load_robot(model, name)[1]
+def _default_name(model: str, name: str | None, xacro_words: tuple[str, ...]) -> str:
+    return load_robot(model, name, parsed_xacro_args(xacro_words))[1]
+
+
+def _xacro_words(robot: RobotSection) -> tuple[str, ...]:
+    """Xacro arguments as a command line has them; xacro's truth values are those of Python, in lower case."""
+    return tuple(
+        f"{name}:={str(value).lower() if isinstance(value, bool) else value}"
+        for name, value in robot.xacro_args.items()
+    )
 
 
 def _source(placed: Placed[RobotSection]) -> str:
