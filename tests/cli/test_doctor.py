@@ -404,3 +404,74 @@ def test_positions_outside_joint_limits_are_a_warning_that_names_degrees(
 def test_a_wheel_that_has_turned_often_is_sound():
     with standing("arm", (2.0005, 900.0), model=ARM):
         assert warnings("arm") == {}
+
+
+@contextmanager
+def static_edges(*edges: tuple[str, str, str]) -> Iterator[None]:
+    """Static edges of robots: (robot, target, source), of a writer each."""
+    with ExitStack() as opened:
+        session = opened.enter_context(connect())
+        for number, (robot, target, source) in enumerate(edges):
+            publisher = opened.enter_context(StaticPublisher(session, robot, f"writer{number}"))
+            publisher.set(Transform(target, source, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+        yield
+
+
+def test_a_static_target_that_is_nearly_a_frame_is_named_and_not_joined():
+    with standing(), static_edges(("rrbot", "lowr", "camera")):
+        said = diagnosed("rrbot", code=0)
+    (found,) = [check for check in said["checks"] if check["name"] == "poses"]
+    assert "'lowr' is near 'lower', and 'rrbot/camera' is on it" in found["text"]
+    assert found["next"] == ("zstate tree rrbot  # if 'lower' is meant, start writer0 with that name")
+
+
+def test_a_static_frame_like_no_other_may_be_joined():
+    with standing(), static_edges(("rrbot", "island", "palm")):
+        said = diagnosed("rrbot", code=0)
+    (found,) = [check for check in said["checks"] if check["name"] == "poses"]
+    assert found["next"].startswith("zstate static rrbot/island rrbot/world")
+
+
+def test_robots_with_a_map_each_are_led_to_one_that_they_share():
+    with standing("a"), standing("b"), static_edges(("a", "map", "world"), ("b", "map", "world")):
+        said = diagnosed(code=0)
+    (found,) = [check for check in said["checks"] if check["state"] == "warning"]
+    assert (found["name"], found["robot"]) == ("frames", None)
+    assert found["text"] == (
+        "'a/map' and 'b/map' are different frames; name one that robots share in full, such as fleet/map"
+    )
+    assert found["next"] == "zstate static fleet/map a/world --xyz 0 0 0  # instead of a/map"
+
+
+def test_robots_in_one_shared_map_and_of_one_model_are_sound():
+    with (
+        standing("a"),
+        standing("b"),
+        static_edges(("a", "fleet/map", "a/world"), ("b", "fleet/map", "b/world")),
+    ):
+        assert warnings() == {}
+
+
+def test_a_second_parent_leads_to_commands_that_exist():
+    with standing(), static_edges(("rrbot", "world", "lower")):
+        said = diagnosed("rrbot", code=0)
+    worrying = [check for check in said["checks"] if check["name"] in ("writers", "tf_static")]
+    assert {check["state"] for check in worrying} == {"warning"}
+    assert {check["next"].partition("  #")[0] for check in worrying} == {"zstate tree rrbot"}
+    assert not any("withdraw(" in check["text"] or "--name" in check["next"] for check in worrying)
+
+
+def test_of_a_dead_driver_beside_a_static_edge_no_pose_is_called_known():
+    with static_edges(("rrbot", "tool", "camera")):
+        said = diagnosed("rrbot", code=1)
+    (poses,) = [check for check in said["checks"] if check["name"] == "poses"]
+    assert (poses["state"], poses["text"]) == ("skipped", "no joint positions")
+
+
+def test_a_single_sample_of_the_past_is_a_pose():
+    with connect() as session, StatePublisher(session, load_model(RRBOT)) as publisher:
+        publisher.publish([0.1, 0.2])
+        said = diagnosed("rrbot", code=1)
+    (poses,) = [check for check in said["checks"] if check["name"] == "poses"]
+    assert poses["state"] == "ok"
+    assert "rrbot/world is known" in poses["text"]

@@ -6,7 +6,8 @@ import pytest
 from looking import Spawn, failure, interrupted, standing, started
 from support import until
 
-from zstate import TransformListener, connect
+from zstate import StaticPublisher, Transform, TransformListener, connect
+from zstate.cli.target_frames import doubtful_edges
 
 pytestmark = pytest.mark.processes
 
@@ -118,3 +119,79 @@ def test_an_edge_of_a_file_is_said_on_each_of_its_wires(spawn: Spawn, ros_router
         for wire in ("native", "ros2"):
             with TransformListener(session, wire=wire) as listener:
                 assert listener.buffer.wait("tool", "camera", timeout_s=10.0).translation[2] == 2.5
+
+
+def test_a_target_that_is_nearly_a_frame_of_the_robot_is_warned_about(spawn: Spawn):
+    with standing():
+        child = started(spawn, "static", "lowr", "flange", *POSE)
+        child.line()
+        until(lambda: "did you mean" in child.stderr)
+        interrupted(child)
+    assert "'rrbot' has no frame 'lowr'; did you mean 'lower'" in child.stderr
+
+
+def test_a_new_target_above_the_robot_leads_to_the_frame_that_robots_share(spawn: Spawn):
+    with standing():
+        child = started(spawn, "static", "map", "world", *POSE)
+        child.line()
+        until(lambda: "warning" in child.stderr)
+        interrupted(child)
+    assert (
+        "'rrbot/map' is a new frame of 'rrbot' alone; name a frame that robots share in full" in child.stderr
+    )
+    assert "for instance fleet/map" in child.stderr
+
+
+def test_an_edge_that_listeners_refuse_beside_the_model_is_warned_about(spawn: Spawn):
+    with standing():
+        child = started(spawn, "static", "world", "upper", *POSE)
+        child.line()
+        until(lambda: "listeners refuse this edge: 'rrbot/upper' has the parent" in child.stderr)
+        interrupted(child)
+    assert "withdraw(" not in child.stderr
+
+
+@pytest.mark.parametrize(
+    "edge",
+    [
+        ("lower", "flange"),
+        ("lowr", "flange", "--new"),
+        ("fleet/map", "rrbot/world"),
+    ],
+)
+def test_of_what_is_known_new_or_shared_nothing_is_said(spawn: Spawn, edge: tuple[str, ...]):
+    with standing(), connect() as session:
+        publisher = StaticPublisher(session, "rrbot", "here")
+        target, source, *new = edge
+        transform = Transform(target, source, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        if new:
+            child = started(spawn, "static", *edge, *POSE)
+            child.line()
+            interrupted(child)
+            assert "warning" not in child.stderr
+        else:
+            assert doubtful_edges(session, publisher, [transform]) == []
+
+
+def test_a_chain_of_edges_that_are_published_together_is_known():
+    chain = [("lower", "mount"), ("mount", "camera"), ("camera", "lens"), ("mont", "light")]
+    with standing(), connect() as session, StaticPublisher(session, "rrbot", "chain") as publisher:
+        edges = [Transform(*names, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for names in chain]
+        (warning,) = doubtful_edges(session, publisher, edges)
+    assert (
+        warning
+        == "'rrbot' has no frame 'mont': 'rrbot/light' is not joined to it (--new if it is a new frame)"
+    )
+
+
+def test_a_static_frame_of_another_writer_is_known_and_has_near_misses():
+    upright = ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with (
+        connect() as session,
+        StaticPublisher(session, "fleet", "site") as site,
+        StaticPublisher(session, "fleet", "here") as here,
+    ):
+        site.set(Transform("map", "hall", *upright))
+        assert doubtful_edges(session, here, [Transform("hall", "gate", *upright)]) == []
+        (warning,) = doubtful_edges(session, here, [Transform("hal", "gate", *upright)])
+    assert warning.startswith("'fleet' has no frame 'hal'; did you mean 'hall'?")

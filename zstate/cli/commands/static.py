@@ -48,6 +48,9 @@ if TYPE_CHECKING:
     help="Whose edge it is; default: that of a full name, or the only one there is.",
 )
 @click.option("--writer", metavar="NAME", help="Under which name; default: this program and its process id.")
+@click.option(
+    "--new", is_flag=True, help="TARGET is a new frame: do not warn that the robot has none of that name."
+)
 @takeover_option
 @wire_option
 @session_options
@@ -63,6 +66,7 @@ def static_command(
     settings: tuple[str, ...],
     robot: str | None,
     writer: str | None,
+    new: bool,
     takeover: bool,
     wire: str,
     network: Network,
@@ -71,16 +75,21 @@ def static_command(
 
     SOURCE becomes a child of TARGET. Late joiners have it at once. Without --xyz it is at the origin of
     TARGET, without a rotation it is not turned; say at least one. Bare frame names are the robot's own;
-    `robot/frame` names a frame in full.
+    `robot/frame` names a frame in full. Warns when the robot has no frame TARGET, with near misses.
+
+    A frame that several robots share, such as a map, belongs to none of them and is named in full: with
+    fleet/map, r1 and r2 stand in one map; a bare map would be r1/map and r2/map, which are two.
 
     \b
     zstate static panda_hand camera --xyz 0.05 0 0.04 --rpy-deg 0 -90 0
-    zstate static fleet/map r1/odom --xyz 2 1 0 --rpy-deg 0 0 90
+    zstate static fleet/map r1/odom --xyz 2 1 0 --rpy-deg 0 0 90   # one map,
+    zstate static fleet/map r2/odom --xyz 5 1 0                    # two robots
     zstate static --file cell.toml --set site=lab
     zstate static --file handeye.yaml                              # of easy_handeye
     zstate static panda_hand camera --file handeye.yaml            # with frames called otherwise
     zstate static base_link laser --xyz 0.2 0 0.1 --wire ros2      # on /tf_static
     """
+    from zstate.cli.target_frames import doubtful_edges
     from zstate.clock import wait_in_slices
     from zstate.statics import StaticPublisher
 
@@ -96,6 +105,7 @@ def static_command(
         edges = [OwnedEdge(edge, robot)]
     spoken = {wire_of for edge in edges for wire_of in edge.wires or (wire,)}
     with open_session(network, tuple(sorted(spoken))) as session, ExitStack() as publishers:
+        published: list[tuple[StaticPublisher, list[Transform]]] = []
         for (owner, wires), owned in _by_owner(session, edges, robot, wire).items():
             publisher = publishers.enter_context(
                 StaticPublisher(session, owner, writer, wires, takeover=takeover)
@@ -103,6 +113,11 @@ def static_command(
             for edge in owned:
                 publisher.set(edge)
                 say_fitted(_sentence(edge, publisher, wires))
+            if "native" in wires and not new:
+                published.append((publisher, owned))
+        for publisher, owned in published:
+            for text in doubtful_edges(session, publisher, owned):
+                note(f"warning: {text}", event="warning", robot=publisher.robot)
         wait_in_slices(threading.Event())
 
 

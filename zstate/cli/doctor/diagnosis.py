@@ -27,6 +27,7 @@ from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
+    from zstate.buffer.frames import FrameInfo
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
 
@@ -92,12 +93,13 @@ def _of_robots(
     called: str,
 ) -> Iterator[Check]:
     from zstate.cli.doctor.ear import Ear, listen
-    from zstate.cli.doctor.robot_checks import robot_checks
+    from zstate.cli.doctor.robot_checks import robot_checks, shared_roots_checks, static_roots
     from zstate.cli.doctor.ros_checks import ros_checks
     from zstate.net.clock_offset import measure_offsets
 
     words = words_of(wire)
     offsets = measure_offsets(session, ANY) if wire == "native" else ()
+    tops: list[FrameInfo] = []
     for first in range(0, len(wanted), _AT_ONCE):
         with ExitStack() as listening:
             some = wanted[first : first + _AT_ONCE]
@@ -114,6 +116,9 @@ def _of_robots(
                     checks = robot_checks(ear, session)
                 for check in checks:
                     yield check.of(ear.info.name)
+                tops += static_roots(ear)
+    if wire == "native":
+        yield from shared_roots_checks(tops)
 
 
 def _absent_check(

@@ -69,7 +69,6 @@ class Ear(Closing):
                     info.name,
                     wire=wire,
                     follow=self.followed,
-                    history_on_join=False,
                     on_event=self.events.append,
                 )
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from zstate.buffer.frames import FrameInfo
 from zstate.cli.console import count_text
@@ -10,6 +10,7 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
 from zstate.cli.doctor.ear import Ear
 from zstate.cli.doctor.samples import Ranges
+from zstate.cli.target_frames import near_frames, without_advice
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text
@@ -58,7 +59,11 @@ def _writers_check(ear: Ear) -> Check:
     for event in ear.events:
         if event.kind == "conflict" and event.stream == "tf_static":
             if _refused_static(ear) is None:  # which says more
-                return warning("writers", event.text, "zstate ls  # shows both; end one of them")
+                return warning(
+                    "writers",
+                    without_advice(event.text),
+                    f"zstate tree {ear.info.name}  # shows the edge that counts",
+                )
         elif event.kind == "conflict":
             then = (
                 f"zstate ls  # shows both; end one of them, or give it --name, another than {ear.info.name}"
@@ -242,7 +247,7 @@ def statics_check(ear: Ear) -> Check:
     refused = _refused_static(ear) or _foreign_static(ear, owned)
     if refused is not None:
         then = f"zstate tree {ear.info.name}  # the frames without that edge; end its writer, or correct it"
-        return warning("tf_static", refused, then)
+        return warning("tf_static", without_advice(refused), then)
     if silent:
         text = f"{others[silent[0]]} announces static edges as {silent[0]!r}, and places no frame"
         return warning("tf_static", text, f"zstate tree {ear.info.name}")
@@ -272,18 +277,61 @@ def _foreign_static(ear: Ear, owned: Iterable[FrameInfo]) -> str | None:
 def poses_check(ear: Ear, model: RobotModel | None) -> Check:
     """Whether the frames hang together, and a pose of the outermost is known."""
     frames, robot = ear.listener.buffer.frames(), ear.info.name
-    if not frames:
-        return skipped("poses", "no frame is known")
     roots = sorted(frame.name for frame in frames if frame.parent is None)
     if len(roots) > 1:
-        text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(roots)}"
-        return warning("poses", text, f"zstate static {roots[0]} {roots[1]} --xyz 0 0 0  # joins two of them")
+        return _trees_check(ear, frames, roots)
+    is_driven = "joint_states" in ear.streams and model is not None
+    if not (ear.samples.count or is_driven or (model is not None and not model.joint_names)):
+        return skipped("poses", "no joint positions")
+    if not frames:
+        return skipped("poses", "no frame is known")
     ends = telling_links(model, 1) if model is not None else ()
     target, source = roots[0], f"{robot}/{ends[0]}" if ends else frames[-1].name
     try:
         ear.listener.buffer.lookup(target, source)
     except LookupFailed as error:
         if not ear.samples.count:
-            return skipped("poses", f"the links move with joints of which nothing is heard: {error}")
+            return skipped("poses", f"no joint positions: {error}")
         return broken("poses", str(error), f"zstate tf {target} {source}")
     return ok("poses", f"{count_text(len(frames), 'frame')} in one tree; {source} in {target} is known")
+
+
+def _trees_check(ear: Ear, frames: Sequence[FrameInfo], roots: Sequence[str]) -> Check:
+    """Frames that are not joined: by a name that is nearly right, or by an edge that is missing."""
+    text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(roots)}"
+    for frame in static_roots(ear):
+        root = frame.parent or ""
+        near = near_frames(root, {frame.name for frame in frames} - {root})
+        if near:
+            robot, _, bare = root.partition("/")
+            text = f"{text}: {bare!r} is near {near[0]!r}, and {frame.name!r} is on it"
+            then = f"zstate tree {robot}  # if {near[0]!r} is meant, start {frame.writer} with that name"
+            return warning("poses", text, then)
+    return warning("poses", text, f"zstate static {roots[0]} {roots[1]} --xyz 0 0 0  # joins two of them")
+
+
+def shared_roots_checks(tops: Iterable[FrameInfo]) -> Iterator[Check]:
+    """Warnings where several robots each have a frame of the same name on top, such as a/map and b/map.
+
+    ``tops`` are the ``static_roots`` of all robots.
+    """
+    owners: dict[str, list[FrameInfo]] = {}
+    for frame in tops:
+        owners.setdefault((frame.parent or "").partition("/")[2], []).append(frame)
+    for name, placed in owners.items():
+        if len(placed) > 1:
+            frames = " and ".join(repr(frame.parent) for frame in placed)
+            text = f"{frames} are different frames; name one that robots share in full, such as fleet/{name}"
+            then = f"zstate static fleet/{name} {placed[0].name} --xyz 0 0 0  # instead of {placed[0].parent}"
+            yield warning("frames", text, then)
+
+
+def static_roots(ear: Ear) -> Iterator[FrameInfo]:
+    """For each root of its own that no model places anything on: one of the frames there."""
+    frames = ear.listener.buffer.frames()
+    writers = {name for name, _ in ear.info.static_names if name != MODEL_WRITER}
+    for root in frames:
+        on_it = [frame for frame in frames if frame.parent == root.name]
+        is_own = root.parent is None and root.name.startswith(f"{ear.info.name}/")
+        if is_own and on_it and all(frame.writer in writers for frame in on_it):
+            yield on_it[0]

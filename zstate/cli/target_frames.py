@@ -1,0 +1,149 @@
+"""Whether the frames on which static edges are put exist: near misses, and frames that are new."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, MessageError, ModelError, ZStateError
+from zstate.model.urdf import parse_urdf
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.wires import wire_named
+from zstate.transform import Transform
+from zstate.wire.keys import MODEL_WRITER, full_name
+from zstate.wire.messages import RobotDescription, StaticTransforms
+
+if TYPE_CHECKING:
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
+    from zstate.statics import StaticPublisher
+    from zstate.wire.wire import Arrival
+
+_MODEL_WITHIN_S = 1.5
+_LOOK_EVERY_S = 0.02
+
+
+def doubtful_edges(session: Session, publisher: StaticPublisher, edges: Sequence[Transform]) -> list[str]:
+    """Warnings about ``edges``, which ``publisher`` publishes: those on unknown frames, and those refused.
+
+    Waits a second or so for the model of each robot after which a target is named; without one, or where
+    this identity may not read it, only near misses of other static frames are reported.
+    """
+    full = [
+        Transform(
+            full_name(publisher.robot, edge.target), full_name(publisher.robot, edge.source), *_pose(edge)
+        )
+        for edge in edges
+    ]
+    warnings: list[str] = []
+    for robot in dict.fromkeys(edge.target.partition("/")[0] for edge in full):
+        with suppress(ZStateError), RobotFrames(session, robot, publisher.writer) as frames:
+            frames.wait_for_model()
+            own = [edge for edge in full if edge.target.startswith(f"{robot}/")]
+            warnings += frames.warnings(own, {edge.source for edge in full})
+    return warnings
+
+
+def _pose(edge: Transform) -> tuple[Sequence[float], Sequence[float]]:
+    return edge.translation.tolist(), edge.rotation.tolist()
+
+
+def near_frames(name: str, known: Collection[str]) -> list[str]:
+    """The frames of the same robot that were probably meant by ``name``, without the robot's name."""
+    robot, _, bare = name.partition("/")
+    others = [frame.removeprefix(f"{robot}/") for frame in known if frame.startswith(f"{robot}/")]
+    return get_close_matches(bare, sorted(others), n=3)
+
+
+def without_advice(text: str) -> str:
+    """The text of a refused edge without the call that only a program can make."""
+    return re.sub(r"; withdraw\('[^']*'\) first if it really moved", "", text)
+
+
+class RobotFrames(Closing):
+    """The links of ``robot`` and the frames of its static writers, without those of the ``writer`` itself."""
+
+    def __init__(self, session: Session, robot: str, writer: str) -> None:
+        self._robot, self._writer = robot, writer
+        self._wire = wire_named("native")
+        self._model: RobotModel | None = None
+        self._statics: dict[str, frozenset[str]] = {}
+        with ExitStack() as opening:
+            key = self._wire.expression(robot, "tf_static")
+            opening.enter_context(LatchedSubscriber(session, key, self._take_statics))
+            key = self._wire.expression(robot, "robot_description")
+            opening.enter_context(LatchedSubscriber(session, key, self._describe))
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def _describe(self, arrival: Arrival) -> None:
+        with suppress(MessageError, ModelError):
+            for message in self._wire.decode("robot_description", arrival, self._robot):
+                if isinstance(message, RobotDescription):
+                    self._model = parse_urdf(message.urdf, f"the URDF of {self._robot!r}")
+
+    def _take_statics(self, arrival: Arrival) -> None:
+        writer = self._wire.statics_writer(arrival.key) or ""
+        if writer in (MODEL_WRITER, self._writer):
+            return
+        with suppress(MessageError):
+            for message in self._wire.decode("tf_static", arrival, self._robot):
+                if isinstance(message, StaticTransforms):
+                    names = (full_name(self._robot, frame) for edge in message.edges for frame in edge)
+                    self._statics[writer] = frozenset(names)
+
+    def wait_for_model(self) -> None:
+        """Return when the model has arrived, or after a second or so without one."""
+        deadline = time.monotonic() + _MODEL_WITHIN_S
+        while self._model is None and time.monotonic() < deadline:
+            time.sleep(_LOOK_EVERY_S)
+
+    def warnings(self, edges: Sequence[Transform], placed: Collection[str]) -> list[str]:
+        """What is doubtful about ``edges``; frames that are ``placed`` with them exist."""
+        links = () if self._model is None else self._model.links
+        known = frozenset(full_name(self._robot, link) for link in links).union(*self._statics.values())
+        targets = dict.fromkeys(edge.target for edge in edges if edge.target not in known.union(placed))
+        sources = {edge.target: edge.source for edge in edges}
+        found = [self._warning(target, sources[target], known) for target in targets]
+        return [*filter(None, found), *self._refusals(edges)]
+
+    def _warning(self, target: str, source: str, known: frozenset[str]) -> str:
+        bare, robot = target.removeprefix(f"{self._robot}/"), self._robot
+        near = near_frames(target, known)
+        if near:
+            which = " or ".join(map(repr, near))
+            return f"{robot!r} has no frame {bare!r}; did you mean {which}? (--new if it is a new frame)"
+        if self._model is None:
+            return ""
+        if source in known:
+            return (
+                f"{target!r} is a new frame of {robot!r} alone; name a frame that robots share in full, "
+                f"for instance fleet/{bare} (--new if it is a new frame)"
+            )
+        return f"{robot!r} has no frame {bare!r}: {source!r} is not joined to it (--new if it is a new frame)"
+
+    def _refusals(self, edges: Sequence[Transform]) -> Iterator[str]:
+        """Why listeners refuse some of ``edges`` beside the model, such as a loop."""
+        if self._model is not None:
+            buffer = TransformBuffer()
+            buffer.add_robot(self._model, self._robot)
+            for edge in edges:
+                refusal = _refusal(buffer, edge, self._writer)
+                if refusal is not None:
+                    yield f"listeners refuse this edge: {without_advice(str(refusal))}"
+
+
+def _refusal(buffer: TransformBuffer, edge: Transform, writer: str) -> InvalidInput | None:
+    try:
+        buffer.insert_static(edge, writer=writer)
+    except InvalidInput as error:
+        return error
+    return None
