@@ -23,7 +23,7 @@ FLOORS = (
     {"transform", "twist"},
     {"model", "buffer", "wire"},
     {"net", "record"},
-    {"sources", "following", "moving_edges", "status"},
+    {"sources", "following", "moving_edges", "status", "lookup_service"},
     {
         "publisher",
         "statics",
@@ -32,7 +32,6 @@ FLOORS = (
         "recording",
         "clock_publisher",
         "simulated_clock",
-        "lookup_service",
     },
     {"ros1", "bridge", "replaying"},
     {"replayer"},

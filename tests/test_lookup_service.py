@@ -17,6 +17,7 @@ from zstate.net.session import Session, connect
 from zstate.publisher import StatePublisher
 from zstate.transform import Transform
 from zstate.wire.json import to_json
+from zstate.wire.keys import Stream
 
 PERIOD = 10_000_000
 KEY = "zstate/r1/lookup"
@@ -127,24 +128,52 @@ def test_where_nobody_answers_it_is_said_what_to_run(sessions: tuple[Session, Se
         ask_lookup(sessions[1], "r1", "world", "tool", timeout_s=0.0)
 
 
-def test_a_publisher_answers_of_what_it_sent_last(sessions: tuple[Session, Session]):
+def test_every_publisher_answers_of_what_it_sent_last(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", cache_s=1.0) as publisher:
-        assert publisher.memory is not None
-        recent = RecentBuffer(RRBOT, "r1", publisher.memory)
-        with LookupService(writer, recent.filled, "r1"):
-            await_answers(reader)
-            with pytest.raises(NoData):
+        await_answers(reader)
+        with pytest.raises(NoData):
+            ask_lookup(reader, "r1", "world", "tool")
+        for number in range(150):
+            publisher.publish([0.01 * number, 0.25], stamp=STAMP + number * PERIOD)
+            if number % 40 == 0:
                 ask_lookup(reader, "r1", "world", "tool")
-            for number in range(150):
-                publisher.publish([0.01 * number, 0.25], stamp=STAMP + number * PERIOD)
-                if number % 40 == 0:
-                    ask_lookup(reader, "r1", "world", "tool")
-            for number in (49, 100, 149):
-                answer = ask_lookup(reader, "r1", "world", "tool", STAMP + number * PERIOD)
-                assert_pose(answer, kinematic_pose(RRBOT, [0.01 * number, 0.25], "world", "tool"))
-            with pytest.raises(InPast):
-                ask_lookup(reader, "r1", "world", "tool", STAMP + 48 * PERIOD)
+        for number in (49, 100, 149):
+            answer = ask_lookup(reader, "r1", "world", "tool", STAMP + number * PERIOD)
+            assert_pose(answer, kinematic_pose(RRBOT, [0.01 * number, 0.25], "world", "tool"))
+        with pytest.raises(InPast):
+            ask_lookup(reader, "r1", "world", "tool", STAMP + 48 * PERIOD)
+        with pytest.raises(UnknownFrame):
+            ask_lookup(reader, "r1", "world", "camera")
+    with pytest.raises(Unreachable):
+        ask_lookup(reader, "r1", "world", "tool", timeout_s=0.2)
+
+
+def test_without_a_cache_a_publisher_answers_of_its_newest_sample(sessions: tuple[Session, Session]):
+    with StatePublisher(sessions[0], RRBOT, "r1", cache_s=0.0) as publisher:
+        await_answers(sessions[1])
+        for number in range(3):
+            publisher.publish([0.5 * number, 0.25], stamp=STAMP + number * PERIOD)
+        answer = ask_lookup(sessions[1], "r1", "world", "tool")
+        assert answer.stamp == STAMP + 2 * PERIOD
+        assert_pose(answer, kinematic_pose(RRBOT, [1.0, 0.25], "world", "tool"))
+        with pytest.raises(InPast):
+            ask_lookup(sessions[1], "r1", "world", "tool", STAMP + PERIOD)
+
+
+def test_a_driver_and_the_state_publisher_beside_it_answer_the_same(sessions: tuple[Session, Session]):
+    driver, other = sessions
+    derived: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
+    with (
+        StatePublisher(driver, RRBOT, "r1", streams=("joint_states",)) as joints,
+        StatePublisher(other, RRBOT, "r1", streams=derived) as state,
+    ):
+        await_answers(other)
+        for publisher in (joints, state):
+            publisher.publish([0.5, 0.25], stamp=STAMP)
+        for session in sessions:
+            answer = ask_lookup(session, "r1", "world", "tool")
+            assert (answer.stamp, answer.kind) == (STAMP, "exact")
 
 
 def test_a_publisher_whose_clock_was_set_back_answers_of_the_time_since(sessions):

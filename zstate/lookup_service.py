@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.tracks import JointTrack
 from zstate.closing import Closing
 from zstate.errors import AmbiguousFrame, ZStateError
 from zstate.locks import new_lock
@@ -15,7 +16,7 @@ from zstate.net.session import Session
 from zstate.transform import Transform
 from zstate.wire.json import to_json
 from zstate.wire.keys import full_name, lookup_key
-from zstate.wire.messages import JointState, from_block
+from zstate.wire.messages import from_block
 from zstate.wire.questions import LookupQuestion, error_to_json
 
 _JSON = "application/json"
@@ -67,29 +68,31 @@ class LookupService(Closing):
 
 
 class RecentBuffer:
-    """A buffer of one robot's frames, filled with what its writer remembers when somebody asks.
+    """A buffer of one robot's frames, filled from its writer's memory at each query.
 
-    Costs the writer nothing otherwise.
+    It is made at the first query; a publisher that is never asked pays nothing.
     """
 
     def __init__(self, model: RobotModel, robot: str, memory: Memory) -> None:
-        self._buffer = TransformBuffer(memory.span_s)
-        self._track = self._buffer.add_robot(model, robot)
+        self._model, self._robot = model, robot
         self._memory = memory
+        self._made: tuple[TransformBuffer, JointTrack] | None = None
         self._next_seq = 0
         self._lock = new_lock()
 
     def filled(self) -> TransformBuffer:
         """The buffer, with every sample until now."""
         with self._lock:
+            if self._made is None:
+                made = TransformBuffer(self._memory.span_s)
+                self._made = made, made.add_robot(self._model, self._robot)
+            buffer, track = self._made
             for state in self._memory.since(self._next_seq):
-                if not self._insert(state):
+                rates = None if state.velocities is None else from_block(state.velocities)
+                sample = (track, state.stamp, from_block(state.positions), rates)
+                if not buffer.insert_joints(*sample):
                     # The writer's clock was set back: what it said before is another epoch.
-                    self._buffer.restart(self._track)
-                    self._insert(state)
+                    buffer.restart(track)
+                    buffer.insert_joints(*sample)
                 self._next_seq = state.seq + 1
-        return self._buffer
-
-    def _insert(self, state: JointState) -> bool:
-        rates = None if state.velocities is None else from_block(state.velocities)
-        return self._buffer.insert_joints(self._track, state.stamp, from_block(state.positions), rates)
+        return buffer

@@ -13,6 +13,7 @@ from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock, outlive_fork
+from zstate.lookup_service import LookupService, RecentBuffer
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.limits import JointLimits
 from zstate.model.robot import RobotModel
@@ -42,6 +43,9 @@ from zstate.wire.writer import Announced, Writer
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """What a robot's state consists of on the network."""
 
+_NEWEST_ONLY_S = 1e-9
+"""Of the memory that answers lookups where there is no cache for listeners that join."""
+
 
 class StatePublisher(Closing):
     """Publishes the state of one robot: each sample is the whole robot at one instant.
@@ -57,8 +61,10 @@ class StatePublisher(Closing):
     With ``takeover`` it writes nevertheless, and readers follow whoever came last.
 
     On the native wire it says once a second how it does, to
-    those who ask (``zstate.net.status``); and it remembers the last ``cache_s`` seconds of samples for
-    listeners that join (``zstate.net.history``; 0 for none). A context manager; safe from any thread.
+    those who ask (``zstate.net.status``); it remembers the last ``cache_s`` seconds of samples for
+    listeners that join (``zstate.net.history``; 0 for none); and it answers lookups of its own frames on
+    ``zstate/<robot>/lookup`` from these, or from the newest sample without a cache
+    (``zstate.lookup_service``). A context manager; safe from any thread.
     """
 
     def __init__(
@@ -106,7 +112,11 @@ class StatePublisher(Closing):
             if "native" in wires and {"joint_states", "tf"}.intersection(streams):
                 status = Beat(writer, lambda: self.stats).status
                 opening.enter_context(StatusPublisher(session, self.robot, writer.identity, status))
-            self.memory = self._remembering(session, streams, cache_s, opening)
+            self._kept = self._remembering(session, streams, cache_s, opening)
+            self.memory = self._kept if cache_s else None
+            if self._kept is not None and {"joint_states", "tf"}.intersection(streams):
+                recent = RecentBuffer(model, self.robot, self._kept)
+                opening.enter_context(LookupService(session, recent.filled, self.robot))
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
@@ -116,10 +126,12 @@ class StatePublisher(Closing):
     def _remembering(
         self, session: Session, streams: Sequence[Stream], cache_s: float, opening: ExitStack
     ) -> Memory | None:
-        if cache_s == 0.0 or "native" not in self._wires:
+        if "native" not in self._wires:
             return None
         numbers = self.model.position_count + 2 * self.model.velocity_count
-        memory = Memory(cache_s, numbers, self._session_id)
+        memory = Memory(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        if cache_s == 0.0:
+            return memory
         output = self._outputs[self._wires.index("native")]
         for stream, say in output.sayings.items():
             if stream in streams:
@@ -219,9 +231,9 @@ class StatePublisher(Closing):
             state = JointState(*head, self._joint_order, block, rates, forces)
             said = [one for output in self._outputs for one in output.said(state)]
             self._seq += 1
-            if self.memory is not None:
+            if self._kept is not None:
                 # First: who hears nothing of this sample yet can then be told of it.
-                self.memory.keep(state)
+                self._kept.keep(state)
             for outlet, payload in said:
                 outlet.put(payload)
             if self._limits is not None:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-
 from zstate.cli.console import report_text, say_fitted
 from zstate.cli.worker import Worker
-from zstate.lookup_service import LookupService, RecentBuffer
-from zstate.net.session import Session
 from zstate.publisher import StatePublisher
 from zstate.sources.source import JointSource
 
@@ -25,13 +21,3 @@ def run(publisher: StatePublisher, source: JointSource, rate_hz: float, seconds:
         say_fitted(report_text(worker.result(1.0)))
         raise
     say_fitted(report_text(report))
-
-
-def answering_lookups(session: Session, *publishers: StatePublisher) -> ExitStack:
-    """Answer lookups of a robot until this is left, with what its publisher on the native wire sent last."""
-    with ExitStack() as opening:
-        for publisher in publishers:
-            if publisher.memory is not None:
-                recent = RecentBuffer(publisher.model, publisher.robot, publisher.memory)
-                opening.enter_context(LookupService(session, recent.filled, publisher.robot))
-        return opening.pop_all()

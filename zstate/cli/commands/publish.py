@@ -107,7 +107,7 @@ def publish_command(
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
     from zstate.cli.clocks import open_clock
-    from zstate.cli.publishing import answering_lookups, run
+    from zstate.cli.publishing import run
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
@@ -122,7 +122,6 @@ def publish_command(
         StatePublisher(
             session, model, called, wires[len(followed) :], clock=time, takeover=takeover
         ) as whole,
-        answering_lookups(session, derived, whole),
         served(metrics, of_publishers(derived, whole)),
     ):
         places = [words_of(wire).place(called, _DERIVED) for wire in followed]
