@@ -256,6 +256,7 @@ def test_equality_knows_that_q_and_minus_q_are_one_turn() -> None:
 def test_a_transform_reads_as_the_pose_of_one_frame_in_another() -> None:
     text = repr(Transform("world", "hand", (1, 2, 3), (0, 0, 0, 1), 1_500_000_000))
     assert text.startswith("<pose of hand in world at 1.500000000: xyz [1.0000, 2.0000, 3.0000] m")
+    assert "-0.0000" not in repr(Transform("world", "hand", (-0.0, -1e-9, 3), (-0.0, -1e-12, 0, 1)))
     assert "at any time" in repr(Transform("world", "hand", (1, 2, 3), (0, 0, 0, 1)))
 
 

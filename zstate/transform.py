@@ -272,8 +272,9 @@ class Transform(Facts):
 
     def __repr__(self) -> str:
         when = "at any time" if self.stamp is None else f"at {stamp_text(self.stamp)}"
-        x, y, z = self._pose[:3]
-        quaternion = ", ".join(f"{value:.4f}" for value in self._pose[3:])
+        # Adding zero turns -0 into 0.
+        x, y, z, *rest = (round(value, 4) + 0.0 for value in self._pose)
+        quaternion = ", ".join(f"{value:.4f}" for value in rest)
         how = f"predicted {duration_text(round(self.predicted_s * 1e9))} ahead" * (self.kind == "predicted")
         return (
             f"<pose of {self.source} in {self.target} {when}: xyz [{x:.4f}, {y:.4f}, {z:.4f}] m, "

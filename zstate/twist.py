@@ -46,4 +46,4 @@ class Twist:
 
 
 def _vector_text(vector: NDArray[np.float64]) -> str:
-    return "[" + ", ".join(f"{value:.4f}" for value in vector.tolist()) + "]"
+    return "[" + ", ".join(f"{round(value, 4) + 0.0:.4f}" for value in vector.tolist()) + "]"

@@ -184,3 +184,21 @@ def test_messages_that_are_not_ours_are_told_once_and_the_stream_goes_on(spawn: 
 
 def test_a_name_that_no_robot_can_have_is_refused():
     assert "'a/b'" in failure("echo", "a/b")
+
+
+def test_the_robot_may_be_left_out_while_there_is_only_one():
+    with standing():
+        assert b"elbow" in zstate("echo", "--once").stdout
+        assert zstate("hz", "--once").stdout.startswith(b"average rate: ")
+
+
+@pytest.mark.parametrize("command", ["echo", "hz"])
+def test_with_several_robots_the_candidates_are_named(command: str):
+    with standing("left"), standing("right"):
+        assert "which robot? announced: 'left', 'right'" in failure(command, "--once")
+
+
+@pytest.mark.parametrize("command", ["echo", "hz"])
+def test_a_topic_of_ros_leads_to_its_wire(command: str):
+    message = failure(command, "/joint_states", code=2)
+    assert f"a topic of ROS, not a robot; `zstate {command} --wire ros2` reads /joint_states" in message

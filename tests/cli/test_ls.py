@@ -88,8 +88,11 @@ def test_a_narrow_terminal_has_less_of_when_and_of_age():
     writer = Writer("driver", "jetson", 412, 0, 7)
     robots = (RobotInfo("arm", (("joint_states", writer),)),)
     with connect() as session, Sampler(session) as sampler:
-        wide, narrow = (robots_text(robots, sampler, width=width).splitlines()[1] for width in (None, 55))
+        wide = robots_text(robots, sampler).splitlines()[1]
+        headings, robot, narrow = robots_text(robots, sampler, width=55).splitlines()
         narrowest = robots_text(robots, sampler, width=40).splitlines()[1]
+    assert (robot, headings.split()) == ("arm", ["robot,", "stream", "rate", "age", "writer"])
+    assert headings.index("writer") == narrow.index("driver@")
     assert "since 1970-01-01" in wide
     assert "since" not in narrow
     assert len(narrow) <= 55

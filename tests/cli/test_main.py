@@ -36,6 +36,12 @@ def test_a_path_that_the_shell_has_torn_apart_is_put_together(
         assert "one path with a space in it; write it in quotes: 'my arm/arm.urdf'" in message
 
 
+def test_without_a_command_the_help_is_printed():
+    alone, helped = zstate(), zstate("--help")
+    assert (alone.returncode, alone.stdout, alone.stderr) == (0, helped.stdout, b"")
+    assert zstate("snapshot").stdout.startswith(b"Usage: zstate snapshot")
+
+
 def test_a_mistyped_command_is_met_with_the_nearest():
     message = failure("jonts", code=2)
     assert "there is no command 'jonts'; did you mean 'joints'?" in message

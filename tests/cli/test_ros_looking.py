@@ -117,7 +117,7 @@ def test_echo_hears_one_namespace_or_the_robot_that_is_named(ros_router: str):
 
 
 def test_whoever_must_name_a_robot_is_told(ros_router: str):
-    assert "Missing argument 'ROBOT'" in failure("echo", "--wire", "native", code=2)
+    assert "no robot is announced" in failure("echo", "--wire", "native")
     message = failure("hz", "--wire", "ros2:namespace=*", code=2)
     assert "each robot has a namespace of its name" in message
 

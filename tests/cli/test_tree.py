@@ -26,9 +26,9 @@ def test_each_edge_has_its_kind_rate_age_and_writer():
         "base",
         "upper",
         "lower",
-        "tool",
         "camera_link",
         "laser_link",
+        "tool",
     ]
     upper = lines[1].split()
     assert upper[1:3] == ["upper", "joint"]
@@ -41,8 +41,8 @@ def test_guides_show_who_hangs_on_whom():
     with standing():
         lines = drawn()
     assert lines[2].startswith("└── base ")
-    assert lines[5].startswith("            ├── tool ")
-    assert lines[7].startswith("            └── laser_link ")
+    assert lines[5].startswith("            ├── camera_link ")
+    assert lines[7].startswith("            └── tool ")
 
 
 def test_static_edges_of_others_stand_in_the_tree():
@@ -90,8 +90,12 @@ def test_a_robot_that_is_not_there_is_an_error_that_lists_the_others():
     assert "announced: 'rrbot'" in message
 
 
-def test_nobody_at_all_is_an_error_that_says_how_to_begin():
-    assert "zstate publish" in failure("tree")
+def test_nobody_at_all_is_no_error_as_in_ls_and_it_is_said_how_to_begin():
+    ended = zstate("tree")
+    assert (ended.returncode, ended.stdout) == (0, b"")
+    assert b"zstate publish" in ended.stderr
+    assert json.loads(zstate("tree", "--json").stdout) == []
+    assert "nobody announces the robot 'rrbot'" in failure("tree", "rrbot")
 
 
 def test_joint_states_alone_have_no_tree_and_it_is_said_who_would_make_one():

@@ -35,10 +35,14 @@ def test_where_there_is_room_everything_stands_on_the_line_of_its_frame():
             "r1/base             root",
             "└── upper           joint   100.0 Hz  2.0 ms  driver@jetson pid 412",
             "    └── lower       joint   100.0 Hz  2.0 ms  driver@jetson pid 412",
-            "        ├── tool    static                    driver@jetson pid 412",
-            "        └── camera  static                    mount",
+            "        ├── camera  static                    mount",
+            "        └── tool    static                    driver@jetson pid 412",
         ]
     )
+
+
+def test_siblings_stand_in_one_order_whichever_came_first():
+    assert tree_text(FRAMES[::-1], NOW, in_full=False) == tree_text(FRAMES, NOW, in_full=False)
 
 
 def test_a_narrow_terminal_has_letters_for_the_writers():
@@ -47,8 +51,8 @@ def test_a_narrow_terminal_has_letters_for_the_writers():
         "r1/base             root",
         "└── upper           joint   100.0 Hz  2.0 ms  a",
         "    └── lower       joint   100.0 Hz  2.0 ms  a",
-        "        ├── tool    static                    a",
-        "        └── camera  static                    b",
+        "        ├── camera  static                    b",
+        "        └── tool    static                    a",
         "a: driver@jetson pid 412",
         "b: mount",
     ]
@@ -59,8 +63,8 @@ def test_a_narrower_one_is_indented_only_where_the_tree_forks():
         "r1/base   root",
         "↓ upper   joint   100.0 Hz  2.0 ms  a",
         "↓ lower   joint   100.0 Hz  2.0 ms  a",
-        "├ tool    static                    a",
-        "└ camera  static                    b",
+        "├ camera  static                    b",
+        "└ tool    static                    a",
     ]
 
 

@@ -120,8 +120,9 @@ class DemoTable:
         """The first transform on one line."""
         text = self._freshness
         for row in self.rows()[:1]:
-            xyz = ", ".join(f"{value:.3f}" for value in row.transform.translation)
-            rpy = ", ".join(f"{degrees(angle):.1f}" for angle in row.transform.rpy)
+            # Adding zero turns -0 into 0.
+            xyz = ", ".join(f"{round(value, 3) + 0.0:.3f}" for value in row.transform.translation.tolist())
+            rpy = ", ".join(f"{round(degrees(angle), 1) + 0.0:.1f}" for angle in row.transform.rpy)
             text += f"; {_link(row)} in {self._root}: xyz [{xyz}] m, rpy [{rpy}] deg"
         return text
 

@@ -21,9 +21,11 @@ def roots(frames: Sequence[FrameInfo]) -> list[str]:
 
 
 def below(frames: Sequence[FrameInfo]) -> dict[str, list[str]]:
-    """The names of each frame's children."""
+    """The names of each frame's children, sorted."""
     children: dict[str, list[str]] = {}
     for frame in frames:
         if frame.parent is not None:
             children.setdefault(frame.parent, []).append(frame.name)
+    for names in children.values():
+        names.sort()
     return children

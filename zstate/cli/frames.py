@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from zstate.cli.console import note
 from zstate.cli.roster import announced_robots
+from zstate.cli.words import words_of
 from zstate.cli.worker import Worker
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
 
+_NO_FRAMES = "announced, but without any frame: who publishes the model? `zstate publish ROBOT` does"
 _MODELS_WITHIN_S = 3.0
 _SAMPLES_WITHIN_S = 1.0
 # A rate that two samples tell may be far off.
@@ -26,18 +28,30 @@ _LOOK_EVERY_S = 0.02
 def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     """Every frame of ``robot``, or of all robots for "*", with rates and stamps where samples come.
 
-    Says on standard error what is announced but does not arrive. Fails when no such robot is
-    announced.
+    Says on standard error what is announced but does not arrive, and that nobody is announced. Fails when
+    ``robot`` is not announced.
     """
+    from zstate.net.presence import discover
+    from zstate.wire.keys import ANY
+
     # Models and statics come while those who write them are asked for, which is mostly waiting.
-    asked = Worker("zstate announced", lambda: announced_robots(session, robot))
+    asked = Worker(
+        "zstate announced",
+        lambda: discover(session) if robot == ANY else announced_robots(session, robot),
+    )
     from zstate.listener import TransformListener
 
     with TransformListener(session, robot) as listener:
         robots = asked.result()
+        if not robots:
+            note(words_of("native").announced(()))
+            return ()
         _wait_for_models(listener, robots)
         _wait_for_samples(listener, robots)
-        return listener.buffer.frames()
+        frames = listener.buffer.frames()
+    if not frames:
+        note(_NO_FRAMES)
+    return frames
 
 
 def _wait_for_models(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> None:

@@ -149,8 +149,7 @@ def main() -> NoReturn:
     try:
         code = group.main(prog_name="zstate", standalone_mode=False)
     except click.UsageError as error:
-        _complain(_usage_text(error))
-        code = error.exit_code
+        code = _end_of_wrong_usage(error)
     except click.ClickException as error:
         _complain(error.format_message())
         code = error.exit_code
@@ -160,6 +159,16 @@ def main() -> NoReturn:
     except SystemExit as leaving:
         code = leaving.code
     _leave(code)
+
+
+def _end_of_wrong_usage(error: click.UsageError) -> int:
+    """Print what is wrong, or the help where only a command was missing; the exit code."""
+    # Click before 8.2 prints the help by itself.
+    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):
+        click.echo(error.format_message())
+        return 0
+    _complain(_usage_text(error))
+    return error.exit_code
 
 
 def _leave(code: str | int | None) -> NoReturn:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from zstate.metrics.address import Address
     from zstate.model.robot import RobotModel
     from zstate.net.security import Credentials
+    from zstate.net.session import Session
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -175,15 +176,28 @@ def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Co
     )
 
 
-def named_robot(robot: str | None, wire: str) -> str:
-    """The robot that a command was given, or the only one that ``wire`` can mean."""
+def named_robot(session: Session, robot: str | None, wire: str) -> str:
+    """The robot that a command was given, or the only one there is or that ``wire`` can mean."""
+    from zstate.cli.roster import only_robot
     from zstate.cli.words import is_ros, words_of
 
     meant = robot or words_of(wire).robot
-    if meant is None:
-        why = "; on this wire each robot has a namespace of its name" if is_ros(wire) else ""
-        raise click.UsageError(f"Missing argument 'ROBOT'{why}.")
-    return meant
+    if meant is not None:
+        return meant
+    if is_ros(wire):
+        raise click.UsageError(
+            "Missing argument 'ROBOT'; on this wire each robot has a namespace of its name."
+        )
+    return only_robot(session)
+
+
+def refuse_topic(robot: str | None, wire: str) -> None:
+    """Raise UsageError where a topic of ROS is given for a robot of the native wire."""
+    if robot is not None and robot.startswith("/") and wire == "native":
+        command = click.get_current_context().command_path
+        raise click.UsageError(
+            f"{robot!r} is a topic of ROS, not a robot; `{command} --wire ros2` reads /joint_states"
+        )
 
 
 def parsed_xacro_args(words: Iterable[str]) -> dict[str, str]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _SILENT_NS = 2_000_000_000
 
 _AGE, _WRITER, _SINCE = 2, 3, 4
+_HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 
 
 def sources(robots: Sequence[RobotInfo]) -> list[Source]:
@@ -38,24 +39,35 @@ def robots_text(robots: Sequence[RobotInfo], sampler: Sampler, *, width: int | N
     """Each robot, and below it each stream: rate, age of the newest sample, writer, since when.
 
     Where that is wider than ``width``, the date is left out, then all of since when, then the age; at last
-    writers become letters that are explained below.
+    writers become letters that are explained below. Headings are above where there is room for them.
     """
     rows = [_row(robot, stream, writer, sampler) for robot in robots for stream, writer in robot.writers]
-    lines, legend = narrowed(rows, None), list[str]()
-    if width is not None and max(map(len, lines), default=0) > width:
-        short = [(*row[:_SINCE], row[_SINCE].rpartition(", ")[2]) for row in rows]
-        lines = narrowed(short, width, (_SINCE, _AGE))
-        if max(map(len, lines)) > width:
-            letters = letters_for(row[_WRITER] for row in rows)
-            named = [(*row[:_WRITER], letters[row[_WRITER]], *row[_SINCE:]) for row in short]
-            lines = narrowed(named, width, (_SINCE, _AGE))
-            legend = [f"{letter}: {printable(writer)}" for writer, letter in letters.items()]
+    lines, legend = _fitted_lines(rows, width)
     text: list[str] = []
+    if width is not None:
+        headed, letters = _fitted_lines([_HEADINGS, *rows], width)
+        if not letters and max(map(len, headed)) <= width:
+            text, lines = headed[:1], headed[1:]
     for robot in robots:
         count = len(robot.writers)
         text += [robot.name, *lines[:count]]
         lines = lines[count:]
     return "\n".join([*text, *legend])
+
+
+def _fitted_lines(rows: Sequence[tuple[str, ...]], width: int | None) -> tuple[list[str], list[str]]:
+    """Rows as lines, as wide as ``width`` if that can be, and what explains their letters."""
+    lines = narrowed(rows, None)
+    if width is None or max(map(len, lines), default=0) <= width:
+        return lines, []
+    short = [(*row[:_SINCE], row[_SINCE].rpartition(", ")[2]) for row in rows]
+    lines = narrowed(short, width, (_SINCE, _AGE))
+    if max(map(len, lines)) <= width:
+        return lines, []
+    letters = letters_for(row[_WRITER] for row in rows)
+    named = [(*row[:_WRITER], letters[row[_WRITER]], *row[_SINCE:]) for row in short]
+    legend = [f"{letter}: {printable(writer)}" for writer, letter in letters.items()]
+    return narrowed(named, width, (_SINCE, _AGE)), legend
 
 
 def _row(robot: RobotInfo, stream: Stream, writer: Writer, sampler: Sampler) -> tuple[str, ...]:

@@ -30,6 +30,14 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     return wanted
 
 
+def only_robot(session: Session) -> str:
+    """The robot that is announced, if it is the only one. Fails with the candidates for several or none."""
+    first, *others = announced_robots(session, "*")
+    if others:
+        fail(f"which robot? {words_of('native').announced((first, *others))}")
+    return first.name
+
+
 class Roster(Closing):
     """The robots that are announced now, kept up to date.
 

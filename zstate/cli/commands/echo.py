@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from zstate.cli.console import say, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import named_robot, session_options, timeout_option, wire_option
+from zstate.cli.options import named_robot, refuse_topic, session_options, timeout_option, wire_option
 
 if TYPE_CHECKING:
     from zstate.cli.document_text import Changes
@@ -54,7 +55,10 @@ def echo_command(
 ) -> None:
     """Print the joint states of ROBOT as they come in, as YAML documents.
 
+    ROBOT may be left out while one robot is announced.
+
     \b
+    zstate echo
     zstate echo panda
     zstate echo panda --field panda_joint1 --csv > joint1.csv
     zstate echo panda --by 0.001
@@ -66,12 +70,12 @@ def echo_command(
     from zstate.cli.tap import Tap
     from zstate.clock import LONGEST_WAIT_S
 
-    heard = named_robot(robot, wire)
-    with (
-        open_session(network, (wire,)) as session,
-        Named(session, heard, wire) as named,
-        Tap(session, heard, "joint_states", wire) as tap,
-    ):
+    refuse_topic(robot, wire)
+    with ExitStack() as opened:
+        session = opened.enter_context(open_session(network, (wire,)))
+        heard = named_robot(session, robot, wire)
+        named = opened.enter_context(Named(session, heard, wire))
+        tap = opened.enter_context(Tap(session, heard, "joint_states", wire))
         show = _printer(form, field, Changes(by) if changed or by else None)
         tapped = tap.first(timeout if once else None)
         show(named.document(tapped))

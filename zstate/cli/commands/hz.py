@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from dataclasses import asdict
 from typing import TYPE_CHECKING, NoReturn
 
@@ -10,7 +11,14 @@ import click
 
 from zstate.cli.console import fail, note, say_fitted, say_json
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import json_option, named_robot, session_options, timeout_option, wire_option
+from zstate.cli.options import (
+    json_option,
+    named_robot,
+    refuse_topic,
+    session_options,
+    timeout_option,
+    wire_option,
+)
 from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
@@ -52,9 +60,11 @@ def hz_command(
 ) -> None:
     """Measure, once a second, the rate at which samples of ROBOT arrive here.
 
-    On ROS's side that is the rate of a topic's messages, of all nodes together.
+    ROBOT may be left out while one robot is announced. On ROS's side that is the rate of a topic's messages,
+    of all nodes together.
 
     \b
+    zstate hz
     zstate hz panda
     zstate hz --wire ros2                              # /joint_states
     zstate hz --wire ros2 --stream tf --once           # /tf
@@ -62,8 +72,10 @@ def hz_command(
     from zstate.cli.arrivals import Arrivals
     from zstate.cli.tap import Tap
 
-    heard = named_robot(robot, wire)
-    with open_session(network, (wire,)) as session, Tap(session, heard, stream, wire) as tap:
+    refuse_topic(robot, wire)
+    with ExitStack() as opened:
+        session = opened.enter_context(open_session(network, (wire,)))
+        tap = opened.enter_context(Tap(session, named_robot(session, robot, wire), stream, wire))
         arrivals = Arrivals(window, of_all=is_ros(wire))
         if once:
             _show(_measured_once(tap, arrivals, timeout), as_json=as_json)

@@ -34,7 +34,8 @@ def ls_command(network: Network, *, watch: bool, as_json: bool, wire: str) -> No
 
     Of joint states also the rate, by their own stamps, and how long ago the last one came. On ROS's side:
     the nodes, and who publishes and subscribes the topics of robots' states, with QoS. With --watch a
-    pipe gets the list anew whenever somebody comes or goes; with --json, one document a second.
+    pipe gets the list anew whenever somebody comes or goes; with --json, one document a second. With nobody
+    announced the list is empty, and the exit code 0. A terminal gets headings.
 
     \b
     zstate ls

@@ -11,6 +11,7 @@ import click
 from zstate.cli.console import count_text, fail, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, wire_option
+from zstate.cli.roster import only_robot
 from zstate.cli.words import words_of
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def plot_command(
         curves = _recorded(file, robot, frames, start or 0.0, seconds)
     else:
         with open_session(network, (wire,)) as session:
-            name = robot or words_of(wire).robot or ("*" if frames else _only_robot(session))
+            name = robot or words_of(wire).robot or ("*" if frames else only_robot(session))
             curves = _live(session, name, wire, frames, seconds or _LIVE_S)
     _draw(curves.chosen(joints), name, frames, output)
 
@@ -108,15 +109,6 @@ def _live(session: Session, robot: str, wire: str, frames: tuple[str, str] | Non
     if frames:
         return live_path(session, robot, wire, frames, seconds)
     return live_joints(session, robot, wire, seconds)
-
-
-def _only_robot(session: Session) -> str:
-    from zstate.cli.roster import announced_robots
-
-    first, *others = announced_robots(session, "*")
-    if others:
-        fail(f"which robot? {words_of('native').announced((first, *others))}")
-    return first.name
 
 
 def _draw(curves: Curves, name: str, frames: tuple[str, str] | None, output: Path | None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import is_terminal, note, say, say_json, terminal_width
+from zstate.cli.console import is_terminal, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
@@ -17,8 +17,6 @@ from zstate.cli.words import is_ros, words_of
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
     from zstate.cli.words import Words
-
-_NO_FRAMES = "announced, but without any frame: who publishes the model? `zstate publish ROBOT` does"
 
 
 @click.command("tree")
@@ -30,7 +28,8 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 
     For each edge: its kind, the rate of its samples, the age of the newest one, and who writes it. In a
-    terminal that is too narrow, writers are letters, and "↓" is before an only child.
+    terminal that is too narrow, writers are letters, and "↓" is before an only child. With nobody announced
+    there is no tree, and the exit code is 0 as that of ls and graph; it is 1 for a ROBOT that is not there.
 
     \b
     zstate tree
@@ -47,8 +46,6 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
         else:
             frames = gathered_frames(session, robot)
         now = time.time_ns()
-    if not frames and not is_ros(wire):
-        note(_NO_FRAMES)
     if form == "json":
         say_json([_facts(frame, now) for frame in frames])
     elif frames:
