@@ -8,6 +8,7 @@ from support import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect
 from zstate.cli.target_frames import doubtful_edges
+from zstate.cli.up.sections import StaticSection
 
 pytestmark = pytest.mark.processes
 
@@ -195,3 +196,17 @@ def test_a_static_frame_of_another_writer_is_known_and_has_near_misses():
         assert doubtful_edges(session, here, [Transform("hall", "gate", *upright)]) == []
         (warning,) = doubtful_edges(session, here, [Transform("hal", "gate", *upright)])
     assert warning.startswith("'fleet' has no frame 'hal'; did you mean 'hall'?")
+
+
+def test_radians_beyond_a_turn_ask_for_degrees(tmp_path: Path):
+    message = failure("static", "r/a", "b", "--xyz", "0", "0", "0", "--rpy", "0", "-90", "0")
+    assert "none beyond 2 pi; got 0, -90, 0" in message
+    assert "to give degrees use --rpy-deg 0 -90 0 (in a file: rpy_deg)" in message
+    file = tmp_path / "cell.toml"
+    file.write_text('[[static]]\ntarget = "r/a"\nsource = "b"\nrpy = [0, -90, 0]\n')
+    assert "none beyond 2 pi; got 0, -90, 0" in failure("static", "--file", str(file))
+
+
+def test_degrees_may_be_more_than_a_turn():
+    turned = StaticSection("r/a", "b", rpy_deg=(0.0, 0.0, 450.0)).transform()
+    assert abs(turned.rotation - [0.0, 0.0, 0.5**0.5, 0.5**0.5]).max() < 1e-12

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import radians
+from math import fmod, radians
 from typing import Literal
 
 import msgspec
@@ -139,7 +139,12 @@ class StaticSection(_Section, frozen=True):
         xyz = self.xyz or (0.0, 0.0, 0.0)
         if self.quat_xyzw is not None:
             return Transform(self.target, self.source, xyz, self.quat_xyzw)
-        return Transform.from_rpy(self.target, self.source, xyz, self._angles())
+        try:
+            return Transform.from_rpy(self.target, self.source, xyz, self._angles())
+        except InvalidInput as error:
+            given = " ".join(f"{angle:g}" for angle in self.rpy or ())
+            degrees = f"; to give degrees use --rpy-deg {given} (in a file: rpy_deg)" if given else ""
+            raise InvalidInput(f"{error}{degrees}") from None
 
     @property
     def _pose_parts(self) -> list[str]:
@@ -149,10 +154,9 @@ class StaticSection(_Section, frozen=True):
     def _angles(self) -> Vector3:
         if self.rpy is not None:
             return self.rpy
-        # Without full turns, which are plain in degrees; in radians they would be taken for a mistake.
-        degrees = self.rpy_deg or (0.0, 0.0, 0.0)
-        roll, pitch, yaw = (angle if abs(angle) <= 360.0 else angle % 360.0 for angle in degrees)
-        return radians(roll), radians(pitch), radians(yaw)
+        # Whole turns of degrees are none, and in radians they would be refused.
+        roll, pitch, yaw = (radians(fmod(angle, 360.0)) for angle in self.rpy_deg or (0.0, 0.0, 0.0))
+        return roll, pitch, yaw
 
 
 def in_a_list(names: Names) -> tuple[str, ...]:
