@@ -143,15 +143,6 @@ def test_a_new_target_above_the_robot_leads_to_the_frame_that_robots_share(spawn
     assert "for instance fleet/map" in child.stderr
 
 
-def test_an_edge_that_listeners_refuse_beside_the_model_is_warned_about(spawn: Spawn):
-    with standing():
-        child = started(spawn, "static", "world", "upper", *POSE)
-        child.line()
-        until(lambda: "listeners refuse this edge: 'rrbot/upper' has the parent" in child.stderr)
-        interrupted(child)
-    assert "withdraw(" not in child.stderr
-
-
 @pytest.mark.parametrize(
     "edge",
     [

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
-from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
-from zstate.errors import InvalidInput, MessageError, ModelError, ZStateError
+from zstate.errors import MessageError, ModelError, ZStateError
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.wires import wire_named
@@ -30,7 +29,7 @@ _LOOK_EVERY_S = 0.02
 
 
 def doubtful_edges(session: Session, publisher: StaticPublisher, edges: Sequence[Transform]) -> list[str]:
-    """Warnings about ``edges``, which ``publisher`` publishes: those on unknown frames, and those refused.
+    """Warnings about those of ``edges``, which ``publisher`` publishes, whose target is unknown.
 
     Waits a second or so for the model of each robot after which a target is named; without one, or where
     this identity may not read it, only near misses of other static frames are reported.
@@ -113,7 +112,7 @@ class RobotFrames(Closing):
         targets = dict.fromkeys(edge.target for edge in edges if edge.target not in known.union(placed))
         sources = {edge.target: edge.source for edge in edges}
         found = [self._warning(target, sources[target], known) for target in targets]
-        return [*filter(None, found), *self._refusals(edges)]
+        return list(filter(None, found))
 
     def _warning(self, target: str, source: str, known: frozenset[str]) -> str:
         bare, robot = target.removeprefix(f"{self._robot}/"), self._robot
@@ -129,21 +128,3 @@ class RobotFrames(Closing):
                 f"for instance fleet/{bare} (--new if it is a new frame)"
             )
         return f"{robot!r} has no frame {bare!r}: {source!r} is not joined to it (--new if it is a new frame)"
-
-    def _refusals(self, edges: Sequence[Transform]) -> Iterator[str]:
-        """Why listeners refuse some of ``edges`` beside the model, such as a loop."""
-        if self._model is not None:
-            buffer = TransformBuffer()
-            buffer.add_robot(self._model, self._robot)
-            for edge in edges:
-                refusal = _refusal(buffer, edge, self._writer)
-                if refusal is not None:
-                    yield f"listeners refuse this edge: {without_advice(str(refusal))}"
-
-
-def _refusal(buffer: TransformBuffer, edge: Transform, writer: str) -> InvalidInput | None:
-    try:
-        buffer.insert_static(edge, writer=writer)
-    except InvalidInput as error:
-        return error
-    return None
