@@ -15,6 +15,7 @@ import zstate
 NAMES = [
     "AccessDenied",
     "AmbiguousFrame",
+    "ClockMismatch",
     "Closed",
     "Disconnected",
     "InFuture",
@@ -127,6 +128,7 @@ ERRORS = {
     "ModelError": ValueError,
     "LookupFailed": zstate.ZStateError,
     "AmbiguousFrame": zstate.LookupFailed,
+    "ClockMismatch": zstate.LookupFailed,
     "Disconnected": zstate.LookupFailed,
     "InFuture": zstate.LookupFailed,
     "InPast": zstate.LookupFailed,

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from zstate.errors import (
         AccessDenied,
         AmbiguousFrame,
+        ClockMismatch,
         Closed,
         Disconnected,
         InFuture,
@@ -53,6 +54,7 @@ __version__ = "0.1.0"
 __all__ = [
     "AccessDenied",
     "AmbiguousFrame",
+    "ClockMismatch",
     "Closed",
     "Disconnected",
     "InFuture",

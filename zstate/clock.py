@@ -26,6 +26,9 @@ SYSTEM = "system"
 SIMULATED = "sim"
 """The domain of the time that a simulation or a replay tells."""
 
+SET_BACK_NS = 100_000_000
+"""The clock of a writer was set back if the next samples are stamped by more before those it sent earlier."""
+
 
 class Clock(Protocol):
     """Two questions about time. Stamps are integer nanoseconds since the Unix epoch.

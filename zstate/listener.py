@@ -44,9 +44,10 @@ class TransformListener(Closing):
     from the publishers of the native wire what they said in the seconds before (``StatePublisher``'s
     ``cache_s``). A context manager.
 
-    All robots in a buffer keep one time, that of ``clock`` where it is given; robots of a simulation want
-    a ``SimulatedClock``. What cannot be used is counted in ``stats``, reported once through ``logging``,
-    and never stops the stream.
+    Each robot has the clock domain that its description names, and robots of different domains may share the
+    buffer; a lookup across two of them raises ClockMismatch. ``clock`` is the one that ages are measured
+    with (default: the system's); for robots of a simulation give a ``SimulatedClock``. What cannot be used is
+    counted in ``stats``, reported once through ``logging``, and never stops the stream.
 
     In a forked process nothing fills the buffer: there it answers from what it held, waits end at once, and
     the errors say so.
@@ -136,6 +137,10 @@ class TransformListener(Closing):
         """What has been received, lost and refused so far."""
         return self._tally.stats()
 
+    def stats_of(self, robot: str) -> Stats:
+        """The part of ``stats`` that concerns one robot."""
+        return self._tally.of(robot).stats()
+
     @property
     def refusals(self) -> dict[str, str]:
         """What could not be used, by reason as in ``stats.refused``: the first of each, in words."""
@@ -174,9 +179,9 @@ class TransformListener(Closing):
         follower = self._followers.get(key)
         if follower is None:
             if self._follow == "joint_states":
-                follower = JointFollower(robot, self._ownership)
+                follower = JointFollower(robot, self._ownership, self._events.note_set_back)
             else:
-                follower = EdgeFollower(robot, self._ownership)
+                follower = EdgeFollower(robot, self._ownership, self._events.note_set_back)
             follower = self._followers.setdefault(key, follower)
             self._ownership.add_robot(robot)
             if self._is_shared and (robot, session) in self._names:
@@ -254,6 +259,7 @@ class TransformListener(Closing):
                     self._take_statics(arrival.key, robot, writer, message)
         elif writer is not None:
             self._static_follower(arrival.key, robot, writer).withdraw()
+            self._statics.pop((arrival.key, 0), None)
             self._events.note_statics(robot, writer, frozenset())
 
     def _is_withdrawn(self, arrival: Arrival) -> bool:
@@ -279,7 +285,7 @@ class TransformListener(Closing):
         try:
             return self._wire.decode(stream, arrival, robot)
         except MessageError as error:
-            self._note_broken(arrival.key, error)
+            self._tally.of(robot).refuse(error.reason, f"{arrival.key}: {error}")
             return ()
 
     def _on_writer(self, announced: Announced, alive: bool) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from support import DEADLINE_S, SOON_S, Child
 
 from zstate import StatePublisher, connect, load_model
+from zstate.clock import Clock
 from zstate.wire.keys import Stream
 
 RRBOT = str(Path(__file__).parents[2] / "models" / "rrbot.urdf")
@@ -62,6 +63,7 @@ def standing(
     model: str = RRBOT,
     wire: str = "native",
     router: str = "",
+    clock: Clock | None = None,
 ) -> Iterator[StatePublisher]:
     """A robot that stands still and says so a hundred times a second, behind ``router`` if there is one."""
     stop = threading.Event()
@@ -72,7 +74,7 @@ def standing(
 
     with (
         connect(mode="client", endpoints=router) if router else connect() as session,
-        StatePublisher(session, load_model(model), robot, (wire,), streams=streams) as publisher,
+        StatePublisher(session, load_model(model), robot, (wire,), streams=streams, clock=clock) as publisher,
     ):
         thread = threading.Thread(target=publish)
         thread.start()

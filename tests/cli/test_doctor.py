@@ -16,6 +16,7 @@ from support import a_free_port, again_and_again
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
+from zstate.clock_publisher import ClockPublisher
 from zstate.wire.keys import Stream
 
 pytestmark = pytest.mark.processes
@@ -205,6 +206,17 @@ def test_a_clock_that_is_ahead_is_broken_before_the_stamps_it_makes():
     assert "10.0 s ahead of this one" in found["text"]
 
 
+@contextmanager
+def simulated_time() -> Iterator[None]:
+    """A simulated time of five seconds, a hundred times a second."""
+    with (
+        connect() as session,
+        ClockPublisher(session) as publisher,
+        again_and_again(lambda: publisher.publish(5 * SECOND)),
+    ):
+        yield
+
+
 def test_simulated_time_that_nobody_tells_is_missed():
     clock = ManualClock(5 * SECOND, "sim")
     with (
@@ -215,6 +227,16 @@ def test_simulated_time_that_nobody_tells_is_missed():
         found = broken_link("rrbot")
     assert found["name"] == "stamps"
     assert "nobody has told the time on 'zstate/clock'" in found["text"]
+
+
+def test_robots_with_different_clocks_are_a_warning_that_names_them():
+    with simulated_time(), standing("left"), standing("right", clock=ManualClock(5 * SECOND, "sim")):
+        done = zstate("doctor")
+    lines = done.stdout.decode().splitlines()
+    (told,) = [line for line in lines if "different clocks" in line]
+    assert told.split()[:2] == ["warning", "clocks"]
+    assert "'left' in 'system' time; 'right' in 'sim' time" in told
+    assert "all is sound" not in lines
 
 
 def test_a_writer_of_a_newer_version_is_named_as_such():

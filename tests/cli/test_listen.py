@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from looking import Spawn, failure, interrupted, standing, started
@@ -49,3 +51,21 @@ def test_it_says_what_it_waits_for(spawn: Spawn):
 
 def test_a_name_that_no_robot_can_have_is_refused():
     assert "'a/b'" in failure("listen", "a/b")
+
+
+def test_many_robots_are_heard_by_one_listener(spawn: Spawn):
+    def threads() -> int:
+        return len(list(Path(f"/proc/{command.process.pid}/task").iterdir()))
+
+    heard: set[str] = set()
+    with ExitStack() as opened:
+        opened.enter_context(standing("bot0"))
+        command = started(spawn, "listen", "--json")
+        until(lambda: json.loads(command.line())["received"] > 0)
+        before = threads()
+        for number in range(1, 6):
+            opened.enter_context(standing(f"bot{number}"))
+        until(lambda: heard.add(json.loads(command.line())["robot"]) or len(heard) == 6)
+        # Links of Zenoh's come to six processes' sessions, but no listeners.
+        assert threads() < before + 4 * 5
+    interrupted(command)

@@ -32,7 +32,11 @@ def grown(url: str, grows: Row) -> dict[Row, float]:
 def test_a_publisher_serves_what_it_does_and_what_it_costs(spawn: Spawn):
     command = started(spawn, "publish", RRBOT, "--source", "sine", "--metrics", "0")
     labels = {"robot": "rrbot", "wire": "native"}
-    rows = grown(url_of(command), row("zstate_publisher_samples_total", stream="joint_states", **labels))
+    url = url_of(command)
+    rows = grown(url, row("zstate_publisher_samples_total", stream="joint_states", **labels))
+    rate = row("zstate_publisher_rate_hertz", stream="joint_states", **labels)
+    until(lambda: scraped(url)[rate] > 50.0)
+    assert scraped(url)[rate] > 50.0  # another scrape at once
     assert rows[row("zstate_publisher_suppressed_total", stream="tf", **labels)] > 0
     assert rows[row("zstate_publisher_commanded_hertz", robot="rrbot")] == 100.0
     assert rows[row("process_resident_memory_bytes")] > 0

@@ -272,3 +272,17 @@ def test_what_is_no_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     with pytest.raises(RecordingError, match="not a recording"):
         TransformBuffer.from_recording(tmp_path / "x.mcap")
+
+
+def test_a_clock_set_back_by_less_than_ten_seconds_begins_anew_in_a_recording_too(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        for number, second in enumerate([10, 11, 12, 6, 7]):
+            tale.joints("arm", START + second * S, swing(number), heard=START + number * S)
+            tale.edges(
+                "cart", START + second * S, {("floor", "cart"): pose(number)}, heard=START + number * S
+            )
+    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    for frames in (("world", "tool"), ("floor", "cart")):
+        assert buffer.latest(*frames) == START + 7 * S
+        assert not buffer.can_lookup(*frames, START + 11 * S)

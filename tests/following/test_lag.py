@@ -18,7 +18,7 @@ def told(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float =
     lag = Lag(Tally())
     with caplog.at_level(logging.WARNING, "zstate"):
         for number, age_s in enumerate(ages_s):
-            lag.note("r1", "driver", 7, round(age_s * S), round(number * every_s * S))
+            lag.note("r1", "driver", round(age_s * S), round(number * every_s * S))
     return len(caplog.records)
 
 

@@ -73,6 +73,13 @@ def test_after_a_clock_was_set_back_only_what_came_then_is_remembered():
     assert seqs(memory.since(0)) == [10, 11]
 
 
+def test_a_clock_set_back_by_less_than_the_span_leaves_nothing_of_before():
+    memory = remembering(10, span_s=10.0)
+    memory.keep(state(10, STAMP - 5 * SECOND))
+    memory.keep(state(11, STAMP - 5 * SECOND + MS))
+    assert seqs(memory.since(0)) == [10, 11]
+
+
 def test_after_a_clock_was_set_forward_only_what_came_then_is_remembered():
     memory = remembering(10, span_s=1.0)
     memory.keep(state(10, STAMP + 3600 * SECOND))

@@ -78,9 +78,9 @@ class TransformBuffer(Questions):
         yet. ``max_age_s`` refuses an older answer. ``predict_s`` allows instants up to so far beyond
         the newest sample, from published velocities; such an answer is of kind "predicted".
 
-        Raises UnknownFrame, AmbiguousFrame, Disconnected, NoData, InPast, InFuture, Stale or NotFinite,
-        all of them LookupFailed; after a wait also a TimeoutError. Raises InvalidInput for names that are
-        no frame names.
+        Raises UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch, NoData, InPast, InFuture, Stale or
+        NotFinite, all of them LookupFailed; after a wait also a TimeoutError. Raises InvalidInput for names
+        that are no frame names.
         """
         if max_age_s is None and timeout_s == 0.0 and predict_s == 0.0:
             try:
@@ -109,8 +109,9 @@ class TransformBuffer(Questions):
         check_names(target, source, fixed)
         for name in (target, source, fixed):
             self._tree.resolve(name, target, source)
-        # A missing connection is blamed before a bad time, on either side.
+        # A missing connection, or two clocks, are blamed before a bad time, on either side.
         self._path(fixed, source)
+        self._path(target, source)
         target_from_fixed = self.lookup(target, fixed, target_at)
         fixed_from_source = self.lookup(fixed, source, source_at)
         try:
@@ -126,7 +127,7 @@ class TransformBuffer(Questions):
         """pose7 of ``source`` in ``target`` at each stamp: (T, 7), and which are valid: (T,).
 
         Rows that have no answer are NaN. Stamps are integers [ns] or datetime64[ns]. Raises UnknownFrame,
-        AmbiguousFrame and Disconnected.
+        AmbiguousFrame, Disconnected and ClockMismatch.
         """
         return self._path(target, source).poses(check_stamps(stamps))
 

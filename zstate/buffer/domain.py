@@ -1,56 +1,91 @@
-"""Domain: whose time the stamps of a buffer are."""
+"""Domain: which clock stamps the samples of each robot in a buffer."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
+
+from zstate.buffer.edge import Edge
 from zstate.locks import new_lock
+
+# So many robots and frames are remembered; of more, the oldest are forgotten.
+_MOST = 4096
 
 
 class Domain:
-    """Stamps of two clocks that say nothing of each other must not meet in one buffer.
+    """The clock domain of each robot. Robots of different domains may share one buffer.
 
-    Which time it is is decided by the clock that the buffer was given, else by the first robot that
-    says whose time it keeps.
+    Stamps of two domains cannot be compared, so a path across both has no answer. ``name`` is the domain to
+    use where one has to be chosen: that of the clock given by the user, else that of most robots.
     """
 
     def __init__(self, given: str | None = None) -> None:
-        self._given = given
+        self.given = given
+        """The domain of the clock that the user gave, None without one."""
         self._kept: dict[str, str] = {}
+        self._present: dict[str, None] = {}
+        self._placed: dict[str, str] = {}
         self._lock = new_lock()
 
     @property
     def name(self) -> str | None:
-        """Its name: "system", or that of a simulated time; None while it is open."""
-        return self._given or self._first()[1] or None
+        """That of the user's clock, else of the majority of robots that have samples and have not left.
 
-    def _first(self) -> tuple[str, str]:
-        """A robot that decides, and the time it keeps; both empty without one."""
-        told = ((robot, kept) for robot, kept in list(self._kept.items()) if kept)
-        return next(told, ("", ""))
+        None while no such robot is known; the first of two equally common domains.
+        """
+        return self.given or self._most_common()
+
+    def _most_common(self) -> str | None:
+        with self._lock:
+            counts = Counter(kept for robot in self._present if (kept := self._kept.get(robot)))
+        return next((domain for domain, _ in counts.most_common(1)), None)
 
     def of(self, robot: str) -> str | None:
-        """The time that ``robot`` keeps: empty where its wire does not tell, None before its description."""
+        """The domain of ``robot``: empty if its wire does not carry it, None before its description."""
         return self._kept.get(robot)
 
-    def decide(self, domain: str) -> None:
-        """Be of this time from now on, whatever robots say."""
-        self._given = domain
+    def of_edge(self, edge: Edge) -> str | None:
+        """The domain of the samples of a moving edge: that of the robot whose writer places it."""
+        return self._kept.get(self.robot_of(edge))
 
-    def objection(self, robot: str, domain: str) -> str:
-        """Why stamps of ``robot``, which keeps the time ``domain``, may not come in; empty when they may.
+    def robot_of(self, edge: Edge) -> str:
+        """The robot whose writer places ``edge``."""
+        if edge.robot is not None:
+            return edge.robot.prefix
+        return self.robot_placing(edge.child)
 
-        A robot whose wire does not tell its time, ``domain=""``, is taken to keep the same.
-        """
+    def robot_placing(self, child: str) -> str:
+        """The robot whose writer places the frame ``child``: that of its name, unless another one does."""
+        return self._placed.get(child) or child.partition("/")[0]
+
+    def set(self, robot: str, domain: str) -> bool:
+        """Set the domain of ``robot``, as its description gives it. Returns whether that is a change."""
         with self._lock:
-            self._kept.pop(robot, None)
-            held, holder = self.name, self._first()[0]
-            if not domain or held in (None, domain):
-                self._kept[robot] = domain
-                return ""
-        if self._given is None:
-            other = f"{holder!r}, which is in the same buffer, keeps {held!r} time"
-        else:
-            other = f"the clock here tells {held!r} time"
-        return (
-            f"{robot!r} keeps {domain!r} time, but {other}; stamps of the two cannot be compared: "
-            "give them buffers of their own, or all of them one clock"
-        )
+            before = self._kept.get(robot)
+            _remember(self._kept, robot, domain)
+        return before != domain
+
+    def place(self, robot: str, children: Iterable[str]) -> None:
+        """Record that writers of ``robot`` place the frames ``children``."""
+        for child in children:
+            if child.partition("/")[0] == robot:
+                self._placed.pop(child, None)
+            else:
+                _remember(self._placed, child, robot)
+
+    def join(self, robot: str) -> None:
+        """Count ``robot`` for the majority: it has samples."""
+        with self._lock:
+            self._present[robot] = None
+
+    def leave(self, robot: str) -> None:
+        """Count ``robot`` no more: its writer has left. Samples it sent stay in its domain."""
+        with self._lock:
+            self._present.pop(robot, None)
+
+
+def _remember(known: dict[str, str], key: str, value: str) -> None:
+    known.pop(key, None)
+    known[key] = value
+    while len(known) > _MOST:
+        del known[next(iter(known))]

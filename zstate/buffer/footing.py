@@ -12,7 +12,9 @@ class Footing(NamedTuple):
 
     ``names`` are those that were asked for, each with the frame it means, or None. ``edges`` are frames,
     each with what places it, or None. Edges are compared as objects: what replaces one is another.
+    ``domains`` are the clock domains of moving edges, one edge for each track.
     """
 
     names: tuple[tuple[str, str | None], ...] = ()
     edges: tuple[tuple[str, Edge | None], ...] = ()
+    domains: tuple[tuple[Edge, str | None], ...] = ()

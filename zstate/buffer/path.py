@@ -51,7 +51,12 @@ class Reading(NamedTuple):
 
 
 class Path:
-    """From ``source`` to ``target`` by way of where their branches meet."""
+    """From ``source`` to ``target`` by way of where their branches meet.
+
+    ``domain`` is the clock domain of its moving edges, empty if none is known.
+    """
+
+    domain = ""
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from zstate.buffer.steps import Fixed, Given, Hinge, Planar, Slide, Step
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
 from zstate.buffer.tree import Tree
 from zstate.clock import check_stamp, check_stamps
-from zstate.errors import InvalidInput
+from zstate.errors import ClockMismatch, InvalidInput
 from zstate.transform import Transform
 
 
@@ -87,7 +87,28 @@ def compile_path(tree: Tree, target: str, source: str, take_views: ViewTaker) ->
     uses = _Uses()
     steps_to_target = _steps(to_target, uses)
     steps_to_source = _steps(to_source, uses)
-    return make_path((target, source), steps_to_target, steps_to_source, uses.done(), take_views)
+    domain = _common_domain(tree, target, source, [*to_target, *to_source])
+    path = make_path((target, source), steps_to_target, steps_to_source, uses.done(), take_views)
+    path.domain = domain
+    return path
+
+
+def _common_domain(tree: Tree, target: str, source: str, edges: Sequence[Edge]) -> str:
+    """The clock domain of all moving edges; empty if none is known. Raises ClockMismatch for two."""
+    first: Edge | None = None
+    for edge in edges:
+        if edge.track is not None and (domain := tree.domain.of_edge(edge)):
+            if first is None:
+                first = edge
+            elif domain != (known := tree.domain.of_edge(first)):
+                raise ClockMismatch(
+                    target,
+                    source,
+                    edges=(first.names, edge.names),
+                    robots=(tree.domain.robot_of(first), tree.domain.robot_of(edge)),
+                    domains=(known or "", domain),
+                )
+    return "" if first is None else tree.domain.of_edge(first) or ""
 
 
 def joints_path(track: JointTrack, take_views: ViewTaker) -> Path:

@@ -35,7 +35,7 @@ _MOST_PATHS = 4096
 _LONGEST_PREDICTION_S = 2e10
 
 # What only a change of the tree can mend.
-_NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected)
+_NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch)
 
 
 class Question(NamedTuple):
@@ -137,20 +137,33 @@ class Questions(Store):
         return transform
 
     def _refuse_stale(self, path: Path, transform: Transform, max_age_s: float) -> None:
-        kept = self.domain.name
-        if path.uses and kept is not None and kept != self.clock.domain:
-            raise _mismatch(kept, self.clock, "max_age_s was given")
+        if path.domain not in ("", self.clock.domain):
+            use = path.uses[0]
+            raise ClockMismatch(
+                path.target,
+                path.source,
+                edges=(use.edge,),
+                robots=(use.track.name,),
+                domains=(path.domain, self.clock.domain),
+            )
         age_s = transform.age(self.clock)
         if path.uses and age_s > max_age_s:
             raise path.stale(transform.stamp, age_s, max_age_s)
 
     def use_clock(self, clock: Clock) -> None:
-        """Tell ages by ``clock``, and take stamps of its time only. Raises ClockMismatch for another time."""
-        kept = self.domain.name
-        if kept not in (None, clock.domain):
-            raise _mismatch(kept, clock, "another clock was given")
+        """Measure ages with ``clock``. Raises InvalidInput if a clock of another domain was given before."""
+        given = self.domain.given
+        if given not in (None, clock.domain):
+            raise InvalidInput(
+                f"the buffer was given a clock of {given!r} time, and now one of {clock.domain!r} time; "
+                "give both the same, or a buffer without a clock"
+            )
         self.clock = clock
-        self.domain.decide(clock.domain)
+        self.domain.given = clock.domain
+
+    def domain_between(self, target: str, source: str) -> str | None:
+        """The clock domain that stamps answers between two frames, None if not known. Raises as ``plan``."""
+        return self._path(target, source).domain or None
 
     def _path(self, target: str, source: str) -> Path:
         return self._known_path(target, source).path
@@ -193,14 +206,6 @@ def _marks(question: Question, reason: LookupFailed, path: Path) -> Marks:
     return marks
 
 
-def _mismatch(kept: str, clock: Clock, occasion: str) -> ClockMismatch:
-    return ClockMismatch(
-        f"{occasion}, but the stamps in this buffer are {kept!r} time and the clock tells {clock.domain!r} "
-        f"time; give the buffer, or the listener, a clock of {kept!r} time",
-        domains=(kept, clock.domain),
-    )
-
-
 def _is_final(question: Question, reason: LookupFailed, expected: Expected) -> bool:
     """Whether no amount of waiting would turn the reason into an answer."""
     if isinstance(reason, InPast):
@@ -208,6 +213,9 @@ def _is_final(question: Question, reason: LookupFailed, expected: Expected) -> b
         return expected.is_hopeless()
     if isinstance(reason, Stale | NotFinite):
         return question.at is not None
+    if isinstance(reason, ClockMismatch):
+        # Of two robots each may start again with the other's clock; the clock that was given stays.
+        return len(reason.edges) < 2
     return isinstance(reason, AmbiguousFrame)
 
 

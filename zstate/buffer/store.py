@@ -44,7 +44,7 @@ class Store:
         self.history_s = history_s
         self.clock: Clock = clock or SystemClock()
         self.domain = Domain(None if clock is None else clock.domain)
-        """Whose time its stamps are."""
+        """Which clock stamps the samples of each robot."""
         self.home = Home()
         """What its tracks know of it."""
         self.clock_offsets: ClockOffsets = self.home.clock_offsets
@@ -54,7 +54,7 @@ class Store:
         self._span_ns = round(history_s * 1e9)
         self._lock = outlive_fork(threading.RLock())
         self._writes = 0
-        self._tree = Tree()
+        self._tree = Tree(self.domain)
         self._room = WaitingRoom(self._tree)
         self._feeds = Feeds(self._tree, self._span_ns, self.home)
 
@@ -131,6 +131,16 @@ class Store:
         with self._lock, suppress(InsertRefused):
             return self._tree.named_for_insert(names[0]), self._tree.named_for_insert(names[1])
         return names
+
+    def set_domain(self, robot: str, domain: str) -> bool:
+        """Set the clock ``domain`` that stamps the samples of ``robot``. Returns whether that is a change."""
+        with self._lock:
+            changed = self.domain.set(robot, domain)
+            if changed:
+                self._tree.version += 1
+        if changed:
+            self._room.notify()
+        return changed
 
     def insert_joints(
         self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
@@ -294,7 +304,7 @@ class Store:
         with self._lock:
             known = self._tree.frames
             names = known if among is None else [name for name in among if name in known]
-            return tuple(frame_info(name, known[name]) for name in names)
+            return tuple(frame_info(name, known[name], self.domain) for name in names)
 
     @property
     def version(self) -> int:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
+from zstate.buffer.domain import Domain
 from zstate.buffer.edge import Edge
 from zstate.buffer.footing import Footing
 from zstate.buffer.names import Names
@@ -27,12 +28,13 @@ class _Gone(NamedTuple):
 class Tree:
     """Frames by name, one parent each. Whoever changes it holds the buffer's lock.
 
-    ``version`` grows with every change of an edge: then what was made of the tree asks whether its footing
-    ``holds``.
+    ``version`` grows with every change of an edge, and of a robot's clock ``domain``: then what was made of
+    the tree asks whether its footing ``holds``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, domain: Domain | None = None) -> None:
         self.version = 0
+        self.domain = domain or Domain()
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
         self.names = Names()
@@ -225,13 +227,17 @@ class Tree:
         else:
             edges = [(edge.child, edge) for frame in frames for edge in self.upwards(frame)]
             edges += [(self.root(frame), None) for frame in frames]
-        return Footing(tuple(meanings.items()), tuple(edges))
+        moving = {edge.track: edge for _, edge in edges if edge is not None and edge.track is not None}
+        domains = tuple((edge, self.domain.of_edge(edge)) for edge in moving.values())
+        return Footing(tuple(meanings.items()), tuple(edges), domains)
 
     def holds(self, footing: Footing) -> bool:
         """Whether the same would be found now. May be asked without the lock."""
-        meaning, frames = self._meaning, self.frames
-        return all(meaning(name) == frame for name, frame in footing.names) and all(
-            frames.get(frame) is edge for frame, edge in footing.edges
+        meaning, frames, domain_of = self._meaning, self.frames, self.domain.of_edge
+        return (
+            all(meaning(name) == frame for name, frame in footing.names)
+            and all(frames.get(frame) is edge for frame, edge in footing.edges)
+            and all(domain_of(edge) == domain for edge, domain in footing.domains)
         )
 
     def _meaning(self, name: str) -> str | None:

@@ -8,6 +8,7 @@ from itertools import pairwise
 from statistics import pstdev
 
 from zstate.cli.tap import Tapped
+from zstate.following.bounded import remember
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ class Arrivals:
         elif not self._of_all:
             self._came.clear()
             self._last.clear()
-        self._last[session] = seq
+        remember(self._last, session, seq)
         self._came.append(tapped.came)
 
     def intervals(self) -> Intervals | None:

@@ -69,7 +69,9 @@ class AwaitedPose:
     def age_s(self, transform: Transform) -> float | None:
         """How old an answer is [s]; None for a static one, and by a clock that does not tell its time."""
         buffer = self._listener.buffer
-        if transform.stamp is None or buffer.domain.name not in (None, buffer.clock.domain):
+        if transform.stamp is None:
+            return None
+        if (buffer.domain_between(*self._frames) or buffer.clock.domain) != buffer.clock.domain:
             return None
         return transform.age(buffer.clock)
 

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from zstate.cli import logs
+from zstate.clock import SYSTEM
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
+    from zstate.buffer.frames import FrameInfo
     from zstate.rate import RateReport
 
 
@@ -79,6 +81,14 @@ def duration_or_dash(nanoseconds: int | None) -> str:
 def age_text(stamp: int | None, now: int) -> str:
     """How long ago an instant was, in words; "-" for none."""
     return duration_or_dash(None if stamp is None else now - stamp)
+
+
+def sample_age_text(frame: FrameInfo, now: int) -> str:
+    """How old the newest sample of a frame is ``now``, by the system's clock; else which clock stamps it."""
+    if frame.newest is None:
+        return "no sample"
+    newest = frame.newest_in(SYSTEM)
+    return f"{frame.domain} time" if newest is None else age_text(newest, now)
 
 
 def rate_text(rate_hz: float | None) -> str:

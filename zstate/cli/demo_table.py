@@ -42,7 +42,7 @@ class DemoTable:
     ) -> None:
         self._listener = listener
         self._buffer = buffer
-        self._meter = buffer.meter
+        self._meter = buffer.meter_of(robot)
         self._robot = robot
         self._root = root
         self._links = links

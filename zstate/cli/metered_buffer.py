@@ -10,7 +10,9 @@ from itertools import islice
 from statistics import median
 
 from zstate.clock import Clock, SystemClock
-from zstate.metrics.measured_buffer import MeasuredBuffer
+from zstate.following.bounded import remember
+from zstate.metrics.histogram import Histogram
+from zstate.metrics.measured_buffer import LATENCY_BOUNDS_S, MeasuredBuffer
 
 # Enough for a median, bounded for a demo that runs for days.
 _KEPT = 100_000
@@ -75,19 +77,39 @@ class Meter:
 
 
 class MeteredBuffer(MeasuredBuffer):
-    """A MeasuredBuffer whose ``meter`` notes when each sample of a robot can be looked up."""
+    """A MeasuredBuffer that also notes, robot by robot, when each sample can be looked up."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
-        self.meter = Meter(clock)
+        self._meters: dict[str, Meter] = {}
+        self._latencies: dict[str, Histogram] = {}
 
-    def _note_sample(self, stamp: int) -> None:
-        super()._note_sample(stamp)
-        self.meter.note(stamp)
+    def meter_of(self, robot: str) -> Meter:
+        """What measures the samples of one robot."""
+        meter = self._meters.get(robot)
+        if meter is None:
+            meter = Meter(self.clock)
+            remember(self._meters, robot, meter)
+        return meter
 
-    def measure(self, since: Mark, until: Mark) -> Measure:
-        """How samples came in between two marks of ``meter``."""
-        measure = self.meter.measure(since, until)
-        if self.domain.name in (None, self.clock.domain):
-            return measure
-        return replace(measure, latency_s=None, age_s=None)
+    def latency_of(self, robot: str) -> Histogram:
+        latency = self._latencies.get(robot)
+        if latency is None:
+            latency = Histogram(LATENCY_BOUNDS_S)
+            remember(self._latencies, robot, latency)
+        return latency
+
+    def _note_sample(self, robot: str, stamp: int) -> None:
+        super()._note_sample(robot, stamp)
+        if self._is_told(robot):
+            self.latency_of(robot).note((self.clock.now() - stamp) * 1e-9)
+        self.meter_of(robot).note(stamp)
+
+    def _is_told(self, robot: str) -> bool:
+        """Whether the clock here tells the time that stamps the samples of ``robot``."""
+        return (self.domain.of(robot) or self.clock.domain) == self.clock.domain
+
+    def measure(self, robot: str, since: Mark, until: Mark) -> Measure:
+        """How samples of ``robot`` came in between two marks of its meter."""
+        measure = self.meter_of(robot).measure(since, until)
+        return measure if self._is_told(robot) else replace(measure, latency_s=None, age_s=None)

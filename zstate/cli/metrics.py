@@ -11,9 +11,9 @@ from zstate.cli.console import note
 if TYPE_CHECKING:
     from zstate.bridge import Bridge
     from zstate.cli.roster import Roster
-    from zstate.listener import TransformListener
     from zstate.metrics.address import Address
     from zstate.metrics.library import Collector
+    from zstate.metrics.listening import Listened
     from zstate.net.session import Session
     from zstate.publisher import StatePublisher
     from zstate.recorder import Recorder
@@ -46,7 +46,7 @@ def of_publishers(*publishers: StatePublisher) -> Callable[[], Collector]:
     return make
 
 
-def of_listeners(listeners: Callable[[], Sequence[TransformListener]]) -> Callable[[], Collector]:
+def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], Collector]:
     """What the listeners that there are by then hear."""
 
     def make() -> Collector:

@@ -283,7 +283,7 @@ reading_clock_option = click.option(
     "--clock",
     type=_CLOCKS,
     envvar="ZSTATE_CLOCK",
-    help="Take robots of this time only, and tell ages by it; default: as the first robot keeps it.",
+    help="Which clock ages are measured with, and which robots' time is used where one must be chosen.",
 )
 rate_option = click.option(
     "--rate",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
+from zstate.following.bounded import remember
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream
@@ -75,7 +76,11 @@ class Sampler(Closing):
             return
         for sample in samples:
             if isinstance(sample, Sample):
-                heard = self._heard.setdefault(Source(robot, stream, sample.session), deque(maxlen=_KEPT))
+                source = Source(robot, stream, sample.session)
+                heard = self._heard.get(source)
+                if heard is None:
+                    heard = deque[_Heard](maxlen=_KEPT)
+                    remember(self._heard, source, heard)
                 heard.append(_Heard(came, sample.stamp, sample.seq))
 
     def wait(self, sources: Collection[Source], timeout_s: float) -> None:

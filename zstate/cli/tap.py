@@ -13,7 +13,7 @@ from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.net.presence import announce_reader
-from zstate.net.streams import StreamSubscriber
+from zstate.net.streams import CAPACITY, StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, check_robot
 from zstate.wire.messages import Message, Sample
@@ -58,7 +58,9 @@ class Tap(Closing):
         for arrival in arrivals:
             for sample in self._decode(arrival):
                 assert isinstance(sample, Sample)
-                self._samples.put(Tapped(came, sample))
+                # Where nothing is taken, as on a terminal that stands still, the newest are left out.
+                if self._samples.qsize() < CAPACITY:
+                    self._samples.put(Tapped(came, sample))
 
     def _decode(self, arrival: Arrival) -> Sequence[Message]:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import age_text, rate_text
+from zstate.cli.console import rate_text, sample_age_text
 from zstate.cli.frame_tree import below, roots, short_name
 from zstate.cli.layout import Guides, chain_lines, in_columns, letters_for, tree_lines
 from zstate.errors import printable
@@ -22,8 +22,7 @@ def _cells(frame: FrameInfo, now: int) -> tuple[str, ...]:
     """Kind, rate and age."""
     if frame.kind not in ("joint", "pose"):
         return frame.kind, "", ""
-    age = "no sample" if frame.newest is None else age_text(frame.newest, now)
-    return frame.kind, rate_text(frame.rate_hz), age
+    return frame.kind, rate_text(frame.rate_hz), sample_age_text(frame, now)
 
 
 def _fewer_cells(frame: FrameInfo, now: int) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ ZStateError
 │   └── UnknownModel                   no model of that name                      .name .near_misses
 ├── LibraryMissing (ImportError)       something to install first
 ├── MessageError (ValueError)          bytes on our keys that are not ours        .reason
-├── ClockMismatch                      two times that cannot be compared          .domains
 ├── SecondWriter                       somebody else writes the same already      .first .robot .stream .edge
 ├── RecordingError                     a file that cannot be read or written      .path
 ├── NetworkError                       Zenoh said no
@@ -22,6 +21,7 @@ ZStateError
     ├── UnknownFrame                   never heard of it                          .name .near_misses
     ├── AmbiguousFrame                 a bare name that several robots have       .name .candidates
     ├── Disconnected                   two trees                                  .roots .gone_s
+    ├── ClockMismatch                  stamps of two clocks on one path           .edges .robots .domains
     ├── NoData                         an edge without any sample
     ├── InFuture                       asked after the newest sample of an edge
     ├── InPast                         asked before the oldest sample of an edge
@@ -34,7 +34,6 @@ A wait that ran out raises the reason it was still waiting for, as a subclass th
 
 from zstate.errors.base import (
     AccessDenied,
-    ClockMismatch,
     Closed,
     ConfigError,
     Found,
@@ -56,7 +55,7 @@ from zstate.errors.base import (
     printable,
 )
 from zstate.errors.instants import InFuture, InPast, NoData, NotFinite, Stale
-from zstate.errors.lookup import AmbiguousFrame, Disconnected, LookupFailed, UnknownFrame
+from zstate.errors.lookup import AmbiguousFrame, ClockMismatch, Disconnected, LookupFailed, UnknownFrame
 from zstate.errors.timeouts import WaitTimeout, timed_out
 from zstate.errors.times import duration_text
 

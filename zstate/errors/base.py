@@ -210,11 +210,3 @@ class RecordingError(ZStateError):
     def __init__(self, message: str, *, path: str) -> None:
         super().__init__(message)
         self.path = path
-
-
-class ClockMismatch(ZStateError):
-    """Stamps of two clocks that say nothing of each other were to be compared; ``domains`` names both."""
-
-    def __init__(self, message: str, *, domains: tuple[str, str]) -> None:
-        super().__init__(message)
-        self.domains = domains

@@ -172,5 +172,43 @@ class Disconnected(LookupFailed):
         return f"; {self._edge_text()} was taken away {when}"
 
 
+class ClockMismatch(LookupFailed):
+    """Stamps of two clock domains would have to be compared; ``domains`` names both.
+
+    Either the path crosses two ``edges`` of two ``robots``, each stamped in its own domain; or the age of one
+    edge was asked for by a clock of another domain, the second of ``domains``.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        source: str,
+        *,
+        edges: tuple[tuple[str, str], ...],
+        robots: tuple[str, ...],
+        domains: tuple[str, str],
+        requested: int | None = None,
+    ) -> None:
+        super().__init__(target, source, edge=edges[0], requested=requested)
+        self.edges = edges
+        self.robots = robots
+        self.domains = domains
+
+    def explanation(self) -> str:
+        first, *others = (
+            f"{parent!r} -> {child!r} of robot {robot!r} is stamped in {domain!r} time"
+            for (parent, child), robot, domain in zip(self.edges, self.robots, self.domains, strict=False)
+        )
+        if others:
+            return (
+                f"{first}, but {others[0]}; stamps of two clocks cannot be compared: start both robots with "
+                "one clock, or look up within one of them"
+            )
+        return (
+            f"{first}, but max_age_s is measured by a clock of {self.domains[1]!r} time; give the listener, "
+            f"or the buffer, a clock of {self.domains[0]!r} time, or leave max_age_s out"
+        )
+
+
 def _any_of(names: Sequence[str]) -> str:
     return " or ".join(repr(name) for name in names)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.following.bounded import remember
 from zstate.following.edge_claims import CONTESTED, Admitted, EdgeSource
-from zstate.following.follower import Follower
+from zstate.following.follower import Follower, SetBack
 from zstate.following.ownership import FrameOwnership
 from zstate.wire.keys import full_name
 from zstate.wire.messages import (
@@ -21,8 +22,10 @@ from zstate.wire.messages import (
 class EdgeFollower(Follower):
     """Follows ready transforms, without a model."""
 
-    def __init__(self, robot: str, ownership: FrameOwnership) -> None:
-        super().__init__(robot, ownership)
+    def __init__(self, robot: str, ownership: FrameOwnership, on_set_back: SetBack | None = None) -> None:
+        super().__init__(robot, ownership, on_set_back)
+        # By the digest of their edges, how far samples reach [ns]; here ``_newest`` is not used.
+        self._newest_of: dict[bytes, int] = {}
         self._edges: Edges = ()
         self._order = b""
         self._described = EdgeSource(robot, "", is_model=True)
@@ -35,8 +38,7 @@ class EdgeFollower(Follower):
 
     def describe(self, description: RobotDescription) -> None:
         self.heard = True
-        if not self._keeps_our_time(description):
-            return
+        self._learn_domain(description)
         with self._lock:
             order = order_digest(description.moving_edges)
             if order == self._order:
@@ -48,6 +50,7 @@ class EdgeFollower(Follower):
                 return
             self._release(self._described)
             self._edges, self._order = edges, order
+            self._buffer.domain.place(self.robot, (child for _, child in edges))
             self._insert_early()
 
     def _named(self, edges: Edges) -> Edges:
@@ -77,6 +80,7 @@ class EdgeFollower(Follower):
             remember(self._full_names, said, edges)
             new = {child for _, child in edges} - {child for _, child in self._undescribed.claims}
             self._ownership.take_over(self._undescribed, new)
+            self._buffer.domain.place(self.robot, new)
         return edges
 
     def _admit(self, source: EdgeSource, edges: Edges) -> Admitted:
@@ -111,7 +115,22 @@ class EdgeFollower(Follower):
         assert isinstance(sample, TransformSample)
         return sample.edges is not None or sample.order == self._order
 
+    def _reach(self, sample: Sample) -> bool:
+        # One writer may stamp one edge later than another, as a camera that took time to look.
+        known = self._newest_of.get(sample.order)
+        if known is None:
+            remember(self._newest_of, sample.order, sample.stamp)
+            return False
+        if sample.stamp >= known:
+            self._newest_of[sample.order] = sample.stamp
+            return False
+        return sample.stamp < known - SET_BACK_NS
+
+    def _reached(self, sample: Sample) -> int | None:
+        return self._newest_of.get(sample.order)
+
     def _restart(self) -> None:
+        self._newest_of.clear()
         self._release(self._described)
         self._release(self._undescribed)
 

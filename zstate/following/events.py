@@ -18,7 +18,7 @@ from zstate.locks import new_lock
 from zstate.wire.keys import Stream
 from zstate.wire.writer import Announced, Writer
 
-Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back"]
+Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
 KEPT = 1024
 
@@ -33,6 +33,7 @@ class Event:
       may write still. "back": it is there again, the same one;
     - "stale": it is announced, but for ten of its periods (half a second at least) no sample has come:
       frozen, or its source is. "resumed": samples come again;
+    - "set back": its clock went back, so that the history of the robot begins with its next sample;
     - "conflict": another one writes the same stream, or places the same frame.
 
     ``writer`` is None where it is not announced; ``text`` says all of it.
@@ -117,6 +118,13 @@ class Events(Closing):
             if silent_s is not None:
                 with self._lock:
                     self._tell_of_silence("resumed", robot, session, silent_s)
+
+    def note_set_back(self, robot: str, session: int, text: str) -> None:
+        """The clock of the writer of the followed stream was set back."""
+        with self._lock:
+            announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+            writer = None if announced is None else announced.writer
+            self._add("set back", robot, self._followed, writer, text)
 
     def note_second_edge(self, robot: str, name: str, child: str, text: str) -> None:
         """The static edge by which the writer ``name`` places ``child`` was refused: another one does."""

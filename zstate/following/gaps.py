@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
+from zstate.following.bounded import remember
 from zstate.following.tally import Tally
 
 
@@ -32,4 +33,7 @@ class Gaps:
             ours = self._is_overflowed or writer in self._overflowed
             self._tally.count("dropped" if ours else "missed", seq - expected)
         self._overflowed.discard(writer)
-        self._next[writer] = max(seq + 1, expected)
+        if writer in self._next:
+            self._next[writer] = max(seq + 1, expected)
+        else:
+            remember(self._next, writer, seq + 1)

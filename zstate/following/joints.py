@@ -6,7 +6,7 @@ from functools import lru_cache
 
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
-from zstate.following.follower import Follower
+from zstate.following.follower import Follower, SetBack
 from zstate.following.ownership import FrameOwnership
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.robot import RobotModel
@@ -24,8 +24,8 @@ def _parsed(urdf: str) -> RobotModel:
 class JointFollower(Follower):
     """Follows joint states, with the robot's model."""
 
-    def __init__(self, robot: str, ownership: FrameOwnership) -> None:
-        super().__init__(robot, ownership)
+    def __init__(self, robot: str, ownership: FrameOwnership, on_set_back: SetBack | None = None) -> None:
+        super().__init__(robot, ownership, on_set_back)
         self._digest = ""
         self._describer: int | None = None
         self._track: JointTrack | None = None
@@ -36,7 +36,8 @@ class JointFollower(Follower):
         with self._lock:
             self._describer = description.session
             self._writer_changed()
-        if not self._keeps_our_time(description) or description.digest == self._digest:
+        self._learn_domain(description)
+        if description.digest == self._digest:
             return
         with self._lock:
             try:

@@ -25,7 +25,7 @@ class _Backlog:
 
 
 class Lag:
-    """Logs, once for each start of a writer, that its samples fell behind by one second more than before.
+    """Logs, once for each program that writes a robot's samples, that they fell behind by a second more.
 
     The clocks of both sides may disagree: only what the age of samples at arrival grows by counts. A burst
     after a cut begins with its oldest sample, so that it does not look like this.
@@ -33,13 +33,14 @@ class Lag:
 
     def __init__(self, tally: Tally) -> None:
         self._tally = tally
-        self._backlogs: dict[int, _Backlog] = {}
+        self._backlogs: dict[tuple[str, str], _Backlog] = {}
 
-    def note(self, robot: str, writer: str | None, session: int, age_ns: int, now_ns: int) -> None:
-        """A sample of ``session`` has come ``age_ns`` after its stamp, which is late."""
-        known = self._backlogs.get(session)
+    def note(self, robot: str, writer: str | None, age_ns: int, now_ns: int) -> None:
+        """A sample of ``writer`` has come ``age_ns`` after its stamp, which is late."""
+        key = (robot, program_of(writer))
+        known = self._backlogs.get(key)
         if known is None:
-            remember(self._backlogs, session, _Backlog(age_ns, now_ns))
+            remember(self._backlogs, key, _Backlog(age_ns, now_ns))
             return
         went_on = now_ns - known.last_ns <= _PAUSE_NS
         known.last_ns = now_ns
@@ -48,11 +49,17 @@ class Lag:
             known.is_told = True
             age, before = duration_text(age_ns), duration_text(known.least_ns)
             self._tally.note(
-                f"lag {session}",
+                f"lag {' '.join(key)}",
                 f"{samples_of(robot, writer)} come {age} after their stamps, {before} shortly before: more "
                 "is sent than the network carries, or than this program takes; `zstate monitor` shows where "
                 "it waits, and a lower rate helps either way",
             )
+
+
+def program_of(writer: str | None) -> str:
+    """Which program on which host it is, whenever it was started; empty if it is not announced."""
+    name, is_known, _ = (writer or "").rpartition(" pid ")
+    return name if is_known else writer or ""
 
 
 def samples_of(robot: str, writer: str | None) -> str:

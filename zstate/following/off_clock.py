@@ -5,7 +5,8 @@ from __future__ import annotations
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, stamp_text
 from zstate.errors.times import counts_from_start, duration_text, unit_mistaken
-from zstate.following.lag import LATE_NS, Lag, samples_of
+from zstate.following.bounded import remember
+from zstate.following.lag import LATE_NS, Lag, program_of, samples_of
 from zstate.following.tally import Tally
 from zstate.wire.messages import Sample, TransformSample
 
@@ -17,7 +18,7 @@ _EVERYTHING = (-(2**63), 2**63)
 
 
 class OffClock:
-    """Counts them in ``off_clock``, and logs the first of each start of a writer.
+    """Counts them in ``off_clock``, and logs the first of each program that writes a robot's samples.
 
     Those that are late, but not by so much, are given to a ``Lag``.
 
@@ -28,7 +29,7 @@ class OffClock:
         self._buffer = buffer
         self._tally = tally
         self._is_described = is_described
-        self._reported: set[int] = set()
+        self._reported: dict[tuple[str, str], None] = {}
         self._lag = Lag(tally)
 
     def look(self) -> tuple[int, int]:
@@ -45,13 +46,15 @@ class OffClock:
             return
         now = self._buffer.clock.now()
         if abs(sample.stamp - now) <= FAR_NS:
-            self._lag.note(robot, writer, sample.session, now - sample.stamp, now)
+            self._lag.note(robot, writer, now - sample.stamp, now)
             return
-        self._tally.count("off_clock")
-        if sample.session not in self._reported:
-            self._reported.add(sample.session)
+        self._tally.of(robot).count("off_clock")
+        # Not by session: a writer that is restarted with each sample would be logged each time.
+        key = (robot, program_of(writer))
+        if key not in self._reported:
+            remember(self._reported, key, None)
             text = _text(samples_of(robot, writer), sample.stamp, now)
-            self._tally.note(f"off clock {sample.session}", text)
+            self._tally.note(f"off clock {' '.join(key)}", text)
 
     def _keeps_system_time(self, robot: str, sample: Sample) -> bool:
         kept = self._buffer.domain.of(robot)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from zstate.following.bounded import MOST
+
 StaticWriter = tuple[str, str]
 """A robot, and the name under which some of its static edges are written."""
 
@@ -23,5 +25,7 @@ class Placements:
             self._writers.setdefault(child, set()).add(writer)
         if children:
             self._children[writer] = children
+            while len(self._children) > MOST:
+                self.replace(next(iter(self._children)), frozenset())
         others = [(child, sorted(self._writers[child] - {writer})) for child in sorted(children)]
         return [(child, writers) for child, writers in others if writers]

@@ -8,7 +8,7 @@ what the recording holds                    what becomes of it
 ==========================================  ============================================================
 a writer ends, a new one goes on later      one history; between the two it is interpolated as elsewhere
 a new writer whose clock is back            the history begins anew with it
-two samples more than 10 s back             the clock was set back: the history begins anew
+two samples in a row more than 0.1 s back   the clock was set back: the history begins anew
 another model (URDF) of a robot             the robot begins anew
 a static edge is withdrawn                  it holds until something else places the frame
 ==========================================  ============================================================

@@ -47,6 +47,7 @@ class RecordedEdges(EdgeFollower):
     def __init__(self, robot: str, ownership: FrameOwnership, times: EdgeTimes) -> None:
         super().__init__(robot, ownership)
         self._times = times
+        self._children: set[str] = set()
 
     def _insert(self, sample: Sample) -> bool:
         assert isinstance(sample, TransformSample)
@@ -55,6 +56,7 @@ class RecordedEdges(EdgeFollower):
         children = [child for _, child in edges]
         if self._times.is_held_up(sample, children):
             return False
+        self._children.update(children)
         if self._times.begins_anew(sample, children):
             self._forget(set(children))
         poses = poses_from_block(sample.poses)
@@ -70,8 +72,9 @@ class RecordedEdges(EdgeFollower):
         text = f"the clock of {sorted(children)[0]!r} went back: its history begins anew"
         self._tally.note(f"{self.robot} back", text)
 
-    def _begin_again(self, sample: Sample) -> bool:
-        return False  # decided edge by edge before
+    def _restart(self) -> None:
+        self._forget(self._children)
+        self._newest_of.clear()
 
 
 class EdgeTimes:

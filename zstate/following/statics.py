@@ -67,4 +67,6 @@ class StaticFollower:
             return None
 
     def _refuse(self, reason: str, error: InvalidInput) -> None:
-        self._ownership.tally.refuse(reason, f"static edge of {self._source.name!r}: {error}")
+        self._ownership.tally.of(self._source.robot).refuse(
+            reason, f"static edge of {self._source.name!r}: {error}"
+        )

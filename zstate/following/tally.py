@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from dataclasses import dataclass
 
+from zstate.following.bounded import MOST, remember
 from zstate.locks import new_lock
 
 _LOG = logging.getLogger("zstate")
@@ -33,14 +34,27 @@ class Stats:
 
 
 class Tally:
-    """The counters behind ``Stats``. Any thread may count."""
+    """The counters behind ``Stats``. Any thread may count.
 
-    def __init__(self) -> None:
+    ``of(robot)`` counts for one robot, and for all of them; ``stats`` are those of all.
+    """
+
+    def __init__(self, parent: Tally | None = None) -> None:
         self._lock = new_lock()
+        self._parent = parent
+        self._parts: dict[str, Tally] = {}
         self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self._refused: Counter[str] = Counter()
         self._first: dict[str, str] = {}
-        self._noted: set[str] = set()
+        self._noted: dict[str, None] = {}
+
+    def of(self, robot: str) -> Tally:
+        """The counters of one robot. Robots beyond the first 4096 have none of their own."""
+        part = self._parts.get(robot)
+        if part is None and len(self._parts) < MOST:
+            with self._lock:
+                part = self._parts.setdefault(robot, Tally(self))
+        return part or self
 
     def count(self, what: str, number: int = 1) -> None:
         """Add to one of the counts that ``Stats`` has."""
@@ -53,15 +67,23 @@ class Tally:
             self._refused[reason] += 1
             first = self._refused[reason] == 1
             self._first.setdefault(reason, text)
-        if first:
+        if first and (self._parent is None or self._parent._is_first(reason, text)):
             facts = {"event": "refused", "reason": reason}
             _LOG.warning("refused (%s): %s; further ones are only counted", reason, text, extra=facts)
 
+    def _is_first(self, reason: str, text: str) -> bool:
+        """Whether no robot had a refusal for that reason before."""
+        with self._lock:
+            return self._first.setdefault(reason, text) is text and not self._refused[reason]
+
     def note(self, event: str, text: str) -> None:
         """Log the first event of its kind."""
+        if self._parent is not None:
+            self._parent.note(event, text)
+            return
         with self._lock:
             first = event not in self._noted
-            self._noted.add(event)
+            remember(self._noted, event, None)
         if first:
             _LOG.warning("%s; further such events are not logged", text)
 
@@ -73,4 +95,9 @@ class Tally:
     def stats(self) -> Stats:
         """All counts now."""
         with self._lock:
-            return Stats(refused=dict(self._refused), **self._counts)
+            refused, counts, parts = self._refused.copy(), Counter(self._counts), list(self._parts.values())
+        for part in parts:
+            with part._lock:
+                refused.update(part._refused)
+                counts.update(part._counts)
+        return Stats(refused=dict(refused), **{what: counts[what] for what in _COUNTED})

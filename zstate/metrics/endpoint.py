@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import socket
 import threading
+import time
 from collections.abc import Iterable, Sequence
 from socketserver import ThreadingMixIn
 from typing import TYPE_CHECKING, cast
@@ -22,6 +23,7 @@ from zstate.metrics.library import (
     ProcessCollector,
     exposition,
 )
+from zstate.metrics.pace import EVERY_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,6 +49,7 @@ class MetricsEndpoint(Closing):
             registry.register(collector)
         ProcessCollector(registry=registry)
         self._server = _bound(host, port)
+        self._server.looks = [look for one in collectors if (look := getattr(one, "look", None)) is not None]
         # Its types leave the arguments of the application out.
         make = cast("Callable[[CollectorRegistry], WSGIApplication]", exposition.make_wsgi_app)  # pyright: ignore
         self._server.set_app(make(registry))
@@ -65,7 +68,19 @@ class MetricsEndpoint(Closing):
 
 
 class _Server(ThreadingMixIn, WSGIServer):
+    """Also calls ``looks`` once a second, from the thread that waits for scrapes."""
+
     daemon_threads = True
+    looks: Sequence[Callable[[], None]] = ()
+    _looked_s = -EVERY_S
+
+    def service_actions(self) -> None:
+        super().service_actions()
+        now_s = time.monotonic()
+        if now_s - self._looked_s >= EVERY_S:
+            self._looked_s = now_s
+            for look in self.looks:
+                look()
 
 
 class _Server6(_Server):

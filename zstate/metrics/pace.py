@@ -2,25 +2,53 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Hashable
 
-# Two scrapers that ask at once are given the same rate.
-_WINDOW_S = 1.0
+from zstate.following.bounded import remember
+
+WINDOW_S = 10.0
+EVERY_S = 1.0
+
+_Marks = deque[tuple[float, float]]
 
 
 class Paces:
-    """Rates [Hz] of counts that are read now and then: each over a second or more before the reading."""
+    """Rates [Hz] of counts over the last ten seconds, independent of when and how often they are read.
+
+    ``note`` is to be called about once a second; without that a rate is the one since the last reading that
+    is at least ten seconds old, or since the first. Any thread may call.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._marks: dict[Hashable, tuple[float, float, float]] = {}
+        self._marks: dict[Hashable, _Marks] = {}
+        self._lock = threading.Lock()
+
+    def note(self, key: Hashable, count: float) -> None:
+        """What ``key`` counts has come to ``count``."""
+        with self._lock:
+            self._note(key, count, self._clock())
 
     def rate_hz(self, key: Hashable, count: float) -> float:
-        """The rate of what ``key`` counts, which has come to ``count``; 0 before there are two readings."""
-        now = self._clock()
-        time_s, before, rate_hz = self._marks.setdefault(key, (now, count, 0.0))
-        if now - time_s >= _WINDOW_S:
-            rate_hz = max(0.0, count - before) / (now - time_s)
-            self._marks[key] = now, count, rate_hz
-        return rate_hz
+        """The rate of what ``key`` counts, which has come to ``count``; 0 at the first reading."""
+        with self._lock:
+            now = self._clock()
+            time_s, before = self._note(key, count, now)
+        return (count - before) / (now - time_s) if now > time_s else 0.0
+
+    def _note(self, key: Hashable, count: float, now: float) -> tuple[float, float]:
+        """Keep this reading if the last one is a second old. Returns the one at the window's beginning."""
+        marks = self._marks.get(key)
+        if marks is None:
+            marks = _Marks()
+            remember(self._marks, key, marks)
+        if marks and count < marks[-1][1]:
+            marks.clear()  # it counts from the beginning again
+        if not marks or now - marks[-1][0] >= EVERY_S:
+            marks.append((now, count))
+        while len(marks) > 1 and now - marks[1][0] >= WINDOW_S:
+            marks.popleft()
+        return marks[0]

@@ -16,6 +16,13 @@ class PublisherMetrics(Collector):
     def __init__(self, publishers: Sequence[StatePublisher]) -> None:
         self._publishers = publishers
         self._paces = Paces()
+        self.look()
+
+    def look(self) -> None:
+        """Note how far the counts have come, from which rates are made; the endpoint does, each second."""
+        for publisher in self._publishers:
+            for (wire, stream), said in publisher.stats.streams.items():
+                self._paces.note((id(publisher), wire, stream), said.samples)
 
     def collect(self) -> Iterable[Metric]:
         families = Families()

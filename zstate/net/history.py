@@ -28,6 +28,7 @@ from itertools import islice
 
 import zenoh
 
+from zstate.clock import SET_BACK_NS
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.net.receiver import JOIN_WITHIN_S
@@ -76,13 +77,18 @@ class Memory:
         self.writer = writer
         self._span_ns = round(span_s * 1e9)
         self._states: deque[JointState] = deque(maxlen=MOST_BYTES // (8 * numbers + _OVERHEAD))
+        self._newest = 0
 
     def keep(self, state: JointState) -> None:
         """Remember ``state``, whose ``seq`` is one more than that of the last."""
         states, stamp = self._states, state.stamp
         limit = stamp - self._span_ns
-        if states and states[-1].stamp - self._span_ns > stamp:
-            states.clear()  # the clock was set back
+        if stamp >= self._newest:
+            self._newest = stamp
+        elif states and stamp < self._newest - SET_BACK_NS:
+            states.clear()  # the clock was set back: readers begin a new history, too
+        if not states:
+            self._newest = stamp
         states.append(state)
         while states[0].stamp < limit:
             states.popleft()

@@ -15,6 +15,7 @@ from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire.keys import Stream
 from zstate.wire.wire import Arrival
 
+ROOM_BYTES = 64 * 2**20
 ROOM = 8192
 """So many arrivals wait here, and then in the rings of the subscriptions, which lose the oldest."""
 
@@ -39,7 +40,7 @@ class Inbox(Closing):
     def __init__(self, session: Session) -> None:
         self._session = session
         self._heard: list[Heard] = []
-        self._waiting = 0
+        self._waiting = self._bytes = 0
         self._has_room = outlive_fork(threading.Condition())
         self._is_open = True
         self._opened = ExitStack()
@@ -65,7 +66,7 @@ class Inbox(Closing):
         """All that waits, in the order of hearing."""
         with self._has_room:
             heard, self._heard = self._heard, []
-            self._waiting = 0
+            self._waiting = self._bytes = 0
             self._has_room.notify_all()
         return heard
 
@@ -79,8 +80,9 @@ class Inbox(Closing):
     def _put(self, heard: Heard) -> None:
         with self._has_room:
             # Who takes too slowly must not fill the memory: it is the ring that loses, and counts.
-            while self._is_open and self._waiting >= ROOM:
+            while self._is_open and (self._waiting >= ROOM or self._bytes >= ROOM_BYTES):
                 self._has_room.wait()
             if self._is_open:
                 self._heard.append(heard)
                 self._waiting += len(heard.arrivals)
+                self._bytes += sum(len(arrival.payload) for arrival in heard.arrivals)

@@ -15,6 +15,7 @@ from zstate.closing import Closing
 from zstate.errors import Closed
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
+from zstate.wire.sizes import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
 from zstate.wire.wire import Arrival
 
 CAPACITY = 1024
@@ -36,19 +37,22 @@ def capacity_for(keyexpr: str) -> int:
     return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
 
 
-def arrival_of(sample: zenoh.Sample, key: str = "") -> Arrival:
-    """What came, as the wires read it; ``key`` is on which, where that is known."""
-    beside = sample.attachment
+def arrival_of(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> Arrival:
+    """What came, as the wires read it; ``key`` is on which, where that is known.
+
+    A payload of more than ``most_bytes`` is not copied: of such a one only the size is given.
+    """
+    payload, beside = sample.payload, sample.attachment
+    key = key or str(sample.key_expr)
+    if len(payload) > most_bytes or (beside is not None and len(beside) > ATTACHMENT_BYTES):
+        return Arrival(key, b"\0", str(sample.encoding), None, max(len(payload), LATCHED_BYTES + 1))
     return Arrival(
-        key or str(sample.key_expr),
-        sample.payload.to_bytes(),
-        str(sample.encoding),
-        None if beside is None else beside.to_bytes(),
+        key, payload.to_bytes(), str(sample.encoding), None if beside is None else beside.to_bytes()
     )
 
 
 def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[Arrival]:
-    arrivals = [arrival_of(sample, key) for sample in batch]
+    arrivals = [arrival_of(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
     if all(arrival.payload for arrival in arrivals):
         return arrivals
     # What is deleted has no payload either; to ask every sample which kind it is costs as much as its key.

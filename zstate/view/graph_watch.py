@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from zstate.closing import Closing
 from zstate.errors import NetworkError
+from zstate.following.bounded import remember
 from zstate.net.presence import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
 from zstate.net.status import watch_status
@@ -71,7 +72,7 @@ class GraphWatch(Closing):
 
     def _hear(self, robot: str, status: Status) -> None:
         with self._lock:
-            self._said[robot, status.session] = status, time.monotonic()
+            remember(self._said, (robot, status.session), (status, time.monotonic()))
 
     def _run(self) -> None:
         while not self._stop.wait(_EVERY_S if self._uses else _SOON_S):

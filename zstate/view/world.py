@@ -9,6 +9,7 @@ from pathlib import Path
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.layout import Layout
 from zstate.buffer.tracks import JointTrack
+from zstate.clock import Clock
 from zstate.closing import Closing
 from zstate.listener import TransformListener
 from zstate.model.robot import RobotModel
@@ -22,7 +23,8 @@ class World(Closing):
     """Every robot that is announced, or those of ``robots``, with what is known of them.
 
     Where the ``session`` is None nothing is followed and ``buffer`` is all there is: a recording, see
-    ``of_recording``. Otherwise it is filled by ``listener``, which hears ``wire``. Methods may be called
+    ``of_recording``. Otherwise it is filled by ``listener``, which hears ``wire``. Ages, and the
+    time line, are those of ``clock``; without one, of the clock that most robots have. Methods may be called
     from any thread.
     """
 
@@ -34,9 +36,10 @@ class World(Closing):
         wire: str = "native",
         buffer: TransformBuffer | None = None,
         history_s: float = 30.0,
+        clock: Clock | None = None,
     ) -> None:
         self.session = session
-        self.buffer = TransformBuffer(history_s) if buffer is None else buffer
+        self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         self.listener: TransformListener | None = None
         if session is not None:
             followed = robots[0] if len(robots) == 1 else ANY

@@ -33,6 +33,7 @@ from zstate.wire.messages import (
     TransformSample,
 )
 from zstate.wire.sample_names import SampleNames
+from zstate.wire.sizes import LATCHED_BYTES, SAMPLE_BYTES, check_edges, check_size
 from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Announced, Writer
 
@@ -60,6 +61,12 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "clock": Clock,
 }
 
+# Nothing is too large that is not larger than this.
+_LEAST_BYTES = 1_000
+
+# Of what travels on no stream of its own.
+_MOST_BYTES: dict[type[Message], int] = {Status: 64_000, Past: 4 * SAMPLE_BYTES}
+
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in _TYPES}
 _ENCODING = re.compile(r"zstate/(\w+);v=([1-9]\d{0,8})")
@@ -78,6 +85,8 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """
     if encoding != ENCODINGS[kind]:
         raise _stranger(encoding, kind)
+    if len(payload) > _LEAST_BYTES and len(payload) > _MOST_BYTES.get(kind, LATCHED_BYTES):
+        raise MessageError(f"a {kind.__name__} of {len(payload)} bytes", reason="too large")
     try:
         return _DECODERS[kind].decode(payload)  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -137,7 +146,12 @@ class NativeWire:
         return robot_of(key)
 
     def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
-        return (decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream]),)
+        if arrival.size or len(arrival.payload) > _LEAST_BYTES:
+            check_size(stream, arrival.size or len(arrival.payload))
+        message = decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream])
+        if stream == "tf_static":
+            check_edges(message)
+        return (message,)
 
     def statics_writer(self, key: str) -> str:
         robot_of(key)

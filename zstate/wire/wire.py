@@ -14,12 +14,17 @@ from zstate.wire.writer import Announced, Writer
 
 
 class Arrival(Struct, frozen=True, gc=False):
-    """One payload as it came from the network, with what came beside it."""
+    """One payload as it came from the network, with what came beside it.
+
+    Of a payload that is too large for its stream only the ``size`` is kept, and one byte, so that it is not
+    taken for a withdrawn value; decoding it raises MessageError.
+    """
 
     key: str
     payload: bytes
     encoding: str
     attachment: bytes | None = None
+    size: int = 0
 
 
 class Place(NamedTuple):

@@ -115,7 +115,7 @@ def _look(
         TransformListener(session, robot, buffer, history_on_join=False) as listener,
     ):
         note(f"waiting for {robot!r} ...")
-        if not _has_begun(buffer.meter, ended):
+        if not _has_begun(buffer.meter_of(robot), ended):
             return
         note(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
         table = DemoTable(listener, buffer, robot, model.root, telling_links(model))

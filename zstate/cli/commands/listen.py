@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from threading import Event
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from zstate.cli.roster import Roster
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
 from zstate.errors import duration_text
+from zstate.following.bounded import remember
 
 if TYPE_CHECKING:
     from zstate.cli.metered_buffer import Mark, Measure, MeteredBuffer
@@ -80,27 +81,49 @@ def listen_command(
             ears.open_new()
 
 
+@dataclass(eq=False)
+class Ear:
+    """One robot that is listened to: what its samples come to since ``mark``."""
+
+    robot: str
+    listener: TransformListener
+    buffer: MeteredBuffer
+    mark: Mark
+
+    @property
+    def stats(self) -> Stats:
+        """The counts of its samples."""
+        return self.listener.stats_of(self.robot)
+
+    def measure(self) -> Measure:
+        """How its samples came in since the last call."""
+        since, self.mark = self.mark, self.buffer.meter_of(self.robot).mark()
+        return self.buffer.measure(self.robot, since, self.mark)
+
+
 class Ears(Closing):
-    """A listener for each robot that is wanted and announced, opened when it appears."""
+    """Listens to the robots that are wanted and announced: one listener for all that follow one stream."""
 
     def __init__(self, session: Session, roster: Roster, robot: str, wire: str, clock: Clock | None) -> None:
         from zstate.wire.keys import ANY, check_robot
 
+        self._wanted = robot
         self._robot = None if robot == ANY else check_robot(robot)
         self._session = session
         self._wire = wire
         self._roster = roster
         self._clock = clock
         self._said = ""
-        self._ears: dict[str, tuple[TransformListener, MeteredBuffer, Mark]] = {}
+        self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
+        self._ears: dict[str, Ear] = {}
         self._opened = ExitStack()
 
     def close(self) -> None:
         self._opened.close()
 
-    def listeners(self) -> list[TransformListener]:
+    def listeners(self) -> list[Ear]:
         """Those that are open."""
-        return [listener for listener, _, _ in self._ears.copy().values()]
+        return list(self._ears.copy().values())
 
     def open_new(self) -> None:
         """Listen to robots that have appeared; says what is waited for while there is none."""
@@ -113,17 +136,22 @@ class Ears(Closing):
         self._said = reason
 
     def _open(self, robot: str, streams: frozenset[Stream]) -> None:
+        follow = self._followed(streams)
+        if follow in streams:
+            listener, buffer = self._listeners.get(follow) or self._listen(follow)
+            remember(self._ears, robot, Ear(robot, listener, buffer, buffer.meter_of(robot).mark()))
+            note(f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot)
+
+    def _listen(self, follow: Follow) -> tuple[TransformListener, MeteredBuffer]:
         from zstate.cli.metered_buffer import MeteredBuffer
         from zstate.listener import TransformListener
 
-        follow = self._followed(streams)
-        if follow in streams:
-            buffer = MeteredBuffer(self._clock)
-            listener = TransformListener(
-                self._session, robot, buffer, self._wire, follow, history_on_join=False
-            )
-            self._ears[robot] = self._opened.enter_context(listener), buffer, buffer.meter.mark()
-            note(f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot)
+        buffer = MeteredBuffer(self._clock)
+        listener = self._opened.enter_context(
+            TransformListener(self._session, self._wanted, buffer, self._wire, follow, history_on_join=False)
+        )
+        self._listeners[follow] = listener, buffer
+        return listener, buffer
 
     def _followed(self, streams: frozenset[Stream]) -> Follow:
         if is_ros(self._wire) and "tf" in streams:
@@ -140,10 +168,8 @@ class Ears(Closing):
 
     def measures(self) -> Iterator[tuple[str, Measure, Stats]]:
         """How the samples of each robot came in since the last call."""
-        for robot, (listener, buffer, since) in sorted(self._ears.items()):
-            now = buffer.meter.mark()
-            self._ears[robot] = listener, buffer, now
-            yield robot, buffer.measure(since, now), listener.stats
+        for robot, ear in sorted(self._ears.items()):
+            yield robot, ear.measure(), ear.stats
 
 
 def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:

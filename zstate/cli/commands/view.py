@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import checked_rate, named_models, session_options, wire_option
+from zstate.cli.options import (
+    checked_rate,
+    named_models,
+    reading_clock_option,
+    session_options,
+    wire_option,
+)
 
 if TYPE_CHECKING:
     from zstate.view.framing import Camera
@@ -84,6 +90,7 @@ def _point(text: str) -> tuple[float, float, float]:
     "default: so that all robots are seen.",
 )
 @wire_option
+@reading_clock_option
 @session_options
 def view_command(
     *,
@@ -98,6 +105,7 @@ def view_command(
     fixed_frame: str,
     camera: Camera | None,
     wire: str,
+    clock: str | None,
 ) -> None:
     """Draw the announced robots, or those that are named, in a browser.
 
@@ -127,6 +135,7 @@ def view_command(
     """
     import_module("zstate.view.library")  # told before anything is heard when it is missing
 
+    from zstate.cli.clocks import open_clock
     from zstate.cli.viewing import (
         chosen_sliders,
         folders_of,
@@ -154,7 +163,8 @@ def view_command(
                     (one, opened.enter_context(its)) for one, its in chosen_sliders(session, named, wire)
                 ]
                 named, moved = [one for one, _ in chosen], [its for _, its in chosen]
-            world = opened.enter_context(World(session, [one.robot for one in named], wire=wire))
+            kept = opened.enter_context(open_clock(session, clock, wire))
+            world = opened.enter_context(World(session, [one.robot for one in named], wire=wire, clock=kept))
         else:
             world = opened.enter_context(World.of_recording(recording))
         page = opened.enter_context(Page(port=0) if snapshot else Page(host, port))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.ear import Ear
 from zstate.clock import SYSTEM, stamp_text
@@ -35,6 +37,22 @@ def _offset_text(one: ClockOffset) -> str:
     side = "ahead of" if one.offset_ns > 0 else "behind"
     size, bound = duration_text(abs(one.offset_ns)), duration_text(one.uncertainty_ns)
     return f"that of {one.writer} is {size} {side} this one (± {bound})"
+
+
+def domains_check(clocks: Mapping[str, str]) -> Check | None:
+    """Whether all robots are stamped by one clock, of those by robot; None if they are, or if not known."""
+    domains: dict[str, list[str]] = {}
+    for robot, clock in clocks.items():
+        if clock:
+            domains.setdefault(clock, []).append(robot)
+    if len(domains) < 2:
+        return None
+    told = "; ".join(f"{', '.join(map(repr, names))} in {domain!r} time" for domain, names in domains.items())
+    return warning(
+        "clocks",
+        f"robots are stamped by different clocks: {told}; there are no poses between them",
+        "zstate publish --help  # --clock: start all of them with the same",
+    )
 
 
 def stamps_check(ear: Ear, session: Session) -> Check:

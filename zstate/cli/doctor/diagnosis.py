@@ -92,6 +92,7 @@ def _of_robots(
     *,
     called: str,
 ) -> Iterator[Check]:
+    from zstate.cli.doctor.clock_checks import domains_check
     from zstate.cli.doctor.ear import Ear, listen
     from zstate.cli.doctor.robot_checks import robot_checks, shared_roots_checks, static_roots
     from zstate.cli.doctor.ros_checks import ros_checks
@@ -100,6 +101,7 @@ def _of_robots(
     words = words_of(wire)
     offsets = measure_offsets(session, ANY) if wire == "native" else ()
     tops: list[FrameInfo] = []
+    clocks: dict[str, str] = {}
     for first in range(0, len(wanted), _AT_ONCE):
         with ExitStack() as listening:
             some = wanted[first : first + _AT_ONCE]
@@ -110,6 +112,8 @@ def _of_robots(
                     ear.ask()
             listen(ears, timeout_s)
             for ear in ears:
+                if ear.description is not None:
+                    clocks[ear.info.name] = ear.description.clock
                 if isinstance(words, RosWords):
                     checks = ros_checks(ear, session, words, called)
                 else:
@@ -119,6 +123,9 @@ def _of_robots(
                 tops += static_roots(ear)
     if wire == "native":
         yield from shared_roots_checks(tops)
+    different = domains_check(clocks)
+    if different is not None:
+        yield different
 
 
 def _absent_check(

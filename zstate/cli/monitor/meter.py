@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
+from zstate.following.bounded import remember
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, Stream, full_name
@@ -72,7 +73,7 @@ class PathMeter(Closing):
         self._lock = threading.Lock()
         self._records: defaultdict[str, _Record] = defaultdict(_Record)
         self._seqs: dict[int, int] = {}
-        self._missed: defaultdict[int, int] = defaultdict(int)
+        self._missed: dict[int, int] = {}
         expression = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, expression, self._take)
 
@@ -86,12 +87,13 @@ class PathMeter(Closing):
             record = self._records.get(self.source(edge))
             if record is None:
                 return None
-            came, missed = list(record.came), self._missed[record.session]
+            came, missed = list(record.came), self._missed.get(record.session, 0)
         now = time.monotonic_ns()
         silent_s = (now - came[-1].at) * 1e-9
         recent = [one for one in came if now - one.at < _WINDOW_NS]
         steps = [(later.at - earlier.at) * 1e-9 for earlier, later in pairwise(recent)]
-        latencies = [one.latency * 1e-9 for one in recent]
+        is_told = edge.domain in (None, self._clock.domain)
+        latencies = [one.latency * 1e-9 for one in recent] if is_told else []
         return Measure(
             rate_hz=len(steps) / sum(steps) if sum(steps) else None,
             latency_s=median(latencies) if latencies else None,
@@ -123,9 +125,12 @@ class PathMeter(Closing):
 
     def _note(self, robot: str, sample: Sample, at: int, now: int) -> None:
         before = self._seqs.get(sample.session)
-        if before is not None and sample.seq > before + 1:
-            self._missed[sample.session] += sample.seq - before - 1
-        self._seqs[sample.session] = max(sample.seq, before or 0)
+        if before is None:
+            before = sample.seq
+            remember(self._missed, sample.session, 0)
+        elif sample.seq > before + 1:
+            self._missed[sample.session] = self._missed.get(sample.session, 0) + sample.seq - before - 1
+        remember(self._seqs, sample.session, max(sample.seq, before))
         for source in _sources(robot, sample):
             record = self._records[source]
             record.session = sample.session

@@ -6,10 +6,11 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import age_text, count_text, rate_text
+from zstate.cli.console import count_text, rate_text, sample_age_text
 from zstate.cli.frame_tree import below, roots, short_name
 from zstate.cli.pictures.cards import BELOW, Card, cards
 from zstate.cli.pictures.svg import ALARM, LINE, MUTED, WRITERS, Svg, text_width
+from zstate.clock import SYSTEM
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -67,7 +68,7 @@ class _Picture:
             return "" if frame.kind == "static" else frame.kind
         if frame.newest is None:
             return f"{frame.kind}, no sample"
-        return f"{frame.kind} · {rate_text(frame.rate_hz)} · {age_text(frame.newest, self._now)}"
+        return f"{frame.kind} · {rate_text(frame.rate_hz)} · {sample_age_text(frame, self._now)}"
 
     def _size(self, name: str) -> tuple[float, float]:
         frame = self._frames[name]
@@ -89,7 +90,8 @@ class _Picture:
     def _note_color(self, frame: FrameInfo) -> str:
         if frame.kind not in ("joint", "pose"):
             return MUTED
-        is_old = frame.newest is None or self._now - frame.newest > _OLD_NS
+        newest = frame.newest_in(SYSTEM)
+        is_old = frame.newest is None or (newest is not None and self._now - newest > _OLD_NS)
         return ALARM if is_old else MUTED
 
     def _join(self, svg: Svg, parent: Card, card: Card, shift: tuple[float, float]) -> None:

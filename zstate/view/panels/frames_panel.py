@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import viser
 
+from zstate.clock import SYSTEM
 from zstate.view.frame_search import found_frames
 from zstate.view.moment import Tree
 from zstate.view.panels import html
@@ -82,7 +83,7 @@ class FramesPanel:
         rows += [("parent", info.parent), ("kind", info.kind), ("writer", info.writer or "unknown")]
         if info.kind != "static":
             rate = "-" if info.rate_hz is None else f"{info.rate_hz:.1f} Hz"
-            rows += [("age", look.age_text(info.newest)), ("rate", rate)]
+            rows += [("age", look.age_text(info.newest_in(look.domain or SYSTEM))), ("rate", rate)]
         return rows
 
     def _pose(self, frame: str, look: Look) -> Rows:

@@ -29,6 +29,7 @@ from zstate.wire.ros2.outlet import Address, RosOutlet
 from zstate.wire.ros2.qos import STREAM_QOS
 from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_of_topic, type_of
 from zstate.wire.sample_names import SampleNames
+from zstate.wire.sizes import check_edges, check_size
 from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Announced, Writer
 
@@ -133,12 +134,18 @@ class Ros2Wire:
         """The key does not tell: all static edges of ROS share one topic."""
 
     def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+        # CDR repeats the names of all frames with each sample.
+        check_size(stream, arrival.size or len(arrival.payload), 4 if stream in ("tf", "joint_states") else 1)
         session, seq = self._origin(arrival)
         try:
             names = self._frame_names(robot)
         except InvalidInput as error:
             raise MessageError(f"a namespace that ROS does not have: {error}", reason="foreign") from None
-        return self._hearing.messages(stream, arrival.payload, session, seq, names)
+        messages = self._hearing.messages(stream, arrival.payload, session, seq, names)
+        if stream == "tf_static":
+            for message in messages:
+                check_edges(message)
+        return messages
 
     def _origin(self, arrival: Arrival) -> tuple[int, int]:
         """Which start of a writer, and which of its messages."""

@@ -1,0 +1,97 @@
+"""What is too large is refused by its stream before it is decoded, and what waits is bounded in bytes."""
+
+from __future__ import annotations
+
+import pytest
+from live import RRBOT, settle
+from support import until
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import MessageError
+from zstate.following.joints import JointFollower
+from zstate.following.ownership import FrameOwnership
+from zstate.following.tally import Tally
+from zstate.listener import TransformListener
+from zstate.net.latched import LatchedPublisher
+from zstate.net.streams import StreamPublisher
+from zstate.net.wires import wire_named
+from zstate.publisher import StatePublisher
+from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
+from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
+from zstate.wire.sizes import EARLY_BYTES, MOST_BYTES, STATIC_EDGES, Waiting
+from zstate.wire.wire import Arrival
+
+ORDER = order_digest(("a",))
+
+
+def statics(count: int) -> StaticTransforms:
+    pose = bytes(8 * 7)
+    return StaticTransforms(1, tuple(("", str(number)) for number in range(count)), pose * count)
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2"])
+@pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description"])
+def test_each_stream_has_a_largest_payload(wire, stream):
+    size = 4 * MOST_BYTES[stream] + 1
+    for arrival in (Arrival("key", bytes(size), "any"), Arrival("key", b"\0", "any", None, size)):
+        with pytest.raises(MessageError) as caught:
+            wire_named(wire).decode(stream, arrival, "r1")
+        assert caught.value.reason == "too large"
+
+
+def test_more_than_ten_thousand_static_edges_are_too_many():
+    def arrival(count: int) -> Arrival:
+        return Arrival("zstate/r1/tf_static/w", encode(statics(count)), ENCODINGS[StaticTransforms])
+
+    assert NativeWire().decode("tf_static", arrival(STATIC_EDGES), "r1")
+    with pytest.raises(MessageError, match="10001 static edges"):
+        NativeWire().decode("tf_static", arrival(STATIC_EDGES + 1), "r1")
+
+
+def test_what_travels_on_no_stream_is_bounded_too():
+    with pytest.raises(MessageError) as caught:
+        decode(bytes(64_001), ENCODINGS[Status], Status)
+    assert caught.value.reason == "too large"
+
+
+def test_the_oldest_give_way_by_number_and_by_bytes():
+    waiting: Waiting[int] = Waiting(3, most_bytes=100)
+    assert [waiting.append(number, 10) for number in range(4)] == [0, 0, 0, 1]
+    assert list(waiting) == [1, 2, 3]
+    assert waiting.append(4, 95) == 3
+    assert list(waiting) == [4]
+    assert waiting.append(5, 101) == 2
+    assert len(waiting) == 0
+
+
+def test_samples_that_wait_for_a_description_are_bounded_in_bytes():
+    tally = Tally()
+    follower = JointFollower("r1", FrameOwnership(TransformBuffer(), tally))
+    block, count = bytes(200_000), 2 * EARLY_BYTES // 200_000
+    for seq in range(count):
+        follower.take(JointState(seq, seq, 1, ORDER, block), overflowed=False)
+    given_up = tally.stats().refused["no description"]
+    assert (count - given_up) * len(block) <= EARLY_BYTES
+
+
+def test_too_large_messages_are_counted_and_the_next_are_taken(sessions):
+    writer, reader = sessions
+    with (
+        StreamPublisher(writer, "zstate/r2/joint_states", ENCODINGS[JointState]) as stranger,
+        LatchedPublisher(writer, "zstate/r1/tf_static/mount", ENCODINGS[StaticTransforms]) as mount,
+        TransformListener(reader) as listener,
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+    ):
+        until(lambda: stranger.has_readers)
+        one = StaticTransforms(1, (("tool", "camera"),), bytes(8 * 6) + b"\0\0\0\0\0\0\xf0\x3f")
+        mount.set(encode(one))
+        until(lambda: "r1/camera" in [frame.name for frame in listener.buffer.frames()])
+        stranger.put(bytes(300_000))
+        stranger.put(bytes(5_000_000))
+        mount.set(bytes(1_100_000))
+        mount.set(bytes(17_000_000))
+        until(lambda: listener.stats.refused == {"too large": 4})
+        settle(writer, "r1")
+        publisher.publish([0.5, 0.5])
+        # What was latched before still holds: the value was not withdrawn.
+        listener.buffer.wait("r1/world", "r1/camera", timeout_s=5.0)
