@@ -150,20 +150,28 @@ def test_a_closed_session_is_said_to_be_closed(sessions):
 def test_a_frame_that_another_static_writer_places_is_refused_with_its_edge_and_writer(sessions, robot):
     ours, theirs = sessions
     with StaticPublisher(theirs, robot, "mount", program="calibration") as mount:
-        mount.set(edge("r1/tool", "r1/camera"))
+        mount.set(edge("hall/tool", "hall/camera"))
         await_tokens(ours, 1)
-        with pytest.raises(SecondWriter, match="'r1/camera' on 'r1/tool' already, as 'mount'") as raised:
-            check_edges(ours, said(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])
-        assert raised.value.edge == ("r1/tool", "r1/camera")
+        with pytest.raises(SecondWriter, match="'hall/camera' on 'hall/tool' already, as 'mount'") as raised:
+            check_edges(ours, said(SECOND, "tf_static", "room"), [("hall/table", "hall/camera")])
+        assert raised.value.edge == ("hall/tool", "hall/camera")
         assert raised.value.first.program == "calibration"
-        check_edges(ours, said(SECOND, "tf_static", "room"), [("r1/tool", "r1/laser")])
-        mount.withdraw("r1/camera")
+        check_edges(ours, said(SECOND, "tf_static", "room"), [("hall/tool", "hall/laser")])
+        mount.withdraw("hall/camera")
         until(lambda: not is_placed(ours))
 
 
 def is_placed(session: Session) -> bool:
     try:
-        check_edges(session, said(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])
+        check_edges(session, said(SECOND, "tf_static", "room"), [("hall/table", "hall/camera")])
     except SecondWriter:
         return True
     return False
+
+
+def test_a_robots_own_writer_is_not_refused_for_another_robots_claim_on_its_frame(sessions):
+    ours, theirs = sessions
+    with StaticPublisher(theirs, "r2", "mount") as mount:
+        mount.set(edge("r1/tool", "r1/camera"))
+        await_tokens(ours, 1)
+        check_edges(ours, said(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])

@@ -130,7 +130,8 @@ class Questions(Store):
         except LookupFailed as reason:
             if reason.requested is None:
                 reason.requested = question.at
-            reason.ended = self._ended
+            if self._ended:
+                reason.ended = self._ended
             raise
         if question.max_age_s is not None:
             self._refuse_stale(path, transform, question.max_age_s)
