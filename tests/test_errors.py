@@ -239,7 +239,9 @@ def one_of_each() -> list[ZStateError]:
         errors.UnknownModel("arn", ["arm"], "no robot is called 'arn'"),
         errors.LibraryMissing("install it"),
         errors.MessageError("no", reason="foreign"),
-        errors.ClockMismatch("no", domains=("sim", "system")),
+        errors.ClockMismatch(
+            "a", "b", edges=(("a", "m"), ("m", "b")), robots=("r1", "r2"), domains=("sim", "system")
+        ),
         errors.RecordingError("no", path="a.mcap"),
         errors.Unreachable("no", endpoints=["tcp/a:1"]),
         errors.AccessDenied("no", reason="wrong CA", endpoint="tcp/a:1"),

@@ -100,7 +100,7 @@ def server(page: Page) -> Iterator[ViserServer]:
         yield page.server
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # not longer: while it is open, no other test of this thread can run asyncio
 def browser() -> Iterator[Browser]:
     sync_api = pytest.importorskip("playwright.sync_api")
     if not Path(CHROMIUM).exists():

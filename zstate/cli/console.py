@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from zstate.cli import logs
-from zstate.clock import SYSTEM
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
@@ -85,6 +84,8 @@ def age_text(stamp: int | None, now: int) -> str:
 
 def sample_age_text(frame: FrameInfo, now: int) -> str:
     """How old the newest sample of a frame is ``now``, by the system's clock; else which clock stamps it."""
+    from zstate.clock import SYSTEM  # loads numpy, which helps do without
+
     if frame.newest is None:
         return "no sample"
     newest = frame.newest_in(SYSTEM)

@@ -124,15 +124,18 @@ def living_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> 
     if not timeout_s > 0.0:
         raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
     deadline = time.monotonic() + timeout_s
-    found: frozenset[str] = frozenset()
+    found = last = frozenset[str]()
     while (remaining_s := deadline - time.monotonic()) > 0.0:
         # Thousands of tokens take a moment: what is asked for last is not cut short.
         within_s, asked_s = max(remaining_s, ANSWER_WITHIN_S), time.monotonic()
         answer = tokens_now(session, expression, within_s)
         if answer and answer == found:
             break
-        is_cut = time.monotonic() - asked_s >= within_s
-        found = answer | found if is_cut else answer or found
+        if time.monotonic() - asked_s >= within_s:
+            found |= answer
+        elif answer or not last:  # an answer without tokens may be wrong; two are not
+            found = answer
+        last = answer
         time.sleep(min(ROUND_S, max(0.0, deadline - time.monotonic())))
     return found
 

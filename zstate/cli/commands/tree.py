@@ -13,7 +13,6 @@ from zstate.cli.console import is_terminal, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
-from zstate.clock import SYSTEM
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -73,5 +72,7 @@ def _drawn(frames: Sequence[FrameInfo], now: int, form: str | None, *, in_full: 
 
 
 def _facts(frame: FrameInfo, now: int) -> dict[str, Any]:
+    from zstate.clock import SYSTEM  # loads numpy
+
     newest = frame.newest_in(SYSTEM)
     return {**asdict(frame), "age_s": None if newest is None else (now - newest) * 1e-9}
