@@ -155,8 +155,10 @@ def test_a_forked_child_is_refused_and_may_close_without_harm():
 
 def test_connect_is_refused_in_a_fork_of_a_process_that_used_zenoh_and_in_forks_of_that(spawn):
     child: Child = spawn("""
-        import os, sys
+        import os, sys, warnings
         from zstate import ZStateError, connect
+
+        warnings.simplefilter("ignore", DeprecationWarning)  # of any fork beside threads
 
         def try_to_connect():
             try:
