@@ -185,6 +185,7 @@ def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
 
 def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     heard = Heard(sessions[1])
+    await_reader(sessions[0], status_key("r1", ME))
     theirs = Writer("driver", "nuc", 3, 1, 99).identity
     wrong = [("r1", theirs, OK), ("*", ME, OK), ("r1", ME, replace(OK, rate_hz=float("nan")))]
     wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]
