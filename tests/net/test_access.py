@@ -190,7 +190,12 @@ def test_a_robot_that_announces_itself_as_another_takes_nothing_over(site: Site)
         until(lambda: publish_and_look(publisher, listener))
         (info,) = discover(site.join("desk"))
         (theirs,) = {writer for stream_of, writer in info.writers if stream_of == "tf"}
-        until(lambda: listener.buffer.frames(("r1/lower",))[0].writer == str(theirs))
+
+        def is_named() -> bool:
+            publisher.publish([0.5, 0.25])  # a sample is inserted under the name that is known by then
+            return listener.buffer.frames(("r1/lower",))[0].writer == str(theirs)
+
+        until(is_named)
         with announce(thief, f"zstate/r2/@writer/tf/{theirs.identity}"):
             until(lambda: [one.robot for one in listener.events() if one.robot == "r2"])
             before = listener.buffer.frames(("r1/lower",))[0].count
