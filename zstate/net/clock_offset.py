@@ -167,7 +167,10 @@ class OffsetMeter(Closing):
             if not self._is_running:
                 self._is_running = True
                 thread = threading.Thread(target=self._run, name="zstate clock offsets", daemon=True)
-                join_at_exit(thread).start()
+                try:
+                    join_at_exit(thread).start()
+                except RuntimeError:  # the interpreter is ending and starts no more threads
+                    self._is_open = False
 
     def close(self) -> None:
         """Measure no more. A second call does nothing."""
