@@ -70,3 +70,13 @@ def test_ctrl_c_ends_a_command(
     child.line(timeout_s=30.0)
     child.process.send_signal(signal.SIGINT)
     child.wait()
+
+
+@pytest.mark.processes
+def test_doctor_of_all_robots_ends_and_counts_those_that_it_did_not_examine(fleet: None):
+    """Each group of 50 silent robots takes the timeout; six of them would take longer than it goes on for."""
+    ended = zstate("doctor", "--timeout", "0.5")
+    assert ended.returncode == 1, ended.stderr.decode()  # drivers are announced, and silent
+    (line,) = (line for line in ended.stdout.decode().splitlines() if "were not examined" in line)
+    assert f"of {ROBOTS + 1} robots were not examined within 2.5 s" in line
+    assert "name one, or give more --timeout" in line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.doctor.check import Check, broken, ok
+from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.doctor.network_checks import (
     access_check,
     elsewhere,
@@ -33,6 +34,10 @@ if TYPE_CHECKING:
 
 _AT_ONCE = 50
 """So many robots are listened to at once: each takes eight threads."""
+
+_TIMEOUTS = 5
+"""After so many timeouts no more robots are examined: of a large fleet, those that are silent take one for
+each group of them."""
 
 
 def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
@@ -102,7 +107,15 @@ def _of_robots(
     offsets = measure_offsets(session, ANY) if wire == "native" else ()
     tops: list[FrameInfo] = []
     clocks: dict[str, str] = {}
+    deadline = time.monotonic() + _TIMEOUTS * timeout_s
     for first in range(0, len(wanted), _AT_ONCE):
+        if time.monotonic() > deadline:
+            text = (
+                f"{len(wanted) - first} of {len(wanted)} robots were not examined within "
+                f"{_TIMEOUTS * timeout_s:g} s; name one, or give more --timeout"
+            )
+            yield warning("robots", text, f"zstate doctor {wanted[first].name}")
+            break
         with ExitStack() as listening:
             some = wanted[first : first + _AT_ONCE]
             ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in some]
