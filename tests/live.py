@@ -15,7 +15,7 @@ from zstate.se3 import to_matrix
 from zstate.transform import Transform
 from zstate.wire.messages import JointState
 from zstate.wire.native import ENCODINGS, decode
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 RRBOT = load_model("rrbot")
 """World, base, two links on continuous joints (shoulder, elbow), and a tool."""
@@ -41,7 +41,7 @@ class Tap:
     """Everything that was heard on one key, as it came."""
 
     def __init__(self, session: Session, key: str) -> None:
-        self.arrivals: list[Arrival] = []
+        self.arrivals: list[SerializedSample] = []
         self._subscriber = StreamSubscriber(session, key, self.arrivals.extend)
 
     def payloads(self, count: int) -> list[bytes]:

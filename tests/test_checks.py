@@ -16,7 +16,7 @@ from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput
 from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
-from zstate.moving_edges import MovingEdges
+from zstate.nodes.robot_encoder import RobotEncoder
 from zstate.transform import Transform
 
 MODEL = load_model("rrbot")
@@ -38,13 +38,13 @@ def doors(numbers: Callable[[Any], Any]) -> dict[str, tuple[Callable[[], object]
     """Every call that takes numbers, with what its refusal has to name."""
     buffer = TransformBuffer()
     track = buffer.add_robot(MODEL)
-    edges = MovingEdges(MODEL, "r")
+    encoder = RobotEncoder(MODEL, "r")
     two, seven = numbers([1, 0]), numbers([1, 0, 0, 0, 0, 0, 1])
     three = numbers([1, 0, 0])
     return {
         "positions": (lambda: buffer.insert_joints(track, 0, two), "positions"),
         "velocities": (lambda: buffer.insert_joints(track, 0, [0.0, 0.0], two), "velocities"),
-        "published": (lambda: edges.block(two), "positions"),
+        "published": (lambda: encoder.encode_positions(two), "positions"),
         "checked": (lambda: MODEL.check_positions(two), "positions"),
         "efforts": (lambda: MODEL.check_efforts(two), "efforts"),
         "kinematics": (lambda: Kinematics(MODEL).edge_poses(two), "positions"),

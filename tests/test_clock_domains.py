@@ -14,7 +14,6 @@ from tales import START, Tale
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock, SystemClock
-from zstate.clock_publisher import ClockPublisher
 from zstate.errors import ClockMismatch, InvalidInput
 from zstate.following.joints import JointFollower
 from zstate.following.off_clock import OffClock, likely_cause
@@ -22,10 +21,10 @@ from zstate.following.ownership import FrameOwnership
 from zstate.following.tally import Tally
 from zstate.listener import TransformListener
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.clock import ClockPublisher, SimulatedClock
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.replayer import Replayer
-from zstate.simulated_clock import SimulatedClock
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.messages import JointState, RobotDescription, TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from live import Tap, await_reader
 
-from zstate.clock_publisher import ClockPublisher
 from zstate.errors import Closed, InvalidInput
+from zstate.nodes.clock import ClockPublisher
 from zstate.wire.messages import Clock
 from zstate.wire.native import ENCODINGS, decode
 from zstate.wire.ros2.plain import decode_clock

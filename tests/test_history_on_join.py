@@ -21,13 +21,13 @@ from zstate.model.catalog import load_model
 from zstate.net.history import Memory, PastReader, answer_past
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.writer import Announced, Writer
 
 MS = 1_000_000
@@ -137,8 +137,8 @@ def test_a_wait_for_the_recent_past_right_after_joining_ends_with_the_exact_pose
         try:
             began = time.time_ns()
             until(lambda: time.time_ns() - began > PAST_NS + 100 * MS)
-            assert publisher.memory is not None
-            sent = RecentBuffer(RRBOT, "r1", publisher.memory)
+            assert publisher.cache is not None
+            sent = RecentBuffer(RRBOT, "r1", publisher.cache)
             for _ in range(5):
                 with TransformListener(reader, "r1") as listener:
                     asked = time.time_ns() - PAST_NS
@@ -234,7 +234,7 @@ def test_a_publisher_without_a_cache_and_a_listener_that_wants_none_have_no_past
 ):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", cache_s=0.0) as publisher:
-        assert publisher.memory is None
+        assert publisher.cache is None
         publish(publisher, 0, 10)
         assert list(reader.zenoh.get(JOINTS, timeout=5.0)) == []
     with StatePublisher(writer, RRBOT, "r2") as publisher:
@@ -336,11 +336,11 @@ def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Sessi
         settle(writer, "r1")
         publisher.publish([0.5, 1.0], [0.1, 0.2], [3.0, 4.0], STAMP)
         publisher.publish([0.5, 1.0], stamp=STAMP + 1)
-        assert publisher.memory is not None
+        assert publisher.cache is not None
         said = tap.payloads(2)
-        pages: list[list[Arrival]] = []
+        pages: list[list[SerializedSample]] = []
         with PastReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
-            past.ask(JOINTS, publisher.memory.since(0)[0].session)
+            past.ask(JOINTS, publisher.cache.since(0)[0].session)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == said
     assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}
@@ -369,7 +369,7 @@ def test_a_past_of_another_session_than_was_asked_is_refused(sessions):
     writer, reader = sessions
     memory = Memory(10.0, 2, 8)
     order = order_digest(RRBOT.joint_names)
-    memory.keep(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
+    memory.append(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
     said = Announced("r1", "joint_states", Writer("driver", "nuc", 1, 2, 8))
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),

@@ -17,13 +17,13 @@ from zstate.model.catalog import load_model
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.presence import discover
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.messages import JointState, order_digest
 from zstate.wire.native import ENCODINGS, encode
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 PERIOD = 10_000_000
 GRIPPER = load_model("gripper")
@@ -197,7 +197,7 @@ def test_gaps_in_a_batch_that_filled_the_ring_are_our_own(sessions, monkeypatch:
     def come(*seqs: int) -> None:
         states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
         key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
-        listener._on_samples([Arrival(key, encode(state), encoding) for state in states])
+        listener._on_samples([SerializedSample(key, encode(state), encoding) for state in states])
 
     with TransformListener(sessions[0], "r1") as listener:
         monkeypatch.setattr(listener, "_capacity", 3)

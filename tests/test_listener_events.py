@@ -13,7 +13,7 @@ from support import Child, until
 from zstate.following.events import Event
 from zstate.listener import TransformListener
 from zstate.net.session import Session, connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 
 Spawn = Callable[..., Child]
 

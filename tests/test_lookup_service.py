@@ -14,7 +14,7 @@ from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, 
 from zstate.lookup_service import LookupService, RecentBuffer
 from zstate.net.service import ask_lookup
 from zstate.net.session import Session, connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.transform import Transform
 from zstate.wire.json import to_json
 from zstate.wire.keys import Stream
@@ -178,8 +178,8 @@ def test_a_driver_and_the_state_publisher_beside_it_answer_the_same(sessions: tu
 
 def test_a_publisher_whose_clock_was_set_back_answers_of_the_time_since(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
-        assert publisher.memory is not None
-        recent = RecentBuffer(RRBOT, "r1", publisher.memory)
+        assert publisher.cache is not None
+        recent = RecentBuffer(RRBOT, "r1", publisher.cache)
         publisher.publish([0.0, 0.0], stamp=STAMP)
         assert recent.filled().latest("world", "tool") == STAMP
         for number in range(2):

@@ -14,8 +14,8 @@ from zstate.model.edges import EdgeTable
 from zstate.model.kinematics import Kinematics
 from zstate.net.presence import discover
 from zstate.net.session import connect
-from zstate.publisher import STREAMS, StatePublisher
-from zstate.status import StreamStats
+from zstate.nodes.publisher import STREAMS, StatePublisher
+from zstate.nodes.publisher_status import StreamStats
 from zstate.wire.messages import TransformSample, from_block, poses_from_block
 from zstate.wire.native import ENCODINGS, decode
 

@@ -9,7 +9,7 @@ from support import Stepping
 
 from zstate.clock import SystemClock
 from zstate.errors import InvalidInput
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
 
 NAN, INF = float("nan"), float("inf")

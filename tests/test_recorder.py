@@ -23,11 +23,11 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.record.reader import RecordReader
 from zstate.recorder import Recorder
 from zstate.sources import SineSource
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.messages import Clock, JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode

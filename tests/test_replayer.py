@@ -25,9 +25,9 @@ from zstate.replayer import Replayer, ReplayReport
 from zstate.transform import Transform
 from zstate.wire.messages import Clock, JointState, StaticTransforms, TransformSample, from_block
 from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.topics import RmwKeys
-from zstate.wire.wire import Arrival
 
 COUNT = 100
 PATHS = [("world", "tool"), ("tool", "lens"), ("laser_link", "world")]
@@ -176,7 +176,7 @@ def test_a_start_within_has_the_latched_values_of_that_time(sessions, tmp_path: 
     tap = Tap(reader, "zstate/arm/joint_states")
     heights: list[float] = []
 
-    def hear(arrival: Arrival) -> None:
+    def hear(arrival: SerializedSample) -> None:
         said = decode(arrival.payload, arrival.encoding, StaticTransforms)
         heights.append(from_block(said.poses)[2])
 

@@ -25,13 +25,13 @@ from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.model.coordinates import velocity_slots
 from zstate.net.presence import discover
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SubscribedSource
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.native import NativeWire
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.ros2.wire import Ros2Wire
-from zstate.wire.wire import Arrival
 
 EVERY = every_joint().model
 WIRES = ("native", "ros2", "ros2dds")
@@ -141,13 +141,13 @@ def test_a_source_takes_what_a_ros_driver_says_and_counts_the_rest(sessions):
 def test_both_wires_say_the_same_numbers_at_the_same_instants(sessions):
     writer, reader = sessions
     keys = {wire: data_key(wire, "r1", "joint_states") for wire in ("native", "ros2")}
-    said: dict[str, list[Arrival]] = {wire: [] for wire in keys}
+    said: dict[str, list[SerializedSample]] = {wire: [] for wire in keys}
 
     def note(wire: str) -> Callable:
         def take(sample) -> None:
             beside = sample.attachment.to_bytes() if sample.attachment else None
             key, payload = str(sample.key_expr), sample.payload.to_bytes()
-            said[wire].append(Arrival(key, payload, str(sample.encoding), beside))
+            said[wire].append(SerializedSample(key, payload, str(sample.encoding), beside))
 
         return take
 

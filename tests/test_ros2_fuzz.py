@@ -23,9 +23,9 @@ from wire.ros2.raw_nodes import (
 from zstate.errors import MessageError
 from zstate.listener import TransformListener
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.ros2.wire import Ros2Wire
-from zstate.wire.wire import Arrival
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +82,7 @@ class Fuzz:
         key = key_of(self._topic)
         self._session.zenoh.put(key, payload, attachment=beside)
         try:
-            said = self._wire.decode(self._topic[0], Arrival(key, payload, "", beside), "r1")
+            said = self._wire.decode(self._topic[0], SerializedSample(key, payload, "", beside), "r1")
         except MessageError:
             self.refusals += 1
         else:

@@ -20,7 +20,7 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.listener import TransformListener
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 
 SECOND = 10**9
 NAMES = RRBOT.joint_names

@@ -27,8 +27,8 @@ from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
-from zstate.statics import StaticPublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 
 SEC, NANOSEC = divmod(STAMP, 10**9)

@@ -16,9 +16,9 @@ from zstate.following.events import Event
 from zstate.listener import TransformListener
 from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import Stream, stream_key, writer_key
 from zstate.wire.messages import JointState, RobotDescription, order_digest

@@ -10,14 +10,13 @@ import pytest
 from live import await_reader
 from support import until
 
-from zstate.clock_publisher import ClockPublisher
 from zstate.errors import Closed, NoClock
 from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.clock import ClockPublisher, SimulatedClock
+from zstate.nodes.publisher import StatePublisher
 from zstate.rate import Rate
-from zstate.simulated_clock import SimulatedClock
 from zstate.sources import SineSource
 
 MS = 1_000_000
@@ -76,7 +75,7 @@ def test_now_is_the_newest_time_that_was_told(sessions, wire, key):
 def test_who_tells_no_time_is_waited_for_as_long_as_was_said(sessions):
     with (
         SimulatedClock(sessions[1], timeout_s=0.05) as clock,
-        pytest.raises(NoClock, match=r"told the time on 'zstate/clock' for 0\.05 s") as caught,
+        pytest.raises(NoClock, match=r"no time was received on 'zstate/clock' for 0\.05 s") as caught,
     ):
         clock.now()
     assert isinstance(caught.value, TimeoutError)
@@ -120,7 +119,7 @@ def test_a_wait_ends_at_once_when_it_is_stopped_or_the_clock_closed(sessions):
         until(lambda: left.is_over)
         assert left.reached is False
     assert not clock.wait_until(0, threading.Event())
-    with pytest.raises(Closed, match="closed before it heard the time"):
+    with pytest.raises(Closed, match="closed before it received a time"):
         clock.now()
 
 

@@ -10,8 +10,8 @@ from zstate.errors import Closed, InsertRefused, InvalidInput
 from zstate.listener import TransformListener
 from zstate.net.presence import discover
 from zstate.net.session import connect
-from zstate.publisher import StatePublisher
-from zstate.statics import StaticPublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)

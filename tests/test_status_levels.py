@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
+from zstate.nodes.publisher_status import Health, PublisherStats, StatusReporter, assess_health
 from zstate.rate import RateReport
-from zstate.status import Beat, PublisherStats, Verdict, verdict
 from zstate.wire.writer import Writer
 
 SECOND = 1_000_000_000
-OK = Verdict("ok")
+OK = Health("ok")
 
 
 def counts(
@@ -28,42 +28,42 @@ def counts(
 
 
 def test_a_publisher_that_publishes_in_time_is_well():
-    assert verdict(counts(5), counts(6), quiet_ns=0) == OK
-    assert verdict(counts(5, rate_hz=100.0), counts(105, rate_hz=100.0), quiet_ns=0) == OK
+    assert assess_health(counts(5), counts(6), quiet_ns=0) == OK
+    assert assess_health(counts(5, rate_hz=100.0), counts(105, rate_hz=100.0), quiet_ns=0) == OK
 
 
 def test_one_that_has_nothing_new_to_say_is_stale_after_two_seconds():
-    assert verdict(counts(5), counts(5), quiet_ns=2 * SECOND) == OK
-    level, text = verdict(counts(5), counts(5), quiet_ns=2 * SECOND + 1)
+    assert assess_health(counts(5), counts(5), quiet_ns=2 * SECOND) == OK
+    level, text = assess_health(counts(5), counts(5), quiet_ns=2 * SECOND + 1)
     assert (level, text) == ("stale", "nothing was published for 2.0 s")
-    assert verdict(counts(), counts(), quiet_ns=3 * SECOND).text.endswith("since this publisher opened")
+    assert assess_health(counts(), counts(), quiet_ns=3 * SECOND).text.endswith("since this publisher opened")
 
 
 def test_a_slow_rate_that_was_asked_for_is_not_stale_before_two_periods():
     slow = counts(5, rate_hz=0.25)
-    assert verdict(slow, slow, quiet_ns=8 * SECOND) == OK
-    assert verdict(slow, slow, quiet_ns=8 * SECOND + 1).level == "stale"
+    assert assess_health(slow, slow, quiet_ns=8 * SECOND) == OK
+    assert assess_health(slow, slow, quiet_ns=8 * SECOND + 1).level == "stale"
 
 
 def test_ticks_that_were_late_or_skipped_since_the_last_time_are_a_warning():
     before = counts(100, rate_hz=100.0, late=3, skipped=1)
-    level, text = verdict(before, counts(140, rate_hz=100.0, late=43, skipped=21), quiet_ns=0)
+    level, text = assess_health(before, counts(140, rate_hz=100.0, late=43, skipped=21), quiet_ns=0)
     assert level == "warn"
     assert "40 ticks late and 20 skipped: 100 Hz" in text
-    assert verdict(before, counts(200, rate_hz=100.0, late=3, skipped=1), quiet_ns=0) == OK
+    assert assess_health(before, counts(200, rate_hz=100.0, late=3, skipped=1), quiet_ns=0) == OK
 
 
 def test_samples_outside_joint_limits_are_a_warning_that_names_the_joint():
     before = replace(counts(5), outside_limits=2, last_excess="'lift' at 3.0 rad is outside -2 to 2")
     now = replace(counts(9), outside_limits=5, last_excess="'lift' at 4.0 rad is outside -2 to 2")
     text = "3 samples are outside joint limits: 'lift' at 4.0 rad is outside -2 to 2"
-    assert verdict(before, now, quiet_ns=0) == Verdict("warn", text)
-    assert verdict(now, replace(now, sent=12), quiet_ns=0) == OK
+    assert assess_health(before, now, quiet_ns=0) == Health("warn", text)
+    assert assess_health(now, replace(now, sent=12), quiet_ns=0) == OK
 
 
 def test_the_ticks_of_an_earlier_run_are_not_those_of_this_one():
     before = counts(100, rate_hz=100.0, late=50, skipped=20)
-    assert verdict(before, counts(110, rate_hz=10.0), quiet_ns=0) == OK
+    assert assess_health(before, counts(110, rate_hz=10.0), quiet_ns=0) == OK
 
 
 @pytest.mark.parametrize(("sent", "level", "share"), [(3, "warn", "2 of 5"), (0, "error", "2 of 2")])
@@ -71,7 +71,7 @@ def test_samples_that_cannot_be_published_are_a_warning_and_an_error_when_there_
     sent: int, level: str, share: str
 ):
     now = counts(10 + sent, refused=2, refusal="joint 'elbow' is nan")
-    assert verdict(counts(10), now, quiet_ns=0) == (
+    assert assess_health(counts(10), now, quiet_ns=0) == (
         level,
         f"{share} samples cannot be published: joint 'elbow' is nan",
     )
@@ -79,8 +79,8 @@ def test_samples_that_cannot_be_published_are_a_warning_and_an_error_when_there_
 
 def test_a_status_tells_who_how_much_and_what_is_commanded():
     read = [counts(), counts(7, rate_hz=50.0, late=2)]
-    beat = Beat(Writer("driver", "nuc", 412, 5, 9), lambda: read.pop(0))
-    status = beat.status()
+    reporter = StatusReporter(Writer("driver", "nuc", 412, 5, 9), lambda: read.pop(0))
+    status = reporter.status()
     assert (status.program, status.host, status.pid, status.session) == ("driver", "nuc", 412, 9)
     assert (status.sent, status.late) == (7, 2)
     assert status.rate_hz > 7.0  # less than a second has passed

@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.presence import discover
     from zstate.net.session import connect
-    from zstate.publisher import StatePublisher
+    from zstate.nodes.clock import SimulatedClock
+    from zstate.nodes.publisher import StatePublisher
+    from zstate.nodes.static_publisher import StaticPublisher
     from zstate.recording import Recording
-    from zstate.simulated_clock import SimulatedClock
     from zstate.sources import JointReading, SineSource
-    from zstate.statics import StaticPublisher
     from zstate.transform import Transform
     from zstate.twist import Twist
 
@@ -93,10 +93,10 @@ _HOMES = {
     "Kinematics": "model.kinematics",
     "Recording": "recording",
     "RobotModel": "model.robot",
-    "SimulatedClock": "simulated_clock",
+    "SimulatedClock": "nodes.clock",
     "SineSource": "sources",
-    "StatePublisher": "publisher",
-    "StaticPublisher": "statics",
+    "StatePublisher": "nodes.publisher",
+    "StaticPublisher": "nodes.static_publisher",
     "Transform": "transform",
     "TransformBuffer": "buffer.buffer",
     "TransformListener": "listener",

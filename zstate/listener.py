@@ -29,7 +29,7 @@ from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.writer import Announced
 
 Follow = Literal["joint_states", "tf"]
@@ -188,7 +188,7 @@ class TransformListener(Closing):
                 follower.name_writer(session, self._names[robot, session])
         return follower
 
-    def _on_samples(self, arrivals: list[Arrival]) -> None:
+    def _on_samples(self, arrivals: list[SerializedSample]) -> None:
         is_full = len(arrivals) >= self._capacity
         if is_full:
             # A ring that is full has lost samples, of whoever sent any, and loses more while it is emptied.
@@ -213,7 +213,7 @@ class TransformListener(Closing):
         if failure is not None:
             raise failure
 
-    def _on_past(self, arrivals: list[Arrival], writer: int) -> bool:
+    def _on_past(self, arrivals: list[SerializedSample], writer: int) -> bool:
         robot = self._robot_of(arrivals[0].key)  # that was asked for
         samples = [
             sample
@@ -233,7 +233,7 @@ class TransformListener(Closing):
     def _note_foreign(self, key: str, error: InvalidInput) -> None:
         self._tally.refuse("foreign", f"{shortened(key)}: {error}")
 
-    def _on_description(self, arrival: Arrival) -> None:
+    def _on_description(self, arrival: SerializedSample) -> None:
         try:
             robot = self._robot_of(arrival.key)
         except InvalidInput as error:
@@ -245,7 +245,7 @@ class TransformListener(Closing):
             if isinstance(description, RobotDescription):
                 self._follower(robot, description.session).describe(description)
 
-    def _on_statics(self, arrival: Arrival) -> None:
+    def _on_statics(self, arrival: SerializedSample) -> None:
         try:
             robot, writer = self._robot_of(arrival.key), self._wire.statics_writer(arrival.key)
         except InvalidInput as error:
@@ -262,7 +262,7 @@ class TransformListener(Closing):
             self._statics.pop((arrival.key, 0), None)
             self._events.note_statics(robot, writer, frozenset())
 
-    def _is_withdrawn(self, arrival: Arrival) -> bool:
+    def _is_withdrawn(self, arrival: SerializedSample) -> bool:
         # In ROS nothing can be taken back: what is empty there is a broken message.
         return not arrival.payload and not self._wire.shared
 
@@ -281,7 +281,7 @@ class TransformListener(Closing):
         make = StaticFollower(robot, writer, self._ownership, is_model=writer == MODEL_WRITER)
         return self._statics.setdefault((key, session), make)
 
-    def _decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+    def _decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         try:
             return self._wire.decode(stream, arrival, robot)
         except MessageError as error:

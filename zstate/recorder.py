@@ -30,8 +30,8 @@ from zstate.record.scribe import Scribe
 from zstate.record.writer import RecordWriter
 from zstate.wire.keys import ANY, Stream, check_robot
 from zstate.wire.messages import Clock, Message, Sample
+from zstate.wire.protocol import SerializedSample, Wire
 from zstate.wire.ros2.topics import SHARED
-from zstate.wire.wire import Arrival, Wire
 from zstate.wire.writer import Announced
 
 FLUSH_NS = 500_000_000
@@ -235,11 +235,11 @@ class Recorder(Closing):
             else:
                 self._write_arrival(scribe, heard, robot, arrival)
 
-    def _write_large(self, robot: str, heard: Heard, arrival: Arrival) -> None:
+    def _write_large(self, robot: str, heard: Heard, arrival: SerializedSample) -> None:
         assert self._scribe is not None
         self._write_arrival(self._scribe, heard, robot, arrival)
 
-    def _write_arrival(self, scribe: Scribe, heard: Heard, robot: str, arrival: Arrival) -> None:
+    def _write_arrival(self, scribe: Scribe, heard: Heard, robot: str, arrival: SerializedSample) -> None:
         stream, stamp = heard.stream, heard.stamp
         static_writer = self._wire.statics_writer(arrival.key) if stream == "tf_static" else None
         if not arrival.payload and stream in _LATCHED:
@@ -251,7 +251,7 @@ class Recorder(Closing):
             if is_known and isinstance(message, Sample | Clock):
                 self._gaps.note((robot, stream, message.session), message.seq)
 
-    def _robot(self, heard: Heard, arrival: Arrival) -> str | None:
+    def _robot(self, heard: Heard, arrival: SerializedSample) -> str | None:
         try:
             if heard.stream == "tf_static":
                 self._wire.statics_writer(arrival.key)  # refuses a key that has none
@@ -260,7 +260,7 @@ class Recorder(Closing):
             self._tally.refuse("foreign", str(error))
             return None
 
-    def _decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+    def _decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         try:
             return self._wire.decode(stream, arrival, robot)
         except MessageError as error:
@@ -275,11 +275,11 @@ class _Large:
     can wait, the oldest values are dropped and counted.
     """
 
-    def __init__(self, write: Callable[[str, Heard, Arrival], None], tally: Tally) -> None:
+    def __init__(self, write: Callable[[str, Heard, SerializedSample], None], tally: Tally) -> None:
         self.failure: Exception | None = None
         self._write = write
         self._tally = tally
-        self._waiting: deque[tuple[str, Heard, Arrival]] = deque()
+        self._waiting: deque[tuple[str, Heard, SerializedSample]] = deque()
         self._bytes = 0
         self._behind: Counter[str] = Counter()
         self._changed = outlive_fork(threading.Condition())
@@ -290,7 +290,7 @@ class _Large:
         """Whether a latched value of ``robot`` with so many bytes is written here."""
         return size >= LARGE_BYTES or self._behind[robot] > 0
 
-    def put(self, robot: str, heard: Heard, arrival: Arrival) -> None:
+    def put(self, robot: str, heard: Heard, arrival: SerializedSample) -> None:
         """Write it later."""
         with self._changed:
             self._waiting.append((robot, heard, arrival))
@@ -340,7 +340,7 @@ class _Large:
                 self._behind[robot] -= 1
                 self._changed.notify_all()
 
-    def _take(self) -> tuple[str, Heard, Arrival] | None:
+    def _take(self) -> tuple[str, Heard, SerializedSample] | None:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or not self._is_open)
             if not self._is_open:

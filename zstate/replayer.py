@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from zstate.clock import Clock, SystemClock
-from zstate.clock_publisher import ClockPublisher
 from zstate.closing import Closing
 from zstate.errors import InvalidInput
 from zstate.following.recorded import check_recorded
@@ -17,6 +16,7 @@ from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.net.wires import wire_names
+from zstate.nodes.clock import ClockPublisher
 from zstate.record.models import first_descriptions, model_of
 from zstate.record.reader import RecordReader
 from zstate.record.transcript import LATCHED, Said, Transcript

@@ -22,13 +22,13 @@ from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_mo
 from zstate.following.joints import JointFollower
 from zstate.following.tally import Tally
 from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
+from zstate.net.writer import WireWriter
 from zstate.wire.messages import JointState, RobotDescription, Sample, order_digest, to_block
+from zstate.wire.protocol import EntityId, SerializedSample
 from zstate.wire.sample_names import SampleNames
-from zstate.wire.wire import Arrival, Place
 
 JOINTS = 30
 ROUNDS = 31
@@ -70,15 +70,14 @@ def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
     """The ways to write one sample of positions and velocities; what they open, the session closes."""
     numbers, state = np.linspace(-1.0, 1.0, JOINTS), sample(model, STAMP)
     publisher = StatePublisher(session, model, "whole", (wire,), streams=["joint_states"])
-    stream = Outlets(session, wire_named(wire), "alone", writer_here(1), sample_names(model)).stream(
-        "joint_states"
-    )
-    payload, beside = stream.encode(state), bytes(33)
+    wire_writer = WireWriter(session, wire_named(wire), "alone", writer_here(1), sample_names(model))
+    writer = wire_writer.open_stream("joint_states")
+    payload, beside = writer.encoder.encode(state), bytes(33)
     bare = session.zenoh.declare_publisher(f"bench/{wire}")
     return {
         "raw put": lambda: bare.put(payload),
         "raw put, attachment": lambda: bare.put(payload, attachment=beside),
-        "outlet: encode, put": lambda: stream.put(stream.encode(state)),
+        "SampleWriter: encode, write": lambda: writer.write(writer.encoder.encode(state)),
         "StatePublisher.publish": lambda: publisher.publish(numbers, numbers, stamp=STAMP),
     }
 
@@ -86,12 +85,18 @@ def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
 def reading(wire: str, model: RobotModel) -> dict[str, Call]:
     """The ways into a message, and into a buffer, of samples that follow each other."""
     spoken = wire_named(wire)
-    outlet = spoken.voice("r1", writer_here(1), Place("1", 0), sample_names(model)).outlet("joint_states", 1)
+    node, names = EntityId("1", 0), sample_names(model)
+    encoder = spoken.stream_encoder(
+        "r1", writer_here(1), "joint_states", node=node, number=1, sample_names=names
+    )
     stamps = count(STAMP, 10_000_000)
 
-    def arrivals() -> list[Arrival]:
-        payloads = [outlet.encode(sample(model, next(stamps))) for _ in range((ROUNDS + 1) * CALLS)]
-        return [Arrival(outlet.key, one, outlet.encoding, outlet.attachment(STAMP)) for one in payloads]
+    def arrivals() -> list[SerializedSample]:
+        payloads = [encoder.encode(sample(model, next(stamps))) for _ in range((ROUNDS + 1) * CALLS)]
+        return [
+            SerializedSample(encoder.key, one, encoder.encoding, encoder.attachment(STAMP))
+            for one in payloads
+        ]
 
     follower = JointFollower("r1", TransformBuffer(), Tally())
     follower.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))

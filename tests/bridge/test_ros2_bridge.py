@@ -21,11 +21,11 @@ from zstate.net.presence import discover
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource, SubscribedSource
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 GRIPPER = load_model("gripper")
 EACH = "ros2:namespace=*"
@@ -97,7 +97,7 @@ class Ear:
         self._robot, self._wire = robot, wire_named(wire)
         self._subscriber = StreamSubscriber(session, self._wire.expression(robot, "joint_states"), self._take)
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         for arrival in arrivals:
             self.stamps.update(s.stamp for s in self._wire.decode("joint_states", arrival, self._robot))
 

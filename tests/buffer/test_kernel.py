@@ -23,7 +23,7 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
 from zstate.extension import kernel
 from zstate.model.catalog import load_model
-from zstate.moving_edges import block_of
+from zstate.nodes.robot_encoder import block_of
 from zstate.se3 import ARRAYS, columns, conjugate, multiply, quaternion_of_rpy
 from zstate.transform import Transform
 from zstate.wire.messages import to_block

@@ -11,7 +11,7 @@ from looking import RRBOT, Spawn, failure, started, zstate
 from zstate import connect
 from zstate.net.security import Credentials
 from zstate.net.streams import StreamSubscriber
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 pytestmark = pytest.mark.processes
 
@@ -42,7 +42,7 @@ def test_a_viewer_who_comes_late_sees_the_robot_move(spawn: Spawn, router: str):
 @pytest.mark.parametrize("user", ["r2", "desk"])
 def test_somebody_else_cannot_write_the_robot_and_is_told_why(router: str, user: str):
     credentials = Credentials(user="desk", password="secret")
-    heard: list[Arrival] = []
+    heard: list[SerializedSample] = []
     with connect(mode="client", endpoints=router, credentials=credentials) as session:
         ear = StreamSubscriber(session, "zstate/r1/**", heard.extend)
         told = failure("publish", RRBOT, "--name", "r1", "--source", "sine", "--user", user)

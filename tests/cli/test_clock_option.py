@@ -14,7 +14,7 @@ from support import again_and_again, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.clock import ManualClock
-from zstate.clock_publisher import ClockPublisher
+from zstate.nodes.clock import ClockPublisher
 
 pytestmark = pytest.mark.processes
 
@@ -67,7 +67,7 @@ def test_a_wait_for_the_time_ends_with_ctrl_c(spawn: Spawn):
 
 def test_tf_gives_up_when_nobody_tells_the_time():
     message = failure("tf", "world", "tool", "--once", "--timeout", "0.7", "--clock", "sim")
-    assert "nobody has told the time on 'zstate/clock' for 0.7 s" in message
+    assert "no time was received on 'zstate/clock' for 0.7 s" in message
 
 
 def test_tf_tells_ages_by_the_time_of_the_robot():

@@ -16,7 +16,7 @@ from support import a_free_port, again_and_again
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
-from zstate.clock_publisher import ClockPublisher
+from zstate.nodes.clock import ClockPublisher
 from zstate.wire.keys import Stream
 
 pytestmark = pytest.mark.processes
@@ -226,7 +226,7 @@ def test_simulated_time_that_nobody_tells_is_missed():
     ):
         found = broken_link("rrbot")
     assert found["name"] == "stamps"
-    assert "nobody has told the time on 'zstate/clock'" in found["text"]
+    assert "no time was received on 'zstate/clock'" in found["text"]
 
 
 def test_robots_with_different_clocks_are_a_warning_that_names_them():

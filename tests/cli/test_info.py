@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from support import until
 
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.recorder import Recorder
 
 pytestmark = pytest.mark.processes

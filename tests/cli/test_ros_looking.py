@@ -10,9 +10,9 @@ from support import until
 
 from zstate import StaticPublisher, Transform, connect
 from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.protocol import EntityId
 from zstate.wire.ros2.wire import Ros2Wire
 from zstate.wire.sample_names import SampleNames
-from zstate.wire.wire import Place
 from zstate.wire.writer import Writer
 
 pytestmark = pytest.mark.processes
@@ -96,10 +96,12 @@ def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router
     )
     wire = Ros2Wire()
     with connect(mode="client", endpoints=ros_router) as session:
-        voice = wire.voice("r", Writer("driver", "", 0, 0, 1), Place(session.zid, 0), SampleNames())
-        outlet = voice.outlet("joint_states", 1)
-        await_reader(session, outlet.key)
-        session.zenoh.put(outlet.key, outlet.encode(unmeasured), attachment=outlet.attachment(5))
+        writer, node = Writer("driver", "", 0, 0, 1), EntityId(session.zid, 0)
+        encoder = wire.stream_encoder(
+            "r", writer, "joint_states", node=node, number=1, sample_names=SampleNames()
+        )
+        await_reader(session, encoder.key)
+        session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))
         document = json.loads(command.line(), parse_constant=pytest.fail)
     assert document["positions"] == {"a": 0.5}
     assert document["efforts"] == {"a": None}

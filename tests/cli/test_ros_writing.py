@@ -11,7 +11,7 @@ from zstate import TransformListener, connect, discover, load_model
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.sources import SubscribedSource
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 pytestmark = pytest.mark.processes
 
@@ -91,7 +91,7 @@ def test_a_static_edge_of_two_ros_frames_needs_no_robot(spawn: Spawn, client: Se
 
 
 def test_what_is_written_on_topics_has_the_names_that_were_given(spawn: Spawn, client: Session):
-    heard: list[Arrival] = []
+    heard: list[SerializedSample] = []
     started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
     with LatchedSubscriber(client, "0/tf_static/**", heard.append):
         until(lambda: heard)

@@ -22,7 +22,7 @@ from zstate.listener import Follow, TransformListener
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.net.wires import wire_named
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.wire.keys import Stream
 from zstate.wire.native import ENCODINGS
 

@@ -12,7 +12,7 @@ from support import until
 from zstate.listener import TransformListener
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import (
     JointState,
     RobotDescription,

@@ -12,8 +12,8 @@ from zstate.errors import InFuture
 from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
-from zstate.statics import StaticPublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.messages import (
     JointState,

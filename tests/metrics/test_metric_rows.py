@@ -23,7 +23,7 @@ from zstate.net.connections import connections
 from zstate.net.presence import RobotInfo, discover, writer_here
 from zstate.net.session import connect
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.wire.messages import JointState
 from zstate.wire.native import ENCODINGS

@@ -20,7 +20,7 @@ from zstate.net.access import Fleet, access_control, access_text
 from zstate.net.presence import announce, discover_readers
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import STREAMS
+from zstate.nodes.publisher import STREAMS
 from zstate.wire import keys
 from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode

@@ -14,7 +14,7 @@ from zstate.net.claims import GONE_WITHIN_S, Claim
 from zstate.net.placing import check_edges
 from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
-from zstate.statics import StaticPublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import Stream, writer_key
 from zstate.wire.writer import Announced, Writer

@@ -15,7 +15,7 @@ from zstate.listener import TransformListener
 from zstate.net.clock_offset import OffsetMeter, measure_offsets
 from zstate.net.service import Answer, Service
 from zstate.net.session import connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
 from zstate.wire.messages import Clock
 from zstate.wire.native import ENCODINGS, encode

@@ -23,7 +23,7 @@ from zstate.net.service import Answer, Service
 from zstate.net.session import Session
 from zstate.wire.messages import JointState, Past
 from zstate.wire.native import ENCODINGS, decode, encode
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r1/joint_states"
 ORDER = bytes(8)
@@ -37,7 +37,7 @@ def state(seq: int, stamp: int | None = None, session: int = 7, numbers: int = 2
 def remembering(count: int, span_s: float = 1e6, numbers: int = 2, session: int = 7) -> Memory:
     memory = Memory(span_s, numbers, session)
     for seq in range(count):
-        memory.keep(state(seq, session=session, numbers=numbers))
+        memory.append(state(seq, session=session, numbers=numbers))
     return memory
 
 
@@ -68,34 +68,34 @@ def test_pages_go_back_from_the_newest():
 
 def test_after_a_clock_was_set_back_only_what_came_then_is_remembered():
     memory = remembering(10, span_s=1.0)
-    memory.keep(state(10, STAMP - 3600 * SECOND))
-    memory.keep(state(11, STAMP - 3600 * SECOND + MS))
+    memory.append(state(10, STAMP - 3600 * SECOND))
+    memory.append(state(11, STAMP - 3600 * SECOND + MS))
     assert seqs(memory.since(0)) == [10, 11]
 
 
 def test_a_clock_set_back_by_less_than_the_span_leaves_nothing_of_before():
     memory = remembering(10, span_s=10.0)
-    memory.keep(state(10, STAMP - 5 * SECOND))
-    memory.keep(state(11, STAMP - 5 * SECOND + MS))
+    memory.append(state(10, STAMP - 5 * SECOND))
+    memory.append(state(11, STAMP - 5 * SECOND + MS))
     assert seqs(memory.since(0)) == [10, 11]
 
 
 def test_after_a_clock_was_set_forward_only_what_came_then_is_remembered():
     memory = remembering(10, span_s=1.0)
-    memory.keep(state(10, STAMP + 3600 * SECOND))
+    memory.append(state(10, STAMP + 3600 * SECOND))
     assert seqs(memory.since(0)) == [10]
 
 
 def test_a_stamp_slightly_back_forgets_nothing():
     memory = remembering(10, span_s=1.0)
-    memory.keep(state(10, STAMP - 85_000))
+    memory.append(state(10, STAMP - 85_000))
     assert seqs(memory.since(0)) == list(range(11))
 
 
 def test_memory_is_bounded_whatever_the_stamps_say():
     memory = Memory(1e6, 100_000, 7)
     for seq in range(100):
-        memory.keep(state(seq, STAMP, numbers=1))
+        memory.append(state(seq, STAMP, numbers=1))
     kept = seqs(memory.since(0))
     assert kept == list(range(100 - len(kept), 100))
     assert 1 <= len(kept) <= MOST_BYTES // 800_000
@@ -111,12 +111,12 @@ class Heard:
     """The pages that came."""
 
     def __init__(self, session: Session, most: int = 1000) -> None:
-        self.pages: list[list[Arrival]] = []
+        self.pages: list[list[SerializedSample]] = []
         self.errors: list[MessageError] = []
         self._most = most
         self.reader = PastReader(session, self._take, lambda _, error: self.errors.append(error))
 
-    def _take(self, arrivals: list[Arrival], writer: int) -> bool:
+    def _take(self, arrivals: list[SerializedSample], writer: int) -> bool:
         self.pages.append(arrivals)
         return len(self.pages) < self._most
 
@@ -139,7 +139,9 @@ def test_a_reader_gets_every_sample_as_it_was_sent_the_newest_page_first(session
         heard.reader.ask(KEY, 7)
         until(lambda: len(heard.pages) == 2)
     assert heard.seqs() == [list(range(3, PAGE_SAMPLES + 3)), [0, 1, 2]]
-    assert heard.pages[1] == [Arrival(KEY, encode(state(seq)), ENCODINGS[JointState]) for seq in range(3)]
+    assert heard.pages[1] == [
+        SerializedSample(KEY, encode(state(seq)), ENCODINGS[JointState]) for seq in range(3)
+    ]
 
 
 def test_a_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Session]):
@@ -351,9 +353,9 @@ def test_a_page_that_cannot_be_taken_does_not_end_the_asking_of_others(sessions,
     raised: list[object] = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
     writer, reader = sessions
-    pages: list[list[Arrival]] = []
+    pages: list[list[SerializedSample]] = []
 
-    def take(arrivals: list[Arrival], _: int) -> bool:
+    def take(arrivals: list[SerializedSample], _: int) -> bool:
         pages.append(arrivals)
         if len(pages) == 1:
             raise InvalidInput("the first")

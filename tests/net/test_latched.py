@@ -4,7 +4,7 @@ from support import Child, until
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber
 from zstate.net.session import connect
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 ENCODING = "zstate/StaticTransforms;v=1"
 ALL = "zstate/*/tf_static/*"
@@ -34,7 +34,7 @@ class Inbox:
         self.heard: list[tuple[str, bytes, str]] = []
         self.subscriber = LatchedSubscriber(session, ALL, self._hear)
 
-    def _hear(self, arrival: Arrival) -> None:
+    def _hear(self, arrival: SerializedSample) -> None:
         if arrival.payload:
             self.values[arrival.key] = arrival.payload
         else:

@@ -17,8 +17,8 @@ from zstate.errors import SecondWriter
 from zstate.listener import TransformListener
 from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
-from zstate.publisher import StatePublisher
-from zstate.statics import StaticPublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import edge_key
 from zstate.wire.writer import Announced, Writer

@@ -14,12 +14,12 @@ from support import SOON_S, until
 
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.net import replies
-from zstate.net.outlets import Outlets
 from zstate.net.presence import RobotInfo, discover, discover_readers, tokens_now, watch, writer_here
 from zstate.net.replies import query, query_tokens
 from zstate.net.session import Session, connect
 from zstate.net.wires import wire_named
-from zstate.statics import StaticPublisher
+from zstate.net.writer import WireWriter, write_all
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import reader_key, writer_key
 from zstate.wire.messages import StaticTransforms, to_block
@@ -73,11 +73,10 @@ def test_they_are_discovered_in_a_session_that_follows_them(sessions: tuple[Sess
 def test_one_session_has_more_static_writers_than_the_default_channel_holds():
     with connect() as session, ExitStack() as opened:
         for number in range(MORE_THAN_THE_DEFAULT):
-            outlets = Outlets(session, wire_named("native"), "r1", writer_here(number))
-            latched = opened.enter_context(outlets).latched("tf_static", f"mount{number}")
-            latched.set(
-                StaticTransforms(number, (("base", f"camera{number}"),), to_block([1, 0, 0, 0, 0, 0, 1]))
-            )
+            wire_writer = WireWriter(session, wire_named("native"), "r1", writer_here(number))
+            latched = opened.enter_context(wire_writer).open_latched("tf_static", f"mount{number}")
+            edges = (("base", f"camera{number}"),)
+            write_all([latched], StaticTransforms(number, edges, to_block([1, 0, 0, 0, 0, 0, 1])))
         last = opened.enter_context(StaticPublisher(session, "r1", "last"))
         last.set(edge("camera0", "lens"))
         with pytest.raises(SecondWriter, match="camera299"):

@@ -17,7 +17,7 @@ from zstate.net.presence import discover
 from zstate.net.session import Session, connect
 from zstate.net.status import StatusPublisher, watch_status
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
 from zstate.wire.keys import status_key
 from zstate.wire.messages import Status

@@ -7,14 +7,14 @@ from support import SOON_S, until
 from zstate.errors import Closed
 from zstate.net.session import connect
 from zstate.net.streams import StreamPublisher, StreamSubscriber
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 KEY = "zstate/r/joint_states"
 ENCODING = "zstate/JointState;v=1"
 
 
 def test_samples_arrive_in_order_with_key_and_encoding(sessions):
-    got: list[Arrival] = []
+    got: list[SerializedSample] = []
     with (
         StreamPublisher(sessions[0], KEY, ENCODING) as publisher,
         StreamSubscriber(sessions[1], "zstate/*/joint_states", got.extend) as subscriber,
@@ -23,15 +23,15 @@ def test_samples_arrive_in_order_with_key_and_encoding(sessions):
         for number in range(100):
             publisher.put(bytes([number]))
         until(lambda: len(got) == 100)
-    assert got == [Arrival(KEY, bytes([number]), ENCODING) for number in range(100)]
+    assert got == [SerializedSample(KEY, bytes([number]), ENCODING) for number in range(100)]
     assert (subscriber.full_batches, subscriber.failures) == (0, 0)
 
 
 def test_readers_of_many_keys_and_writers_of_a_session_go_on_when_one_of_its_readers_closes(sessions):
     here, there = sessions
     ours, theirs = "zstate/ours/joint_states", "zstate/theirs/joint_states"
-    gone: list[Arrival] = []
-    heard: dict[str, list[Arrival]] = {"here": [], "there": []}
+    gone: list[SerializedSample] = []
+    heard: dict[str, list[SerializedSample]] = {"here": [], "there": []}
     many = "zstate/*/joint_states"
     with (
         StreamPublisher(here, ours, "") as mine,
@@ -54,7 +54,7 @@ def test_readers_of_many_keys_and_writers_of_a_session_go_on_when_one_of_its_rea
 
 
 def test_what_goes_beside_a_sample_arrives_with_it(sessions):
-    got: list[Arrival] = []
+    got: list[SerializedSample] = []
     with (
         StreamPublisher(sessions[0], KEY, "") as publisher,
         StreamSubscriber(sessions[1], KEY, got.extend),
@@ -75,10 +75,10 @@ def test_a_writer_knows_whether_anybody_reads(sessions):
 
 def test_a_slow_reader_gets_the_newest_samples_and_is_told_that_its_ring_was_full(sessions):
     batches: list[list[int]] = []
-    seen: list[Arrival] = []
+    seen: list[SerializedSample] = []
     busy, go_on = threading.Event(), threading.Event()
 
-    def slow(samples: list[Arrival]) -> None:
+    def slow(samples: list[SerializedSample]) -> None:
         batches.append([int(sample.payload) for sample in samples])
         busy.set()
         assert go_on.wait(10)
@@ -106,7 +106,7 @@ def test_a_reader_that_raises_is_counted_reported_once_and_goes_on(sessions, mon
     reported: list[object] = []
     monkeypatch.setattr(threading, "excepthook", lambda arguments: reported.append(arguments.exc_value))
 
-    def raises(samples: list[Arrival]) -> None:
+    def raises(samples: list[SerializedSample]) -> None:
         raise RuntimeError(str(samples[0].payload))
 
     with (
@@ -122,9 +122,9 @@ def test_a_reader_that_raises_is_counted_reported_once_and_goes_on(sessions, mon
 
 def test_a_subscriber_may_be_closed_twice_and_from_its_own_thread(sessions):
     closed = threading.Event()
-    got: list[Arrival] = []
+    got: list[SerializedSample] = []
 
-    def close_myself(samples: list[Arrival]) -> None:
+    def close_myself(samples: list[SerializedSample]) -> None:
         got.extend(samples)
         subscriber.close()
         closed.set()
@@ -142,7 +142,7 @@ def test_a_subscriber_may_be_closed_twice_and_from_its_own_thread(sessions):
 def test_close_returns_within_a_second_while_the_reader_is_busy(sessions):
     busy, go_on = threading.Event(), threading.Event()
 
-    def hold(samples: list[Arrival]) -> None:
+    def hold(samples: list[SerializedSample]) -> None:
         busy.set()
         go_on.wait(10)
 

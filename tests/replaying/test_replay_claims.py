@@ -14,9 +14,9 @@ from tales import MS, START, Tale, pose
 from zstate.errors import SecondWriter
 from zstate.net.presence import tokens_now
 from zstate.net.session import connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.replayer import Replayer
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 
 COUNT = 20

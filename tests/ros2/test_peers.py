@@ -19,8 +19,8 @@ from support import until
 
 from zstate.listener import TransformListener
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
-from zstate.statics import StaticPublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 
 WIRE = f"ros2:domain={DOMAIN}"

@@ -11,7 +11,7 @@ from ros_messages import JOINT_STATE, STRING, TF_MESSAGE
 from support import until
 
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.wire.ros2.graph import EndpointToken, NodeToken, parse_token
 from zstate.wire.ros2.qos import Qos
 

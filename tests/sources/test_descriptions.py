@@ -9,7 +9,7 @@ from support import until
 from zstate.model.catalog import load_model
 from zstate.net.latched import LatchedPublisher
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources.descriptions import Descriptions
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import ENCODINGS, encode

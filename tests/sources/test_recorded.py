@@ -13,7 +13,7 @@ from tales import MS, START, Bag, S, Tale, swing, swing_rates
 from zstate.errors import InvalidInput
 from zstate.model.catalog import load_model
 from zstate.net.session import connect
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources.recorded import RecordedSource
 
 NOW = 1_900_000_000 * S

@@ -8,7 +8,7 @@ from support import until
 from zstate.model.catalog import load_model
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources import SubscribedSource
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode

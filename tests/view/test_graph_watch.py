@@ -8,7 +8,7 @@ from live import RRBOT
 from support import until
 
 from zstate.listener import TransformListener
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.view.graph_watch import GraphWatch
 
 

@@ -12,7 +12,7 @@ from support import until as until_then
 from zstate.model.catalog import load_model
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.view.sliders import Sliders
 
 pytestmark = [pytest.mark.browser, pytest.mark.processes]

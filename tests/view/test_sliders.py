@@ -14,7 +14,7 @@ from zstate.errors import InvalidInput
 from zstate.listener import TransformListener
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.view.sliders import Sliders
 from zstate.wire.messages import from_block
 

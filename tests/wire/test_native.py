@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
+from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     Clock,
     JointCommand,
@@ -21,10 +22,11 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
+from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder, Wire
 from zstate.wire.sample_names import SampleNames
-from zstate.wire.wire import Arrival, Place, Wire
 from zstate.wire.writer import Announced, Writer
 
+WRITER = Writer("arm", "jetson", 412, 5, 7)
 NAMES = ("j1", "j2")
 ORDER = order_digest(NAMES)
 EDGES = (("b", "a"), ("a", "h"))
@@ -236,21 +238,29 @@ def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, a
         assert error.reason in {"truncated", "malformed"}
 
 
+def encoder_of(stream: Stream, name: str = "") -> StreamEncoder:
+    node = EntityId("z1", 0)
+    return NativeWire().stream_encoder(
+        "r1", WRITER, stream, node=node, number=0, sample_names=SampleNames(), name=name
+    )
+
+
 def test_the_native_wire_says_every_stream_through_the_seam():
     wire: Wire = NativeWire()
-    voice = wire.voice("r1", Writer("arm", "jetson", 412, 5, 7), Place("z1", 0), SampleNames())
     by_type = {type(message): message for message in MESSAGES}
     for stream, kind in STREAM_TYPES.items():
-        message, outlet = by_type[kind], voice.outlet(stream, 0, "w")
-        assert outlet.encoding == ENCODINGS[kind]
-        assert outlet.key.startswith(wire.expression("r1", stream).rstrip("*"))
-        arrival = Arrival(outlet.key, outlet.encode(message), outlet.encoding, outlet.attachment(0))
+        message, encoder = by_type[kind], encoder_of(stream, "w")
+        assert encoder.encoding == ENCODINGS[kind]
+        assert encoder.key.startswith(wire.expression("r1", stream).rstrip("*"))
+        arrival = SerializedSample(
+            encoder.key, encoder.encode(message), encoder.encoding, encoder.attachment(0)
+        )
         assert wire.decode(stream, arrival, "r1") == (message,)
 
 
 def test_a_token_of_the_native_wire_says_who_writes_what():
-    wire, writer = NativeWire(), Writer("arm", "jetson", 412, 5, 7)
-    outlet = wire.voice("r1", writer, Place("z1", 0), SampleNames()).outlet("tf", 0)
-    assert outlet.token is not None
-    assert wire.announced(outlet.token, "r1") == Announced("r1", "tf", writer)
+    wire = NativeWire()
+    encoder = encoder_of("tf")
+    assert encoder.token is not None
+    assert wire.announced(encoder.token, "r1") == Announced("r1", "tf", WRITER)
     assert wire.announced("zstate/r1/@writer/tf/nonsense", "r1") is None

@@ -17,11 +17,11 @@ from zstate.listener import TransformListener
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
 from zstate.net.wires import wire_named
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.sizes import EARLY_BYTES, MOST_BYTES, STATIC_EDGES, Waiting
-from zstate.wire.wire import Arrival
 
 ORDER = order_digest(("a",))
 
@@ -35,15 +35,18 @@ def statics(count: int) -> StaticTransforms:
 @pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description"])
 def test_each_stream_has_a_largest_payload(wire, stream):
     size = 4 * MOST_BYTES[stream] + 1
-    for arrival in (Arrival("key", bytes(size), "any"), Arrival("key", b"\0", "any", None, size)):
+    for arrival in (
+        SerializedSample("key", bytes(size), "any"),
+        SerializedSample("key", b"\0", "any", None, size),
+    ):
         with pytest.raises(MessageError) as caught:
             wire_named(wire).decode(stream, arrival, "r1")
         assert caught.value.reason == "too large"
 
 
 def test_more_than_ten_thousand_static_edges_are_too_many():
-    def arrival(count: int) -> Arrival:
-        return Arrival("zstate/r1/tf_static/w", encode(statics(count)), ENCODINGS[StaticTransforms])
+    def arrival(count: int) -> SerializedSample:
+        return SerializedSample("zstate/r1/tf_static/w", encode(statics(count)), ENCODINGS[StaticTransforms])
 
     assert NativeWire().decode("tf_static", arrival(STATIC_EDGES), "r1")
     with pytest.raises(MessageError, match="10001 static edges"):

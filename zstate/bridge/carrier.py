@@ -13,11 +13,11 @@ from zstate.errors import Closed, InvalidInput, ZStateError
 from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources.descriptions import Descriptions
 from zstate.sources.source import JointReading
 from zstate.sources.subscribed import SubscribedSource
-from zstate.statics import StaticPublisher
 
 PROGRAM = "zstate_bridge"
 """As whom a bridge writes, on both wires: by this name bridges know what was carried already."""

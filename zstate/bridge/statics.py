@@ -14,11 +14,11 @@ from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
-from zstate.statics import StaticPublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import StaticTransforms, poses_from_block, to_block
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 
 class StaticCarrier(Closing):
@@ -45,7 +45,7 @@ class StaticCarrier(Closing):
         """Follow the edges no more; those that were published stay. A second call does nothing."""
         self._subscriber.close()
 
-    def _take(self, arrival: Arrival) -> None:
+    def _take(self, arrival: SerializedSample) -> None:
         try:
             writer = self._wire.statics_writer(arrival.key)
         except InvalidInput as error:

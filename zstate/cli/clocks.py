@@ -12,7 +12,7 @@ from zstate.errors import NoClock
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
-    from zstate.simulated_clock import SimulatedClock
+    from zstate.nodes.clock import SimulatedClock
 
 # Whoever tells the time does it many times a second; waiting is mentioned only afterwards.
 _GRACE_S = 0.5
@@ -29,7 +29,7 @@ def open_clock(
     if kind is None or kind == SYSTEM:
         yield None if kind is None else SystemClock()
         return
-    from zstate.simulated_clock import SimulatedClock
+    from zstate.nodes.clock import SimulatedClock
 
     with SimulatedClock(session, wire) as clock:
         _await(clock, timeout_s)

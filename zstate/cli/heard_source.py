@@ -8,7 +8,7 @@ from zstate.cli.console import note
 from zstate.cli.words import words_of
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SubscribedSource
 
 

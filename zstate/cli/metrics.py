@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from zstate.metrics.library import Collector
     from zstate.metrics.listening import Listened
     from zstate.net.session import Session
-    from zstate.publisher import StatePublisher
+    from zstate.nodes.publisher import StatePublisher
     from zstate.recorder import Recorder
 
 

@@ -13,7 +13,7 @@ from zstate.errors import MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.messages import JointState, RobotDescription
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
     from zstate.cli.tap import Tapped
@@ -44,7 +44,7 @@ class Named(Closing):
         """What the robot is, once it has been described."""
         return self._writer.model
 
-    def _describe(self, arrival: Arrival) -> None:
+    def _describe(self, arrival: SerializedSample) -> None:
         if not arrival.payload:
             return
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from zstate.cli.console import report_text, say_fitted
 from zstate.cli.worker import Worker
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.sources.source import JointSource
 
 

@@ -15,7 +15,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.messages import RobotDescription
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -87,7 +87,7 @@ class Readiness(Closing):
                 return True
         return False
 
-    def _note_still(self, arrival: Arrival) -> None:
+    def _note_still(self, arrival: SerializedSample) -> None:
         """Of a robot without moving joints no sample need come."""
         with suppress(MessageError, InvalidInput):  # withdrawn; or broken, which the listener says
             robot = self._spoken.robot_of(arrival.key)

@@ -18,7 +18,7 @@ from zstate.wire.messages import Sample
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
-    from zstate.wire.wire import Arrival
+    from zstate.wire.protocol import SerializedSample
 
 # Enough for a steady number, few enough to notice a change.
 _KEPT = 200
@@ -60,7 +60,7 @@ class Sampler(Closing):
     def hear(self, stream: Stream, robot: str = "*") -> None:
         """Listen to ``stream`` of ``robot``, or of all of them, from now on."""
 
-        def take(arrivals: list[Arrival]) -> None:
+        def take(arrivals: list[SerializedSample]) -> None:
             came = time.monotonic_ns()
             for arrival in arrivals:
                 self._take(stream, arrival, came)
@@ -68,7 +68,7 @@ class Sampler(Closing):
         key = self._wire.expression(robot, stream)
         self._opened.enter_context(StreamSubscriber(self._session, key, take))
 
-    def _take(self, stream: Stream, arrival: Arrival, came: int) -> None:
+    def _take(self, stream: Stream, arrival: SerializedSample, came: int) -> None:
         try:
             robot = self._wire.robot_of(arrival.key)
             samples = self._wire.decode(stream, arrival, robot)

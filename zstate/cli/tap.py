@@ -17,7 +17,7 @@ from zstate.net.streams import CAPACITY, StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, check_robot
 from zstate.wire.messages import Message, Sample
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -53,7 +53,7 @@ class Tap(Closing):
         self._subscriber.close()
         self._roster.close()
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         came = time.monotonic_ns()
         for arrival in arrivals:
             for sample in self._decode(arrival):
@@ -62,7 +62,7 @@ class Tap(Closing):
                 if self._samples.qsize() < CAPACITY:
                     self._samples.put(Tapped(came, sample))
 
-    def _decode(self, arrival: Arrival) -> Sequence[Message]:
+    def _decode(self, arrival: SerializedSample) -> Sequence[Message]:
         try:
             return self._wire.decode(self._stream, arrival, self.robot)
         except MessageError as error:

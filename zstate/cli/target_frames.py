@@ -21,8 +21,8 @@ from zstate.wire.messages import RobotDescription, StaticTransforms
 if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
-    from zstate.statics import StaticPublisher
-    from zstate.wire.wire import Arrival
+    from zstate.nodes.static_publisher import StaticPublisher
+    from zstate.wire.protocol import SerializedSample
 
 _MODEL_WITHIN_S = 1.5
 _LOOK_EVERY_S = 0.02
@@ -83,13 +83,13 @@ class RobotFrames(Closing):
     def close(self) -> None:
         self._opened.close()
 
-    def _describe(self, arrival: Arrival) -> None:
+    def _describe(self, arrival: SerializedSample) -> None:
         with suppress(MessageError, ModelError):
             for message in self._wire.decode("robot_description", arrival, self._robot):
                 if isinstance(message, RobotDescription):
                     self._model = parse_urdf(message.urdf, f"the URDF of {self._robot!r}")
 
-    def _take_statics(self, arrival: Arrival) -> None:
+    def _take_statics(self, arrival: SerializedSample) -> None:
         writer = self._wire.statics_writer(arrival.key) or ""
         if writer in (MODEL_WRITER, self._writer):
             return

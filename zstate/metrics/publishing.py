@@ -7,7 +7,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from zstate.metrics.families import Families
 from zstate.metrics.library import Collector, Metric
 from zstate.metrics.pace import Paces
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 
 
 class PublisherMetrics(Collector):

@@ -101,10 +101,10 @@ class Claim(Closing):
         A second after the first call it looks twenty times a second only, however often it is called.
         """
         if self._first is None:
-            self._session.check()
             now = time.monotonic()
             if now < self._look_at:
                 return
+            self._session.check()
             if self._tokens is None:
                 self._heard_of_all_at = now + _AT_ONCE_S
             elif now > self._heard_of_all_at:

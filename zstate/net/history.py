@@ -39,7 +39,7 @@ from zstate.net.turns import Turns
 from zstate.wire.keys import Stream, stream_key
 from zstate.wire.messages import JointState, Past
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 PAGE_BYTES = 32_000
 PAGE_SAMPLES = 256
@@ -79,8 +79,8 @@ class Memory:
         self._states: deque[JointState] = deque(maxlen=MOST_BYTES // (8 * numbers + _OVERHEAD))
         self._newest = 0
 
-    def keep(self, state: JointState) -> None:
-        """Remember ``state``, whose ``seq`` is one more than that of the last."""
+    def append(self, state: JointState) -> None:
+        """Cache ``state``, whose ``seq`` is one more than that of the last."""
         states, stamp = self._states, state.stamp
         limit = stamp - self._span_ns
         if stamp >= self._newest:
@@ -140,7 +140,7 @@ def _page(states: Sequence[JointState], say: Callable[[JointState], bytes]) -> t
     return tuple(reversed(samples))
 
 
-def _past_in(page: Arrival) -> Past:
+def _past_in(page: SerializedSample) -> Past:
     if len(page.payload) > MOST_PAGE_BYTES:
         text = f"a page of {len(page.payload)} bytes, more than {MOST_PAGE_BYTES}"
         raise MessageError(text, reason="too large")
@@ -179,7 +179,7 @@ class PastReader(Closing):
     def __init__(
         self,
         session: Session,
-        on_page: Callable[[list[Arrival], int], bool],
+        on_page: Callable[[list[SerializedSample], int], bool],
         on_error: Callable[[str, MessageError], None],
     ) -> None:
         self._session = session
@@ -275,7 +275,7 @@ class PastReader(Closing):
         except MessageError as error:
             self._on_error(page.key, error)
             return None
-        arrivals = [Arrival(page.key, sample, past.encoding) for sample in past.samples]
+        arrivals = [SerializedSample(page.key, sample, past.encoding) for sample in past.samples]
         is_wanted = bool(arrivals) and self._on_page(arrivals, asked.writer)
         asked.pages += 1
         goes_back = past.before is not None and (asked.before is None or past.before < asked.before)

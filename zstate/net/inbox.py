@@ -13,7 +13,7 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire.keys import Stream
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 ROOM_BYTES = 64 * 2**20
 ROOM = 8192
@@ -29,7 +29,7 @@ class Heard(NamedTuple):
 
     stream: Stream
     robot: str | None
-    arrivals: list[Arrival]
+    arrivals: list[SerializedSample]
     stamp: int
     overflowed: bool
 
@@ -49,7 +49,7 @@ class Inbox(Closing):
         """Subscribe to samples."""
         capacity = capacity_for(expression)
 
-        def put(arrivals: list[Arrival]) -> None:
+        def put(arrivals: list[SerializedSample]) -> None:
             self._put(Heard(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity))
 
         self._opened.enter_context(StreamSubscriber(self._session, expression, put))
@@ -57,7 +57,7 @@ class Inbox(Closing):
     def hear_latched(self, stream: Stream, expression: str, robot: str | None) -> None:
         """Subscribe to latched values; an empty payload is one that was withdrawn."""
 
-        def put(arrival: Arrival) -> None:
+        def put(arrival: SerializedSample) -> None:
             self._put(Heard(stream, robot, [arrival], time.time_ns(), overflowed=False))
 
         self._opened.enter_context(LatchedSubscriber(self._session, expression, put))

@@ -14,7 +14,7 @@ from zstate.errors import Closed, InvalidInput
 from zstate.net.receiver import Receiver, Ring, take_each
 from zstate.net.session import Session
 from zstate.net.streams import arrival_of
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
 HEARTBEAT_S = 0.5
@@ -72,7 +72,7 @@ class LatchedSubscriber(Closing):
     value was withdrawn. See ``Receiver`` for what happens when it raises.
     """
 
-    def __init__(self, session: Session, keyexpr: str, on_value: Callable[[Arrival], None]) -> None:
+    def __init__(self, session: Session, keyexpr: str, on_value: Callable[[SerializedSample], None]) -> None:
         def hand_over(batch: list[zenoh.Sample]) -> None:
             # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
             take_each(batch, lambda sample: on_value(arrival_of(sample)))

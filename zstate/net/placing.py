@@ -38,7 +38,7 @@ from zstate.wire.keys import (
 )
 from zstate.wire.messages import Edges, RobotDescription, StaticTransforms
 from zstate.wire.native import NativeWire
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.writer import Announced, Writer
 
 Edge = tuple[str, str]
@@ -223,7 +223,7 @@ def _statics_now(session: Session) -> Iterator[tuple[str, str, StaticTransforms]
                 yield robot, name, said
 
 
-def _kept_now(session: Session, expression: str) -> Iterator[Arrival]:
+def _kept_now(session: Session, expression: str) -> Iterator[SerializedSample]:
     """What latched publishers on these keys keep for late joiners."""
     kept = f"{expression}/@adv/**"
     for reply in query(session.zenoh, kept, ANSWER_WITHIN_S, accept_replies=zenoh.ReplyKeyExpr.ANY):

@@ -20,7 +20,7 @@ from zstate.net.router_losses import RouterLosses
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, MOST_CHARACTERS, READERS, Stream, parse_reader_key, shortened
-from zstate.wire.wire import Wire
+from zstate.wire.protocol import Wire
 from zstate.wire.writer import Announced, Writer
 
 CAPACITY = 16_384

@@ -19,7 +19,7 @@ from zstate.net.streams import StreamPublisher, StreamSubscriber
 from zstate.wire.keys import parse_status_key, status_expression, status_key
 from zstate.wire.messages import Status
 from zstate.wire.native import ENCODINGS, decode, encode
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.writer import Writer
 
 PERIOD_S = 1.0
@@ -74,10 +74,10 @@ class StatusWatch(Closing):
         self._callback = callback
         self._subscriber = StreamSubscriber(session, status_expression(robot), self._take)
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         take_each(arrivals, self._take_one)
 
-    def _take_one(self, arrival: Arrival) -> None:
+    def _take_one(self, arrival: SerializedSample) -> None:
         try:
             robot, status = _status_in(arrival)
         except (MessageError, InvalidInput) as error:
@@ -90,7 +90,7 @@ class StatusWatch(Closing):
         self._subscriber.close()
 
 
-def _status_in(arrival: Arrival) -> tuple[str, Status]:
+def _status_in(arrival: SerializedSample) -> tuple[str, Status]:
     """The robot and its writer's status. Raises MessageError, or InvalidInput for a key of no writer."""
     if len(arrival.payload) > MOST_BYTES:
         text = f"a Status of {len(arrival.payload)} bytes, more than {MOST_BYTES}"

@@ -15,8 +15,8 @@ from zstate.closing import Closing
 from zstate.errors import Closed
 from zstate.net.receiver import Receiver, Ring
 from zstate.net.session import Session
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.sizes import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
-from zstate.wire.wire import Arrival
 
 CAPACITY = 1024
 """So many samples of one key wait for a reader that is held up: a second at 1 kHz."""
@@ -37,7 +37,7 @@ def capacity_for(keyexpr: str) -> int:
     return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
 
 
-def arrival_of(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> Arrival:
+def arrival_of(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> SerializedSample:
     """What came, as the wires read it; ``key`` is on which, where that is known.
 
     A payload of more than ``most_bytes`` is not copied: of such a one only the size is given.
@@ -45,13 +45,13 @@ def arrival_of(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BY
     payload, beside = sample.payload, sample.attachment
     key = key or str(sample.key_expr)
     if len(payload) > most_bytes or (beside is not None and len(beside) > ATTACHMENT_BYTES):
-        return Arrival(key, b"\0", str(sample.encoding), None, max(len(payload), LATCHED_BYTES + 1))
-    return Arrival(
+        return SerializedSample(key, b"\0", str(sample.encoding), None, max(len(payload), LATCHED_BYTES + 1))
+    return SerializedSample(
         key, payload.to_bytes(), str(sample.encoding), None if beside is None else beside.to_bytes()
     )
 
 
-def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[Arrival]:
+def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[SerializedSample]:
     arrivals = [arrival_of(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
     if all(arrival.payload for arrival in arrivals):
         return arrivals
@@ -61,7 +61,7 @@ def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[Arrival]:
 
 
 class StreamPublisher(Closing):
-    """Puts samples on one key. Under congestion samples are dropped rather than the writer delayed."""
+    """Publishes samples on one key. Under congestion samples are dropped; the writer is never delayed."""
 
     def __init__(self, session: Session, key: str, encoding: str) -> None:
         self._session = session
@@ -78,9 +78,9 @@ class StreamPublisher(Closing):
 
     @property
     def has_readers(self) -> bool:
-        """Whether anybody subscribes to this key now. Cheap enough to ask before each sample."""
+        """Whether this key has a subscriber now. Cheap enough to check before each sample."""
         if self._changes is None:
-            # Zenoh tells of each change, beginning with a first reader; the last one it told is what holds.
+            # Zenoh reports each change, beginning with the first subscriber; only the newest is kept.
             ring: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
             self._changes = self._publisher.declare_matching_listener(ring)
         change = self._changes.handler.try_recv()
@@ -89,7 +89,7 @@ class StreamPublisher(Closing):
         return self._has_readers
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> None:
-        """Hand one sample to the network, with what goes beside it. Raises Closed."""
+        """Send one sample with its attachment. Raises Closed."""
         self._session.check()
         try:
             self._publisher.put(payload, attachment=attachment)
@@ -97,7 +97,7 @@ class StreamPublisher(Closing):
             raise Closed(f"the publisher of {self._key!r} is closed") from None
 
     def close(self) -> None:
-        """Withdraw from the key. A second call does nothing."""
+        """Undeclare the publisher. A second call does nothing."""
         if self._changes is not None:
             self._session.release(self._changes)
         self._session.release(self._publisher)
@@ -114,7 +114,7 @@ class StreamSubscriber(Closing):
         self,
         session: Session,
         keyexpr: str,
-        on_samples: Callable[[list[Arrival]], None],
+        on_samples: Callable[[list[SerializedSample]], None],
         capacity: int | None = None,
     ) -> None:
         self._keys = keys = _Keys(session, keyexpr)

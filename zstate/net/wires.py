@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from zstate.errors import InvalidInput
 from zstate.wire.native import NativeWire
-from zstate.wire.wire import Wire
+from zstate.wire.protocol import Wire
 
 if TYPE_CHECKING:
     from zstate.wire.ros2.options import Ros2Options

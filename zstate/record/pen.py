@@ -9,8 +9,8 @@ from zstate.record.split import ChannelId
 from zstate.record.writer import RecordWriter
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Clock, Message, Sample
+from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
 from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.outlet import Address, RosOutlet
 from zstate.wire.sample_names import SampleNames
 
 OPEN_CHANNELS = 1024
@@ -19,7 +19,7 @@ BURST = 1000
 CHANNELS_PER_S = 10.0
 """A robot opens this many channels a second of log time, after the first ``BURST``."""
 
-_NOWHERE = Address("", "", None)
+_NOWHERE = TopicAddress("", "", None)
 _NAMED = SampleNames()
 
 
@@ -32,7 +32,7 @@ class Pen:
         self._stream: Stream = stream
         self._names = names
         self._sample_names = _NAMED
-        self._outlet = RosOutlet(stream, _NOWHERE, names, _NAMED)
+        self._encoder = RosStreamEncoder(stream, _NOWHERE, names, _NAMED)
 
     def write(self, message: Sample | Clock, sample_names: SampleNames, log_time: int) -> None:
         """Write one sample; ``sample_names`` names its numbers."""
@@ -60,8 +60,8 @@ class Pen:
     def _encode(self, message: Message, sample_names: SampleNames) -> bytes:
         if sample_names is not self._sample_names:
             self._sample_names = sample_names
-            self._outlet = RosOutlet(self._stream, _NOWHERE, self._names, sample_names)
-        return self._outlet.encode(message)
+            self._encoder = RosStreamEncoder(self._stream, _NOWHERE, self._names, sample_names)
+        return self._encoder.encode(message)
 
 
 class Pens:

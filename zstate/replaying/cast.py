@@ -13,7 +13,7 @@ from zstate.following.unmodelled import Unmodelled
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
 from zstate.record.models import joint_order
 from zstate.record.transcript import Said, Speaker
 from zstate.replaying.standing import Standing, static_key

@@ -10,11 +10,11 @@ from contextlib import ExitStack, contextmanager
 from zstate.clock import SIMULATED
 from zstate.closing import Closing
 from zstate.net.claims import Claim
-from zstate.net.outlets import LatchedOutlet, Outlets, StreamOutlet
 from zstate.net.placing import Edge, named_edges, placing
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named
+from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     JointState,
@@ -50,17 +50,17 @@ class Verbatim(Closing):
         self._cast = cast
         self._is_alone = "native" in wires and not takeover
         self._seqs: Counter[Stream] = Counter()
-        self._latched: dict[tuple[Stream, str], list[LatchedOutlet]] = {}
+        self._latched: dict[tuple[Stream, str], list[LatchedWriter]] = {}
         self._placed: dict[str, set[Edge]] = {}
         self._writer = writer = writer_here(self._session_id)
         cast.add(self._session_id)
         with ExitStack() as opening:
             self._claim = self._claimed(opening, [Announced(robot, stream, writer) for stream in streams])
-            self._outlets = [
-                opening.enter_context(Outlets(session, wire_named(wire), robot, writer)) for wire in wires
+            self._wire_writers = [
+                opening.enter_context(WireWriter(session, wire_named(wire), robot, writer)) for wire in wires
             ]
-            self._streams: dict[Stream, list[StreamOutlet]] = {
-                stream: [outlets.stream(stream) for outlets in self._outlets] for stream in streams
+            self._streams: dict[Stream, list[SampleWriter]] = {
+                stream: [one.open_stream(stream) for one in self._wire_writers] for stream in streams
             }
             self._opened = opening.pop_all()
 
@@ -75,10 +75,8 @@ class Verbatim(Closing):
             again = JointState(*head, *numbers, message.names)
         else:
             again = TransformSample(*head, message.poses, message.edges)
-        said = [(outlet, outlet.encode(again)) for outlet in self._streams[stream]]
+        write_all(self._streams[stream], again)
         self._seqs[stream] += 1
-        for outlet, payload in said:
-            outlet.put(payload)
 
     def describe(self, description: RobotDescription, writer: str) -> None:
         """What the robot is, for late joiners too."""
@@ -86,28 +84,26 @@ class Verbatim(Closing):
         again = RobotDescription(
             self._session_id, said.urdf, said.digest, said.joint_names, said.moving_edges, SIMULATED
         )
-        for outlet in self._latch("robot_description", writer):
-            outlet.set(again)
+        write_all(self._latch("robot_description", writer), again)
 
     def fix(self, statics: StaticTransforms, writer: str) -> None:
         """All static edges of one ``writer``; none at all take back what it said before."""
         key: tuple[Stream, str] = ("tf_static", writer)
         if statics.edges:
-            outlets = self._latch(*key)
+            writers = self._latch(*key)
             with self._placing(statics, writer):
-                for outlet in outlets:
-                    outlet.set(StaticTransforms(self._session_id, statics.edges, statics.poses))
+                write_all(writers, StaticTransforms(self._session_id, statics.edges, statics.poses))
         else:
-            for outlet in self._latched.get(key, ()):
-                outlet.withdraw()
+            for latched in self._latched.get(key, ()):
+                latched.withdraw()
             self._placed.pop(writer, None)
 
-    def _latch(self, stream: Stream, writer: str) -> list[LatchedOutlet]:
+    def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
         if (stream, writer) not in self._latched:
             said = self._said(stream, writer)
             with ExitStack() as opening:
                 claim = self._claimed(opening, [said])
-                opened = [outlets.latched(stream, writer) for outlets in self._outlets]
+                opened = [one.open_latched(stream, writer) for one in self._wire_writers]
                 if claim is not None:
                     claim.settle()
                 self._opened.push(opening.pop_all())

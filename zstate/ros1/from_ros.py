@@ -12,11 +12,11 @@ from zstate.errors import Closed, InsertRefused, InvalidInput, MessageError, Sec
 from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.publisher import StatePublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.ros1.messages import JointStateReader, get_stamp, pose_of
 from zstate.ros1.names import FrameNames
 from zstate.ros1.node import NAME, Node, writer_of
-from zstate.statics import StaticPublisher
 from zstate.transform import Transform
 
 # A node's /tf is looked into so often; it may come a thousand times a second.

@@ -14,7 +14,7 @@ from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
 from zstate.wire.native import NativeWire
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 
 class Hearer(Protocol):
@@ -51,22 +51,22 @@ class Hearing(Closing):
             opening.enter_context(StreamSubscriber(session, key, self._on_joints))
             self._opened = opening.pop_all()
 
-    def _on_description(self, arrival: Arrival) -> None:
+    def _on_description(self, arrival: SerializedSample) -> None:
         if arrival.payload:
             self._hand_over("robot_description", arrival)
 
-    def _on_statics(self, arrival: Arrival) -> None:
+    def _on_statics(self, arrival: SerializedSample) -> None:
         if arrival.payload:
             self._hand_over("tf_static", arrival)
         else:
             with suppress(InvalidInput):  # a key that no writer has
                 self._hearer.place(self._wire.statics_writer(arrival.key), None)
 
-    def _on_joints(self, arrivals: list[Arrival]) -> None:
+    def _on_joints(self, arrivals: list[SerializedSample]) -> None:
         for arrival in arrivals:
             self._hand_over("joint_states", arrival)
 
-    def _hand_over(self, stream: Stream, arrival: Arrival) -> None:
+    def _hand_over(self, stream: Stream, arrival: SerializedSample) -> None:
         try:
             for message in self._wire.decode(stream, arrival, self._robot):
                 self._tell(arrival.key, message)

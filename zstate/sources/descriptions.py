@@ -15,7 +15,7 @@ from zstate.net.session import Session
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY
 from zstate.wire.messages import RobotDescription
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 _LOG = logging.getLogger("zstate")
 
@@ -43,7 +43,7 @@ class Descriptions(Closing):
         key = self._wire.expression(robot, "robot_description")
         self._subscriber = LatchedSubscriber(session, key, self._take)
 
-    def _take(self, arrival: Arrival) -> None:
+    def _take(self, arrival: SerializedSample) -> None:
         if not arrival.payload:
             return
         try:

@@ -18,7 +18,7 @@ from zstate.net.wires import wire_named
 from zstate.sources.source import JointReading
 from zstate.sources.states import StateReader
 from zstate.wire.messages import JointState, Message
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 _LOG = logging.getLogger("zstate")
 
@@ -47,14 +47,14 @@ class SubscribedSource(Closing):
         self._subscriber = StreamSubscriber(session, key, self._take)
         self._announcements = announce_reader(session, self._wire, self._robot, ["joint_states"])
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         states = [state for arrival in arrivals for state in self._decode(arrival)]
         readings = [reading for state in states if (reading := self._read(state)) is not None]
         with self._changed:
             self._readings.extend(readings)
             self._changed.notify_all()
 
-    def _decode(self, arrival: Arrival) -> Sequence[Message]:
+    def _decode(self, arrival: SerializedSample) -> Sequence[Message]:
         try:
             return self._wire.decode("joint_states", arrival, self._robot)
         except MessageError as error:

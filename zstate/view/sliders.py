@@ -15,7 +15,7 @@ from zstate.errors import InvalidInput, SecondWriter
 from zstate.locks import new_lock
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.publisher import STREAMS, StatePublisher
+from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.rate import check_rate
 from zstate.sources.sine import SineSource
 from zstate.sources.source import JointReading

@@ -1,4 +1,4 @@
-"""The native wire: plain keys, MessagePack arrays, type and version in the Zenoh encoding."""
+"""Native wire format: plain keys, MessagePack arrays, type and version in the Zenoh encoding."""
 
 from __future__ import annotations
 
@@ -32,26 +32,26 @@ from zstate.wire.messages import (
     Status,
     TransformSample,
 )
+from zstate.wire.protocol import EntityId, SerializedSample
 from zstate.wire.sample_names import SampleNames
 from zstate.wire.sizes import LATCHED_BYTES, SAMPLE_BYTES, check_edges, check_size
-from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Announced, Writer
 
 VERSION = 1
 
 M = TypeVar("M", bound=Message)
 
-_TYPES: tuple[type[Message], ...] = (
-    JointState,
-    TransformSample,
-    JointCommand,
-    StaticTransforms,
-    RobotDescription,
-    Clock,
-    Status,
-    Past,
-)
-ENCODINGS: dict[type[Message], str] = {kind: f"zstate/{kind.__name__};v={VERSION}" for kind in _TYPES}
+# Literals, because they are part of the protocol and the class names are not.
+ENCODINGS: dict[type[Message], str] = {
+    JointState: "zstate/JointState;v=1",
+    TransformSample: "zstate/TransformSample;v=1",
+    JointCommand: "zstate/JointCommand;v=1",
+    StaticTransforms: "zstate/StaticTransforms;v=1",
+    RobotDescription: "zstate/RobotDescription;v=1",
+    Clock: "zstate/Clock;v=1",
+    Status: "zstate/Status;v=1",
+    Past: "zstate/Past;v=1",
+}
 STREAM_TYPES: dict[Stream, type[Message]] = {
     "joint_states": JointState,
     "tf": TransformSample,
@@ -61,48 +61,48 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "clock": Clock,
 }
 
-# Nothing is too large that is not larger than this.
+# No limit is smaller, so that most payloads pass with one comparison.
 _LEAST_BYTES = 1_000
 
-# Of what travels on no stream of its own.
+# Messages that have no stream.
 _MOST_BYTES: dict[type[Message], int] = {Status: 64_000, Past: 4 * SAMPLE_BYTES}
 
 _ENCODER = msgspec.msgpack.Encoder()
-_DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in _TYPES}
+_DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
 _ENCODING = re.compile(r"zstate/(\w+);v=([1-9]\d{0,8})")
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of ``message``; they travel under the encoding ``ENCODINGS[type(message)]``."""
+    """The payload of ``message``, to be sent under the encoding ``ENCODINGS[type(message)]``."""
     return _ENCODER.encode(message)
 
 
 def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """The message of type ``kind`` in ``payload``, whose Zenoh encoding is ``encoding``.
 
-    Raises MessageError with the reason "foreign" (another type, or not ours at all), "newer version",
-    "truncated" or "malformed". Whether the numbers are finite is the buffer's business.
+    Raises MessageError with the reason "foreign" (another type, or not a zstate message), "newer version",
+    "too large", "truncated" or "malformed". The buffer checks whether the numbers are finite.
     """
     if encoding != ENCODINGS[kind]:
-        raise _stranger(encoding, kind)
+        raise _foreign_error(encoding, kind)
     if len(payload) > _LEAST_BYTES and len(payload) > _MOST_BYTES.get(kind, LATCHED_BYTES):
-        raise MessageError(f"a {kind.__name__} of {len(payload)} bytes", reason="too large")
+        raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
     try:
         return _DECODERS[kind].decode(payload)  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise _broken(payload, kind, error) from None
+        raise _malformed_error(payload, kind, error) from None
 
 
-class NativeOutlet:
-    """How one writer says one stream on the native wire."""
+class NativeStreamEncoder:
+    """Encodes one stream of one writer as MessagePack."""
 
     can_withdraw = True
 
-    def __init__(self, robot: str, stream: Stream, writer: Writer, name: str) -> None:
+    def __init__(self, robot: str, writer: Writer, stream: Stream, name: str) -> None:
         self.key = stream_key(robot, stream, name)
         self.encoding = ENCODINGS[STREAM_TYPES[stream]]
-        said = Announced(robot, stream, writer, name if stream == "tf_static" else "")
-        self.token = None if stream == "clock" else writer_key(robot, stream, said.identity)
+        announced = Announced(robot, stream, writer, name if stream == "tf_static" else "")
+        self.token = None if stream == "clock" else writer_key(robot, stream, announced.identity)
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
@@ -111,27 +111,27 @@ class NativeOutlet:
         return None
 
 
-class NativeVoice:
-    """One writer of one robot on the native wire."""
-
-    token = None
-
-    def __init__(self, robot: str, writer: Writer) -> None:
-        self._robot = robot
-        self._writer = writer
-
-    def outlet(self, stream: Stream, number: int, name: str = "") -> NativeOutlet:
-        return NativeOutlet(self._robot, stream, self._writer, name)
-
-
 class NativeWire:
-    """The native wire behind the seam of ``zstate.wire.wire.Wire``."""
+    """The native wire format (``zstate.wire.protocol.Wire``)."""
 
     name = "native"
     shared: frozenset[Stream] = frozenset()
 
-    def voice(self, robot: str, writer: Writer, place: Place, sample_names: SampleNames) -> NativeVoice:
-        return NativeVoice(robot, writer)
+    def node_token(self, robot: str, writer: Writer, node: EntityId) -> None:
+        return None
+
+    def stream_encoder(
+        self,
+        robot: str,
+        writer: Writer,
+        stream: Stream,
+        *,
+        node: EntityId,
+        number: int,
+        sample_names: SampleNames,
+        name: str = "",
+    ) -> NativeStreamEncoder:
+        return NativeStreamEncoder(robot, writer, stream, name)
 
     def reader_tokens(
         self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
@@ -145,7 +145,7 @@ class NativeWire:
     def robot_of(self, key: str) -> str:
         return robot_of(key)
 
-    def decode(self, stream: Stream, arrival: Arrival, robot: str) -> Sequence[Message]:
+    def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         if arrival.size or len(arrival.payload) > _LEAST_BYTES:
             check_size(stream, arrival.size or len(arrival.payload))
         message = decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream])
@@ -167,23 +167,26 @@ class NativeWire:
             return None
 
 
-def _stranger(encoding: str, kind: type[Message]) -> MessageError:
-    match = _ENCODING.fullmatch(encoding)
-    if match and match[1] == kind.__name__ and int(match[2]) > VERSION:
+def _type_name(kind: type[Message]) -> str:
+    return ENCODINGS[kind].removeprefix("zstate/").partition(";")[0]
+
+
+def _foreign_error(encoding: str, kind: type[Message]) -> MessageError:
+    match, name = _ENCODING.fullmatch(encoding), _type_name(kind)
+    if match and match[1] == name and int(match[2]) > VERSION:
         return MessageError(
-            f"{kind.__name__} of version {match[2]}, but this zstate reads version {VERSION}: "
-            "`pip install -U zstate`",
+            f"{name} of version {match[2]}, but this zstate reads version {VERSION}: `pip install -U zstate`",
             reason="newer version",
         )
     return MessageError(
-        f"not a {kind.__name__}: its encoding is {encoding!r}, ours is {ENCODINGS[kind]!r}; "
+        f"not a {name}: its encoding is {encoding!r}, ours is {ENCODINGS[kind]!r}; "
         "another program writes on this key",
         reason="foreign",
     )
 
 
-def _broken(payload: bytes, kind: type[Message], error: Exception) -> MessageError:
-    # msgspec has one exception for both and tells them apart in its text only
+def _malformed_error(payload: bytes, kind: type[Message], error: Exception) -> MessageError:
+    # msgspec raises one exception for both, which differ in the text only
     if type(error) is msgspec.DecodeError and "truncated" in str(error):
-        return MessageError(f"a {kind.__name__} cut off after {len(payload)} bytes", reason="truncated")
-    return MessageError(f"a malformed {kind.__name__}: {error}", reason="malformed")
+        return MessageError(f"a {_type_name(kind)} cut off after {len(payload)} bytes", reason="truncated")
+    return MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed")

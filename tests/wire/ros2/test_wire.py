@@ -19,10 +19,11 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import MessageError
+from zstate.wire.keys import Stream
+from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
 from zstate.wire.sample_names import SampleNames
-from zstate.wire.wire import Arrival, Place
 from zstate.wire.writer import Writer
 
 STAMP = 1_700_000_000_123_456_789
@@ -48,30 +49,39 @@ def endpoint(topic, name: str, *, kind: str = "MP", namespace: str = "", hash_: 
     return f"@ros2_lv/0/{ZID}/3/9/{kind}/%/{around}/{name}/{path}/{topic[1]}/{hash_ or topic[2]}/{topic[3]}"
 
 
-def arrival(payload: bytes = GOOD, beside: bytes | None = attachment(7, GID), key: str = "") -> Arrival:
-    return Arrival(key or key_of(JOINT_STATES), payload, "zenoh/bytes", beside)
+def arrival(
+    payload: bytes = GOOD, beside: bytes | None = attachment(7, GID), key: str = ""
+) -> SerializedSample:
+    return SerializedSample(key or key_of(JOINT_STATES), payload, "zenoh/bytes", beside)
+
+
+def encoder_of(wire: Ros2Wire, stream: Stream, number: int) -> StreamEncoder:
+    node = EntityId(ZID, 3)
+    return wire.stream_encoder("r1", WRITER, stream, node=node, number=number, sample_names=SampleNames())
 
 
 def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
-    voice = wire(namespace="fleet/r1", domain=5).voice("r1", WRITER, Place(ZID, 3), SampleNames())
-    assert voice.token == f"@ros2_lv/5/{ZID}/3/3/NN/%/%fleet%r1/arm_driver"
-    outlet = voice.outlet("joint_states", 9)
-    assert outlet.key == key_of(JOINT_STATES, "fleet/r1", 5)
+    there = wire(namespace="fleet/r1", domain=5)
+    assert (
+        there.node_token("r1", WRITER, EntityId(ZID, 3)) == f"@ros2_lv/5/{ZID}/3/3/NN/%/%fleet%r1/arm_driver"
+    )
+    encoder = encoder_of(there, "joint_states", 9)
+    assert encoder.key == key_of(JOINT_STATES, "fleet/r1", 5)
     around = f"@ros2_lv/5/{ZID}/3/9/MP/%/%fleet%r1/arm_driver/%fleet%r1%joint_states"
-    assert outlet.token == "/".join([around, *JOINT_STATES[1:]])
-    assert outlet.attachment(8) == struct.pack("<qqB", 1, 8, 16) + gid_of(outlet.token)
-    tf = voice.outlet("tf", 10)
+    assert encoder.token == "/".join([around, *JOINT_STATES[1:]])
+    assert encoder.attachment(8) == struct.pack("<qqB", 1, 8, 16) + gid_of(encoder.token)
+    tf = encoder_of(there, "tf", 10)
     assert tf.key == key_of(TF, "", 5)
     assert tf.token.split("/")[9:] == ["%tf", *TF[1:]]
 
 
 def test_the_bridges_wire_has_plain_keys_its_own_tokens_and_nothing_beside():
-    voice = Ros2DdsWire(Ros2Options(namespace="r1")).voice("r1", WRITER, Place(ZID, 3), SampleNames())
-    assert voice.token is None
-    outlet = voice.outlet("tf_static", 9)
-    assert (outlet.key, outlet.attachment(8)) == ("r1/tf_static", None)
+    bridged = Ros2DdsWire(Ros2Options(namespace="r1"))
+    assert bridged.node_token("r1", WRITER, EntityId(ZID, 3)) is None
+    encoder = encoder_of(bridged, "tf_static", 9)
+    assert (encoder.key, encoder.attachment(8)) == ("r1/tf_static", None)
     key = f"@/{ZID}/@ros2_lv/MP/r1§tf_static/tf2_msgs§msg§TFMessage"
-    assert outlet.token == f"{key}/:1:1:0,1:typehash={TF_STATIC[2]};"
+    assert encoder.token == f"{key}/:1:1:0,1:typehash={TF_STATIC[2]};"
 
 
 @pytest.mark.parametrize("topic", TOPICS)

@@ -63,7 +63,7 @@ def joints_command(
     """
     from zstate.cli.clocks import open_clock
     from zstate.cli.publishing import run
-    from zstate.publisher import StatePublisher
+    from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
 
     model, called = load_robot(robot, name, xacro_args)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from zstate.metrics.address import Address
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
-    from zstate.publisher import StatePublisher
+    from zstate.nodes.publisher import StatePublisher
     from zstate.wire.keys import Stream
 
 _RATE_HZ = 100.0
@@ -108,7 +108,7 @@ def publish_command(
     """
     from zstate.cli.clocks import open_clock
     from zstate.cli.publishing import run
-    from zstate.publisher import StatePublisher
+    from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
 
     model, called = load_robot(robot, name, xacro_args)

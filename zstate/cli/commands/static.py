@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from zstate.cli.up.edges import OwnedEdge
     from zstate.cli.up.sections import Quaternion, Vector3
     from zstate.net.session import Session
-    from zstate.statics import StaticPublisher
+    from zstate.nodes.static_publisher import StaticPublisher
     from zstate.transform import Transform
 
 
@@ -91,7 +91,7 @@ def static_command(
     """
     from zstate.cli.target_frames import doubtful_edges
     from zstate.clock import wait_in_slices
-    from zstate.statics import StaticPublisher
+    from zstate.nodes.static_publisher import StaticPublisher
 
     if file is not None:
         edges = _edges_of_file(file, settings, target, source)

@@ -108,7 +108,7 @@ def _cause(ear: Ear) -> tuple[str, str]:
 
 
 def _simulated_check(domain: str, session: Session) -> Check:
-    from zstate.simulated_clock import SimulatedClock
+    from zstate.nodes.clock import SimulatedClock
 
     with SimulatedClock(session) as clock:
         try:

@@ -21,7 +21,7 @@ from zstate.net.status import watch_status
 from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, clock_key
 from zstate.wire.messages import RobotDescription, Status
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 from zstate.wire.writer import Writer
 
 AT_LEAST_S = 1.2
@@ -77,7 +77,7 @@ class Ear(Closing):
     def close(self) -> None:
         self._opened.close()
 
-    def _take_description(self, arrival: Arrival) -> None:
+    def _take_description(self, arrival: SerializedSample) -> None:
         try:
             for said in self._wire.decode("robot_description", arrival, self.info.name):
                 if isinstance(said, RobotDescription):

@@ -13,7 +13,7 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, TransformSample
-from zstate.wire.wire import Arrival, Wire
+from zstate.wire.protocol import SerializedSample, Wire
 
 
 @dataclass
@@ -44,7 +44,7 @@ class NodeSamples(Closing):
     def close(self) -> None:
         self._subscriber.close()
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         for arrival in arrivals:
             with suppress(MessageError):  # the listener beside this counts and names those of tf
                 for said in self._wire.decode(self._stream, arrival, self._robot):

@@ -19,7 +19,7 @@ from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
-from zstate.status import ARE_OUTSIDE
+from zstate.nodes.publisher_status import ARE_OUTSIDE
 from zstate.wire.keys import MODEL_WRITER, foreign_objection
 from zstate.wire.messages import Status
 

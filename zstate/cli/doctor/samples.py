@@ -16,7 +16,7 @@ from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Sample, from_block, order_digest
-from zstate.wire.wire import Arrival, Wire
+from zstate.wire.protocol import SerializedSample, Wire
 
 
 class Samples(Closing):
@@ -52,7 +52,7 @@ class Samples(Closing):
         """How long there has been none."""
         return time.monotonic_ns() - self._came[1]
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         for arrival in arrivals:
             with suppress(MessageError):  # the listener beside this counts and names them
                 for sample in self._wire.decode(self._stream, arrival, self._robot):

@@ -19,7 +19,7 @@ from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, Stream, full_name
 from zstate.wire.messages import JointState, Sample, TransformSample
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -108,14 +108,14 @@ class PathMeter(Closing):
         """What edges have in common whose samples are the same: the joints of a robot come together."""
         return edge.name.partition("/")[0] + "/" if edge.kind == "joint" else edge.name
 
-    def _take(self, arrivals: list[Arrival]) -> None:
+    def _take(self, arrivals: list[SerializedSample]) -> None:
         at, now = time.monotonic_ns(), self._clock.now()
         with self._lock:
             for arrival in arrivals:
                 for robot, sample in self._samples(arrival):
                     self._note(robot, sample, at, now)
 
-    def _samples(self, arrival: Arrival) -> Iterator[tuple[str, Sample]]:
+    def _samples(self, arrival: SerializedSample) -> Iterator[tuple[str, Sample]]:
         try:
             robot = self._wire.robot_of(arrival.key) if self._robot == ANY else self._robot
             messages = self._wire.decode(self._stream, arrival, robot)

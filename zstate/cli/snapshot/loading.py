@@ -12,9 +12,9 @@ from zstate.cli.worker import Worker
 from zstate.clock import SystemClock
 from zstate.closing import Closing
 from zstate.net.session import Session
-from zstate.publisher import STREAMS, StatePublisher
+from zstate.nodes.publisher import STREAMS, StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
 from zstate.rate import Rate
-from zstate.statics import StaticPublisher
 
 
 def chosen(snapshot: Snapshot, robots: Sequence[str]) -> tuple[list[RobotShot], list[StaticShot]]:

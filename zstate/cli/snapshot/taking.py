@@ -26,7 +26,7 @@ from zstate.sources import JointReading, SubscribedSource
 from zstate.sources.descriptions import Descriptions
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import StaticTransforms, poses_from_block
-from zstate.wire.wire import Arrival
+from zstate.wire.protocol import SerializedSample
 
 _LOOK_EVERY_S = 0.02
 
@@ -95,7 +95,7 @@ class _Sitting(Closing):
         self._model = model
         self._source = SubscribedSource(self._session, model, self.info.name, wire=self._wire_name)
 
-    def _take_statics(self, arrival: Arrival) -> None:
+    def _take_statics(self, arrival: SerializedSample) -> None:
         try:
             writer = self._wire.statics_writer(arrival.key) or arrival.key
         except InvalidInput as error:

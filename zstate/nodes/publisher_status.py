@@ -1,4 +1,4 @@
-"""How a publisher does: its counts, and what a second's worth of them says."""
+"""Publisher counters, and the health level derived from them once a second."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from zstate.wire.writer import Writer
 _LOG = logging.getLogger("zstate")
 
 _QUIET_NS = 2_000_000_000
-"""A publisher without a commanded rate is stale after so long without a sample."""
+"""A publisher without a commanded rate is stale after this long without a sample."""
 
 _CHECKED_EVERY_NS, _CHECKED_AT_ONCE = 1_000_000_000, 1000
-"""Positions are checked against joint limits in groups of so many samples, or of a second."""
+"""Positions are checked against joint limits in groups of one second, at most 1000 samples."""
 
 ARE_OUTSIDE = "samples are outside joint limits"
-"""In the text of a ``Status`` that warns of this."""
+"""Part of the text of a ``Status`` that warns about joint limits."""
 
 
 class StreamStats(NamedTuple):
-    """What one stream on one wire took: ``suppressed`` samples were not said, since nobody read them."""
+    """Counts of one stream on one wire; ``suppressed`` samples were not sent, for want of a reader."""
 
     samples: int
     bytes: int
@@ -41,10 +41,10 @@ class StreamStats(NamedTuple):
 class PublisherStats:
     """Counts since the publisher opened.
 
-    ``sent`` samples were published, ``refused`` ones could not be: the last for ``last_refusal``.
-    ``streams`` tells by (wire, stream) what each took; ``rate`` how the last ``run`` keeps its rate,
-    None before one. ``outside_limits`` of the published samples had joints outside their limits, which
-    ``last_excess`` names; these are checked in groups of one second or 1000 samples.
+    ``sent`` samples were published, ``refused`` ones were not; ``last_refusal`` is the newest reason.
+    ``streams`` has the counts by (wire, stream). ``rate`` is the report of the last ``run``, None before
+    the first. ``outside_limits`` published samples had joints outside their limits, the newest described
+    by ``last_excess``; they are checked in groups of one second or 1000 samples.
     """
 
     sent: int
@@ -59,8 +59,8 @@ class PublisherStats:
 class LimitWatch:
     """Counts the samples whose positions exceed joint limits, and logs the first.
 
-    Samples are checked in groups, the first at once, which takes about 0.1 us for each. One thread at a
-    time adds.
+    The first sample is checked at once, later ones in groups, which takes about 0.1 us per sample.
+    Not thread-safe.
     """
 
     def __init__(self, limits: JointLimits, robot: str) -> None:
@@ -71,7 +71,7 @@ class LimitWatch:
         self._began = self._due = 0
 
     def add(self, stamp: int, block: bytes) -> None:
-        """Count the sample of ``stamp`` [ns], whose positions are ``block``."""
+        """Count the sample with ``stamp`` [ns] and the positions ``block``, now or with its group."""
         self._blocks.append(block)
         if not self._began <= stamp < self._due or len(self._blocks) >= _CHECKED_AT_ONCE:
             self._check()
@@ -80,7 +80,7 @@ class LimitWatch:
     def _check(self) -> None:
         positions = np.frombuffer(b"".join(self._blocks), "<f8").reshape(len(self._blocks), -1)
         self._blocks.clear()
-        # Nearly always nothing is outside, and these two rows are sufficient to know it.
+        # Usually nothing is outside, and these two rows are sufficient to show it.
         extremes = np.stack((positions.min(axis=0), positions.max(axis=0)))
         if not self._limits.are_exceeded(extremes).any():
             return
@@ -92,15 +92,15 @@ class LimitWatch:
             _LOG.warning("%s: %s; further samples outside limits are only counted", self._robot, self.last)
 
 
-class Verdict(NamedTuple):
+class Health(NamedTuple):
     """A level and the reason for it."""
 
     level: Level
     text: str = ""
 
 
-class Beat:
-    """Makes of a publisher's counts a ``Status``, each time of what has happened since the last time."""
+class StatusReporter:
+    """Derives a ``Status`` from a publisher's counts, each time from their change since the last one."""
 
     def __init__(self, writer: Writer, stats: Callable[[], PublisherStats]) -> None:
         self._writer = writer
@@ -109,30 +109,30 @@ class Beat:
         self._at_ns = self._sent_at_ns = time.monotonic_ns()
 
     def status(self) -> Status:
-        """How it does now."""
+        """The status of the time since the last call."""
         before, now, at_ns = self._stats, self._read(), time.monotonic_ns()
         if now.sent > before.sent:
             self._sent_at_ns = at_ns
         rate_hz = (now.sent - before.sent) * 1e9 / max(at_ns - self._at_ns, 1)
-        level, text = verdict(before, now, quiet_ns=at_ns - self._sent_at_ns)
+        level, text = assess_health(before, now, quiet_ns=at_ns - self._sent_at_ns)
         self._stats, self._at_ns = now, at_ns
         writer, late = self._writer, now.rate.late if now.rate else 0
         head = (time.time_ns(), writer.session, level, writer.program, writer.host, writer.pid)
         return Status(*head, rate_hz, now.sent, late, text, _values(now))
 
 
-def verdict(before: PublisherStats, now: PublisherStats, *, quiet_ns: int) -> Verdict:
-    """What two readings of the counts say, when the last sample was seen ``quiet_ns`` ago."""
+def assess_health(before: PublisherStats, now: PublisherStats, *, quiet_ns: int) -> Health:
+    """The health of a publisher between two readings of its counts, ``quiet_ns`` after its last sample."""
     sent, refused = now.sent - before.sent, now.refused - before.refused
     if refused:
         text = f"{refused} of {sent + refused} samples cannot be published: {now.last_refusal}"
-        return Verdict("warn" if sent else "error", text)
+        return Health("warn" if sent else "error", text)
     if quiet_ns > _longest_pause_ns(now.rate):
         what = "since this publisher opened" if not now.sent else f"for {duration_text(quiet_ns)}"
-        return Verdict("stale", f"nothing was published {what}")
+        return Health("stale", f"nothing was published {what}")
     outside = now.outside_limits - before.outside_limits
     if outside:
-        return Verdict("warn", f"{outside} {ARE_OUTSIDE}: {now.last_excess}")
+        return Health("warn", f"{outside} {ARE_OUTSIDE}: {now.last_excess}")
     return _punctuality(before.rate, now.rate)
 
 
@@ -140,14 +140,14 @@ def _longest_pause_ns(rate: RateReport | None) -> float:
     return _QUIET_NS if rate is None else max(_QUIET_NS, 2e9 / rate.commanded_hz)
 
 
-def _punctuality(before: RateReport | None, now: RateReport | None) -> Verdict:
+def _punctuality(before: RateReport | None, now: RateReport | None) -> Health:
     if now is None:
-        return Verdict("ok")
+        return Health("ok")
     late = now.late - (before.late if before else 0)
     skipped = now.skipped - (before.skipped if before else 0)
     if late <= 0 and skipped <= 0:
-        return Verdict("ok")
-    return Verdict(
+        return Health("ok")
+    return Health(
         "warn",
         f"{late} ticks late and {skipped} skipped: {now.commanded_hz:g} Hz are more than this process keeps; "
         "its source or its machine is slow",
@@ -160,6 +160,6 @@ def _values(stats: PublisherStats) -> dict[str, str]:
         values["outside limits"] = f"{stats.outside_limits} samples, {stats.last_excess}"
     if stats.rate is not None:
         values |= {"commanded": f"{stats.rate.commanded_hz:g} Hz", "skipped": str(stats.rate.skipped)}
-    for (wire, stream), said in stats.streams.items():
-        values[f"{wire} {stream}"] = f"{said.samples} samples, {said.bytes} bytes"
+    for (wire, stream), counts in stats.streams.items():
+        values[f"{wire} {stream}"] = f"{counts.samples} samples, {counts.bytes} bytes"
     return values

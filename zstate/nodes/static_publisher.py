@@ -1,4 +1,4 @@
-"""StaticPublisher: edges that never move, for everybody, whenever they join."""
+"""Publisher of static transforms: edges that never move, latched for listeners that join later."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock
 from zstate.net.claims import Claim
-from zstate.net.outlets import Outlets
 from zstate.net.placing import check_readers, placing
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.wires import wire_named, wire_names
+from zstate.net.writer import WireWriter, write_all
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
@@ -25,18 +25,18 @@ from zstate.wire.writer import Announced, Writer
 
 
 class StaticPublisher(Closing):
-    """Publishes static edges under one writer's name; several writers of a robot coexist.
+    """Publishes static edges under one writer's name; a robot may have several such writers.
 
-    Bare frame names are the robot's own; other frames are named in full, ``robot/frame``. All edges
-    of a writer travel together, and a new value replaces the old one everywhere. ``close()`` withdraws
-    them; the ROS wires cannot say that, so that there only late joiners do not get them any more.
-    ``writer`` tells this publisher from others: unless given, the program, its process id and a random
-    number. ``program`` is the script's name unless given.
+    Bare frame names are the robot's own; other frames have full names, ``robot/frame``. All edges of a
+    writer travel together, and a new value replaces the previous one everywhere. ``close()`` withdraws
+    them; the ROS wires cannot express that, so there only later joiners no longer receive them.
+    ``writer`` distinguishes this publisher from others; default: the program, its process id and a
+    random number. ``program`` is the script's name by default.
 
-    On the native wire SecondWriter is raised, and names the first, where somebody else who lives writes
-    under the same name, and by ``set`` for a frame that another static writer of any robot places; of two
-    that do so at the same moment by the later one, which is closed by it where both have one name. Not
-    with ``takeover``.
+    On the native wire SecondWriter, which names the first writer, is raised if another active writer has
+    the same name, and by ``set`` if another static writer of any robot places the same frame. If two do
+    so at once, the later one raises it, and is closed if both have one name. Not raised with
+    ``takeover``.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class StaticPublisher(Closing):
             raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
         self._session_id = identity.session
         self._edges: dict[str, Transform] = {}
-        # Refuses here, where the mistake is made, what every reader would refuse.
+        # Raises here, where the mistake is made, what every listener would refuse.
         self._check = TransformBuffer()
         self._lock = new_lock()
         self._closed = False
@@ -64,10 +64,10 @@ class StaticPublisher(Closing):
         self._announced = Announced(self.robot, "tf_static", identity, self.writer)
         self._claim: Claim | None = None
         with ExitStack() as opening:
-            if "native" in wire_names(wires) and not takeover:  # in ROS static edges are everybody's
+            if "native" in wire_names(wires) and not takeover:  # in ROS any node may write them
                 self._claim = opening.enter_context(Claim(session, [self._announced]))
             self._latched = [
-                opening.enter_context(Outlets(session, wire_named(wire), robot, identity)).latched(
+                opening.enter_context(WireWriter(session, wire_named(wire), robot, identity)).open_latched(
                     "tf_static", self.writer
                 )
                 for wire in wire_names(wires)
@@ -83,9 +83,9 @@ class StaticPublisher(Closing):
     def set(self, transform: Transform) -> None:
         """Publish or replace the edge that places ``transform.source`` on ``transform.target``.
 
-        Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges, and on
-        the native wire for an edge that contradicts a model that is announced or places a frame of another
-        robot where that robot, or a third one, has a say; InvalidInput for names that cannot be frames,
+        Raises InsertRefused for a self edge, a loop or a second parent among this writer's edges; on the
+        native wire also for an edge that contradicts an announced model, or that places a frame of another
+        robot if that robot, or a third one, places it. Raises InvalidInput for names that cannot be frames,
         SecondWriter and Closed.
         """
         parent = full_name(self.robot, transform.target)
@@ -96,23 +96,20 @@ class StaticPublisher(Closing):
                 if child not in self._edges:
                     check_readers(self._session, self._announced, [(parent, child)])
                     placed.enter_context(placing(self._session, self._announced, [(parent, child)]))
-                # Now: of those who have answered we have heard, too, if they came before.
-                self._yield_to_the_first(self._claim)
+                # Last: an earlier writer that answered above has announced itself by now.
+                try:
+                    self._claim.check()
+                except SecondWriter:
+                    self._opened.close()  # without withdrawing: the value of this name is the first writer's
+                    raise
             self._check.insert_static(
                 Transform(parent, child, transform.translation, transform.rotation), writer=self.writer
             )
             self._edges[child] = transform
             self._send()
 
-    def _yield_to_the_first(self, claim: Claim) -> None:
-        try:
-            claim.check()
-        except SecondWriter:
-            self._opened.close()  # not withdrawn: what is under this name is the first one's
-            raise
-
     def withdraw(self, child: str) -> None:
-        """Take back the edge that places ``child``. Raises InvalidInput if it is not one of ours."""
+        """Withdraw the edge that places ``child``. Raises InvalidInput if this writer has none."""
         check_names(child)
         name = full_name(self.robot, child)
         with self._lock:
@@ -133,11 +130,7 @@ class StaticPublisher(Closing):
     def _send(self) -> None:
         edges = tuple((edge.target, edge.source) for edge in self._edges.values())
         poses = to_block([edge.pose7 for edge in self._edges.values()])
-        message = StaticTransforms(self._session_id, edges, poses)
-        # All of them first: what one wire cannot say is said on none.
-        said = [(latched, latched.encode(message)) for latched in self._latched]
-        for latched, payload in said:
-            latched.put(payload)
+        write_all(self._latched, StaticTransforms(self._session_id, edges, poses))
 
     def close(self) -> None:
         """Withdraw the edges. A second call does nothing."""
@@ -151,5 +144,5 @@ class StaticPublisher(Closing):
 
 
 def _default_writer(identity: Writer) -> str:
-    # The name of a script may have blanks, which no key has.
+    # A script name may have blanks, which a key cannot.
     return f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"

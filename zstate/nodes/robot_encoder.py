@@ -1,4 +1,4 @@
-"""MovingEdges: the edges of a model, as they are said on the network."""
+"""Encoder of one robot's state: positions to blocks, joint states to transform samples."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zstate.extension import kernel
 from zstate.model.edges import EdgeTable
@@ -26,14 +26,18 @@ if TYPE_CHECKING or kernel == "c":
 else:
 
     def block_of(numbers: object, count: int) -> None:
-        """None: how to take them has to be found out."""
+        """None: the caller checks them with numpy."""
 
 
 Positions: TypeAlias = ArrayLike | Mapping[str, float | Sequence[float]]
 
 
-class MovingEdges:
-    """The edges of a model as they are called on the network, moving and fixed apart."""
+class RobotEncoder:
+    """Checks and encodes the samples of a model published under the name ``robot``.
+
+    ``names`` are the moving edges (parent, child) in the order of a transform sample's poses, with the
+    frame names of the wire; ``order`` is their digest.
+    """
 
     def __init__(self, model: RobotModel, robot: str) -> None:
         self._model = model
@@ -48,8 +52,8 @@ class MovingEdges:
         self._fixed_names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if is_fixed)
         self._fixed_poses = [form.origin for form in forms if form.kind == "fixed"]
 
-    def block(self, positions: Positions) -> bytes:
-        """``positions`` as a block, once they are known to be a posture of the robot. Raises InvalidInput."""
+    def encode_positions(self, positions: Positions) -> bytes:
+        """``positions`` as a block. Raises InvalidInput unless they are a configuration of the robot."""
         block = block_of(positions, self._count)
         if block is None:
             model = self._model
@@ -59,14 +63,11 @@ class MovingEdges:
             self._table.normalised(from_block(block))
         return block
 
-    def poses(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """``parent_from_child`` of each of ``names``: (n, 7)."""
-        return self._table.poses(positions).take(self._rows, axis=0)
-
-    def sample(self, state: JointState) -> TransformSample:
-        """What ``state`` means for the moving edges."""
-        poses = to_block(self.poses(from_block(state.positions)))
-        return TransformSample(state.stamp, state.seq, state.session, self.order, poses)
+    def transform_sample(self, state: JointState) -> TransformSample:
+        """The pose of each moving edge, ``parent_from_child``, in ``state``."""
+        poses = self._table.poses(from_block(state.positions)).take(self._rows, axis=0)
+        return TransformSample(state.stamp, state.seq, state.session, self.order, to_block(poses))
 
     def statics(self, session: int) -> StaticTransforms:
+        """The fixed edges of the model."""
         return StaticTransforms(session, self._fixed_names, to_block(self._fixed_poses))

@@ -24,9 +24,9 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
+from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.outlet import Address, RosOutlet
 from zstate.wire.sample_names import SampleNames
 
 STAMP = 1_700_000_000_123_456_789
@@ -40,9 +40,9 @@ ARM = SampleNames(("a", "b"), (0, 1), EDGES)
 GID = bytes(range(16))
 
 
-def outlet(sample_names: SampleNames = ARM, gid: bytes | None = GID, prefix: str = "") -> RosOutlet:
+def encoder(sample_names: SampleNames = ARM, gid: bytes | None = GID, prefix: str = "") -> RosStreamEncoder:
     names = FrameNames(Ros2Options(frame_prefix=prefix), "r1")
-    return RosOutlet("joint_states", Address("key", "token", gid), names, sample_names)
+    return RosStreamEncoder("joint_states", TopicAddress("key", "token", gid), names, sample_names)
 
 
 def state(*blocks, names=None, stamp: int = STAMP) -> JointState:
@@ -54,11 +54,11 @@ def state(*blocks, names=None, stamp: int = STAMP) -> JointState:
 @pytest.mark.parametrize("blocks", [([1.0, 2.0],), ([1.0, 2.0], [3.0, 4.0]), ([1.0, 2.0], None, [5.0, 6.0])])
 def test_joint_states_are_named_by_the_layout(blocks):
     filled = [block or [] for block in (*blocks, None, None)][:3]
-    assert outlet().encode(state(*blocks)) == rosbags_joint_state(STAMP, "", ("a", "b"), *filled)
+    assert encoder().encode(state(*blocks)) == rosbags_joint_state(STAMP, "", ("a", "b"), *filled)
 
 
 def test_joint_states_that_bring_their_names_keep_them():
-    one = outlet()
+    one = encoder()
     for names in (("x",), ("y", "z", "w"), ("x",)):
         numbers = [float(n) for n in range(len(names))]
         expected = rosbags_joint_state(STAMP, "", names, numbers, numbers, [])
@@ -67,7 +67,7 @@ def test_joint_states_that_bring_their_names_keep_them():
 
 def test_a_robot_that_floats_has_no_velocity_for_the_last_number_of_its_quaternion():
     positions, rates = [0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0, 0.5], [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0]
-    payload = outlet(DRONE).encode(state(positions, rates, rates))
+    payload = encoder(DRONE).encode(state(positions, rates, rates))
     said = STORE.deserialize_cdr(payload, "sensor_msgs/msg/JointState")
     assert tuple(said.name) == DRONE.coordinates
     assert said.position.tolist() == positions
@@ -78,7 +78,7 @@ def test_a_robot_that_floats_has_no_velocity_for_the_last_number_of_its_quaterni
 
 
 def test_moving_edges_are_those_of_the_layout_or_of_the_message():
-    one = outlet(prefix="r1/")
+    one = encoder(prefix="r1/")
     expected = (("r1/base", "r1/arm"), ("r1/arm", "fleet/tool"))
     sample = TransformSample(STAMP, 0, 1, DIGEST, to_block(POSES))
     assert one.encode(sample) == rosbags_tf_message([STAMP] * 2, expected, POSES)
@@ -91,15 +91,15 @@ def test_static_edges_have_the_stamp_by_which_ros_means_always():
     for count in (2, 0):
         statics = StaticTransforms(1, EDGES[:count], to_block(POSES[:count]))
         expected = rosbags_tf_message([0] * count, EDGES[:count], POSES[:count])
-        assert outlet().encode(statics) == expected
+        assert encoder().encode(statics) == expected
 
 
 def test_a_description_is_its_text_and_a_clock_its_time():
     description = RobotDescription(1, "<robot name='ä'/>", "", (), ())
-    assert outlet().encode(description) == rosbags_cdr("std_msgs/msg/String", "<robot name='ä'/>")
+    assert encoder().encode(description) == rosbags_cdr("std_msgs/msg/String", "<robot name='ä'/>")
     for stamp in (0, STAMP):
         expected = rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(stamp))
-        assert outlet().encode(Clock(stamp, 0, 1)) == expected
+        assert encoder().encode(Clock(stamp, 0, 1)) == expected
 
 
 @pytest.mark.parametrize("stamp", [0, 2**31 * 10**9, -(2**31) * 10**9 - 1])
@@ -109,29 +109,29 @@ def test_a_moment_that_ros_cannot_say_is_refused(stamp: int):
         TransformSample(stamp, 0, 1, DIGEST, to_block(POSES)),
     ):
         with pytest.raises(InvalidInput, match="stamp"):
-            outlet().encode(message)
+            encoder().encode(message)
 
 
 def test_what_has_no_topic_and_numbers_that_have_no_names_are_refused():
     with pytest.raises(InvalidInput, match="no topic for a JointCommand"):
-        outlet().encode(JointCommand(STAMP, 0, 1, DIGEST))
+        encoder().encode(JointCommand(STAMP, 0, 1, DIGEST))
     with pytest.raises(InvalidInput, match="2 names need"):
-        outlet().encode(state([1.0, 2.0, 3.0]))
+        encoder().encode(state([1.0, 2.0, 3.0]))
     with pytest.raises(InvalidInput, match="2 edges need"):
-        outlet().encode(TransformSample(STAMP, 0, 1, DIGEST, to_block(POSES[:1])))
+        encoder().encode(TransformSample(STAMP, 0, 1, DIGEST, to_block(POSES[:1])))
     with pytest.raises(InvalidInput, match="2 names need"):
-        outlet().encode(state([1.0, 2.0], [1.0]))
+        encoder().encode(state([1.0, 2.0], [1.0]))
 
 
 def test_attachments_are_numbered_from_one_on_and_a_refused_message_takes_no_number():
-    one = outlet()
+    one = encoder()
     assert one.attachment(5) == struct.pack("<qqB", 1, 5, 16) + GID
     with pytest.raises(InvalidInput):
         one.encode(state([1.0, 2.0], stamp=0))
     assert one.attachment(6) == struct.pack("<qqB", 2, 6, 16) + GID
-    assert outlet(gid=None).attachment(5) is None
+    assert encoder(gid=None).attachment(5) is None
 
 
 def test_nothing_is_withdrawn_and_no_encoding_told():
-    assert (outlet().can_withdraw, outlet().encoding) == (False, "")
-    assert (outlet().key, outlet().token) == ("key", "token")
+    assert (encoder().can_withdraw, encoder().encoding) == (False, "")
+    assert (encoder().key, encoder().token) == ("key", "token")

@@ -1,4 +1,4 @@
-"""Outlets: all that one writer puts on one wire, from its announcement to its leave."""
+"""Writers of one robot on one wire, from announcement to close."""
 
 import pytest
 from live import STAMP, await_reader
@@ -6,10 +6,10 @@ from support import until
 from wire.ros2.raw_nodes import DESCRIPTION, JOINT_STATES, Ear, key_of, tokens
 
 from zstate.errors import Closed, InvalidInput
-from zstate.net.outlets import Outlets
 from zstate.net.presence import discover, writer_here
 from zstate.net.session import connect
 from zstate.net.wires import wire_named
+from zstate.net.writer import WireWriter, write_all
 from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
 from zstate.wire.sample_names import SampleNames
 
@@ -29,8 +29,8 @@ def no_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
-def outlets(session, wire: str) -> Outlets:
-    return Outlets(session, wire_named(wire), "r1", writer_here(3), LAYOUT)
+def opened(session, wire: str) -> WireWriter:
+    return WireWriter(session, wire_named(wire), "r1", writer_here(3), LAYOUT)
 
 
 @pytest.mark.parametrize("wire", WIRES)
@@ -38,11 +38,11 @@ def test_what_is_open_is_announced_and_is_heard_until_it_closes(sessions, wire: 
     writer, reader = sessions
     joints, described = KEYS[wire]
     ear = Ear(reader, joints)
-    with outlets(writer, wire) as out:
-        stream = out.stream("joint_states")
-        out.latched("robot_description").set(DESCRIBED)
+    with opened(writer, wire) as out:
+        stream = out.open_stream("joint_states")
+        write_all([out.open_latched("robot_description")], DESCRIBED)
         await_reader(writer, joints)
-        stream.put(stream.encode(STATE))
+        write_all([stream], STATE)
         ear.heard(1)
         late = Ear(reader, described, latched=True)
         late.heard(1)
@@ -58,20 +58,20 @@ def test_a_value_is_withdrawn_only_where_that_can_be_said(sessions, wire: str, k
     writer, reader = sessions
     ear = Ear(reader, KEYS[wire][1])
     await_reader(writer, KEYS[wire][1])
-    with outlets(writer, wire) as out:
-        latched = out.latched("robot_description")
-        latched.set(DESCRIBED)
+    with opened(writer, wire) as out:
+        latched = out.open_latched("robot_description")
+        write_all([latched], DESCRIBED)
         latched.withdraw()
         if wire == "ros2":
-            latched.set(DESCRIBED)
+            write_all([latched], DESCRIBED)
         assert [str(sample.kind).rpartition(".")[2] for sample in ear.heard(2)] == kinds
 
 
 @pytest.mark.parametrize("wire", WIRES)
 def test_readers_are_known(sessions, wire: str):
     writer, reader = sessions
-    with outlets(writer, wire) as out:
-        stream = out.stream("joint_states")
+    with opened(writer, wire) as out:
+        stream = out.open_stream("joint_states")
         assert not stream.has_readers
         ear = Ear(reader, KEYS[wire][0])
         until(lambda: stream.has_readers)
@@ -81,11 +81,11 @@ def test_readers_are_known(sessions, wire: str):
 @pytest.mark.parametrize("wire", WIRES)
 def test_after_close_nothing_is_put_and_closing_again_does_nothing(wire: str):
     with connect() as session:
-        out = outlets(session, wire)
-        stream, latched = out.stream("joint_states"), out.latched("robot_description")
+        out = opened(session, wire)
+        stream, latched = out.open_stream("joint_states"), out.open_latched("robot_description")
         out.close()
         out.close()
-        for use in (lambda: stream.put(stream.encode(STATE)), lambda: latched.set(DESCRIBED)):
+        for use in (lambda: write_all([stream], STATE), lambda: write_all([latched], DESCRIBED)):
             with pytest.raises(Closed):
                 use()
         latched.withdraw()
@@ -94,10 +94,10 @@ def test_after_close_nothing_is_put_and_closing_again_does_nothing(wire: str):
 
 def test_each_has_a_number_of_its_own_in_its_session(sessions):
     writer, reader = sessions
-    with outlets(writer, "ros2") as one, outlets(writer, "ros2") as other:
+    with opened(writer, "ros2") as one, opened(writer, "ros2") as other:
         for out in (one, other):
-            out.stream("joint_states")
-            out.stream("tf")
+            out.open_stream("joint_states")
+            out.open_stream("tf")
         until(lambda: len(tokens(reader)) == 6)
         ids = [token.split("/")[4] for token in tokens(reader)]
         nodes = [token.split("/")[3] for token in tokens(reader)]
@@ -106,5 +106,5 @@ def test_each_has_a_number_of_its_own_in_its_session(sessions):
 
 
 def test_what_ros_has_no_topic_for_is_refused(sessions):
-    with outlets(sessions[0], "ros2") as out, pytest.raises(InvalidInput, match="'joint_commands'"):
-        out.stream("joint_commands")
+    with opened(sessions[0], "ros2") as out, pytest.raises(InvalidInput, match="'joint_commands'"):
+        out.open_stream("joint_commands")

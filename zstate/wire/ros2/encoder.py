@@ -1,4 +1,4 @@
-"""RosOutlet: the messages of one writer of one topic, as CDR, each signed by the writer's gid."""
+"""Encoder of one ROS 2 topic: CDR payloads, and attachments with the writer's gid."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from zstate.wire.sample_names import SampleNames
 
 
 @dataclass(frozen=True)
-class Address:
-    """Where one topic is put, and the token that tells who puts it; ``gid`` is None where none is told."""
+class TopicAddress:
+    """The key and liveliness token of one writer of a topic; ``gid`` is None if the wire sends none."""
 
     key: str
     token: str
     gid: bytes | None
 
 
-class RosOutlet:
-    """How one writer says one stream in ROS 2."""
+class RosStreamEncoder:
+    """Encodes one stream of one writer as ROS 2 messages."""
 
     encoding = ""
-    can_withdraw = False  # a ROS node takes a Zenoh delete for a broken message
+    can_withdraw = False  # ROS nodes log a Zenoh delete as a malformed message
 
     def __init__(
-        self, stream: Stream, address: Address, names: FrameNames, sample_names: SampleNames
+        self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleNames
     ) -> None:
         self.key = address.key
         self.token = address.token
@@ -56,7 +56,7 @@ class RosOutlet:
         self._edges: tuple[Edges, TfMessageEncoder] | None = None
 
     def attachment(self, now: int) -> bytes | None:
-        """Sequence number, time of writing ``now`` [ns] and writer, which every ROS node asks for."""
+        """Sequence number, time of sending ``now`` [ns] and gid, which ROS nodes require."""
         if self._gid is None:
             return None
         self._seq += 1
@@ -65,13 +65,13 @@ class RosOutlet:
     def encode(self, message: Message) -> bytes:
         """``message`` as CDR.
 
-        Raises InvalidInput for a stamp that ROS has no place for, and for numbers without names.
+        Raises InvalidInput for a stamp that ROS cannot represent, and for numbers without names.
         """
         if isinstance(message, JointState):
             return self._encode_joints(message)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
-            return self._encode_edges(edges, _dated(message.stamp), message.poses)
+            return self._encode_edges(edges, _checked_stamp(message.stamp), message.poses)
         if isinstance(message, StaticTransforms):
             return self._encode_edges(message.edges, 0, message.poses)
         if isinstance(message, RobotDescription):
@@ -87,10 +87,10 @@ class RosOutlet:
         rates, forces = state.velocities, state.efforts
         if len(self._sample_names.velocity_slots) != len(names):
             rates, forces = self._spread(rates, len(names)), self._spread(forces, len(names))
-        return self._joints[1].encode(_dated(state.stamp), state.positions, rates, forces)
+        return self._joints[1].encode(_checked_stamp(state.stamp), state.positions, rates, forces)
 
     def _spread(self, block: bytes | None, count: int) -> bytes | None:
-        """Each number in the place of its coordinate: ROS knows as many velocities as positions."""
+        """Each number at the index of its coordinate: in ROS there are as many velocities as positions."""
         slots = self._sample_names.velocity_slots
         if block is None or len(block) != 8 * len(slots):
             return block
@@ -104,7 +104,7 @@ class RosOutlet:
         return self._edges[1].encode(stamp, poses)
 
 
-def _dated(stamp: int) -> int:
+def _checked_stamp(stamp: int) -> int:
     if not stamp:
         raise InvalidInput(
             "the stamp is 0, by which ROS means that there is none; give the time of the sample"

@@ -1,0 +1,1 @@
+"""Nodes: publishers, static publishers and clocks that programs open on a session."""

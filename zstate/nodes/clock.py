@@ -1,0 +1,200 @@
+"""Simulated time: a publisher, and a clock that follows the published time."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+
+from zstate.clock import SIMULATED, check_stamp, wait_in_slices
+from zstate.closing import Closing
+from zstate.errors import Closed, MessageError, NoClock, duration_text
+from zstate.locks import new_lock
+from zstate.net.presence import writer_here
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber
+from zstate.net.wires import wire_named, wire_names
+from zstate.net.writer import WireWriter, write_all
+from zstate.wire.messages import Clock
+from zstate.wire.protocol import SerializedSample
+from zstate.wire.ros2.topics import SHARED
+
+_LOG = logging.getLogger("zstate")
+
+SET_BACK_NS = 100_000_000
+"""A larger step back ends all waits; a smaller one lengthens them a little."""
+
+# After this long without a stamp from the newest publisher an older one is followed again.
+_SILENT_S = 2.0
+
+# A wait cannot be notified by its stop event, so it checks it this often in real time.
+_STOP_WITHIN_S = 0.05
+
+
+class ClockPublisher(Closing):
+    """Publishes simulated time on zstate/clock, or on /clock of a ROS wire.
+
+    Time that goes back is a new start of the clock, and needs a new publisher. A context manager; safe
+    from any thread.
+    """
+
+    def __init__(self, session: Session, wires: str | Sequence[str] = ("native",)) -> None:
+        self._session_id = secrets.randbits(32)
+        self._seq = 0
+        self._lock = new_lock()
+        writer = writer_here(self._session_id)
+        with ExitStack() as opening:
+            # Time belongs to no robot; on a ROS wire its topic is that of the shared namespace.
+            self._writers = [
+                opening.enter_context(WireWriter(session, wire_named(wire), SHARED, writer)).open_stream(
+                    "clock"
+                )
+                for wire in wire_names(wires)
+            ]
+            self._opened = opening.pop_all()
+        self._is_open = True
+
+    def publish(self, stamp: int) -> None:
+        """Publish the time ``stamp`` [ns]. Raises Closed, and InvalidInput if a wire cannot represent it."""
+        with self._lock:
+            if not self._is_open:
+                raise Closed("the clock's publisher is closed")
+            write_all(self._writers, Clock(check_stamp(stamp), self._seq, self._session_id))
+            self._seq += 1
+
+    def close(self) -> None:
+        """Stop publishing. A second call does nothing."""
+        with self._lock:
+            self._is_open = False
+            self._opened.close()
+
+
+class SimulatedClock(Closing):
+    """The newest time received on ``zstate/clock``, or on ``/clock`` of a ROS wire.
+
+    It stands still between messages, and may jump. The first call of ``now`` waits until a time is
+    received, for at most ``timeout_s``. Of several publishers the newest is followed; messages of the
+    others are counted in ``refused``. A context manager; safe from any thread.
+    """
+
+    domain = SIMULATED
+
+    def __init__(self, session: Session, wire: str = "native", *, timeout_s: float = 5.0) -> None:
+        self.timeout_s = timeout_s
+        self.epoch = 0
+        """How often the time went back."""
+        self.refused: dict[str, int] = {}
+        self._wire = wire_named(wire)
+        self._now: int | None = None
+        self._session: int | None = None
+        self._ended_sessions: set[int] = set()
+        self._received_s = 0.0
+        self._has_time = threading.Event()
+        self._lock = new_lock()
+        self._waits: list[tuple[int, threading.Event]] = []
+        self._is_open = True
+        self.key = self._wire.expression(SHARED, "clock")
+        """The key that it subscribes to."""
+        self._subscriber = StreamSubscriber(session, self.key, self._on_samples)
+
+    def now(self) -> int:
+        """The newest stamp [ns]. Raises NoClock if none is received within ``timeout_s``, and Closed."""
+        now = self._now
+        return self.wait(self.timeout_s) if now is None else now
+
+    def wait(self, timeout_s: float | None = None) -> int:
+        """The newest stamp [ns], waiting for the first; None waits for ever. Raises NoClock and Closed."""
+        if not wait_in_slices(self._has_time, timeout_s):
+            raise NoClock(
+                f"no time was received on {self.key!r} for {timeout_s:g} s; start the simulation or "
+                "`zstate replay`",
+                waited_s=timeout_s or 0.0,
+            )
+        if self._now is None:
+            raise Closed("the simulated clock was closed before it received a time")
+        return self._now
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        """Block until ``stamp``, or until ``stop`` is set or the clock closed. True when it was reached.
+
+        Also true as soon as the time goes back by more than a tenth of a second.
+        """
+        reached = threading.Event()
+        with self._lock:
+            if stop.is_set() or not self._is_open:
+                return False
+            if self._now is not None and self._now >= stamp:
+                return True
+            self._waits.append((stamp, reached))
+        # The message with the time wakes this; the interval is for ``stop`` only.
+        while not reached.wait(_STOP_WITHIN_S):
+            if stop.is_set():
+                with self._lock:
+                    self._waits = [wait for wait in self._waits if wait[1] is not reached]
+                return False
+        return self._is_open and not stop.is_set()
+
+    def close(self) -> None:
+        """Unsubscribe, and end all waits. A second call does nothing."""
+        self._subscriber.close()
+        with self._lock:
+            self._is_open = False
+            self._wake(lambda _: True)
+        self._has_time.set()
+
+    def _on_samples(self, arrivals: list[SerializedSample]) -> None:
+        for arrival in arrivals:
+            try:
+                (message,) = self._wire.decode("clock", arrival, SHARED)
+            except MessageError as error:
+                self._refuse(error.reason, str(error))
+                continue
+            assert isinstance(message, Clock)
+            if self._follows(message.session):
+                self._set(message.stamp)
+            else:
+                self._refuse(
+                    "second clock", f"another publisher of the time is active: {message.session:08x}"
+                )
+
+    def _follows(self, session: int) -> bool:
+        """Whether ``session`` is the one to follow: the newest to appear, while it is active."""
+        now_s = time.monotonic()
+        if session in self._ended_sessions and now_s - self._received_s < _SILENT_S:
+            return False
+        if session != self._session:
+            if self._session is not None:
+                self._ended_sessions.add(self._session)
+            self._ended_sessions.discard(session)
+            self._session = session
+        self._received_s = now_s
+        return True
+
+    def _set(self, stamp: int) -> None:
+        before = stamp if self._now is None else self._now
+        went_back = before - stamp > SET_BACK_NS
+        if went_back:
+            self.epoch += 1
+            if self.epoch == 1:
+                text = "the time on %r went back by %s; further jumps are only counted, in epoch"
+                _LOG.warning(text, self.key, duration_text(before - stamp))
+        with self._lock:
+            self._now = stamp
+            self._wake(lambda awaited: went_back or awaited <= stamp)
+        self._has_time.set()
+
+    def _wake(self, is_due: Callable[[int], bool]) -> None:
+        waits, self._waits = self._waits, []
+        for wait in waits:
+            if is_due(wait[0]):
+                wait[1].set()
+            else:
+                self._waits.append(wait)
+
+    def _refuse(self, reason: str, text: str) -> None:
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+        if self.refused[reason] == 1:
+            _LOG.warning("%s refused (%s): %s; further ones are only counted", self.key, reason, text)

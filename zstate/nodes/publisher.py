@@ -1,0 +1,272 @@
+"""Publisher of a robot's state: joint positions in, joint states and transforms on Zenoh out."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+from numpy.typing import ArrayLike
+
+from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
+from zstate.closing import Closing
+from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.locks import new_lock, outlive_fork
+from zstate.lookup_service import LookupService, RecentBuffer
+from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.model.limits import JointLimits
+from zstate.model.robot import RobotModel
+from zstate.net.claims import Claim
+from zstate.net.clock_offset import ClockService
+from zstate.net.history import Memory, answer_past
+from zstate.net.presence import writer_here
+from zstate.net.session import Session
+from zstate.net.status import StatusPublisher
+from zstate.net.wires import wire_named, wire_names
+from zstate.net.writer import SampleWriter, WireWriter, write_all
+from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
+from zstate.nodes.robot_encoder import Positions, RobotEncoder
+from zstate.rate import Rate, RateReport
+from zstate.sources.source import JointSource
+from zstate.wire.keys import MODEL_WRITER, Stream, check_robot
+from zstate.wire.messages import (
+    JointState,
+    RobotDescription,
+    StaticTransforms,
+    order_digest,
+    to_block,
+)
+from zstate.wire.sample_names import SampleNames
+from zstate.wire.writer import Announced
+
+STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+"""The streams of a robot's state."""
+
+_SAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
+
+_NEWEST_ONLY_S = 1e-9
+"""Span of the cache that serves lookups when there is no cache for joining listeners."""
+
+
+class StatePublisher(Closing):
+    """Publishes the state of one robot: each sample is the whole robot at one instant.
+
+    Samples go out on ``joint_states``; the moving edges also on ``tf``, while that stream has a reader.
+    The model (``robot_description``) and its fixed edges (``tf_static``) are latched, so that listeners
+    receive them whenever they join. ``robot`` is the name on the network; default: the model's name.
+    ``streams`` lists what this publisher writes, if another program writes the rest. ``program`` is the
+    writer's name for others; default: the script's name.
+
+    Raises SecondWriter, which names the first writer, if another writer of one of its streams is active
+    on the native wire. If two open at once, ``publish`` of the later one raises it and closes that
+    publisher. With ``takeover`` it publishes nevertheless, and listeners use the newest writer.
+
+    On the native wire it publishes its status once a second while that has a reader
+    (``zstate.net.status``), caches the last ``cache_s`` seconds of samples for joining listeners
+    (``zstate.net.history``; 0 for none), and answers lookups of its own frames on
+    ``zstate/<robot>/lookup`` from that cache, or from the newest sample without one
+    (``zstate.lookup_service``). A context manager; safe from any thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        model: RobotModel,
+        robot: str | None = None,
+        wires: str | Sequence[str] = ("native",),
+        *,
+        streams: Sequence[Stream] = STREAMS,
+        clock: Clock | None = None,
+        program: str = "",
+        takeover: bool = False,
+        cache_s: float = 2.0,
+    ) -> None:
+        self.model = model
+        self.robot = check_robot(robot or model.name)
+        self._clock: Clock = clock or SystemClock()
+        self._lock = new_lock()
+        self._stop = outlive_fork(threading.Event())
+        self._opened = ExitStack()
+        self._encoder = RobotEncoder(model, self.robot)
+        self._session_id = secrets.randbits(32)
+        self._seq = 0
+        self._refused = 0
+        self._last_refusal = ""
+        self._rate: Rate | None = None
+        self._wires = wires = wire_names(wires)
+        self._joint_order = order_digest(model.joint_names)
+        _check_streams(streams)
+        limits = JointLimits(model)
+        self._limits = LimitWatch(limits, self.robot) if limits and wires else None
+        sample_names = SampleNames(coordinate_names(model), velocity_slots(model), self._encoder.names)
+        writer = writer_here(self._session_id, program)
+        with ExitStack() as opening:
+            # ROS topics may have several writers, so ownership is checked on the native wire only.
+            self._claim = None
+            if "native" in wires and streams and not takeover:
+                announced = [
+                    Announced(self.robot, stream, writer, MODEL_WRITER if stream == "tf_static" else "")
+                    for stream in streams
+                ]
+                self._claim = opening.enter_context(Claim(session, announced))
+            if "native" in wires and self._clock.domain == SYSTEM:
+                # Before this writer is announced: readers that see its token measure its clock at once.
+                opening.enter_context(ClockService(session, self.robot, writer, self._clock))
+            wire_writers = [
+                opening.enter_context(WireWriter(session, wire_named(wire), self.robot, writer, sample_names))
+                for wire in wires
+            ]
+            self._writers: dict[tuple[str, Stream], SampleWriter] = {}
+            for wire, wire_writer in zip(wires, wire_writers, strict=True):
+                if "robot_description" in streams:
+                    description = wire_writer.open_latched("robot_description", MODEL_WRITER)
+                    write_all([description], self.description())
+                if "tf_static" in streams:
+                    write_all([wire_writer.open_latched("tf_static", MODEL_WRITER)], self.statics())
+                for stream in _SAMPLED:
+                    if stream in streams:
+                        self._writers[wire, stream] = wire_writer.open_stream(stream)
+            self._joints = [one for (_, stream), one in self._writers.items() if stream == "joint_states"]
+            self._transforms = [one for (_, stream), one in self._writers.items() if stream == "tf"]
+            if "native" in wires and self._writers:
+                status = StatusReporter(writer, lambda: self.stats).status
+                opening.enter_context(StatusPublisher(session, self.robot, writer.identity, status))
+            self._recent = self._open_cache(session, cache_s, opening)
+            self.cache = self._recent if cache_s else None
+            if self._recent is not None and self._writers:
+                recent = RecentBuffer(model, self.robot, self._recent)
+                opening.enter_context(LookupService(session, recent.filled, self.robot))
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        closed = ", closed" if self._stop.is_set() else ""
+        return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._seq} samples{closed}>"
+
+    def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> Memory | None:
+        if "native" not in self._wires:
+            return None
+        numbers = self.model.position_count + 2 * self.model.velocity_count
+        cache = Memory(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        if cache_s:
+            encoders = {key: writer.encoder for key, writer in self._writers.items()}
+            joints, transforms = encoders.get(("native", "joint_states")), encoders.get(("native", "tf"))
+            if joints is not None:
+                opening.enter_context(answer_past(session, self.robot, "joint_states", cache, joints.encode))
+            if transforms is not None:
+                robot, encode = self._encoder, transforms.encode
+                service = answer_past(
+                    session, self.robot, "tf", cache, lambda state: encode(robot.transform_sample(state))
+                )
+                opening.enter_context(service)
+        return cache
+
+    def description(self) -> RobotDescription:
+        """The robot's model and conventions, latched for listeners."""
+        model = self.model
+        return RobotDescription(
+            self._session_id,
+            model.urdf,
+            model.digest,
+            model.joint_names,
+            self._encoder.names,
+            self._clock.domain,
+        )
+
+    def statics(self) -> StaticTransforms:
+        """The robot's fixed edges, latched for listeners without its model."""
+        return self._encoder.statics(self._session_id)
+
+    @property
+    def stats(self) -> PublisherStats:
+        """Counts of published, suppressed and refused samples."""
+        streams = {
+            stream: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
+            for stream, writer in self._writers.items()
+        }
+        rate = None if self._rate is None else self._rate.report()
+        counts = (self._seq, self._refused, self._last_refusal, streams, rate)
+        limits = self._limits
+        return (
+            PublisherStats(*counts) if limits is None else PublisherStats(*counts, limits.count, limits.last)
+        )
+
+    def publish(
+        self,
+        positions: Positions,
+        velocities: ArrayLike | None = None,
+        efforts: ArrayLike | None = None,
+        stamp: int | None = None,
+    ) -> None:
+        """Publish one sample: the robot at ``stamp`` [ns]; default: now.
+
+        ``positions`` [rad] or [m] are in the order of ``model.joint_names``, or a mapping from all joint
+        names; ``velocities`` per second and ``efforts`` [Nm] or [N], if known, are in the same order.
+        Positions outside joint limits are published, counted in ``stats``, and logged once. Raises
+        InvalidInput for wrong counts, unknown or missing names, NaN and infinity, a floating joint without
+        a unit quaternion, and a stamp that a wire cannot represent; SecondWriter; and Closed. If it raises,
+        nothing was sent.
+        """
+        try:
+            block = self._encoder.encode_positions(positions)
+            rates = None if velocities is None else to_block(self.model.check_velocities(velocities))
+            forces = None if efforts is None else to_block(self.model.check_efforts(efforts))
+            stamp = self._clock.now() if stamp is None else check_stamp(stamp)
+            with self._lock:
+                if self._stop.is_set():
+                    raise Closed(f"the publisher of {self.robot!r} is closed")
+                if self._claim is not None:
+                    self._claim.check()
+                head = (stamp, self._seq, self._session_id)
+                state = JointState(*head, self._joint_order, block, rates, forces)
+                # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
+                payloads = [(writer, writer.encoder.encode(state)) for writer in self._joints]
+                readable = [writer for writer in self._transforms if writer.has_readers]
+                if readable:
+                    sample = self._encoder.transform_sample(state)
+                    payloads += [(writer, writer.encoder.encode(sample)) for writer in readable]
+                self._seq += 1
+                if self._recent is not None:
+                    # Before sending: a reader that misses this sample can then request it as history.
+                    self._recent.append(state)
+                for writer, payload in payloads:
+                    writer.write(payload)
+                if self._limits is not None:
+                    self._limits.add(stamp, block)
+        except InvalidInput as error:
+            self._last_refusal = str(error)
+            self._refused += 1
+            raise
+        except SecondWriter:
+            with self._lock:
+                self._opened.close()  # latched values too
+            raise
+
+    def run(self, source: JointSource, rate_hz: float = 100.0, *, seconds: float | None = None) -> RateReport:
+        """Publish the readings of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
+
+        Each tick has an absolute deadline; ``Rate`` describes late ticks. If the source has no new
+        reading, the tick publishes nothing. Raises SecondWriter.
+        """
+        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
+        for now in rate:
+            reading = source.read(now)
+            if reading is not None:
+                stamp = now if reading.stamp is None else reading.stamp
+                try:
+                    self.publish(reading.positions, reading.velocities, reading.efforts, stamp)
+                except Closed:
+                    break
+        return rate.report()
+
+    def close(self) -> None:
+        """Stop publishing; ``run`` returns. A second call does nothing."""
+        self._stop.set()
+        with self._lock:
+            self._opened.close()
+
+
+def _check_streams(streams: Sequence[Stream]) -> None:
+    for stream in streams:
+        if stream not in STREAMS:
+            raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")

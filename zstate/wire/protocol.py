@@ -1,0 +1,143 @@
+"""Protocols that a wire format implements: encoding, keys, liveliness tokens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+from msgspec import Struct
+
+from zstate.wire.keys import Stream
+from zstate.wire.messages import Message
+from zstate.wire.sample_names import SampleNames
+from zstate.wire.writer import Announced, Writer
+
+
+class SerializedSample(Struct, frozen=True, gc=False):
+    """One payload as received from the network, with its key, encoding and attachment.
+
+    If the payload exceeds the limit of its stream, ``size`` is its length and ``payload`` a single byte,
+    because an empty payload would mean a withdrawn value. Decoding such a sample raises MessageError.
+    """
+
+    key: str
+    payload: bytes
+    encoding: str
+    attachment: bytes | None = None
+    size: int = 0
+
+
+class EntityId(NamedTuple):
+    """Identifies a writer on the network: its Zenoh session, and its number within that session."""
+
+    zid: str
+    number: int
+
+
+class StreamEncoder(Protocol):
+    """Encodes one stream of one writer: key, Zenoh encoding, liveliness token, payloads, attachments."""
+
+    @property
+    def key(self) -> str:
+        """The key of the stream."""
+        ...
+
+    @property
+    def encoding(self) -> str:
+        """The Zenoh encoding of the payloads; empty for none."""
+        ...
+
+    @property
+    def token(self) -> str | None:
+        """The liveliness token of this writer of this stream, if the wire format has one."""
+        ...
+
+    @property
+    def can_withdraw(self) -> bool:
+        """Whether readers of this wire format accept that a latched value is withdrawn."""
+        ...
+
+    def encode(self, message: Message) -> bytes:
+        """The payload of ``message``. Raises InvalidInput if the wire format cannot represent it."""
+        ...
+
+    def attachment(self, now: int) -> bytes | None:
+        """The attachment of the next payload, which is sent at ``now`` [ns]."""
+        ...
+
+
+class Wire(Protocol):
+    """One wire format for the streams of a robot: keys, encodings and bytes.
+
+    A stream carries the same messages in each: JointState on ``joint_states``, TransformSample on ``tf``,
+    StaticTransforms on ``tf_static``, RobotDescription on ``robot_description``, Clock on ``clock``.
+    Decoding may keep state, so each reader has an instance of its own.
+    """
+
+    @property
+    def name(self) -> str:
+        """Its name for users: "native", ..."""
+        ...
+
+    @property
+    def shared(self) -> frozenset[Stream]:
+        """The streams of a robot that several writers publish, each a part."""
+        ...
+
+    def node_token(self, robot: str, writer: Writer, node: EntityId) -> str | None:
+        """The liveliness token of ``writer`` as a node of the ROS graph; None if there is no such graph."""
+        ...
+
+    def stream_encoder(
+        self,
+        robot: str,
+        writer: Writer,
+        stream: Stream,
+        *,
+        node: EntityId,
+        number: int,
+        sample_names: SampleNames,
+        name: str = "",
+    ) -> StreamEncoder:
+        """The encoder of ``stream`` of ``robot`` for ``writer``.
+
+        ``node`` identifies the writer, ``number`` this stream within the session; ``name`` is the one under
+        which the writer publishes static edges. Raises InvalidInput for names that cannot be in a key.
+        """
+        ...
+
+    def reader_tokens(
+        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
+    ) -> tuple[str, ...]:
+        """The liveliness tokens of ``reader`` for ``streams`` of ``robot``, or of all robots for ``"*"``.
+
+        ``number()`` returns the next unused number of the session.
+        """
+        ...
+
+    def expression(self, robot: str, stream: Stream) -> str:
+        """The key expression of ``stream`` from all writers of ``robot``, or of all robots for ``"*"``."""
+        ...
+
+    def robot_of(self, key: str) -> str:
+        """The robot that a key belongs to. Raises InvalidInput if it belongs to none."""
+        ...
+
+    def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
+        """The messages of a sample received on ``stream`` of ``robot``. Raises MessageError."""
+        ...
+
+    def statics_writer(self, key: str) -> str | None:
+        """The name under which the static edges on ``key`` are written, if the key has it.
+
+        Raises InvalidInput if the key belongs to no robot.
+        """
+        ...
+
+    def writers_expression(self, robot: str) -> str:
+        """The key expression of the tokens of all writers of ``robot``, or of all robots for ``"*"``."""
+        ...
+
+    def announced(self, token: str, robot: str) -> Announced | None:
+        """The writer and stream of a token under that expression; None for any other token."""
+        ...
