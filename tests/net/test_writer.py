@@ -16,6 +16,7 @@ from zstate.wire.sample_names import SampleNames
 WIRES = ("native", "ros2", "ros2dds")
 LAYOUT = SampleNames(("a", "b"), (0, 1))
 STATE = JointState(STAMP, 0, 1, order_digest(("a", "b")), to_block([1.0, 2.0]))
+UNSTAMPED = JointState(0, 0, 1, STATE.order, STATE.positions)
 DESCRIBED = RobotDescription(1, "<robot/>", "digest", (), ())
 KEYS = {
     "native": ("zstate/r1/joint_states", "zstate/r1/robot_description"),
@@ -103,6 +104,17 @@ def test_each_has_a_number_of_its_own_in_its_session(sessions):
         nodes = [token.split("/")[3] for token in tokens(reader)]
     assert len(set(ids)) == 6
     assert len(set(nodes)) == 2
+
+
+def test_a_message_that_one_wire_cannot_represent_is_sent_on_none(sessions):
+    with opened(sessions[0], "native") as native, opened(sessions[0], "ros2") as ros:
+        writers = [native.open_stream("joint_states"), ros.open_stream("joint_states")]
+        with pytest.raises(InvalidInput, match="the stamp is 0"):
+            write_all(writers, UNSTAMPED)
+        assert [(writer.samples, writer.bytes) for writer in writers] == [(0, 0), (0, 0)]
+        write_all(writers, STATE)
+    sizes = [len(writer.encoder.encode(STATE)) for writer in writers]
+    assert [(writer.samples, writer.bytes) for writer in writers] == [(1, size) for size in sizes]
 
 
 def test_what_ros_has_no_topic_for_is_refused(sessions):

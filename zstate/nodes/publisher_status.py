@@ -30,7 +30,7 @@ ARE_OUTSIDE = "samples are outside joint limits"
 
 
 class StreamStats(NamedTuple):
-    """Counts of one stream on one wire; ``suppressed`` samples were not sent, for want of a reader."""
+    """Counts of one stream on one wire; ``suppressed`` samples had no reader and were not sent."""
 
     samples: int
     bytes: int

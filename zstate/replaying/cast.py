@@ -1,4 +1,4 @@
-"""Cast: everybody who speaks in one pass of a replay."""
+"""Publishers of one playback pass."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from zstate.wire.messages import (
 
 
 class Cast(Closing):
-    """Says again what was recorded, as new writers.
+    """Publishers for one playback pass, with new writer identities.
 
-    Robots with one of ``models`` get a StatePublisher, which computes their transforms anew where it
-    was their own publisher that wrote them; everything else is said as it was. ``standing`` is what
-    holds from the beginning. What cannot be said is counted in ``tally``.
-    Raises SecondWriter where somebody else writes the same now, but with ``takeover``.
+    Robots with one of ``models`` get a StatePublisher, which recomputes their transforms if their own
+    publisher wrote them; everything else is republished unchanged. ``standing`` are the latched messages
+    at the start of the pass. Messages that cannot be published are counted in ``tally``.
+    Raises SecondWriter if another writer of the same is active now; not with ``takeover``.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class Cast(Closing):
         return streams
 
     def take(self, said: Said) -> bool:
-        """Say it; whether there was something to say."""
+        """Publish it. Returns whether anything was published."""
         if isinstance(said.message, RobotDescription | StaticTransforms):
             changed = self._standing.take(said)
             return changed is not None and self._say_counted(changed)
@@ -142,7 +142,7 @@ class Cast(Closing):
         return True
 
     def close(self) -> None:
-        """Everybody falls silent. A second call does nothing."""
+        """Close all publishers. A second call does nothing."""
         self._opened.close()
 
     def _close_robots(self) -> None:
@@ -151,7 +151,7 @@ class Cast(Closing):
 
 
 class _Robot(Closing):
-    """A robot whose model is known, and its joint states."""
+    """The StatePublisher of a robot whose model is known."""
 
     def __init__(  # noqa: PLR0917 - one use, just above
         self,
@@ -173,18 +173,18 @@ class _Robot(Closing):
             robot,
             wires,
             streams=self.streams,
-            # Every sample has its own stamp; the clock is there to say that these are of another time.
+            # Samples have stamps of their own; this clock only announces simulated time.
             clock=ManualClock(domain=SIMULATED),
             takeover=takeover,
         )
 
     @property
     def session_id(self) -> int:
-        """What others know its messages by."""
+        """The session in its messages."""
         return self._publisher.description().session
 
     def publish(self, state: JointState) -> None:
-        """Raises MessageError and InvalidInput for what cannot be said."""
+        """Publish ``state``. Raises MessageError and InvalidInput."""
         positions, velocities, efforts = self._order.read(state)
         self._publisher.publish(positions, velocities, efforts, state.stamp)
 
@@ -193,9 +193,9 @@ class _Robot(Closing):
 
 
 def _is_computed(robot: str, speakers: Collection[Speaker]) -> bool:
-    """Whether the transforms of a robot with a model are those that follow from its joint states.
+    """Whether the transforms of a robot with a model follow from its joint states.
 
-    So it is where nobody wrote others, or the writer of the joint states wrote them, too.
+    They do if there are none, or if the writers of the joint states wrote them too.
     """
     sessions: dict[Stream, set[int]] = {"tf": set(), "joint_states": set()}
     for speaker in speakers:

@@ -1,4 +1,4 @@
-"""Verbatim: what a robot said, said again as it is, by one new writer."""
+"""Republishes recorded messages of a robot unchanged, as one new writer."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Verbatim(Closing):
     """Publishes messages of ``robot`` on all ``wires``, with a session and sequence numbers of its own.
 
     ``streams`` are announced at once, latched values with the first of their name. A message that one of
-    the wires cannot say raises InvalidInput, and is said on none. Where somebody else who lives writes
-    the same on the native wire, SecondWriter is raised; not with ``takeover``. The static edges of those
-    whose sessions are in ``cast``, ours among them, may be of one frame, as they were.
+    the wires cannot represent raises InvalidInput, and is sent on none. Raises SecondWriter if another
+    writer of the same is active on the native wire; not with ``takeover``. Writers whose sessions are in
+    ``cast``, this one among them, may place the same frame, as they did in the recording.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Verbatim(Closing):
             self._opened = opening.pop_all()
 
     def say(self, message: JointState | TransformSample) -> None:
-        """One sample."""
+        """Publish one sample."""
         if self._claim is not None:
             self._claim.check()
         stream: Stream = "joint_states" if isinstance(message, JointState) else "tf"
@@ -79,15 +79,19 @@ class Verbatim(Closing):
         self._seqs[stream] += 1
 
     def describe(self, description: RobotDescription, writer: str) -> None:
-        """What the robot is, for late joiners too."""
-        said = description
+        """Publish the robot description, latched."""
         again = RobotDescription(
-            self._session_id, said.urdf, said.digest, said.joint_names, said.moving_edges, SIMULATED
+            self._session_id,
+            description.urdf,
+            description.digest,
+            description.joint_names,
+            description.moving_edges,
+            SIMULATED,
         )
         write_all(self._latch("robot_description", writer), again)
 
     def fix(self, statics: StaticTransforms, writer: str) -> None:
-        """All static edges of one ``writer``; none at all take back what it said before."""
+        """Publish all static edges of one ``writer``, latched; if there are none, withdraw them."""
         key: tuple[Stream, str] = ("tf_static", writer)
         if statics.edges:
             writers = self._latch(*key)
@@ -100,9 +104,9 @@ class Verbatim(Closing):
 
     def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
         if (stream, writer) not in self._latched:
-            said = self._said(stream, writer)
+            announced = self._announced(stream, writer)
             with ExitStack() as opening:
-                claim = self._claimed(opening, [said])
+                claim = self._claimed(opening, [announced])
                 opened = [one.open_latched(stream, writer) for one in self._wire_writers]
                 if claim is not None:
                     claim.settle()
@@ -110,7 +114,7 @@ class Verbatim(Closing):
             self._latched[stream, writer] = opened
         return self._latched[stream, writer]
 
-    def _said(self, stream: Stream, writer: str) -> Announced:
+    def _announced(self, stream: Stream, writer: str) -> Announced:
         return Announced(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
 
     def _claimed(self, opening: ExitStack, wanted: Sequence[Announced]) -> Claim | None:
@@ -118,16 +122,16 @@ class Verbatim(Closing):
 
     @contextmanager
     def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:
-        """While edges of ``writer`` are said, some of them for the first time."""
+        """Announce the new ones of the edges of ``writer`` while they are sent."""
         edges = set(named_edges(self._robot, statics.edges))
         new = sorted(edges - self._placed.get(writer, set())) if self._is_alone else []
         with ExitStack() as placed:
             if new:
-                said = self._said("tf_static", writer)
-                placed.enter_context(placing(self._session, said, new, beside=self._cast))
+                announced = self._announced("tf_static", writer)
+                placed.enter_context(placing(self._session, announced, new, beside=self._cast))
             yield
         self._placed[writer] = edges
 
     def close(self) -> None:
-        """Stop; who has the latched values keeps them. A second call does nothing."""
+        """Stop publishing; listeners keep the latched values. A second call does nothing."""
         self._opened.close()

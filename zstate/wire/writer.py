@@ -1,4 +1,4 @@
-"""Writer: who writes a stream, as others are told."""
+"""Writer identity, and what a writer's liveliness token announces."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _MOST_OF_AN_IDENTITY = 4 * 12 * MOST_CHARACTERS
 
 @dataclass(frozen=True, order=True, slots=True)
 class Writer:
-    """One writer: which program, where, since when [ns], and the ``session`` in its samples.
+    """One writer: its program, host, process, start time ``since`` [ns], and the ``session`` of its samples.
 
-    A wire that does not tell where or since when leaves ``host`` empty, ``pid`` and ``since`` zero.
+    On wires without them ``host`` is empty, and ``pid`` and ``since`` are zero.
     ``pid`` and ``since`` are below 2^63, ``session`` is below 2^64.
     """
 
@@ -32,20 +32,20 @@ class Writer:
 
     @property
     def identity(self) -> str:
-        """All of it in one chunk of a key."""
+        """All fields in one chunk of a key."""
         fields = (self.program, self.host, self.pid, self.since, self.session)
         return ",".join(_quoted(str(field)) for field in fields)
 
     @classmethod
     def parse(cls, identity: str) -> Writer:
-        """The writer whose ``identity`` this is. Raises InvalidInput for anything else."""
+        """The writer with this ``identity``. Raises InvalidInput if it is not one."""
         fields = identity.split(",") if len(identity) <= _MOST_OF_AN_IDENTITY else []
         if len(fields) == 5 and all(map(_is_number, fields[2:])):
             program, host = unquote(fields[0]), unquote(fields[1])
             pid, since, session = map(int, fields[2:])
             found = cls(program, host, pid, since, session)
             in_range = max(pid, since) < 2**63 and session < 2**64
-            # Written in one way only: two tokens of one writer would be two writers.
+            # One canonical form: two tokens of one writer would count as two writers.
             if in_range and max(len(program), len(host)) <= MOST_CHARACTERS and found.identity == identity:
                 return found
         raise InvalidInput(
@@ -56,10 +56,10 @@ class Writer:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """What a liveliness token says: ``writer`` writes ``stream`` of ``robot``.
+    """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
-    ``name`` is the one under which it writes static edges; empty for other streams, and where the wire
-    does not tell.
+    ``name`` is the one under which it writes static edges; empty for other streams, and on wires without
+    such names.
     """
 
     robot: str
@@ -75,7 +75,7 @@ class Announced:
 
     @classmethod
     def parse(cls, robot: str, stream: Stream, identity: str) -> Announced:
-        """What a token with this ``identity`` says. Raises InvalidInput for anything else."""
+        """The content of a token with this ``identity``. Raises InvalidInput if it is not one."""
         fields = identity.split(",", 6)
         is_named = len(fields) == 6 and stream == "tf_static"
         name = check_writer(unquote(fields.pop())) if is_named else ""
@@ -85,9 +85,9 @@ class Announced:
         return found
 
     def excludes(self, other: Announced) -> bool:
-        """Whether only one of the two writers can be meant: both say the same, and neither knows the other.
+        """Whether the two are different writers of the same stream, of which only one may be active.
 
-        Several writers of static edges have a name each; whose name is not known may be any.
+        Writers of static edges conflict if their names are equal; without a name they never do.
         """
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
         is_one = self.stream != "tf_static" or bool(self.name)
@@ -95,7 +95,7 @@ class Announced:
 
 
 def _quoted(text: str) -> str:
-    # The name of a script may have bytes that are no text.
+    # A script name may have bytes that are not text.
     return quote(text, safe="", errors="replace")
 
 
