@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.console import count_text
 from zstate.cli.probe import silent_rendezvous
 
@@ -101,8 +101,7 @@ class NativeWords:
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
 
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:
-        near = get_close_matches(robot, [info.name for info in robots], n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(robot, [info.name for info in robots])
         return f"nobody announces the robot {robot!r}{hint} ({self.announced(robots)})"
 
     def silence(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:
