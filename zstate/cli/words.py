@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 from zstate._util.suggestions import did_you_mean
 from zstate.cli.console import count_text
-from zstate.cli.probe import silent_rendezvous
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -93,9 +92,10 @@ class NativeWords:
     def announced(self, robots: Sequence[RobotInfo]) -> str:
         if not robots:
             from zstate.model.known import example_name
+            from zstate.net.refusal import check_rendezvous  # loads ssl, which few need
 
             start = f"start one, for instance with `zstate publish {example_name()} --source sine`"
-            silent = silent_rendezvous()
+            silent = check_rendezvous()
             advice = f"{silent.text}; `zstate doctor` says more" if silent else start
             return f"no robot is announced; {advice}"
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
