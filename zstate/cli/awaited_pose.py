@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, NoReturn
 
 from zstate.cli.console import fail, note
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _NOT_RECEIVED = (
 class AwaitedPose:
     """Asks ``listener`` for one pose, again and again, and tells a person what it waits for."""
 
-    def __init__(self, listener: TransformListener, roster: Roster, target: str, source: str) -> None:
+    def __init__(self, listener: TransformListener, roster: RobotDirectory, target: str, source: str) -> None:
         self._listener = listener
         self._roster = roster
         self._words = roster.words

@@ -6,9 +6,9 @@ import time
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import note
-from zstate.cli.roster import announced_robots
+from zstate.cli.processes import BackgroundCall
+from zstate.cli.robot_directory import announced_robots
 from zstate.cli.words import words_of
-from zstate.cli.worker import Worker
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -35,7 +35,7 @@ def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     from zstate.wire.keys import ANY
 
     # Models and statics come while those who write them are asked for, which is mostly waiting.
-    asked = Worker(
+    asked = BackgroundCall(
         "zstate announced",
         lambda: discover(session) if robot == ANY else announced_robots(session, robot),
     )

@@ -86,11 +86,11 @@ def _connect_to_ros(network: Network, timeout_s: float | None) -> Session:
 
 
 def _connect(network: Network, timeout_s: float | None) -> Session:
-    from zstate.cli.worker import Worker
+    from zstate.cli.processes import BackgroundCall
     from zstate.net.session import connect
 
     # In a thread of its own: a signal ends the wait for it, which Zenoh's would not.
-    worker = Worker(
+    worker = BackgroundCall(
         "zstate connect",
         lambda: connect(
             network.config,

@@ -8,7 +8,7 @@ from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import note
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import is_ros
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
@@ -39,7 +39,7 @@ class Readiness(Closing):
         self._listeners: dict[str, list[TransformListener]] = {}
         with ExitStack() as opening:
             robot = self._robots[0] if len(self._robots) == 1 else "*"
-            self._roster = opening.enter_context(Roster(session, robot, wire))
+            self._roster = opening.enter_context(RobotDirectory(session, robot, wire))
             if not is_ros(wire):
                 key = self._spoken.expression(robot, "robot_description")
                 opening.enter_context(LatchedSubscriber(session, key, self._note_still))

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import fail, note
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -28,7 +28,7 @@ def gathered_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
     from zstate.listener import TransformListener
 
     with (
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as roster,
         TransformListener(session, robot, wire=wire, follow="tf") as listener,
     ):
         if not _somebody_is_there(listener, roster):
@@ -39,7 +39,7 @@ def gathered_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
         return listener.buffer.frames()
 
 
-def _somebody_is_there(listener: TransformListener, roster: Roster) -> bool:
+def _somebody_is_there(listener: TransformListener, roster: RobotDirectory) -> bool:
     deadline = time.monotonic() + _ANNOUNCED_WITHIN_S
     while time.monotonic() < deadline:
         if listener.buffer.frames() or _nodes(roster):
@@ -48,7 +48,7 @@ def _somebody_is_there(listener: TransformListener, roster: Roster) -> bool:
     return False
 
 
-def _silent_nodes(listener: TransformListener, roster: Roster) -> list[str]:
+def _silent_nodes(listener: TransformListener, roster: RobotDirectory) -> list[str]:
     """Wait until all nodes have spoken twice and nothing is new; who had not, when it took too long."""
     deadline = time.monotonic() + _SPOKEN_WITHIN_S
     count, changed = 0, time.monotonic()
@@ -62,7 +62,7 @@ def _silent_nodes(listener: TransformListener, roster: Roster) -> list[str]:
     return sorted(_nodes(roster) - _writers(listener.buffer.frames(), least=1))
 
 
-def _nodes(roster: Roster) -> set[str]:
+def _nodes(roster: RobotDirectory) -> set[str]:
     """Who publishes transforms that move."""
     said = (pair for info in roster.robots() for pair in info.writers)
     return {str(writer) for stream, writer in said if stream == "tf"}

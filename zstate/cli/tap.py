@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.cli.console import fail, note
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import MessageError
@@ -42,7 +42,7 @@ class Tap(Closing):
         self._wire = wire_named(wire)
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[Tapped] = queue.SimpleQueue()
-        self._roster = Roster(session, robot, wire)
+        self._roster = RobotDirectory(session, robot, wire)
         key = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, key, self._take)
         self._announcements = announce_reader(session, self._wire, robot, (stream,))

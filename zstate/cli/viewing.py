@@ -14,7 +14,7 @@ import click
 
 from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.options import load_robot
-from zstate.cli.worker import Worker
+from zstate.cli.processes import BackgroundCall
 from zstate.model.catalog import is_path
 from zstate.model.known import find
 from zstate.model.robot import RobotModel
@@ -102,10 +102,10 @@ def _announced_model(session: Session, robot: str, wire: str) -> RobotModel:
 
 
 @contextmanager
-def running(view: View) -> Generator[Worker[None]]:
+def running(view: View) -> Generator[BackgroundCall[None]]:
     """The view at work, until this is left."""
     stop = threading.Event()
-    worker = Worker("zstate view", lambda: view.run(stop))
+    worker = BackgroundCall("zstate view", lambda: view.run(stop))
     try:
         yield worker
     finally:

@@ -15,12 +15,13 @@ from zstate.cli.options import (
     checked_rate,
     heard_robot_option,
     json_option,
+    open_clock,
     reading_clock_option,
     session_options,
     timeout_option,
     wire_option,
 )
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed
 from zstate.errors import LookupFailed
 
@@ -111,13 +112,12 @@ def tf_command(
     zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
     from zstate.cli.awaited_pose import AwaitedPose
-    from zstate.cli.clocks import open_clock
     from zstate.listener import TransformListener
 
     ends = once or at is not None
     with (
         open_session(network, (wire,)) as session,
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as roster,
         open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
         TransformListener(session, robot, wire=wire, follow=followed(wire), clock=time_kept) as listener,
     ):

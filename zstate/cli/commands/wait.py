@@ -87,7 +87,7 @@ def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s
 
 def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
     from zstate.cli.awaited_pose import AwaitedPose
-    from zstate.cli.roster import Roster
+    from zstate.cli.robot_directory import RobotDirectory
     from zstate.cli.words import followed
     from zstate.listener import TransformListener
 
@@ -95,7 +95,7 @@ def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s:
     deadline = time.monotonic() + timeout_s
     with (
         open_session(network, (wire,), timeout_s=timeout_s) as session,
-        Roster(session, "*", wire) as roster,
+        RobotDirectory(session, "*", wire) as roster,
         TransformListener(session, wire=wire, follow=followed(wire)) as listener,
     ):
         awaited = AwaitedPose(listener, roster, target, source)
@@ -104,7 +104,7 @@ def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s:
 
 
 def _await_router(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.worker import Worker
+    from zstate.cli.processes import BackgroundCall
     from zstate.net.config import ROUTER_ENDPOINT
 
     endpoints = names or network.connect or (() if network.is_given else (ROUTER_ENDPOINT,))
@@ -115,7 +115,7 @@ def _await_router(network: Network, names: tuple[str, ...], wire: str, timeout_s
         with open_session(client, timeout_s=timeout_s):
             pass
 
-    worker = Worker("zstate wait", join)
+    worker = BackgroundCall("zstate wait", join)
     try:
         worker.result(min(_GRACE_S, timeout_s))
     except Unreachable:

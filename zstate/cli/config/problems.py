@@ -9,8 +9,8 @@ import click
 
 from zstate._util.suggestions import did_you_mean
 from zstate.cli.config.settings import network_of
-from zstate.cli.identity import PASSWORD_VARIABLE
 from zstate.cli.logs import FORMAT_VARIABLE, FORMATS
+from zstate.cli.options import PASSWORD_VARIABLE
 from zstate.errors import ZStateError
 from zstate.extension import VARIABLE as KERNEL_VARIABLE
 from zstate.net.config import CONFIG_VARIABLE, endpoint_list

@@ -13,7 +13,7 @@ from zstate.cli.monitor.meter import PathMeter
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.errors import duration_text
 from zstate.listener import TransformListener
 from zstate.transform import Transform
@@ -61,7 +61,7 @@ class Monitored(ABC):
 class MonitoredEdges(Monitored):
     """All edges."""
 
-    def __init__(self, listener: TransformListener, meter: PathMeter, roster: Roster) -> None:
+    def __init__(self, listener: TransformListener, meter: PathMeter, roster: RobotDirectory) -> None:
         super().__init__(listener, meter)
         self._roster = roster
 
@@ -95,7 +95,7 @@ class MonitoredPose(Monitored):
     """One pose, and the edges on its path."""
 
     def __init__(
-        self, listener: TransformListener, meter: PathMeter, roster: Roster, frames: tuple[str, str]
+        self, listener: TransformListener, meter: PathMeter, roster: RobotDirectory, frames: tuple[str, str]
     ) -> None:
         super().__init__(listener, meter)
         self._target, self._source = frames

@@ -12,7 +12,7 @@ from zstate.cli.console import fail, note
 from zstate.cli.documents import Document, DocumentWriter
 from zstate.cli.named_joints import Named
 from zstate.cli.plot.curves import Curves, joint_curves, path_curves
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.tap import Tap
 from zstate.cli.words import followed
 from zstate.following.recorded import check_recorded
@@ -46,7 +46,7 @@ def live_joints(session: Session, robot: str, wire: str, seconds: float) -> Curv
 def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], seconds: float) -> Curves:
     """The path of frame B in frame A for ``seconds`` from now on. Fails when no pose comes."""
     with (
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as roster,
         TransformListener(
             session,
             robot,
