@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-import time
+import threading
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
+from zstate.clock import wait_in_slices
 from zstate.closing import Closing
 from zstate.errors import MessageError, ModelError, ZStateError
 from zstate.model.urdf import parse_urdf
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from zstate.wire.wire import Arrival
 
 _MODEL_WITHIN_S = 1.5
-_LOOK_EVERY_S = 0.02
 
 
 def doubtful_edges(session: Session, publisher: StaticPublisher, edges: Sequence[Transform]) -> list[str]:
@@ -72,6 +72,7 @@ class RobotFrames(Closing):
         self._robot, self._writer = robot, writer
         self._wire = wire_named("native")
         self._model: RobotModel | None = None
+        self._described = threading.Event()
         self._statics: dict[str, frozenset[str]] = {}
         with ExitStack() as opening:
             key = self._wire.expression(robot, "tf_static")
@@ -88,6 +89,7 @@ class RobotFrames(Closing):
             for message in self._wire.decode("robot_description", arrival, self._robot):
                 if isinstance(message, RobotDescription):
                     self._model = parse_urdf(message.urdf, f"the URDF of {self._robot!r}")
+                    self._described.set()
 
     def _take_statics(self, arrival: Arrival) -> None:
         writer = self._wire.statics_writer(arrival.key) or ""
@@ -100,10 +102,8 @@ class RobotFrames(Closing):
                     self._statics[writer] = frozenset(names)
 
     def wait_for_model(self) -> None:
-        """Return when the model has arrived, or after a second or so without one."""
-        deadline = time.monotonic() + _MODEL_WITHIN_S
-        while self._model is None and time.monotonic() < deadline:
-            time.sleep(_LOOK_EVERY_S)
+        """Wait until the model has arrived, at most 1.5 s."""
+        wait_in_slices(self._described, _MODEL_WITHIN_S)
 
     def warnings(self, edges: Sequence[Transform], placed: Collection[str]) -> list[str]:
         """What is doubtful about ``edges``; frames that are ``placed`` with them exist."""

@@ -67,7 +67,7 @@ def echo_command(
     """
     from zstate.cli.document_text import Changes
     from zstate.cli.named_joints import Named
-    from zstate.cli.tap import Tap
+    from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
 
     refuse_topic(robot, wire)
@@ -75,7 +75,7 @@ def echo_command(
         session = opened.enter_context(open_session(network, (wire,)))
         heard = named_robot(session, robot, wire)
         named = opened.enter_context(Named(session, heard, wire))
-        tap = opened.enter_context(Tap(session, heard, "joint_states", wire))
+        tap = opened.enter_context(StreamReader(session, heard, "joint_states", wire))
         show = _printer(form, field, Changes(by) if changed or by else None)
         tapped = tap.first(timeout if once else None)
         show(named.document(tapped))

@@ -26,7 +26,7 @@ from zstate.cli.words import followed
 from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
-    from zstate.cli.awaited_pose import AwaitedPose
+    from zstate.cli.waiting import PoseWaiter
     from zstate.listener import TransformListener
     from zstate.transform import Transform
     from zstate.twist import Twist
@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 # So long without a newer answer is worth a word.
 _SILENCE_S = 2.0
 
-# The second sample of whoever has no velocities comes sooner.
-_SPEED_WITHIN_S = 1.0
-_LOOK_EVERY_S = 0.02
+# Without velocities a twist needs a second sample, which arrives sooner.
+_TWIST_WITHIN_S = 1.0
 
 
 def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | None:
@@ -111,7 +110,7 @@ def tf_command(
     zstate tf panda_link0 panda_hand --twist --precision 6
     zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
-    from zstate.cli.awaited_pose import AwaitedPose
+    from zstate.cli.waiting import PoseWaiter
     from zstate.listener import TransformListener
 
     ends = once or at is not None
@@ -121,16 +120,16 @@ def tf_command(
         open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
         TransformListener(session, robot, wire=wire, follow=followed(wire), clock=time_kept) as listener,
     ):
-        awaited = AwaitedPose(listener, roster, target, source)
+        awaited = PoseWaiter(listener, roster, target, source)
 
         def show(transform: Transform) -> None:
-            speed = _speed(listener, transform) if twist else None
+            velocity = _wait_for_twist(listener, transform) if twist else None
             if as_json:
-                _show_json(transform, awaited.age_s(transform), speed)
+                _show_json(transform, awaited.age_s(transform), velocity)
             else:
                 say(transform_text(transform, precision))
                 if twist:
-                    say(twist_text(speed, precision))
+                    say(twist_text(velocity, precision))
 
         if not as_json:
             say(f"pose of {source} in {target}")
@@ -140,7 +139,7 @@ def tf_command(
             _follow(awaited, rate, show)
 
 
-def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
+def _follow(awaited: PoseWaiter, rate_hz: float, show: Any) -> None:
     """Show each answer that is new. Never returns."""
     from zstate.clock import SystemClock
     from zstate.rate import Rate
@@ -157,14 +156,14 @@ def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
             note(awaited.silence())
 
 
-def _speed(listener: TransformListener, transform: Transform) -> Twist | None:
-    """How fast the source moves, soon; None where one sample without velocities does not tell."""
-    deadline = time.monotonic() + _SPEED_WITHIN_S
-    speed = _twist(listener, transform)
-    while speed is None and time.monotonic() < deadline:
-        time.sleep(_LOOK_EVERY_S)
-        speed = _twist(listener, transform)
-    return speed
+def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:
+    """The twist of the source in the target; None if it is still unknown after 1 s."""
+    from zstate.cli.waiting import Changes
+
+    changes = Changes()
+    with listener.buffer.watch(transform.target, transform.source, changes.notify):
+        changes.wait_for(lambda: _twist(listener, transform) is not None, _TWIST_WITHIN_S)
+    return _twist(listener, transform)
 
 
 def _twist(listener: TransformListener, transform: Transform) -> Twist | None:

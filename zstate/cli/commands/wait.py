@@ -68,7 +68,7 @@ def _tell(what: str, names: tuple[str, ...], began: float, reason: str | None) -
 
 
 def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.readiness import Readiness
+    from zstate.cli.waiting import RobotReadiness
     from zstate.wire.keys import check_robot
 
     for name in names:
@@ -76,7 +76,7 @@ def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s
     deadline = time.monotonic() + timeout_s
     with (
         open_session(network, (wire,), timeout_s=timeout_s) as session,
-        Readiness(session, names, wire) as readiness,
+        RobotReadiness(session, names, wire) as readiness,
     ):
         reason = readiness.wait(max(deadline - time.monotonic(), 0.0))
         if reason:
@@ -86,8 +86,8 @@ def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s
 
 
 def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.awaited_pose import AwaitedPose
     from zstate.cli.robot_directory import RobotDirectory
+    from zstate.cli.waiting import PoseWaiter
     from zstate.cli.words import followed
     from zstate.listener import TransformListener
 
@@ -98,7 +98,7 @@ def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s:
         RobotDirectory(session, "*", wire) as roster,
         TransformListener(session, wire=wire, follow=followed(wire)) as listener,
     ):
-        awaited = AwaitedPose(listener, roster, target, source)
+        awaited = PoseWaiter(listener, roster, target, source)
         awaited.answer(timeout_s=max(round(deadline - time.monotonic(), 1), 0.1))
     return f"ready: the pose of {source!r} in {target!r} is known"
 
