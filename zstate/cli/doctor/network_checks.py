@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from importlib import metadata
@@ -12,6 +11,7 @@ from zstate import __version__
 from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.network import Network
+from zstate.cli.waiting import Changes
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
@@ -21,7 +21,6 @@ from zstate.net.presence import announce, discover
 from zstate.net.refusal import accepts_tcp, check_all_tcp, check_rendezvous, check_tcp, knock
 from zstate.net.rendezvous import rendezvous_addresses
 from zstate.net.session import Session, connect
-from zstate.net.streams import StreamPublisher
 
 _MET_WITHIN_S = 1.0
 
@@ -100,18 +99,20 @@ def _host_check(session: Session) -> Check:
 
 
 def _met_at(session: Session, count: int) -> int | None:
-    """At which of the rendezvous addresses there is a lobby; who has just joined may not know yet."""
-    deadline = time.monotonic() + _MET_WITHIN_S
+    """Number of the first rendezvous address with a lobby; None if none is seen within 1 s."""
+    changes = Changes()
     with ExitStack() as opened:
-        probes = [
-            opened.enter_context(StreamPublisher(session, lobby_key(number), "")) for number in range(count)
-        ]
-        while time.monotonic() < deadline:
-            for number, probe in enumerate(probes):
-                if probe.has_readers:
-                    return number
-            time.sleep(0.02)
-    return None
+        publishers = [session.zenoh.declare_publisher(lobby_key(number)) for number in range(count)]
+        for publisher in publishers:
+            opened.callback(session.release, publisher)
+            opened.callback(session.release, publisher.declare_matching_listener(changes.notify))
+
+        def met() -> list[int]:
+            # The stub of zenoh says bool; it is an object that is always true.
+            return [number for number, one in enumerate(publishers) if one.matching_status.matching]  # pyright: ignore
+
+        changes.wait_for(met, _MET_WITHIN_S)
+        return next(iter(met()), None)
 
 
 def access_check(session: Session, network: Network, robot: str) -> Check | None:
