@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from zstate.cli.console import note
 from zstate.cli.processes import BackgroundCall
 from zstate.cli.robot_directory import announced_robots
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import words_of
 
 if TYPE_CHECKING:
@@ -40,29 +40,31 @@ def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     )
     from zstate.listener import TransformListener
 
-    changes = Changes()
+    waiter = ConditionWaiter()
     with TransformListener(session, robot) as listener:
-        listener.add_observer(changes.notify)
+        listener.add_observer(waiter.notify)
         robots = asked.result()
         if not robots:
             note(words_of("native").announced(()))
             return ()
-        _wait_for_models(listener, robots, changes)
-        _wait_for_samples(listener, robots, changes)
+        _wait_for_models(listener, robots, waiter)
+        _wait_for_samples(listener, robots, waiter)
         frames = listener.buffer.frames()
     if not frames:
         note(_NO_FRAMES)
     return frames
 
 
-def _wait_for_models(listener: TransformListener, robots: tuple[RobotInfo, ...], changes: Changes) -> None:
+def _wait_for_models(
+    listener: TransformListener, robots: tuple[RobotInfo, ...], waiter: ConditionWaiter
+) -> None:
     """Wait for all models, and for all static edges or 0.15 s without a new frame; note what is missing."""
 
     def is_complete(stable: bool) -> bool:
         has_statics = stable or _has_statics(listener.buffer.frames(), robots)
         return has_statics and not _missing(listener, robots)
 
-    changes.wait_until_stable(
+    waiter.wait_until_stable(
         lambda: len(listener.buffer.frames()), is_complete, quiet_s=QUIET_S, timeout_s=_MODELS_WITHIN_S
     )
     for text in _missing(listener, robots):
@@ -91,7 +93,9 @@ def _missing(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> list
     return missing
 
 
-def _wait_for_samples(listener: TransformListener, robots: tuple[RobotInfo, ...], changes: Changes) -> None:
+def _wait_for_samples(
+    listener: TransformListener, robots: tuple[RobotInfo, ...], waiter: ConditionWaiter
+) -> None:
     """Wait for enough samples of every published joint to measure its rate, at most 1 s."""
     published = {robot.name for robot in robots if "joint_states" in _streams(robot)}
 
@@ -99,7 +103,7 @@ def _wait_for_samples(listener: TransformListener, robots: tuple[RobotInfo, ...]
         frames = (frame for frame in listener.buffer.frames() if frame.name.partition("/")[0] in published)
         return all(frame.kind != "joint" or _tells_its_rate(frame) for frame in frames)
 
-    changes.wait_for(have_rates, _SAMPLES_WITHIN_S)
+    waiter.wait_for(have_rates, _SAMPLES_WITHIN_S)
 
 
 def _tells_its_rate(frame: FrameInfo) -> bool:

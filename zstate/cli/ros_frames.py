@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from zstate.cli.console import fail, note
 from zstate.cli.frames import QUIET_S
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -26,27 +26,27 @@ def gathered_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
     """
     from zstate.listener import TransformListener
 
-    changes = Changes()
+    waiter = ConditionWaiter()
     with (
-        RobotDirectory(session, robot, wire, changes.notify) as roster,
+        RobotDirectory(session, robot, wire, waiter.notify) as roster,
         TransformListener(session, robot, wire=wire, follow="tf") as listener,
     ):
-        listener.add_observer(changes.notify)
-        if not changes.wait_for(lambda: listener.buffer.frames() or _nodes(roster), _ANNOUNCED_WITHIN_S):
+        listener.add_observer(waiter.notify)
+        if not waiter.wait_for(lambda: listener.buffer.frames() or _nodes(roster), _ANNOUNCED_WITHIN_S):
             fail(roster.words.silence(robot, "tf", roster.robots(), ended=False))
-        for node in _silent_nodes(listener, roster, changes):
+        for node in _silent_nodes(listener, roster, waiter):
             topic = roster.words.place(robot, ("tf",))
             note(f"{node} announces {topic}, but has sent nothing for {_SPOKEN_WITHIN_S:g} s")
         return listener.buffer.frames()
 
 
-def _silent_nodes(listener: TransformListener, roster: RobotDirectory, changes: Changes) -> list[str]:
+def _silent_nodes(listener: TransformListener, roster: RobotDirectory, waiter: ConditionWaiter) -> list[str]:
     """Wait for two samples of each node and 0.15 s without a new frame; the nodes without any after 2 s."""
 
     def is_complete(stable: bool) -> bool:
         return stable and not _nodes(roster) - _writers(listener.buffer.frames(), least=2)
 
-    changes.wait_until_stable(
+    waiter.wait_until_stable(
         lambda: len(listener.buffer.frames()), is_complete, quiet_s=QUIET_S, timeout_s=_SPOKEN_WITHIN_S
     )
     return sorted(_nodes(roster) - _writers(listener.buffer.frames(), least=1))

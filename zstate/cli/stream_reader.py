@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from zstate.cli.console import fail, note
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
 from zstate.errors import MessageError
@@ -43,8 +43,8 @@ class StreamReader(Closing):
         self._wire = wire_named(wire)
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[TimedSample] = queue.SimpleQueue()
-        self._changes = Changes()
-        self._directory = RobotDirectory(session, robot, wire, self._changes.notify)
+        self._waiter = ConditionWaiter()
+        self._directory = RobotDirectory(session, robot, wire, self._waiter.notify)
         key = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, key, self._on_samples)
         self._announcements = announce_reader(session, self._wire, robot, (stream,))
@@ -63,7 +63,7 @@ class StreamReader(Closing):
                 # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
                 if self._samples.qsize() < CAPACITY:
                     self._samples.put(TimedSample(came, sample))
-        self._changes.notify()
+        self._waiter.notify()
 
     def _decode(self, arrival: Arrival) -> Sequence[Message]:
         try:
@@ -83,10 +83,10 @@ class StreamReader(Closing):
 
     def first(self, timeout_s: float | None = None) -> TimedSample:
         """The first sample. Notes what it waits for; fails after ``timeout_s``."""
-        changes = self._changes
-        if not changes.wait_for(self._samples.qsize, timeout_s, self._reason):
+        waiter = self._waiter
+        if not waiter.wait_for(self._samples.qsize, timeout_s, self._reason):
             fail(f"gave up after {timeout_s:g} s: {self._reason()}")
-        if changes.noted:
+        if waiter.noted:
             note(f"heard {self._directory.words.place(self.robot, (self._stream,))}")
         return self._samples.get_nowait()
 

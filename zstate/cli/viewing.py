@@ -15,7 +15,7 @@ import click
 from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.options import load_robot
 from zstate.cli.processes import BackgroundCall
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 from zstate.model.catalog import is_path
 from zstate.model.known import find
 from zstate.model.robot import RobotModel
@@ -190,7 +190,7 @@ def _is_there(world: World, robots: Sequence[str]) -> bool:
 
 def _wait_for(world: World, condition: Callable[[], bool], timeout_s: float) -> bool:
     """Wait until ``condition()``, on what the world shows, is true; False after ``timeout_s``."""
-    changes = Changes()
+    waiter = ConditionWaiter()
     if world.listener is not None:
-        world.listener.add_observer(changes.notify)
-    return changes.wait_for(condition, timeout_s)
+        world.listener.add_observer(waiter.notify)
+    return waiter.wait_for(condition, timeout_s)

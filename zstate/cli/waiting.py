@@ -46,8 +46,8 @@ _NOT_RECEIVED = (
 )
 
 
-class Changes:
-    """Wakes the main thread when a condition that it waits for may have changed.
+class ConditionWaiter:
+    """Wakes the waiting main thread when a condition may have become true.
 
     ``notify`` is a callback for subscriptions: any thread, any arguments. ``noted`` is the last reason that
     the latest ``wait_for`` printed, empty if it ended without.
@@ -134,11 +134,11 @@ class RobotReadiness(Closing):
         self._format = wire_named(wire)
         self._rigid: set[str] = set()
         self._listeners: dict[str, list[TransformListener]] = {}
-        self._changes = Changes()
+        self._waiter = ConditionWaiter()
         self._missing = ""
         with ExitStack() as opening:
             robot = self._robots[0] if len(self._robots) == 1 else "*"
-            directory = RobotDirectory(session, robot, wire, self._changes.notify)
+            directory = RobotDirectory(session, robot, wire, self._waiter.notify)
             self._directory = opening.enter_context(directory)
             if not is_ros(wire):
                 key = self._format.expression(robot, "robot_description")
@@ -154,7 +154,7 @@ class RobotReadiness(Closing):
 
     def wait(self, timeout_s: float) -> str:
         """Wait until all robots are ready; what is missing after ``timeout_s``, empty if nothing is."""
-        self._changes.wait_for(self._are_ready, timeout_s, lambda: self._missing)
+        self._waiter.wait_for(self._are_ready, timeout_s, lambda: self._missing)
         return self._missing
 
     def _are_ready(self) -> bool:
@@ -189,7 +189,7 @@ class RobotReadiness(Closing):
             for message in self._format.decode("robot_description", arrival, robot):
                 if isinstance(message, RobotDescription) and not message.moving_edges:
                     self._rigid.add(robot)
-                    self._changes.notify()
+                    self._waiter.notify()
 
     def _first_missing(self, streams: Collection[Stream]) -> Stream:
         """The missing stream on which the others depend."""
@@ -209,7 +209,7 @@ class RobotReadiness(Closing):
         listener = TransformListener(
             self._session, robot, wire=self._wire, follow=follow, history_on_join=False
         )
-        listener.add_observer(self._changes.notify)
+        listener.add_observer(self._waiter.notify)
         return self._opened.enter_context(listener)
 
 

@@ -116,16 +116,16 @@ def tf_command(
     ends = once or at is not None
     with (
         open_session(network, (wire,)) as session,
-        RobotDirectory(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as directory,
         open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
         TransformListener(session, robot, wire=wire, follow=followed(wire), clock=time_kept) as listener,
     ):
-        awaited = PoseWaiter(listener, roster, target, source)
+        waiter = PoseWaiter(listener, directory, target, source)
 
         def show(transform: Transform) -> None:
             velocity = _wait_for_twist(listener, transform) if twist else None
             if as_json:
-                _show_json(transform, awaited.age_s(transform), velocity)
+                _show_json(transform, waiter.age_s(transform), velocity)
             else:
                 say(transform_text(transform, precision))
                 if twist:
@@ -134,12 +134,12 @@ def tf_command(
         if not as_json:
             say(f"pose of {source} in {target}")
         if ends:
-            show(awaited.answer(at, timeout_s=timeout))
+            show(waiter.answer(at, timeout_s=timeout))
         else:
-            _follow(awaited, rate, show)
+            _follow(waiter, rate, show)
 
 
-def _follow(awaited: PoseWaiter, rate_hz: float, show: Any) -> None:
+def _follow(waiter: PoseWaiter, rate_hz: float, show: Any) -> None:
     """Show each answer that is new. Never returns."""
     from zstate.clock import SystemClock
     from zstate.rate import Rate
@@ -147,22 +147,22 @@ def _follow(awaited: PoseWaiter, rate_hz: float, show: Any) -> None:
     shown: Transform | None = None
     news_at, silent = time.monotonic(), False
     for _ in Rate(rate_hz, SystemClock(), Event()):
-        transform = awaited.answer()
+        transform = waiter.answer()
         if transform != shown:
             show(transform)
             shown, news_at, silent = transform, time.monotonic(), False
         elif not silent and transform.stamp is not None and time.monotonic() - news_at > _SILENCE_S:
             silent = True
-            note(awaited.silence())
+            note(waiter.silence())
 
 
 def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:
     """The twist of the source in the target; None if it is still unknown after 1 s."""
-    from zstate.cli.waiting import Changes
+    from zstate.cli.waiting import ConditionWaiter
 
-    changes = Changes()
-    with listener.buffer.watch(transform.target, transform.source, changes.notify):
-        changes.wait_for(lambda: _twist(listener, transform) is not None, _TWIST_WITHIN_S)
+    waiter = ConditionWaiter()
+    with listener.buffer.watch(transform.target, transform.source, waiter.notify):
+        waiter.wait_for(lambda: _twist(listener, transform) is not None, _TWIST_WITHIN_S)
     return _twist(listener, transform)
 
 

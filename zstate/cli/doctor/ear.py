@@ -8,7 +8,7 @@ from contextlib import ExitStack
 
 from zstate.cli.doctor.node_samples import NodeSamples
 from zstate.cli.doctor.samples import Samples
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.following.events import Event
@@ -135,10 +135,10 @@ class Ear(Closing):
                 self.stuck.add(writer)
 
 
-def listen(ears: Sequence[Ear], changes: Changes, timeout_s: float) -> None:
+def listen(ears: Sequence[Ear], waiter: ConditionWaiter, timeout_s: float) -> None:
     """Wait until everything announced has arrived, at least 1.2 s, at most ``timeout_s``.
 
-    ``changes`` is notified by the ears.
+    ``waiter`` is notified by the ears.
     """
     time.sleep(min(AT_LEAST_S, timeout_s))
-    changes.wait_for(lambda: not any(ear.lacks for ear in ears), timeout_s - AT_LEAST_S)
+    waiter.wait_for(lambda: not any(ear.lacks for ear in ears), timeout_s - AT_LEAST_S)

@@ -11,7 +11,7 @@ from zstate import __version__
 from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.network import Network
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
@@ -100,18 +100,18 @@ def _host_check(session: Session) -> Check:
 
 def _met_at(session: Session, count: int) -> int | None:
     """Number of the first rendezvous address with a lobby; None if none is seen within 1 s."""
-    changes = Changes()
+    waiter = ConditionWaiter()
     with ExitStack() as opened:
         publishers = [session.zenoh.declare_publisher(lobby_key(number)) for number in range(count)]
         for publisher in publishers:
             opened.callback(session.release, publisher)
-            opened.callback(session.release, publisher.declare_matching_listener(changes.notify))
+            opened.callback(session.release, publisher.declare_matching_listener(waiter.notify))
 
         def met() -> list[int]:
             # The stub of zenoh says bool; it is an object that is always true.
             return [number for number, one in enumerate(publishers) if one.matching_status.matching]  # pyright: ignore
 
-        changes.wait_for(met, _MET_WITHIN_S)
+        waiter.wait_for(met, _MET_WITHIN_S)
         return next(iter(met()), None)
 
 

@@ -12,7 +12,7 @@ from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.cli.waiting import Changes, PoseWaiter
+from zstate.cli.waiting import ConditionWaiter, PoseWaiter
 from zstate.errors import duration_text
 from zstate.listener import TransformListener
 from zstate.transform import Transform
@@ -61,9 +61,9 @@ class MonitoredEdges(Monitored):
         self._roster = roster
 
     def wait(self, timeout_s: float | None) -> None:
-        changes = Changes()
-        self._listener.add_observer(changes.notify)
-        if not changes.wait_for(self._rows, timeout_s, self._reason):
+        waiter = ConditionWaiter()
+        self._listener.add_observer(waiter.notify)
+        if not waiter.wait_for(self._rows, timeout_s, self._reason):
             fail(f"gave up after {timeout_s:g} s: {self._reason()}")
 
     def _reason(self) -> str:

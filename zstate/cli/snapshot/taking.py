@@ -12,7 +12,7 @@ from zstate import __version__
 from zstate.cli.console import fail, note
 from zstate.cli.network import Network
 from zstate.cli.snapshot.snapshot import FORMAT, Configuration, RobotShot, Snapshot, StaticShot
-from zstate.cli.waiting import Changes
+from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import words_of
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
@@ -39,9 +39,9 @@ def taken(session: Session, network: Network, robots: Sequence[str], wire: str, 
     if not wanted:
         fail(words.announced(announced))
     with ExitStack() as sitters:
-        changes = Changes()
-        sittings = [sitters.enter_context(_Sitting(session, info, wire, changes)) for info in wanted]
-        changes.wait_for(lambda: not any(sitting.lacking() for sitting in sittings), timeout_s)
+        waiter = ConditionWaiter()
+        sittings = [sitters.enter_context(_Sitting(session, info, wire, waiter)) for info in wanted]
+        waiter.wait_for(lambda: not any(sitting.lacking() for sitting in sittings), timeout_s)
         for sitting in sittings:
             for text in sitting.lacking():
                 note(f"{sitting.info.name}: {text} within {timeout_s:g} s", robot=sitting.info.name)
@@ -65,9 +65,9 @@ def taken(session: Session, network: Network, robots: Sequence[str], wire: str, 
 class _Sitting(Closing):
     """What has been heard of one robot so far."""
 
-    def __init__(self, session: Session, info: RobotInfo, wire: str, changes: Changes) -> None:
+    def __init__(self, session: Session, info: RobotInfo, wire: str, waiter: ConditionWaiter) -> None:
         self.info = info
-        self._changes = changes
+        self._waiter = waiter
         self._session = session
         self._wire_name = wire
         self._wire = wire_named(wire)
@@ -90,13 +90,13 @@ class _Sitting(Closing):
             self._source.close()
         self._model = model
         self._source = SubscribedSource(
-            self._session, model, self.info.name, wire=self._wire_name, on_readings=self._changes.notify
+            self._session, model, self.info.name, wire=self._wire_name, on_readings=self._waiter.notify
         )
-        self._changes.notify()
+        self._waiter.notify()
 
     def _take_statics(self, arrival: Arrival) -> None:
         self._insert_statics(arrival)
-        self._changes.notify()
+        self._waiter.notify()
 
     def _insert_statics(self, arrival: Arrival) -> None:
         try:
