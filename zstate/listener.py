@@ -121,7 +121,7 @@ class TransformListener(Closing):
         opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_statics)))
         key = expression(robot, self._follow)
         self._capacity = capacity_for(key)
-        opening.enter_context(StreamSubscriber(session, key, self._observed(self._on_samples)))
+        opening.enter_context(StreamSubscriber(session, key, self._on_samples))
         if self._recalls and self._wire.name == "native":
             self._past = PastReader(session, self._observed(self._on_past), self._note_broken)
             opening.enter_context(self._past)
@@ -231,6 +231,8 @@ class TransformListener(Closing):
                 self._note_foreign(arrival.key, error)
             except Exception as error:  # the samples behind it are not to blame
                 failure = error
+        for notify in self._observers:  # not by _observed(), whose call costs 0.2 us
+            notify()
         if failure is not None:
             raise failure
 
