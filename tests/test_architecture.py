@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
-    {"closing", "errors", "locks", "_kernel"},
+    {"_util", "closing", "errors", "locks", "_kernel"},
     {"checks", "extension"},
     {"clock"},
     {"se3", "rate", "facts"},

@@ -249,3 +249,14 @@ def test_a_token_that_no_writer_declares_hides_no_other(sessions, robot):
         assert measure_offsets(reader, "*")
     for token in tokens:
         token.undeclare()
+
+
+def test_observers_are_called_after_each_batch_that_was_processed(sessions):
+    writer, reader = sessions
+    seen: list[int] = []
+    with TransformListener(reader, "r1", history_on_join=False) as listener:
+        listener.add_observer(lambda: seen.append(listener.stats.received))
+        with StatePublisher(writer, RRBOT, "r1") as publisher:
+            settle(writer, "r1", "joint_states")
+            publisher.publish(np.zeros(2), stamp=STAMP)
+            until(lambda: 1 in seen)

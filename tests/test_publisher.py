@@ -66,7 +66,7 @@ def test_positions_may_come_by_name_in_any_order(sessions):
         (([0.0, NAN],), r"must be finite; not so: 'elbow' \(nan\)"),
         (([-INF, 0.0],), r"'shoulder' \(-inf\)"),
         (({"elbow": 1.0},), "missing: 'shoulder'"),
-        (({"elbow": 1.0, "shoulder": 1.0, "elbov": 1.0},), "unknown joint 'elbov', did you mean 'elbow'"),
+        (({"elbow": 1.0, "shoulder": 1.0, "elbov": 1.0},), "unknown joint 'elbov'; did you mean 'elbow'"),
         (({"elbow": 1.0, "shoulder": 1.0, "lower_to_tool": 1.0},), "'lower_to_tool' is fixed"),
         (({"elbow": NAN, "shoulder": 1.0},), "must be finite"),
         (([0.0, 0.0], [1.0]), "takes 2 velocities"),

@@ -6,7 +6,7 @@ import os
 import weakref
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
-from typing import Literal
+from typing import Literal, ParamSpec, TypeVar
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import Clock
@@ -33,6 +33,9 @@ from zstate.wire.protocol import SerializedSample
 from zstate.wire.writer import Announced
 
 Follow = Literal["joint_states", "tf"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class TransformListener(Closing):
@@ -102,6 +105,7 @@ class TransformListener(Closing):
         self._statics: dict[tuple[str, int], StaticFollower] = {}
         self._overflowed: set[Follower] = set()
         self._past: PastReader | None = None
+        self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             opening.enter_context(self._events)
             self._open(session, wire, opening)
@@ -112,19 +116,20 @@ class TransformListener(Closing):
     def _open(self, session: Session, wire: str, opening: ExitStack) -> None:
         expression, robot = self._wire.expression, self.robot
         key = expression(robot, "robot_description")
-        opening.enter_context(LatchedSubscriber(session, key, self._on_description))
+        opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_description)))
         key = expression(robot, "tf_static")
-        opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
+        opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_statics)))
         key = expression(robot, self._follow)
         self._capacity = capacity_for(key)
         opening.enter_context(StreamSubscriber(session, key, self._on_samples))
         if self._recalls and self._wire.name == "native":
-            self._past = PastReader(session, self._on_past, self._note_broken)
+            self._past = PastReader(session, self._observed(self._on_past), self._note_broken)
             opening.enter_context(self._past)
         if not self._wire.shared:
             self._clocks = opening.enter_context(WriterClocks(session, self.buffer))
         # After the subscription: who is asked for the past then has everything newer sent to us.
-        opening.enter_context(watch(session, robot, self._on_writer, wire, self._on_cut_off))
+        on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
+        opening.enter_context(watch(session, robot, on_writer, wire, on_cut_off))
         for announcement in announce_reader(session, self._wire, robot, self._heard):
             opening.enter_context(announcement)
 
@@ -157,6 +162,22 @@ class TransformListener(Closing):
         froze before it vanished has "left".
         """
         return self._events.recent()
+
+    def add_observer(self, notify: Callable[[], object]) -> None:
+        """Call ``notify()`` after each batch of messages that was processed, on its thread: keep it short."""
+        self._observers = (*self._observers, notify)
+
+    def _observed(self, handle: Callable[P, R]) -> Callable[P, R]:
+        """``handle``, followed by the calls of the observers."""
+
+        def handle_and_notify(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return handle(*args, **kwargs)
+            finally:
+                for notify in self._observers:
+                    notify()
+
+        return handle_and_notify
 
     def close(self) -> None:
         """Stop listening; the buffer keeps what it has. A second call does nothing."""
@@ -210,6 +231,8 @@ class TransformListener(Closing):
                 self._note_foreign(arrival.key, error)
             except Exception as error:  # the samples behind it are not to blame
                 failure = error
+        for notify in self._observers:  # not by _observed(), whose call costs 0.2 us
+            notify()
         if failure is not None:
             raise failure
 

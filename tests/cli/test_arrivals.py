@@ -3,12 +3,12 @@ from __future__ import annotations
 import pytest
 
 from zstate.cli.arrivals import Arrivals
-from zstate.cli.tap import Tapped
+from zstate.cli.stream_reader import TimedSample
 from zstate.wire.messages import JointState, order_digest
 
 
-def arrival(came_ms: int, seq: int, session: int = 1) -> Tapped:
-    return Tapped(came_ms * 1_000_000, JointState(0, seq, session, order_digest(()), b""))
+def arrival(came_ms: int, seq: int, session: int = 1) -> TimedSample:
+    return TimedSample(came_ms * 1_000_000, JointState(0, seq, session, order_digest(()), b""))
 
 
 def test_rate_spread_and_gaps_are_those_of_the_arrivals():

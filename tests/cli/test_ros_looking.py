@@ -145,7 +145,7 @@ def test_listen_follows_tf_and_the_joints_of_a_robot_that_is_named(spawn: Spawn,
 
 def test_a_wire_that_cannot_be_is_wrong_usage_in_its_own_words():
     message = failure("tf", "a", "b", "--wire", "ros2:domian=5", code=2)
-    assert "no option 'domian', did you mean 'domain'?" in message
+    assert "no option 'domian'; did you mean 'domain'?" in message
     assert "'native'" in failure("ls", "--wire", "ros3", code=2)
 
 

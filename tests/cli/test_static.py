@@ -7,7 +7,7 @@ from looking import Spawn, failure, interrupted, standing, started
 from support import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect
-from zstate.cli.target_frames import doubtful_edges
+from zstate.cli.frame_checks import unknown_target_warnings
 from zstate.cli.up.sections import StaticSection
 
 pytestmark = pytest.mark.processes
@@ -162,14 +162,14 @@ def test_of_what_is_known_new_or_shared_nothing_is_said(spawn: Spawn, edge: tupl
             interrupted(child)
             assert "warning" not in child.stderr
         else:
-            assert doubtful_edges(session, publisher, [transform]) == []
+            assert unknown_target_warnings(session, publisher, [transform]) == []
 
 
 def test_a_chain_of_edges_that_are_published_together_is_known():
     chain = [("lower", "mount"), ("mount", "camera"), ("camera", "lens"), ("mont", "light")]
     with standing(), connect() as session, StaticPublisher(session, "rrbot", "chain") as publisher:
         edges = [Transform(*names, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for names in chain]
-        (warning,) = doubtful_edges(session, publisher, edges)
+        (warning,) = unknown_target_warnings(session, publisher, edges)
     assert (
         warning
         == "'rrbot' has no frame 'mont': 'rrbot/light' is not joined to it (--new if it is a new frame)"
@@ -184,8 +184,8 @@ def test_a_static_frame_of_another_writer_is_known_and_has_near_misses():
         StaticPublisher(session, "fleet", "here") as here,
     ):
         site.set(Transform("map", "hall", *upright))
-        assert doubtful_edges(session, here, [Transform("hall", "gate", *upright)]) == []
-        (warning,) = doubtful_edges(session, here, [Transform("hal", "gate", *upright)])
+        assert unknown_target_warnings(session, here, [Transform("hall", "gate", *upright)]) == []
+        (warning,) = unknown_target_warnings(session, here, [Transform("hal", "gate", *upright)])
     assert warning.startswith("'fleet' has no frame 'hal'; did you mean 'hall'?")
 
 

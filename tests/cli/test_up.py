@@ -284,7 +284,7 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         ("[network]\nmode = 'client'\n", "network: mode 'client' needs connect"),
         ("[robot]\nmodel = 'panda'\n", "cell.toml:1: robot: write [[robot]]"),
         ("[[robots]]\nmodel = 'panda'\n", "robots: there is no such table; did you mean 'robot'?"),
-        (robot(model="rrbott"), "robot[0]: no robot is called 'rrbott', did you mean 'rrbot'"),
+        (robot(model="rrbott"), "robot[0]: no robot is called 'rrbott'; did you mean 'rrbot'"),
         (robot(rate=0), "robot[0]: a rate is above 0"),
         (robot() + robot(rate="fast"), "cell.toml:7: robot[1].rate: Expected `float | null`, got `str`"),
         (robot() + robot(), "robot[1]: robot[0] is called 'rrbot' already"),

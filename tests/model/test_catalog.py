@@ -67,7 +67,7 @@ def test_an_unknown_name_has_near_misses_and_says_where_was_looked():
         load_model("rrbott")
     assert caught.value.name == "rrbott"
     assert caught.value.near_misses[0] == "rrbot"
-    assert "no robot is called 'rrbott', did you mean 'rrbot'" in str(caught.value)
+    assert "no robot is called 'rrbott'; did you mean 'rrbot'" in str(caught.value)
     assert "looked in zstate (" in str(caught.value)
 
 

@@ -141,7 +141,7 @@ def test_wrong_positions_are_refused_with_what_is_wanted() -> None:
 
 
 def test_an_unknown_link_is_refused_with_a_near_miss() -> None:
-    with pytest.raises(InvalidInput, match="no link 'camera_lnk', did you mean 'camera_link'"):
+    with pytest.raises(InvalidInput, match="no link 'camera_lnk'; did you mean 'camera_link'"):
         own("rrbot").twist("camera_lnk", [0.0, 0.0], [0.0, 0.0])
     with pytest.raises(InvalidInput, match="no link 'map'"):
         own("rrbot").twist("tool", [0.0, 0.0], [0.0, 0.0], "map")

@@ -38,7 +38,7 @@ def test_an_unknown_joint_comes_with_the_missing_one_that_it_looks_like() -> Non
     first, second = model.joint_names
     with pytest.raises(InvalidInput) as caught:
         model.positions({f"{first}_joint": 0.0, second: 0.0})
-    assert f"unknown joint '{first}_joint', did you mean {first!r}?; missing: {first!r}" in str(caught.value)
+    assert f"unknown joint '{first}_joint'; did you mean {first!r}?; missing: {first!r}" in str(caught.value)
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-200, 0.9989, 1.0011, 2.0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import pstdev
 
-from zstate.cli.tap import Tapped
+from zstate.cli.stream_reader import TimedSample
 from zstate.following.bounded import remember
 
 
@@ -39,7 +39,7 @@ class Arrivals:
         self._of_all = of_all
         self._last: dict[int, int] = {}
 
-    def note(self, tapped: Tapped) -> None:
+    def note(self, tapped: TimedSample) -> None:
         """Another arrival. Several samples of one message are one."""
         session, seq = tapped.sample.session, tapped.sample.seq
         before = self._last.get(session)

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
     from zstate.rate import RateReport
 
+GRACE_S = 0.5
+"""Most waits end sooner; a longer one is mentioned."""
+
 
 def say(text: str = "") -> None:
     """One line of the result, there at once."""

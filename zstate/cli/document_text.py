@@ -7,10 +7,10 @@ import io
 import json
 import re
 from collections.abc import Iterable
-from difflib import get_close_matches
 from math import isnan
 from typing import TYPE_CHECKING, Any, cast
 
+from zstate._util.suggestions import did_you_mean
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -107,8 +107,7 @@ def field_of(document: Document, field: str) -> Any:
         if name in known:
             return known[name]
     joints = list(dict.fromkeys(name.partition(".")[2] for name in known if "." in name))
-    near = get_close_matches(field, [*known, *joints], n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(field, [*known, *joints])
     raise InvalidInput(
         f"a joint state of this robot has no field {field!r}{hint} (fields: {', '.join(document)}; "
         f"joints: {', '.join(joints) or 'without names'})"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import note
-from zstate.cli.roster import announced_robots
+from zstate.cli.processes import BackgroundCall
+from zstate.cli.robot_directory import announced_robots
+from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import words_of
-from zstate.cli.worker import Worker
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -21,8 +21,7 @@ _MODELS_WITHIN_S = 3.0
 _SAMPLES_WITHIN_S = 1.0
 # A rate that two samples tell may be far off.
 _RATE_OVER_NS = 100_000_000
-_QUIET_S = 0.15
-_LOOK_EVERY_S = 0.02
+QUIET_S = 0.15
 
 
 def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
@@ -35,37 +34,39 @@ def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     from zstate.wire.keys import ANY
 
     # Models and statics come while those who write them are asked for, which is mostly waiting.
-    asked = Worker(
+    asked = BackgroundCall(
         "zstate announced",
         lambda: discover(session) if robot == ANY else announced_robots(session, robot),
     )
     from zstate.listener import TransformListener
 
+    waiter = ConditionWaiter()
     with TransformListener(session, robot) as listener:
+        listener.add_observer(waiter.notify)
         robots = asked.result()
         if not robots:
             note(words_of("native").announced(()))
             return ()
-        _wait_for_models(listener, robots)
-        _wait_for_samples(listener, robots)
+        _wait_for_models(listener, robots, waiter)
+        _wait_for_samples(listener, robots, waiter)
         frames = listener.buffer.frames()
     if not frames:
         note(_NO_FRAMES)
     return frames
 
 
-def _wait_for_models(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> None:
-    """Until all that is announced is there, or all robots are described and nothing came for a moment."""
-    deadline = time.monotonic() + _MODELS_WITHIN_S
-    count, changed = 0, time.monotonic()
-    while (now := time.monotonic()) < deadline:
-        frames = listener.buffer.frames()
-        if len(frames) != count:
-            count, changed = len(frames), now
-        is_quiet = now - changed > _QUIET_S
-        if (is_quiet or _has_statics(frames, robots)) and not _missing(listener, robots):
-            break
-        time.sleep(_LOOK_EVERY_S)
+def _wait_for_models(
+    listener: TransformListener, robots: tuple[RobotInfo, ...], waiter: ConditionWaiter
+) -> None:
+    """Wait for all models, and for all static edges or 0.15 s without a new frame; note what is missing."""
+
+    def is_complete(stable: bool) -> bool:
+        has_statics = stable or _has_statics(listener.buffer.frames(), robots)
+        return has_statics and not _missing(listener, robots)
+
+    waiter.wait_until_stable(
+        lambda: len(listener.buffer.frames()), is_complete, quiet_s=QUIET_S, timeout_s=_MODELS_WITHIN_S
+    )
     for text in _missing(listener, robots):
         note(text)
 
@@ -92,16 +93,17 @@ def _missing(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> list
     return missing
 
 
-def _wait_for_samples(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> None:
-    """Until there are enough samples of whatever is written, or it is clear that they are slow."""
-    written = {robot.name for robot in robots if "joint_states" in _streams(robot)}
-    deadline = time.monotonic() + _SAMPLES_WITHIN_S
-    while time.monotonic() < deadline and any(
-        frame.kind == "joint" and not _tells_its_rate(frame)
-        for frame in listener.buffer.frames()
-        if frame.name.partition("/")[0] in written
-    ):
-        time.sleep(_LOOK_EVERY_S)
+def _wait_for_samples(
+    listener: TransformListener, robots: tuple[RobotInfo, ...], waiter: ConditionWaiter
+) -> None:
+    """Wait for enough samples of every published joint to measure its rate, at most 1 s."""
+    published = {robot.name for robot in robots if "joint_states" in _streams(robot)}
+
+    def have_rates() -> bool:
+        frames = (frame for frame in listener.buffer.frames() if frame.name.partition("/")[0] in published)
+        return all(frame.kind != "joint" or _tells_its_rate(frame) for frame in frames)
+
+    waiter.wait_for(have_rates, _SAMPLES_WITHIN_S)
 
 
 def _tells_its_rate(frame: FrameInfo) -> bool:

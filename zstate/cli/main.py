@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import signal
 import sys
 import threading
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from types import FrameType
@@ -15,7 +17,6 @@ from typing import TYPE_CHECKING, NoReturn
 import click
 
 from zstate.cli import logs
-from zstate.cli.help_text import HelpContext
 from zstate.errors import ZStateError
 
 if TYPE_CHECKING:
@@ -62,6 +63,52 @@ COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
 """Set by the function of a shell while it asks what to offer."""
 
 
+# Columns that click leaves free at the right.
+_MARGIN = 2
+# An example and its comment, in columns.
+_EXAMPLE = re.compile(r"( *)(\S.*?) {2,}(# .*)")
+# Options of every command that joins the network.
+_NETWORK = frozenset(
+    ("--mode", "--connect", "--listen", "--config", "--certs", "--identity", "--user", "--password-file")
+)
+
+
+class HelpFormatter(click.HelpFormatter):
+    """click's formatter with two changes.
+
+    The network options, equal for every command, get a section of their own below the other options.
+    An example stays on one line; a comment that does not fit beside it goes above.
+    """
+
+    def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
+        rows = list(rows)
+        network = [row for row in rows if row[0].split(" ")[0] in _NETWORK]
+        if len(network) < len(_NETWORK):
+            super().write_dl(rows, col_max, col_spacing)
+            return
+        super().write_dl([row for row in rows if row not in network], col_max, col_spacing)
+        self.dedent()
+        with self.section("Network, the same for every command"):
+            super().write_dl(network, col_max, col_spacing)
+        self.indent()
+
+    def getvalue(self) -> str:
+        return "\n".join(part for line in super().getvalue().split("\n") for part in self._wrap_example(line))
+
+    def _wrap_example(self, line: str) -> list[str]:
+        example = _EXAMPLE.fullmatch(line)
+        if example is None or len(line) <= self.width + _MARGIN:
+            return [line]
+        indent, command, comment = example.groups()
+        return [indent + comment, indent + command]
+
+
+class HelpContext(click.Context):
+    """The context of every command: help is written by ``HelpFormatter``."""
+
+    formatter_class = HelpFormatter
+
+
 class Commands(click.Group):
     """The commands; ``--help`` imports none of them."""
 
@@ -78,9 +125,9 @@ class Commands(click.Group):
         if logs.log_format_option not in command.params:
             command.params.append(logs.log_format_option)
         if COMPLETION_VARIABLE in os.environ:
-            from zstate.cli.completing import taught
+            from zstate.cli.completion import with_completion
 
-            return taught(command)
+            return with_completion(command)
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
@@ -136,7 +183,7 @@ def group(ctx: click.Context, until_eof: bool) -> None:
     # The name under which others see what this process writes.
     sys.argv[0] = f"zstate-{ctx.invoked_subcommand}"
     if until_eof:
-        from zstate.cli.children import end_with_parent
+        from zstate.cli.processes import end_with_parent
 
         end_with_parent()
 

@@ -10,7 +10,7 @@ from zstate.cli.console import note
 
 if TYPE_CHECKING:
     from zstate.bridge import Bridge
-    from zstate.cli.roster import Roster
+    from zstate.cli.robot_directory import RobotDirectory
     from zstate.metrics.address import Address
     from zstate.metrics.library import Collector
     from zstate.metrics.listening import Listened
@@ -57,7 +57,7 @@ def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], Co
     return make
 
 
-def of_writers(roster: Roster) -> Callable[[], Collector]:
+def of_writers(roster: RobotDirectory) -> Callable[[], Collector]:
     """Who writes."""
 
     def make() -> Collector:

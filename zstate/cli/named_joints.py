@@ -16,7 +16,7 @@ from zstate.wire.messages import JointState, RobotDescription
 from zstate.wire.protocol import SerializedSample
 
 if TYPE_CHECKING:
-    from zstate.cli.tap import Tapped
+    from zstate.cli.stream_reader import TimedSample
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
 
@@ -56,7 +56,7 @@ class Named(Closing):
         self._writer.describe(description)
         self._described.set()
 
-    def document(self, tapped: Tapped) -> Document:
+    def document(self, tapped: TimedSample) -> Document:
         """What a sample says, with the names of its joints if they can be known."""
         assert isinstance(tapped.sample, JointState)
         if not self._writer.knows(tapped.sample) and not self._warned:

@@ -86,11 +86,11 @@ def _connect_to_ros(network: Network, timeout_s: float | None) -> Session:
 
 
 def _connect(network: Network, timeout_s: float | None) -> Session:
-    from zstate.cli.worker import Worker
+    from zstate.cli.processes import BackgroundCall
     from zstate.net.session import connect
 
     # In a thread of its own: a signal ends the wait for it, which Zenoh's would not.
-    worker = Worker(
+    worker = BackgroundCall(
         "zstate connect",
         lambda: connect(
             network.config,
@@ -108,11 +108,11 @@ def _connect(network: Network, timeout_s: float | None) -> Session:
 
 
 def _explained(error: Unreachable) -> Unreachable:
-    from zstate.cli.probe import unanswered
+    from zstate.net.refusal import check_all_tcp  # loads ssl, which few need
 
     if not error.endpoints:
         return error
-    text, then = unanswered(error.endpoints)
+    text, then = check_all_tcp(error.endpoints)
     options = "".join(f" --connect {endpoint}" for endpoint in error.endpoints)
     advice = (
         f"try `{then.partition('  #')[0]}`, or `zstate doctor{options}`"

@@ -1,26 +1,143 @@
-"""What commands have in common: how they join the network, and how numbers are given."""
+"""Options that several commands share: session, credentials, clock, wire, rates and durations."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+import os
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from zstate.cli.identity import identity_options, plain_identity_options
+from zstate.cli.console import GRACE_S, note
 from zstate.cli.network import Network
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, NoClock
 
 if TYPE_CHECKING:
+    from zstate.clock import Clock
     from zstate.metrics.address import Address
     from zstate.model.robot import RobotModel
     from zstate.net.security import Credentials
     from zstate.net.session import Session
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+PASSWORD_VARIABLE = "ZSTATE_PASSWORD"
+
+_IDENTITY_OPTIONS = (
+    click.option(
+        "--certs",
+        type=click.Path(exists=True, file_okay=False),
+        metavar="DIR",
+        envvar="ZSTATE_CERTS",
+        help="Encrypt, with the ca.pem, NAME.pem and NAME.key of this folder (`zstate certs` makes such).",
+    ),
+    click.option(
+        "--identity",
+        metavar="NAME",
+        envvar="ZSTATE_IDENTITY",
+        help="Which certificate of --certs to show; access control knows this command by it.",
+    ),
+    click.option(
+        "--user",
+        metavar="NAME",
+        envvar="ZSTATE_USER",
+        help=f"For a router that asks; its password is in {PASSWORD_VARIABLE}, or in --password-file.",
+    ),
+    click.option(
+        "--password-file",
+        type=click.Path(exists=True, dir_okay=False),
+        metavar="FILE",
+        envvar="ZSTATE_PASSWORD_FILE",
+        help="A file that only you can read; its first line is the password of --user.",
+    ),
+)
+_USERS = click.option(
+    "--users",
+    type=click.Path(exists=True, dir_okay=False),
+    metavar="FILE",
+    envvar="ZSTATE_USERS",
+    help="Who may connect: user:password lines, in a file that only you can read; default: everybody.",
+)
+
+
+def identity_options(command: Command) -> Command:
+    """Add the credential options to a command, which receives ``credentials``."""
+    return _with_credentials(command, _IDENTITY_OPTIONS)
+
+
+def router_identity_options(command: Command) -> Command:
+    """The same, with ``--users``."""
+    return _with_credentials(command, (*_IDENTITY_OPTIONS, _USERS))
+
+
+def plain_identity_options(command: Command) -> Command:
+    """The same options, passed on unchanged."""
+    return _with_options(command, _IDENTITY_OPTIONS)
+
+
+def _with_credentials(command: Command, options: Sequence[Callable[[Any], Any]]) -> Command:
+    @functools.wraps(command)
+    def with_credentials(
+        *,
+        certs: str | None,
+        identity: str | None,
+        user: str | None,
+        password_file: str | None,
+        users: str | None = None,
+        **others: Any,
+    ) -> Any:
+        credentials = credentials_of(certs, identity, user, password_file, users)
+        return command(credentials=credentials, **others)
+
+    return _with_options(with_credentials, options)
+
+
+def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def credentials_of(
+    certs: str | None,
+    identity: str | None,
+    user: str | None,
+    password_file: str | None,
+    users: str | None,
+) -> Credentials | None:
+    """Credentials of these options. Raises UsageError for half a pair, ConfigError for unusable files."""
+    if (certs is None) != (identity is None):
+        given, lacking = ("--certs", "--identity NAME") if identity is None else ("--identity", "--certs DIR")
+        raise click.UsageError(f"{given} is of no use without {lacking}")
+    if password_file is not None and user is None:
+        raise click.UsageError("--password-file is of no use without --user NAME")
+    if certs is None and user is None and users is None:
+        return None
+    from zstate.net.security import Credentials
+
+    password = None if user is None else _password(user, password_file)
+    if certs is None or identity is None:
+        return Credentials(user=user, password=password, users=users)
+    return Credentials.from_folder(certs, identity, user=user, password=password, users=users)
+
+
+def _password(user: str, file: str | None) -> str:
+    # Never on the command line, which every user of the machine can read.
+    if file is None:
+        password = os.environ.get(PASSWORD_VARIABLE)
+        if not password:
+            raise click.UsageError(
+                f"the password of {user!r} is missing; put it into {PASSWORD_VARIABLE} or a --password-file"
+            )
+        return password
+    from zstate.net.credential_files import password_in
+
+    return password_in(file)
 
 
 def session_options(command: Command) -> Command:
@@ -178,7 +295,7 @@ def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Co
 
 def named_robot(session: Session, robot: str | None, wire: str) -> str:
     """The robot that a command was given, or the only one there is or that ``wire`` can mean."""
-    from zstate.cli.roster import only_robot
+    from zstate.cli.robot_directory import only_robot
     from zstate.cli.words import is_ros, words_of
 
     meant = robot or words_of(wire).robot
@@ -303,3 +420,29 @@ heard_robot_option = click.option(
 name_option = click.option(
     "--name", metavar="NAME", help="The robot's name on the network; default: as it is called here."
 )
+
+
+@contextmanager
+def open_clock(
+    session: Session, kind: str | None, wire: str, *, timeout_s: float | None = None
+) -> Generator[Clock | None]:
+    """The clock that ``--clock`` selects; None if the option was not given.
+
+    A simulated clock subscribes on ``wire`` and is yielded once it has received its first message.
+    Raises NoClock if none arrives within ``timeout_s``.
+    """
+    from zstate.clock import SYSTEM, SystemClock, stamp_text  # loads numpy, which helps do without
+
+    if kind is None or kind == SYSTEM:
+        yield None if kind is None else SystemClock()
+        return
+    from zstate.nodes.clock import SimulatedClock
+
+    with SimulatedClock(session, wire) as clock:
+        try:
+            clock.wait(GRACE_S if timeout_s is None else min(timeout_s, GRACE_S))
+        except NoClock:
+            note(f"waiting for the simulated time on {clock.key} ...")
+            clock.wait(timeout_s)
+            note(f"heard {clock.key}: it is {stamp_text(clock.now())}")
+        yield clock

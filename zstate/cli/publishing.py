@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from zstate.cli.console import report_text, say_fitted
-from zstate.cli.worker import Worker
+from zstate.cli.processes import BackgroundCall
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources.source import JointSource
 
@@ -13,7 +13,7 @@ def run(publisher: StatePublisher, source: JointSource, rate_hz: float, seconds:
 
     The signal interrupts this thread, which only waits, so that the publisher's loop ends in order.
     """
-    worker = Worker("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
+    worker = BackgroundCall("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
     try:
         report = worker.result()
     except SystemExit:

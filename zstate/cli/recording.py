@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import count_text
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
     from zstate.recorder import Recorder, RecorderStats
@@ -37,7 +37,7 @@ def files_text(files: Sequence[Path]) -> str:
 class Progress:
     """A recording under way: what is recorded, how fast, and what it waits for."""
 
-    def __init__(self, recorder: Recorder, roster: Roster, robots: Sequence[str]) -> None:
+    def __init__(self, recorder: Recorder, roster: RobotDirectory, robots: Sequence[str]) -> None:
         self._recorder = recorder
         self._roster = roster
         self._robots = robots

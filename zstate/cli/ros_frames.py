@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import fail, note
-from zstate.cli.roster import Roster
+from zstate.cli.frames import QUIET_S
+from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.waiting import ConditionWaiter
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
 # Nodes that publish transforms do so at 1 Hz at least; those that go on saying nothing are named.
 _SPOKEN_WITHIN_S = 2.0
 _ANNOUNCED_WITHIN_S = 1.0
-_QUIET_S = 0.15
-_LOOK_EVERY_S = 0.02
 
 
 def gathered_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameInfo, ...]:
@@ -27,42 +26,33 @@ def gathered_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
     """
     from zstate.listener import TransformListener
 
+    waiter = ConditionWaiter()
     with (
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire, waiter.notify) as roster,
         TransformListener(session, robot, wire=wire, follow="tf") as listener,
     ):
-        if not _somebody_is_there(listener, roster):
+        listener.add_observer(waiter.notify)
+        if not waiter.wait_for(lambda: listener.buffer.frames() or _nodes(roster), _ANNOUNCED_WITHIN_S):
             fail(roster.words.silence(robot, "tf", roster.robots(), ended=False))
-        for node in _silent_nodes(listener, roster):
+        for node in _silent_nodes(listener, roster, waiter):
             topic = roster.words.place(robot, ("tf",))
             note(f"{node} announces {topic}, but has sent nothing for {_SPOKEN_WITHIN_S:g} s")
         return listener.buffer.frames()
 
 
-def _somebody_is_there(listener: TransformListener, roster: Roster) -> bool:
-    deadline = time.monotonic() + _ANNOUNCED_WITHIN_S
-    while time.monotonic() < deadline:
-        if listener.buffer.frames() or _nodes(roster):
-            return True
-        time.sleep(_LOOK_EVERY_S)
-    return False
+def _silent_nodes(listener: TransformListener, roster: RobotDirectory, waiter: ConditionWaiter) -> list[str]:
+    """Wait for two samples of each node and 0.15 s without a new frame; the nodes without any after 2 s."""
 
+    def is_complete(stable: bool) -> bool:
+        return stable and not _nodes(roster) - _writers(listener.buffer.frames(), least=2)
 
-def _silent_nodes(listener: TransformListener, roster: Roster) -> list[str]:
-    """Wait until all nodes have spoken twice and nothing is new; who had not, when it took too long."""
-    deadline = time.monotonic() + _SPOKEN_WITHIN_S
-    count, changed = 0, time.monotonic()
-    while (now := time.monotonic()) < deadline:
-        frames = listener.buffer.frames()
-        if len(frames) != count:
-            count, changed = len(frames), now
-        if now - changed > _QUIET_S and not _nodes(roster) - _writers(frames, least=2):
-            break
-        time.sleep(_LOOK_EVERY_S)
+    waiter.wait_until_stable(
+        lambda: len(listener.buffer.frames()), is_complete, quiet_s=QUIET_S, timeout_s=_SPOKEN_WITHIN_S
+    )
     return sorted(_nodes(roster) - _writers(listener.buffer.frames(), least=1))
 
 
-def _nodes(roster: Roster) -> set[str]:
+def _nodes(roster: RobotDirectory) -> set[str]:
     """Who publishes transforms that move."""
     said = (pair for info in roster.robots() for pair in info.writers)
     return {str(writer) for stream, writer in said if stream == "tf"}

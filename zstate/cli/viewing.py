@@ -14,7 +14,8 @@ import click
 
 from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.options import load_robot
-from zstate.cli.worker import Worker
+from zstate.cli.processes import BackgroundCall
+from zstate.cli.waiting import ConditionWaiter
 from zstate.model.catalog import is_path
 from zstate.model.known import find
 from zstate.model.robot import RobotModel
@@ -96,16 +97,16 @@ def chosen_sliders(session: Session, named: Sequence[Named], wire: str) -> Itera
 
 def _announced_model(session: Session, robot: str, wire: str) -> RobotModel:
     with World(session, (robot,), wire=wire) as world:
-        if not _until(lambda: robot in world.models, _ANNOUNCED_WITHIN_S):
+        if not _wait_for(world, lambda: robot in world.models, _ANNOUNCED_WITHIN_S):
             fail(f"{robot!r} is announced, but not what it looks like; `zstate doctor {robot}` says more")
         return world.models[robot]
 
 
 @contextmanager
-def running(view: View) -> Generator[Worker[None]]:
+def running(view: View) -> Generator[BackgroundCall[None]]:
     """The view at work, until this is left."""
     stop = threading.Event()
-    worker = Worker("zstate view", lambda: view.run(stop))
+    worker = BackgroundCall("zstate view", lambda: view.run(stop))
     try:
         yield worker
     finally:
@@ -134,15 +135,17 @@ def take_snapshot(
     fixed_frame: str = "",
 ) -> None:
     """Write one picture, once the robots are there, and name those that are in it, and not, and why."""
-    if not _until(lambda: _is_there(world, robots), _ANNOUNCED_WITHIN_S):
+    if not _wait_for(world, lambda: _is_there(world, robots), _ANNOUNCED_WITHIN_S):
         there = ", ".join(map(repr, world.robots())) or "none"
         whom = " and ".join(map(repr, robots)) or "any robot"
         fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {whom}; robots that were heard: {there}")
-    if fixed_frame and not _until(lambda: fixed_frame in world.moment().tree.index, _ANNOUNCED_WITHIN_S):
+    if fixed_frame and not _wait_for(
+        world, lambda: fixed_frame in world.moment().tree.index, _ANNOUNCED_WITHIN_S
+    ):
         world.moment().tree.row(fixed_frame)  # raises, with near misses
     if not robots and world.session is not None:
         time.sleep(_OTHERS_WITHIN_S)
-    _until(lambda: not world.moment().reasons, _SAMPLES_WITHIN_S)
+    _wait_for(world, lambda: not world.moment().reasons, _SAMPLES_WITHIN_S)
     width, height = size
     take_picture(page, path, width=width, height=height, hold=view.hold)
     sights = view.sights()
@@ -185,10 +188,9 @@ def _is_there(world: World, robots: Sequence[str]) -> bool:
     return all(robot in models for robot in robots) if robots else bool(models)
 
 
-def _until(condition: Callable[[], bool], timeout_s: float) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
+def _wait_for(world: World, condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Wait until ``condition()``, on what the world shows, is true; False after ``timeout_s``."""
+    waiter = ConditionWaiter()
+    if world.listener is not None:
+        world.listener.add_observer(waiter.notify)
+    return waiter.wait_for(condition, timeout_s)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.console import count_text
-from zstate.cli.probe import silent_rendezvous
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -93,16 +92,16 @@ class NativeWords:
     def announced(self, robots: Sequence[RobotInfo]) -> str:
         if not robots:
             from zstate.model.known import example_name
+            from zstate.net.refusal import check_rendezvous  # loads ssl, which few need
 
             start = f"start one, for instance with `zstate publish {example_name()} --source sine`"
-            silent = silent_rendezvous()
+            silent = check_rendezvous()
             advice = f"{silent.text}; `zstate doctor` says more" if silent else start
             return f"no robot is announced; {advice}"
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
 
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:
-        near = get_close_matches(robot, [info.name for info in robots], n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(robot, [info.name for info in robots])
         return f"nobody announces the robot {robot!r}{hint} ({self.announced(robots)})"
 
     def silence(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, cast
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from zstate import __version__, kernel
+from zstate._util.endpoint import format_host
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, PortBusy
 from zstate.metrics.address import LOCAL
@@ -53,8 +54,7 @@ class MetricsEndpoint(Closing):
         # Its types leave the arguments of the application out.
         make = cast("Callable[[CollectorRegistry], WSGIApplication]", exposition.make_wsgi_app)  # pyright: ignore
         self._server.set_app(make(registry))
-        shown = f"[{host}]" if ":" in host else host
-        self.url = f"http://{shown}:{self._server.server_port}/metrics"
+        self.url = f"http://{format_host(host)}:{self._server.server_port}/metrics"
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(_POLL_S,), name="zstate metrics", daemon=True
         )

@@ -69,11 +69,6 @@ class Findings:
             raise ModelError(self.source, self.sorted())
 
 
-def did_you_mean(near: str | None) -> str:
-    """``; did you mean 'x'?``, or nothing for no near miss."""
-    return "" if near is None else f"; did you mean {near!r}?"
-
-
 def quoted(text: str) -> str:
     """``text`` in quotes, shortened where a file holds something endless."""
     return repr(shortened(text))

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Final
 
-from zstate.model.findings import Findings, did_you_mean, quoted, shortened
+from zstate._util.suggestions import suggestion_text
+from zstate.model.findings import Findings, quoted, shortened
 from zstate.model.numbers import NumberFault, read_number, read_numbers
 from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic
 from zstate.model.xml import Element
@@ -69,7 +70,7 @@ class JointReader:
             near, message = None, f"{label} has no type; one of {', '.join(POSITION_COUNTS)}"
         else:
             near = self._findings.near_miss(given, POSITION_COUNTS)
-            choice = did_you_mean(near) or _choices(POSITION_COUNTS)
+            choice = suggestion_text(near) or _choices(POSITION_COUNTS)
             message = f"{label} has the unknown type {quoted(given)}{choice}"
         self._findings.error(element.line, message, f'type="{near or "revolute"}"')
         return "fixed"
@@ -88,7 +89,7 @@ class JointReader:
             return ""
         if link not in self._links:
             near = self._findings.near_miss(link, self._links)
-            message = f"{label}: its {tag} {quoted(link)} is not a link{did_you_mean(near)}"
+            message = f"{label}: its {tag} {quoted(link)} is not a link{suggestion_text(near)}"
             fix = (
                 f'<link name="{shortened(link)}"/> in <robot>' if near is None else f'<{tag} link="{near}"/>'
             )

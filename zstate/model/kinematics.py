@@ -8,13 +8,13 @@ or text: its model is built joint by joint from the RobotModel, depth first as i
 from __future__ import annotations
 
 from collections import defaultdict
-from difflib import get_close_matches
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.suggestions import did_you_mean
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.locks import new_lock
 from zstate.model.edges import EdgeForm, EdgeTable, Floats
@@ -82,8 +82,7 @@ class Kinematics:
 
     def _row(self, link: str) -> int:
         if link not in self.model.links:
-            near = get_close_matches(link, self.model.links, n=1)
-            hint = f", did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(link, self.model.links)
             raise InvalidInput(f"{self.model.name!r} has no link {link!r}{hint}")
         return self.model.links.index(link)
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib import metadata, util
 from pathlib import Path
 
+from zstate._util.suggestions import suggestion_text
 from zstate.errors import UnknownModel
 from zstate.model.findings import quoted
 
@@ -87,17 +88,13 @@ def package_folders() -> tuple[Path, ...]:
 def _unknown(name: str, wanted: str) -> UnknownModel:
     entries = catalog()
     near = get_close_matches(wanted[:100], [entry.name for entry in entries], n=3)
-    parts = [f"no robot is called {quoted(name)}{_did_you_mean(near)}"]
+    parts = [f"no robot is called {quoted(name)}{suggestion_text(*near)}"]
     counts = {origin: sum(entry.origin == origin for entry in entries) for origin in _COLLECTIONS}
     looked = ", ".join(f"{origin} ({count} names)" for origin, count in counts.items())
     parts.append(f"looked in {looked}; a path to a file works as well")
     if not counts["example-robot-data"]:
         parts.append("for many more robots, pip install 'zstate[robots]'")
     return UnknownModel(name, near, "; ".join(parts))
-
-
-def _did_you_mean(near: Sequence[str]) -> str:
-    return f", did you mean {' or '.join(repr(name) for name in near)}?" if near else ""
 
 
 def _own() -> dict[str, Path]:

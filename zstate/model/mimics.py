@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from zstate.model.findings import Findings, did_you_mean, quoted
+from zstate._util.suggestions import suggestion_text
+from zstate.model.findings import Findings, quoted
 from zstate.model.robot import POSITION_COUNTS, Joint
 
 MAX_CHAIN = 100
@@ -27,7 +28,8 @@ def _check_master(findings: Findings, joint: Joint, name: str, by_name: Mapping[
     if master is None:
         near = findings.near_miss(name, (other for other in by_name if other != joint.name))
         fix = _FOLLOW if near is None else f'<mimic joint="{near}"/>'
-        findings.error(joint.line, f"{label} {quoted(name)}, which does not exist{did_you_mean(near)}", fix)
+        message = f"{label} {quoted(name)}, which does not exist{suggestion_text(near)}"
+        findings.error(joint.line, message, fix)
     elif master is joint:
         findings.error(joint.line, f"{label} itself", _FOLLOW)
     elif POSITION_COUNTS[master.type] != 1:

@@ -32,6 +32,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.suggestions import suggestion_text
 from zstate.checks import real_numbers
 from zstate.errors import Found, InvalidInput
 
@@ -259,7 +260,7 @@ class RobotModel:
             kind = "fixed" if joint.mimic is None else f"a mimic of {joint.mimic.joint!r}"
             return f"{name!r} is {kind} and takes no position"
         near = near_joint(name, missing) or near_joint(name, self.joint_names)
-        return f"unknown joint {name!r}" + (f", did you mean {near!r}?" if near else "")
+        return f"unknown joint {name!r}{suggestion_text(near)}"
 
 
 def near_joint(name: object, known: Sequence[str]) -> str | None:

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from zstate.model.findings import Finding, Findings, did_you_mean, quoted
+from zstate._util.suggestions import suggestion_text
+from zstate.model.findings import Finding, Findings, quoted
 from zstate.model.numbers import NumberFault, read_number, read_numbers
 from zstate.model.robot import RobotModel
 from zstate.model.xml import Element, read_document
@@ -139,7 +140,7 @@ class _Reader:
             return self._materials[name]
         if next(_defined(materials[:1]), None) is not None:
             return self._material(materials[0])
-        near = did_you_mean(self.findings.near_miss(name, self._materials))
+        near = suggestion_text(self.findings.near_miss(name, self._materials))
         message = f"link {quoted(link)}: the material {quoted(name)} is defined nowhere{near}"
         self.findings.warning(materials[0].line, message, '<color rgba="0.7 0.7 0.7 1"/> inside it')
         return Material()

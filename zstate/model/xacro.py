@@ -9,11 +9,11 @@ import os
 from collections import Counter
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from zstate._util.suggestions import did_you_mean
 from zstate.errors import ModelError
 from zstate.model.findings import Finding
 
@@ -88,8 +88,7 @@ def _findings(warnings: Counter[str], mappings: _Arguments, args: Mapping[str, s
         yield Finding(None, f"xacro: {' '.join(text.split())}{times}", "warning")
     for name in args:
         if name not in mappings.used:
-            near = get_close_matches(name, list(mappings.used), n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(name, mappings.used)
             yield Finding(None, f"the xacro argument {name!r} is not used by the file{hint}", "warning")
 
 

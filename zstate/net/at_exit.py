@@ -37,7 +37,6 @@ from zstate.net.forked import forked_text
 WITHIN_S = 1.5
 THREAD_NAME = "zstate exit"
 
-_LOOK_EVERY_S = 0.005
 _MOMENT_S = 0.02
 _USERS_END_WITHIN_S = 0.5
 
@@ -68,6 +67,8 @@ class _Process:
         self._leaving: list[Callable[[], None]] = []
         self._requested = threading.Event()
         self._done = threading.Event()
+        self._none_opening = threading.Event()
+        self._none_opening.set()
         self._thread: threading.Thread | None = None
 
     @contextmanager
@@ -83,11 +84,14 @@ class _Process:
                 self._thread.start()
             self.zenoh_started_in = os.getpid()
             self.opening += 1
+            self._none_opening.clear()
         try:
             yield
         finally:
             with self._lock:
                 self.opening -= 1
+                if not self.opening:
+                    self._none_opening.set()
 
     def end(self, leave: Callable[[], None] | None = None) -> None:
         if leave is not None:
@@ -111,8 +115,7 @@ class _Process:
         deadline = time.monotonic() + WITHIN_S
         for leave in (*self._leaving, *(session.leave for session in tuple(self.sessions))):
             leave()
-        while self.opening and time.monotonic() < deadline:
-            time.sleep(_LOOK_EVERY_S)
+        self._none_opening.wait(max(0.0, deadline - time.monotonic()))
         for session in tuple(self.sessions):  # what was just being opened
             session.leave()
         for thread in threading.enumerate():

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias
 
 import zenoh
 
+from zstate._util.endpoint import parse_endpoint, parse_host_port
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.security import Credentials
 
@@ -67,7 +68,6 @@ directly; the router passes on what is said between peers and clients.
 
 _ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
 _LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
-_HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})")
 
 
 def endpoint_list(endpoints: str | Sequence[str]) -> tuple[str, ...]:
@@ -82,8 +82,7 @@ def _check_endpoint(endpoint: str) -> str:
         raise InvalidInput(f"{endpoint!r} is not an endpoint; {_advice(endpoint)}")
     address = re.split(r"[?#]", rest, maxsplit=1)[0]
     if protocol in _ADDRESSED:
-        match = _HOST_PORT.fullmatch(address)
-        if not match or int(match[2]) > 65535:
+        if parse_endpoint(endpoint) is None:
             raise InvalidInput(f"{endpoint!r} does not say host and port; {_advice(address, protocol)}")
     elif not address:
         raise InvalidInput(f"{endpoint!r} has no address after {protocol + '/'!r}")
@@ -91,7 +90,7 @@ def _check_endpoint(endpoint: str) -> str:
 
 
 def _advice(address: str, protocol: str = "tcp") -> str:
-    if _HOST_PORT.fullmatch(address) and int(address.rpartition(":")[2]) <= 65535:
+    if parse_host_port(address):
         return f"write '{protocol}/{address}'"
     if re.fullmatch(r"[\w.-]+", address):
         return f"write '{protocol}/{address}:7447'"

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
-import re
 import socket
 from collections.abc import Iterable, Sequence
 from typing import get_args
 
+from zstate._util.endpoint import parse_endpoint
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import ANY_LOOPBACK_PORT, ROUTER_ENDPOINT, Mode
 from zstate.net.security import Credentials
 
 _WITHIN_A_HOST = ("unixsock-stream/", "unixpipe/")
-_HOST = re.compile(r"\w+/\[?(?P<host>[^\]/?#]+)\]?:\d+.*")
 
 
 def check_mode(mode: str) -> Mode:
@@ -49,8 +48,8 @@ def check_stays_here(endpoints: Iterable[str]) -> None:
 
 
 def _is_loopback(endpoint: str) -> bool:
-    match = _HOST.fullmatch(endpoint)
-    host = match["host"] if match else ""
+    parsed = parse_endpoint(endpoint)
+    host = parsed.host if parsed else ""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

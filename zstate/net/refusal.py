@@ -1,22 +1,30 @@
-"""Why a router let nobody in. Zenoh says of all reasons the same: unable to connect."""
+"""Explains why an endpoint does not accept a session, with plain sockets.
+
+Zenoh reports "unable to connect" for every reason: no route, refused port, TLS, certificate or user.
+"""
 
 from __future__ import annotations
 
-import re
 import socket
 import ssl
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from textwrap import shorten
+from typing import NamedTuple
 
+from zstate._util.endpoint import parse_endpoint
 from zstate.errors import AccessDenied, NetworkError, Unreachable
 from zstate.net.credential_files import trusting
+from zstate.net.rendezvous import silent_addresses
 from zstate.net.security import Credentials
 
 ANSWERS_WITHIN_S = 2.0
 
 _REFUSES_WITHIN_S = 1.0  # judged is our certificate after our part of the handshake is over
-_ADDRESS = re.compile(r"(?P<protocol>tcp|tls)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
+_CONNECTS_WITHIN_S = 1.0  # check_tcp
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +84,22 @@ def knock(endpoints: Sequence[str], credentials: Credentials | None) -> Answers:
 
 def _knock(endpoint: str, credentials: Credentials | None) -> Refusal | None:
     """What the one behind ``endpoint`` objects to; None where nobody is, or where it cannot be asked."""
-    match = _ADDRESS.match(endpoint)
-    if match is None:
+    parsed = parse_endpoint(endpoint)
+    if parsed is None or parsed.protocol not in ("tcp", "tls"):
         return None
+    address = (parsed.host, parsed.port)
     try:
-        with socket.create_connection((match["host"], int(match["port"])), ANSWERS_WITHIN_S) as link:
-            if match["protocol"] == "tls":
-                refusal = _greet(link, match["host"], credentials)
+        with socket.create_connection(address, ANSWERS_WITHIN_S) as link:
+            if parsed.protocol == "tls":
+                refusal = _greet(link, parsed.host, credentials)
             elif credentials is not None and credentials.ca is not None:
                 refusal = _SPEAKS_NO_TLS  # found by multicast; ours would not speak to it
             else:
                 refusal = _SPEAKS_TLS if _speaks_tls(link) else _of_user(credentials)
     except (OSError, UnicodeError):
         return None
-    presumes_plain = refusal is _SPEAKS_NO_TLS or (match["protocol"] == "tcp" and refusal is not _SPEAKS_TLS)
-    if presumes_plain and not _answers_plainly((match["host"], int(match["port"]))):
+    presumes_plain = refusal is _SPEAKS_NO_TLS or (parsed.protocol == "tcp" and refusal is not _SPEAKS_TLS)
+    if presumes_plain and not _answers_plainly(address):
         return SILENT
     return refusal
 
@@ -246,3 +255,86 @@ def _of_user(credentials: Credentials | None) -> Refusal:
         f"the user {credentials.user!r} or the password is not what it knows; check its --users file (a "
         "router that has none refuses whoever names a user)",
     )
+
+
+class Unreachability(NamedTuple):
+    """Why no TCP connection is established, and the command to run next."""
+
+    text: str
+    next: str
+
+
+def check_tcp(endpoint: str) -> Unreachability | None:
+    """Why ``endpoint`` accepts no TCP connection; None if it does, or if it is not reached by TCP."""
+    address = _tcp_address(endpoint)
+    if address is None:
+        return None
+    host, port = address
+    try:
+        socket.create_connection(address, _CONNECTS_WITHIN_S).close()
+    except socket.gaierror:
+        return Unreachability(f"the name {host!r} is not known here", f"getent hosts {host}")
+    except ConnectionRefusedError:
+        text = "connection refused: the host is there, and nobody listens at that port"
+        if host == "localhost" or host.startswith(("127.", "::1")):
+            return Unreachability(text, f"zstate router --listen {endpoint}")
+        protocol = endpoint.partition("/")[0]
+        return Unreachability(text, f"zstate router --listen {protocol}/0.0.0.0:{port}  # on {host}")
+    except TimeoutError:
+        text = f"no answer within {_CONNECTS_WITHIN_S:g} s: is the host switched on, and no firewall between?"
+    except (OSError, UnicodeError) as error:
+        text = (getattr(error, "strerror", None) or str(error)).lower()
+    else:
+        return None
+    return Unreachability(text, f"ping -c 3 {host}")
+
+
+def accepts_tcp(endpoint: str) -> bool:
+    """Whether any program accepts TCP connections at ``endpoint``."""
+    return _tcp_address(endpoint) is not None and check_tcp(endpoint) is None
+
+
+def check_all_tcp(endpoints: Sequence[str]) -> Unreachability:
+    """Why no session was opened at any of ``endpoints``, and the command for the first that explains it."""
+    found = {endpoint: check_tcp(endpoint) for endpoint in endpoints}
+    # Where a TCP connection is accepted, the session was not.
+    accepted = {endpoint: SILENT.text if _tcp_address(endpoint) else "no answer" for endpoint in endpoints}
+    reasons = [f"{endpoint!r} ({why.text if why else accepted[endpoint]})" for endpoint, why in found.items()]
+    then = next((why.next for why in found.values() if why), "")
+    return Unreachability(f"nothing answers at {' or '.join(reasons)}", then)
+
+
+def _tcp_address(endpoint: str) -> tuple[str, int] | None:
+    parsed = parse_endpoint(endpoint)
+    return (parsed.host, parsed.port) if parsed and parsed.protocol in ("tcp", "tls", "ws") else None
+
+
+def check_rendezvous() -> Unreachability | None:
+    """Which program blocks the rendezvous port of this host; None if none does."""
+    for host, port in silent_addresses():
+        met = f"programs of this host meet at {host}:{port}, and"
+        holder = _holder(port)
+        if holder is None:
+            text = f"{met} whoever has that port does not answer: it is another program, or a stopped one"
+            return Unreachability(text, f"ss -ltnp 'sport = :{port}'  # who is it?")
+        pid, command, is_stopped = holder
+        met += f" process {pid} ({command}), which has that port, does not answer:"
+        if is_stopped:
+            text = f"{met} it is stopped, as by Ctrl-Z; continue it (`fg`), or end it"
+            return Unreachability(text, f"kill -CONT {pid}")
+        return Unreachability(f"{met} it is another program, or one of zstate that hangs", f"ps -fp {pid}")
+    return None
+
+
+def _holder(port: int) -> tuple[int, str, bool] | None:
+    """Id and command of the process that listens at ``port``, and whether it is stopped; Linux only."""
+    with suppress(OSError):
+        rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+        listening = {f"socket:[{row[9]}]" for row in rows if row[3] == "0A" and int(row[1][-4:], 16) == port}
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # of another user, or gone
+                if listening.intersection(str(link.readlink()) for link in process.glob("fd/*")):
+                    command = process.joinpath("cmdline").read_text().replace("\0", " ").strip()
+                    state = process.joinpath("stat").read_text().rpartition(")")[2].split()[0]
+                    return int(process.name), shorten(command, 60), state in "Tt"
+    return None

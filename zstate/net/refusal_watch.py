@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import secrets
 import socket
 import threading
@@ -16,6 +15,7 @@ from contextlib import suppress
 
 import zenoh
 
+from zstate._util.endpoint import Endpoint, parse_endpoint
 from zstate.closing import Closing
 from zstate.errors import Closed
 from zstate.net.at_exit import join_at_exit
@@ -34,10 +34,6 @@ _BYPASS = (
     "the router; peers send over direct links, and get nothing from each other without. Connect as "
     "a client: mode='client' (--mode client)"
 )
-_ADDRESS = re.compile(r"(?P<protocol>tcp|tls)/\[?(?P<host>[^\]?#]+)\]?:(?P<port>\d+)")
-
-Address = tuple[str, str, int]
-"""Protocol, IP address and port."""
 
 
 class RefusalWatch(Closing):
@@ -91,7 +87,7 @@ class RefusalWatch(Closing):
             self._may_bypass = False
             _LOG.warning(_BYPASS, " and ".join(map(repr, self._endpoints)), extra={"event": "bypass"})
         links = {_addresses(str(link.dst)) for link in self._session.info.links()}
-        linked = frozenset[Address]().union(*links)
+        linked = frozenset[Endpoint]().union(*links)
         if linked and not self._needs_all:
             self._settled.clear()
             return
@@ -147,15 +143,14 @@ class RefusalWatch(Closing):
         return True
 
 
-def _addresses(endpoint: str) -> frozenset[Address]:
+def _addresses(endpoint: str) -> frozenset[Endpoint]:
     """All that the host of ``endpoint`` stands for; none where that is not known, or not by TCP."""
-    match = _ADDRESS.match(endpoint)
-    if match is None:
+    parsed = parse_endpoint(endpoint)
+    if parsed is None or parsed.protocol not in ("tcp", "tls"):
         return frozenset()
     try:
-        found = socket.getaddrinfo(match["host"], int(match["port"]), type=socket.SOCK_STREAM)
+        found = socket.getaddrinfo(parsed.host, parsed.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return frozenset()
-    return frozenset(
-        (match["protocol"], str(info[4][0]).removeprefix("::ffff:"), int(match["port"])) for info in found
-    )
+    hosts = {str(info[4][0]).removeprefix("::ffff:") for info in found}
+    return frozenset(Endpoint(parsed.protocol, host, parsed.port) for host in hosts)

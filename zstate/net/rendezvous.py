@@ -16,7 +16,6 @@ answers, they are introduced there, and so meet the process that was stopped.
 from __future__ import annotations
 
 import os
-import re
 import socket
 import threading
 import time
@@ -25,6 +24,7 @@ from contextlib import suppress
 
 import zenoh
 
+from zstate._util.endpoint import parse_host_port
 from zstate.errors import Closed, ConfigError
 from zstate.locks import new_lock, outlive_fork
 from zstate.net.at_exit import join_at_exit
@@ -38,7 +38,6 @@ JOIN_WITHIN_S = 0.3
 
 _MET_WITHIN_S = 3.0
 _ROUND_S = 0.002
-_HOST_PORT = re.compile(r"([\w.-]+):([1-9]\d{0,4})")
 
 
 def rendezvous_addresses() -> tuple[tuple[str, int], ...]:
@@ -47,9 +46,10 @@ def rendezvous_addresses() -> tuple[tuple[str, int], ...]:
     Those of ``ZSTATE_RENDEZVOUS``, with blanks between, if that is set; else 127.0.0.1:7450, 7451, 7452.
     """
     text = os.environ.get(RENDEZVOUS_VARIABLE) or RENDEZVOUS
-    matches = [_HOST_PORT.fullmatch(address) for address in text.split()]
-    addresses = tuple((match[1], int(match[2])) for match in matches if match and int(match[2]) <= 65535)
-    if not matches or len(addresses) < len(matches):
+    parsed = [parse_host_port(address) for address in text.split()]
+    # IPv6 is not supported here, and port 0 is not a place to meet.
+    addresses = tuple(address for address in parsed if address and address[1] and ":" not in address[0])
+    if not parsed or len(addresses) < len(parsed):
         raise ConfigError(
             f"{RENDEZVOUS_VARIABLE} is {text!r}; write 'host:port', for instance '127.0.0.1:7450', or "
             "several with blanks between",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
@@ -30,11 +30,18 @@ class SubscribedSource(Closing):
     """The ``joint_states`` of ``robot``, as they come in: ``for reading in source: ...``
 
     ``read`` gives the newest one that has not been read. Iteration ends with ``close()``. Samples that
-    cannot be used are counted in ``refused``, by reason; the first of each is also logged.
+    cannot be used are counted in ``refused``, by reason; the first of each is also logged. ``on_readings()``
+    is called, from one thread, after each batch of samples.
     """
 
     def __init__(
-        self, session: Session, model: RobotModel, robot: str | None = None, *, wire: str = "native"
+        self,
+        session: Session,
+        model: RobotModel,
+        robot: str | None = None,
+        *,
+        wire: str = "native",
+        on_readings: Callable[[], object] | None = None,
     ) -> None:
         self.refused: dict[str, int] = {}
         self._states = StateReader(model)
@@ -43,6 +50,7 @@ class SubscribedSource(Closing):
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
         self._changed = threading.Condition()
         self._closed = False
+        self._on_readings = on_readings
         key = self._wire.expression(self._robot, "joint_states")
         self._subscriber = StreamSubscriber(session, key, self._take)
         self._announcements = announce_reader(session, self._wire, self._robot, ["joint_states"])
@@ -53,6 +61,8 @@ class SubscribedSource(Closing):
         with self._changed:
             self._readings.extend(readings)
             self._changed.notify_all()
+        if self._on_readings is not None:
+            self._on_readings()
 
     def _decode(self, arrival: SerializedSample) -> Sequence[Message]:
         try:

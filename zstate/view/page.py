@@ -16,6 +16,7 @@ import viser
 import websockets.asyncio.server
 from websockets.http11 import Request, Response
 
+from zstate._util.endpoint import format_host
 from zstate.closing import Closing
 from zstate.errors import InvalidInput
 from zstate.view.door import Door, is_websocket
@@ -161,7 +162,7 @@ def _named(host: str) -> str:
     """What others call this host."""
     if host in ("", "0.0.0.0", "::"):
         return socket.gethostname()
-    return f"[{host}]" if ":" in host else host
+    return format_host(host)
 
 
 @contextlib.contextmanager

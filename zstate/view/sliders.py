@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from datetime import datetime
-from difflib import get_close_matches
 
 import numpy as np
 
+from zstate._util.suggestions import did_you_mean
 from zstate.clock import Clock
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, SecondWriter
@@ -153,9 +153,7 @@ class Sliders(Closing):
         """
         names = [dial.name for dial in self.dials.dials]
         if name not in names:
-            near = get_close_matches(name, names, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise InvalidInput(f"{self.robot!r} has no slider {name!r}{hint}")
+            raise InvalidInput(f"{self.robot!r} has no slider {name!r}{did_you_mean(name, names)}")
         dial = self.dials.dials[names.index(name)]
         if not dial.lower <= value <= dial.upper:
             raise InvalidInput(

@@ -27,7 +27,7 @@ def test_every_option_can_be_written():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("namepsace=r1", "has no option 'namepsace', did you mean 'namespace'? known: domain, namespace,"),
+        ("namepsace=r1", "has no option 'namepsace'; did you mean 'namespace'? known: domain, namespace,"),
         ("colour=red", "has no option 'colour'; known: domain, namespace, frame_prefix, tf, hash, node"),
         ("domain", "'domain' is not written as key=value"),
         ("tf=global,tf=global", "'tf' is given twice"),

@@ -86,12 +86,12 @@ def _announced(session: Session) -> Sequence[str] | None:
 
 
 def _ros_session(endpoint: str) -> Session:
-    from zstate.cli.worker import Worker
+    from zstate.cli.processes import BackgroundCall
     from zstate.net.session import connect
 
     try:
         # In a thread of its own: a signal ends the wait for it.
-        return Worker("zstate connect", lambda: connect(mode="client", endpoints=endpoint)).result()
+        return BackgroundCall("zstate connect", lambda: connect(mode="client", endpoints=endpoint)).result()
     except Unreachable:
         fail(
             f"nothing answers at {endpoint!r}, where the router of the ROS 2 nodes should be; start one "

@@ -50,7 +50,7 @@ def demo_command(
     xacro arguments. Where panda is not installed, the default is rrbot, which comes with zstate. The two
     processes meet on a port of their own and disturb nobody.
     """
-    from zstate.cli.children import ChildCommand
+    from zstate.cli.processes import ChildProcess
 
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"which robot, {robot!r} or {robot_option!r}?")
@@ -62,7 +62,7 @@ def demo_command(
     ended = threading.Event()
     words = [f"{name}:={value}" for name, value in xacro_args.items()]
     arguments = ["publish", wanted, *words, "--source", "sine", "--name", called, "--rate", repr(rate)]
-    with ChildCommand(
+    with ChildProcess(
         "publisher", [*arguments, "--connect", endpoint], on_end=lambda _: ended.set()
     ) as publisher:
         size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"

@@ -67,22 +67,22 @@ def echo_command(
     """
     from zstate.cli.document_text import Changes
     from zstate.cli.named_joints import Named
-    from zstate.cli.tap import Tap
+    from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
 
     refuse_topic(robot, wire)
     with ExitStack() as opened:
         session = opened.enter_context(open_session(network, (wire,)))
-        heard = named_robot(session, robot, wire)
-        named = opened.enter_context(Named(session, heard, wire))
-        tap = opened.enter_context(Tap(session, heard, "joint_states", wire))
+        name = named_robot(session, robot, wire)
+        named = opened.enter_context(Named(session, name, wire))
+        reader = opened.enter_context(StreamReader(session, name, "joint_states", wire))
         show = _printer(form, field, Changes(by) if changed or by else None)
-        tapped = tap.first(timeout if once else None)
-        show(named.document(tapped))
+        sample = reader.first(timeout if once else None)
+        show(named.document(sample))
         while not once:
-            tapped = tap.next(LONGEST_WAIT_S)
-            if tapped is not None:
-                show(named.document(tapped))
+            sample = reader.next(LONGEST_WAIT_S)
+            if sample is not None:
+                show(named.document(sample))
 
 
 def _with_nulls(value: Any) -> Any:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
 import click
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.console import fail, note, say, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
@@ -53,8 +53,7 @@ def graph_command(network: Network, robot: str, form: str | None, wire: str) -> 
 def _of_robot(graph: Graph, robot: str) -> Graph:
     streams = tuple(one for one in graph.streams if one.robot in (robot, "*"))
     if not streams:
-        near = get_close_matches(robot, {one.robot for one in graph.streams}, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(robot, {one.robot for one in graph.streams})
         fail(f"nobody writes or reads anything of {robot!r}{hint}")
     return replace(graph, streams=streams)
 

@@ -23,7 +23,7 @@ from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
     from zstate.cli.arrivals import Arrivals, Intervals
-    from zstate.cli.tap import Tap
+    from zstate.cli.stream_reader import StreamReader
     from zstate.wire.keys import Stream
 
 _SETTLING_S = 0.1
@@ -70,12 +70,12 @@ def hz_command(
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
     from zstate.cli.arrivals import Arrivals
-    from zstate.cli.tap import Tap
+    from zstate.cli.stream_reader import StreamReader
 
     refuse_topic(robot, wire)
     with ExitStack() as opened:
         session = opened.enter_context(open_session(network, (wire,)))
-        tap = opened.enter_context(Tap(session, named_robot(session, robot, wire), stream, wire))
+        tap = opened.enter_context(StreamReader(session, named_robot(session, robot, wire), stream, wire))
         arrivals = Arrivals(window, of_all=is_ros(wire))
         if once:
             _show(_measured_once(tap, arrivals, timeout), as_json=as_json)
@@ -83,7 +83,7 @@ def hz_command(
             _follow(tap, arrivals, as_json=as_json)
 
 
-def _begin(tap: Tap, timeout_s: float | None) -> None:
+def _begin(tap: StreamReader, timeout_s: float | None) -> None:
     """Wait for samples, and let those pass that queued up while this process was starting."""
     from zstate.cli.arrivals import Arrivals
 
@@ -91,7 +91,7 @@ def _begin(tap: Tap, timeout_s: float | None) -> None:
     _listen(tap, Arrivals(2), _SETTLING_S)
 
 
-def _measured_once(tap: Tap, arrivals: Arrivals, timeout_s: float) -> Intervals:
+def _measured_once(tap: StreamReader, arrivals: Arrivals, timeout_s: float) -> Intervals:
     _begin(tap, timeout_s)
     deadline = time.monotonic() + timeout_s
     measured = None
@@ -103,7 +103,7 @@ def _measured_once(tap: Tap, arrivals: Arrivals, timeout_s: float) -> Intervals:
     return measured
 
 
-def _follow(tap: Tap, arrivals: Arrivals, *, as_json: bool) -> NoReturn:
+def _follow(tap: StreamReader, arrivals: Arrivals, *, as_json: bool) -> NoReturn:
     _begin(tap, None)
     silent = False
     while True:
@@ -116,7 +116,7 @@ def _follow(tap: Tap, arrivals: Arrivals, *, as_json: bool) -> NoReturn:
         silent = not came
 
 
-def _listen(tap: Tap, arrivals: Arrivals, seconds: float) -> int:
+def _listen(tap: StreamReader, arrivals: Arrivals, seconds: float) -> int:
     """Note what comes within ``seconds``; how many samples that were."""
     deadline, count = time.monotonic() + seconds, 0
     while (left_s := deadline - time.monotonic()) > 0.0:

@@ -14,6 +14,7 @@ from zstate.cli.options import (
     load_robot,
     metrics_option,
     name_option,
+    open_clock,
     rate_option,
     seconds_option,
     session_options,
@@ -61,7 +62,6 @@ def joints_command(
     zstate joints arm.urdf --rate 500 --seconds 10
     zstate joints panda --wire ros2                    # /joint_states, for a robot_state_publisher
     """
-    from zstate.cli.clocks import open_clock
     from zstate.cli.publishing import run
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource

@@ -13,8 +13,15 @@ import click
 from zstate.cli.console import note, say_fitted, say_json
 from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import json_option, metrics_option, reading_clock_option, session_options, wire_option
-from zstate.cli.roster import Roster
+from zstate.cli.options import (
+    json_option,
+    metrics_option,
+    open_clock,
+    reading_clock_option,
+    session_options,
+    wire_option,
+)
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
 from zstate.errors import duration_text
@@ -62,13 +69,12 @@ def listen_command(
     zstate listen panda --json
     zstate listen --wire ros2:domain=5
     """
-    from zstate.cli.clocks import open_clock
     from zstate.clock import SystemClock
     from zstate.rate import Rate
 
     with (
         open_session(network, (wire,)) as session,
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as roster,
         open_clock(session, clock, wire) as time,
         Ears(session, roster, robot, wire, time) as ears,
         served(metrics, of_listeners(ears.listeners), of_writers(roster)),
@@ -104,7 +110,9 @@ class Ear:
 class Ears(Closing):
     """Listens to the robots that are wanted and announced: one listener for all that follow one stream."""
 
-    def __init__(self, session: Session, roster: Roster, robot: str, wire: str, clock: Clock | None) -> None:
+    def __init__(
+        self, session: Session, roster: RobotDirectory, robot: str, wire: str, clock: Clock | None
+    ) -> None:
         from zstate.wire.keys import ANY, check_robot
 
         self._wanted = robot

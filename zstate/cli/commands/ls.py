@@ -98,13 +98,13 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
 
 
 def _watch_robots(session: Session, sampler: Sampler, *, as_json: bool) -> NoReturn:
+    from zstate.cli.robot_directory import RobotDirectory
     from zstate.cli.robot_list import robots_facts, robots_text
-    from zstate.cli.roster import Roster
 
     def text(robots: tuple[RobotInfo, ...], width: int | None) -> str:
         return robots_text(robots, sampler, width=width) if robots else roster.words.announced(robots)
 
-    with Roster(session) as roster:
+    with RobotDirectory(session) as roster:
         time.sleep(_MEETING_S)
         if as_json:
             _repeat_json(lambda: robots_facts(roster.robots(), sampler))

@@ -12,12 +12,13 @@ from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     heard_robot_option,
     json_option,
+    open_clock,
     reading_clock_option,
     session_options,
     timeout_option,
     wire_option,
 )
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed
 
 if TYPE_CHECKING:
@@ -62,7 +63,6 @@ def monitor_command(
     zstate monitor map r1/base_link --once --json | jq '.edges[] | {child, rate_hz}'
     zstate monitor odom base_link --wire ros2
     """
-    from zstate.cli.clocks import open_clock
     from zstate.cli.monitor.meter import PathMeter
     from zstate.cli.monitor.monitored import MonitoredEdges, MonitoredPose
     from zstate.clock import SystemClock
@@ -74,7 +74,7 @@ def monitor_command(
     follow = followed(wire)
     with (
         open_session(network, (wire,)) as session,
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as roster,
         open_clock(session, clock, wire, timeout_s=timeout if once else None) as kept,
         TransformListener(
             session, robot, wire=wire, follow=follow, clock=kept, history_on_join=False

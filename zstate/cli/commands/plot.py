@@ -11,7 +11,7 @@ import click
 from zstate.cli.console import count_text, fail, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, wire_option
-from zstate.cli.roster import only_robot
+from zstate.cli.robot_directory import only_robot
 from zstate.cli.words import words_of
 
 if TYPE_CHECKING:

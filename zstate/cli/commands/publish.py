@@ -17,6 +17,7 @@ from zstate.cli.options import (
     load_robot,
     metrics_option,
     name_option,
+    open_clock,
     seconds_option,
     session_options,
     takeover_option,
@@ -106,7 +107,6 @@ def publish_command(
     zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
-    from zstate.cli.clocks import open_clock
     from zstate.cli.publishing import run
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource

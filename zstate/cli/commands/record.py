@@ -12,7 +12,7 @@ from zstate.cli.console import fail, is_terminal, note, say_fitted
 from zstate.cli.metrics import of_recorder, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
     from zstate.cli.recording import Progress
@@ -96,13 +96,13 @@ def record_command(
             fail(str(error).replace("overwrite=True", "--overwrite"))
         with (
             recorder,
-            Roster(session, robots[0] if len(robots) == 1 else "*", wire) as roster,
+            RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as roster,
             served(metrics, of_recorder(recorder), of_writers(roster)),
         ):
             _run(recorder, roster, robots, duration)
 
 
-def _run(recorder: Recorder, roster: Roster, robots: tuple[str, ...], duration: float | None) -> None:
+def _run(recorder: Recorder, roster: RobotDirectory, robots: tuple[str, ...], duration: float | None) -> None:
     from zstate.cli.recording import Progress
 
     progress = Progress(recorder, roster, robots)

@@ -13,7 +13,7 @@ from zstate.cli.options import checked_seconds, session_options, takeover_option
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from zstate.cli.worker import Worker
+    from zstate.cli.processes import BackgroundCall
     from zstate.replayer import Replayer, ReplayReport
 
 _LINE_S = 1.0
@@ -102,10 +102,10 @@ def replay_command(
 
 
 def _run(replayer: Replayer) -> None:
+    from zstate.cli.processes import BackgroundCall
     from zstate.cli.replaying import report_text
-    from zstate.cli.worker import Worker
 
-    worker = Worker("zstate replay", replayer.run)
+    worker = BackgroundCall("zstate replay", replayer.run)
     try:
         report = _show(replayer, worker)
     except SystemExit:
@@ -117,7 +117,7 @@ def _run(replayer: Replayer) -> None:
         fail("no sample was published; `zstate info` shows what the file holds")
 
 
-def _show(replayer: Replayer, worker: Worker[ReplayReport]) -> ReplayReport:
+def _show(replayer: Replayer, worker: BackgroundCall[ReplayReport]) -> ReplayReport:
     """Until it has ended."""
     from zstate.cli.replaying import progress_line
 
@@ -134,7 +134,7 @@ def _show(replayer: Replayer, worker: Worker[ReplayReport]) -> ReplayReport:
     return report
 
 
-def _result(worker: Worker[ReplayReport], timeout_s: float) -> ReplayReport | None:
+def _result(worker: BackgroundCall[ReplayReport], timeout_s: float) -> ReplayReport | None:
     with suppress(TimeoutError):
         return worker.result(timeout_s)
     return None

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.console import fail, note, say, say_fitted
-from zstate.cli.identity import router_identity_options
 from zstate.cli.metrics import of_connections, of_writers, served
 from zstate.cli.network import Network, open_session
-from zstate.cli.options import config_option, metrics_option
-from zstate.cli.roster import Roster
+from zstate.cli.options import config_option, metrics_option, router_identity_options
+from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
     from zstate.metrics.address import Address
@@ -171,7 +170,7 @@ def _run(network: Network, listen: tuple[str, ...], metrics: Address | None, fil
 
     with (
         open_session(network) as session,
-        Roster(session) as roster,
+        RobotDirectory(session) as roster,
         served(metrics, of_connections(session), of_writers(roster)),
     ):
         say_fitted(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")

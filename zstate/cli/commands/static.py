@@ -89,7 +89,7 @@ def static_command(
     zstate static panda_hand camera --file handeye.yaml            # with frames called otherwise
     zstate static base_link laser --xyz 0.2 0 0.1 --wire ros2      # on /tf_static
     """
-    from zstate.cli.target_frames import doubtful_edges
+    from zstate.cli.frame_checks import unknown_target_warnings
     from zstate.clock import wait_in_slices
     from zstate.nodes.static_publisher import StaticPublisher
 
@@ -116,7 +116,7 @@ def static_command(
             if "native" in wires and not new:
                 published.append((publisher, owned))
         for publisher, owned in published:
-            for text in doubtful_edges(session, publisher, owned):
+            for text in unknown_target_warnings(session, publisher, owned):
                 note(f"warning: {text}", event="warning", robot=publisher.robot)
         wait_in_slices(threading.Event())
 

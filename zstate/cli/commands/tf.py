@@ -15,17 +15,18 @@ from zstate.cli.options import (
     checked_rate,
     heard_robot_option,
     json_option,
+    open_clock,
     reading_clock_option,
     session_options,
     timeout_option,
     wire_option,
 )
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed
 from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
-    from zstate.cli.awaited_pose import AwaitedPose
+    from zstate.cli.waiting import PoseWaiter
     from zstate.listener import TransformListener
     from zstate.transform import Transform
     from zstate.twist import Twist
@@ -33,9 +34,8 @@ if TYPE_CHECKING:
 # So long without a newer answer is worth a word.
 _SILENCE_S = 2.0
 
-# The second sample of whoever has no velocities comes sooner.
-_SPEED_WITHIN_S = 1.0
-_LOOK_EVERY_S = 0.02
+# Without velocities a twist needs a second sample, which arrives sooner.
+_TWIST_WITHIN_S = 1.0
 
 
 def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | None:
@@ -110,37 +110,36 @@ def tf_command(
     zstate tf panda_link0 panda_hand --twist --precision 6
     zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
-    from zstate.cli.awaited_pose import AwaitedPose
-    from zstate.cli.clocks import open_clock
+    from zstate.cli.waiting import PoseWaiter
     from zstate.listener import TransformListener
 
     ends = once or at is not None
     with (
         open_session(network, (wire,)) as session,
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as directory,
         open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
         TransformListener(session, robot, wire=wire, follow=followed(wire), clock=time_kept) as listener,
     ):
-        awaited = AwaitedPose(listener, roster, target, source)
+        waiter = PoseWaiter(listener, directory, target, source)
 
         def show(transform: Transform) -> None:
-            speed = _speed(listener, transform) if twist else None
+            velocity = _wait_for_twist(listener, transform) if twist else None
             if as_json:
-                _show_json(transform, awaited.age_s(transform), speed)
+                _show_json(transform, waiter.age_s(transform), velocity)
             else:
                 say(transform_text(transform, precision))
                 if twist:
-                    say(twist_text(speed, precision))
+                    say(twist_text(velocity, precision))
 
         if not as_json:
             say(f"pose of {source} in {target}")
         if ends:
-            show(awaited.answer(at, timeout_s=timeout))
+            show(waiter.answer(at, timeout_s=timeout))
         else:
-            _follow(awaited, rate, show)
+            _follow(waiter, rate, show)
 
 
-def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
+def _follow(waiter: PoseWaiter, rate_hz: float, show: Any) -> None:
     """Show each answer that is new. Never returns."""
     from zstate.clock import SystemClock
     from zstate.rate import Rate
@@ -148,23 +147,23 @@ def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
     shown: Transform | None = None
     news_at, silent = time.monotonic(), False
     for _ in Rate(rate_hz, SystemClock(), Event()):
-        transform = awaited.answer()
+        transform = waiter.answer()
         if transform != shown:
             show(transform)
             shown, news_at, silent = transform, time.monotonic(), False
         elif not silent and transform.stamp is not None and time.monotonic() - news_at > _SILENCE_S:
             silent = True
-            note(awaited.silence())
+            note(waiter.silence())
 
 
-def _speed(listener: TransformListener, transform: Transform) -> Twist | None:
-    """How fast the source moves, soon; None where one sample without velocities does not tell."""
-    deadline = time.monotonic() + _SPEED_WITHIN_S
-    speed = _twist(listener, transform)
-    while speed is None and time.monotonic() < deadline:
-        time.sleep(_LOOK_EVERY_S)
-        speed = _twist(listener, transform)
-    return speed
+def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:
+    """The twist of the source in the target; None if it is still unknown after 1 s."""
+    from zstate.cli.waiting import ConditionWaiter
+
+    waiter = ConditionWaiter()
+    with listener.buffer.watch(transform.target, transform.source, waiter.notify):
+        waiter.wait_for(lambda: _twist(listener, transform) is not None, _TWIST_WITHIN_S)
+    return _twist(listener, transform)
 
 
 def _twist(listener: TransformListener, transform: Transform) -> Twist | None:

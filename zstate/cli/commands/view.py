@@ -14,6 +14,7 @@ from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
     named_models,
+    open_clock,
     reading_clock_option,
     session_options,
     wire_option,
@@ -135,7 +136,6 @@ def view_command(
     """
     import_module("zstate.view.library")  # told before anything is heard when it is missing
 
-    from zstate.cli.clocks import open_clock
     from zstate.cli.viewing import (
         chosen_sliders,
         folders_of,

@@ -1,4 +1,4 @@
-"""zstate wait: until a robot, a pose or a router is there."""
+"""zstate wait: wait until a robot, a pose or a router is available."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say, say_json
+from zstate.cli.console import GRACE_S, count_text, fail, note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, timeout_option, wire_option
 from zstate.errors import Unreachable, ZStateError
-
-_GRACE_S = 0.5
 
 
 @click.command("wait")
@@ -39,20 +37,20 @@ def wait_command(
     """
     _check_count(what, names)
     began = time.monotonic()
-    ways = {"robot": _await_robots, "frame": _await_frame, "router": _await_router}
+    waits = {"robot": _wait_for_robots, "frame": _wait_for_pose, "router": _wait_for_router}
     try:
-        told = ways[what](network, names, wire, timeout)
+        text = waits[what](network, names, wire, timeout)
     except click.UsageError:
         raise
     except (ZStateError, click.ClickException) as failure:
         if not as_json:
             raise
-        _tell(what, names, began, str(failure))
+        _print_outcome(what, names, began, str(failure))
         raise SystemExit(1) from None
     if as_json:
-        _tell(what, names, began, None)
+        _print_outcome(what, names, began, None)
     else:
-        say(told)
+        say(text)
 
 
 def _check_count(what: str, names: tuple[str, ...]) -> None:
@@ -62,13 +60,13 @@ def _check_count(what: str, names: tuple[str, ...]) -> None:
         raise click.UsageError("a pose has two frames: `zstate wait frame A B` waits for that of B in A")
 
 
-def _tell(what: str, names: tuple[str, ...], began: float, reason: str | None) -> None:
+def _print_outcome(what: str, names: tuple[str, ...], began: float, reason: str | None) -> None:
     waited_s = round(time.monotonic() - began, 3)
     say_json({"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason})
 
 
-def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.readiness import Readiness
+def _wait_for_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.waiting import RobotReadiness
     from zstate.wire.keys import check_robot
 
     for name in names:
@@ -76,7 +74,7 @@ def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s
     deadline = time.monotonic() + timeout_s
     with (
         open_session(network, (wire,), timeout_s=timeout_s) as session,
-        Readiness(session, names, wire) as readiness,
+        RobotReadiness(session, names, wire) as readiness,
     ):
         reason = readiness.wait(max(deadline - time.monotonic(), 0.0))
         if reason:
@@ -85,9 +83,9 @@ def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s
         return f"ready: {', '.join(ready)}"
 
 
-def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.awaited_pose import AwaitedPose
-    from zstate.cli.roster import Roster
+def _wait_for_pose(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.robot_directory import RobotDirectory
+    from zstate.cli.waiting import PoseWaiter
     from zstate.cli.words import followed
     from zstate.listener import TransformListener
 
@@ -95,32 +93,33 @@ def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s:
     deadline = time.monotonic() + timeout_s
     with (
         open_session(network, (wire,), timeout_s=timeout_s) as session,
-        Roster(session, "*", wire) as roster,
+        RobotDirectory(session, "*", wire) as directory,
         TransformListener(session, wire=wire, follow=followed(wire)) as listener,
     ):
-        awaited = AwaitedPose(listener, roster, target, source)
-        awaited.answer(timeout_s=max(round(deadline - time.monotonic(), 1), 0.1))
+        PoseWaiter(listener, directory, target, source).answer(
+            timeout_s=max(round(deadline - time.monotonic(), 1), 0.1)
+        )
     return f"ready: the pose of {source!r} in {target!r} is known"
 
 
-def _await_router(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
-    from zstate.cli.worker import Worker
+def _wait_for_router(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.processes import BackgroundCall
     from zstate.net.config import ROUTER_ENDPOINT
 
     endpoints = names or network.connect or (() if network.is_given else (ROUTER_ENDPOINT,))
     client = replace(network, mode="client", connect=endpoints)
     where = " or ".join(map(repr, endpoints)) or "the configured endpoints"
 
-    def join() -> None:
+    def connect() -> None:
         with open_session(client, timeout_s=timeout_s):
             pass
 
-    worker = Worker("zstate wait", join)
+    call = BackgroundCall("zstate wait", connect)
     try:
-        worker.result(min(_GRACE_S, timeout_s))
+        call.result(min(GRACE_S, timeout_s))
     except Unreachable:
         raise
     except TimeoutError:
         note(f"waiting: nobody answers at {where} yet", event="waiting")
-        worker.result()
+        call.result()
     return f"ready: the router at {where}"

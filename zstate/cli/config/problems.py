@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from difflib import get_close_matches
 
 import click
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.config.settings import network_of
-from zstate.cli.identity import PASSWORD_VARIABLE
 from zstate.cli.logs import FORMAT_VARIABLE, FORMATS
+from zstate.cli.options import PASSWORD_VARIABLE
 from zstate.errors import ZStateError
 from zstate.extension import VARIABLE as KERNEL_VARIABLE
 from zstate.net.config import CONFIG_VARIABLE, endpoint_list
@@ -66,9 +66,7 @@ def _unread(context: click.Context) -> Iterator[str]:
     known = {*_VARIABLES, *(str(one.envvar) for one in context.command.params if one.envvar)}
     for variable in sorted(os.environ):
         if variable.startswith(_PREFIX) and variable not in known and not _is_of_command(context, variable):
-            near = get_close_matches(variable, known, n=1)
-            hint = f"; did you mean {near[0]}?" if near else ""
-            yield f"nothing reads {variable}{hint}"
+            yield f"nothing reads {variable}{did_you_mean(variable, known)}"
 
 
 def _is_of_command(context: click.Context, variable: str) -> bool:

@@ -11,9 +11,9 @@ from typing import Any, cast
 import click
 
 from zstate.cli.config.setting import Setting, of_option, of_variable
-from zstate.cli.identity import PASSWORD_VARIABLE, credentials_of
 from zstate.cli.logs import FORMAT_VARIABLE
 from zstate.cli.network import Network
+from zstate.cli.options import PASSWORD_VARIABLE, credentials_of
 from zstate.cli.words import is_ros
 from zstate.errors import InvalidInput
 from zstate.extension import VARIABLE as KERNEL_VARIABLE

@@ -22,6 +22,7 @@ from zstate.cli.doctor.network_checks import (
 )
 from zstate.cli.doctor.next_command import looking_there
 from zstate.cli.network import Network, open_session
+from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import RosWords, is_ros, words_of, writing
 from zstate.errors import ZStateError
 from zstate.net.config import ROUTER_ENDPOINT
@@ -118,12 +119,13 @@ def _of_robots(
             break
         with ExitStack() as listening:
             some = wanted[first : first + _AT_ONCE]
-            ears = [listening.enter_context(Ear(session, info, wire, robots)) for info in some]
+            waiter = ConditionWaiter()
+            ears = [listening.enter_context(Ear(session, info, wire, robots, waiter.notify)) for info in some]
             if wire == "native":
                 for ear in ears:
                     ear.offsets = tuple(one for one in offsets if one.robot == ear.info.name)
                     ear.ask()
-            listen(ears, timeout_s)
+            listen(ears, waiter, timeout_s)
             for ear in ears:
                 if ear.description is not None:
                     clocks[ear.info.name] = ear.description.clock

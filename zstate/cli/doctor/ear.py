@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 
 from zstate.cli.doctor.node_samples import NodeSamples
 from zstate.cli.doctor.samples import Samples
+from zstate.cli.waiting import ConditionWaiter
 from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.following.events import Event
@@ -27,7 +28,6 @@ from zstate.wire.writer import Writer
 AT_LEAST_S = 1.2
 """Writers say once a second how they do."""
 
-_LOOK_EVERY_S = 0.02
 _OF_NODES: tuple[Stream, ...] = ("joint_states", "tf")
 _ANSWERS_WITHIN_S = 0.4
 
@@ -36,7 +36,12 @@ class Ear(Closing):
     """Hears the robot ``info``, and how its writers do."""
 
     def __init__(
-        self, session: Session, info: RobotInfo, wire: str, neighbours: Iterable[RobotInfo] = ()
+        self,
+        session: Session,
+        info: RobotInfo,
+        wire: str,
+        neighbours: Iterable[RobotInfo] = (),
+        on_change: Callable[[], object] = lambda: None,
     ) -> None:
         self.info = info
         self.neighbours = tuple(neighbours)
@@ -51,10 +56,12 @@ class Ear(Closing):
         self.offsets: tuple[ClockOffset, ...] = ()
         self.stuck: set[Writer] = set()
         self._session, self._wire = session, wire_named(wire)
+        self._on_change = on_change
         with ExitStack() as opening:
             key = self._wire.expression(info.name, "robot_description")
             opening.enter_context(LatchedSubscriber(session, key, self._take_description))
-            self.samples = opening.enter_context(Samples(session, info.name, self.followed, self._wire))
+            samples = Samples(session, info.name, self.followed, self._wire, on_change)
+            self.samples = opening.enter_context(samples)
             self.nodes: dict[Stream, NodeSamples] = {}
             """By stream, what each node says, on ROS's side."""
             if is_native:
@@ -82,6 +89,7 @@ class Ear(Closing):
             for said in self._wire.decode("robot_description", arrival, self.info.name):
                 if isinstance(said, RobotDescription):
                     self.description = said
+                    self._on_change()
         except MessageError:
             pass  # withdrawn; or broken, which the listener counts and names
 
@@ -127,10 +135,10 @@ class Ear(Closing):
                 self.stuck.add(writer)
 
 
-def listen(ears: Iterable[Ear], timeout_s: float) -> None:
-    """Until all has come that is announced, a little more than a second at least, ``timeout_s`` at most."""
-    began, ears = time.monotonic(), list(ears)
-    while (lasting_s := time.monotonic() - began) < timeout_s:
-        if lasting_s > AT_LEAST_S and not any(ear.lacks for ear in ears):
-            break
-        time.sleep(_LOOK_EVERY_S)
+def listen(ears: Sequence[Ear], waiter: ConditionWaiter, timeout_s: float) -> None:
+    """Wait until everything announced has arrived, at least 1.2 s, at most ``timeout_s``.
+
+    ``waiter`` is notified by the ears.
+    """
+    time.sleep(min(AT_LEAST_S, timeout_s))
+    waiter.wait_for(lambda: not any(ear.lacks for ear in ears), timeout_s - AT_LEAST_S)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from importlib import metadata
@@ -12,17 +11,16 @@ from zstate import __version__
 from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.network import Network
-from zstate.cli.probe import is_open, objection, silent_rendezvous, unanswered
+from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.connections import connections
 from zstate.net.lobby import lobby_key
 from zstate.net.presence import announce, discover
-from zstate.net.refusal import knock
+from zstate.net.refusal import accepts_tcp, check_all_tcp, check_rendezvous, check_tcp, knock
 from zstate.net.rendezvous import rendezvous_addresses
 from zstate.net.session import Session, connect
-from zstate.net.streams import StreamPublisher
 
 _MET_WITHIN_S = 1.0
 
@@ -50,7 +48,7 @@ def installation_check() -> Check:
 def refused_check(error: ZStateError, network: Network) -> Check:
     """There is no session, and ``error`` says why."""
     if isinstance(error, Unreachable) and error.endpoints:
-        text, then = unanswered(error.endpoints)
+        text, then = check_all_tcp(error.endpoints)
         for options, robots in elsewhere(network):
             text += f"; {with_options(options)}: {', '.join(map(repr, robots))}"
         return broken("network", text, then or f"zstate config{_options(network)}")
@@ -74,7 +72,7 @@ def network_check(session: Session, network: Network) -> Check:
     links = ", ".join(sorted({str(link.dst) for link in session.zenoh.info.links()}))
     text = f"{network.joins_as}, linked to {' and '.join(parts) or 'nobody'}{f' ({links})' if links else ''}"
     for endpoint in network.connect if network.joins_as != "client" else ():
-        why = objection(endpoint)
+        why = check_tcp(endpoint)
         if why is not None:
             text = f"nothing answers at {endpoint!r} ({why.text}); a peer goes on trying"
             return broken("network", text, why.next)
@@ -90,7 +88,7 @@ def _host_check(session: Session) -> Check:
     if met == 0:
         count = connections(session).sessions["peer"] - 1
         return ok("network", f"programs of this host, which meet at {addresses[0]}: {count} besides this one")
-    silent = silent_rendezvous()
+    silent = check_rendezvous()
     if silent is None:
         return broken(
             "network", f"programs of this host meet at {addresses[0]}, and none of them is found", ""
@@ -101,18 +99,20 @@ def _host_check(session: Session) -> Check:
 
 
 def _met_at(session: Session, count: int) -> int | None:
-    """At which of the rendezvous addresses there is a lobby; who has just joined may not know yet."""
-    deadline = time.monotonic() + _MET_WITHIN_S
+    """Number of the first rendezvous address with a lobby; None if none is seen within 1 s."""
+    waiter = ConditionWaiter()
     with ExitStack() as opened:
-        probes = [
-            opened.enter_context(StreamPublisher(session, lobby_key(number), "")) for number in range(count)
-        ]
-        while time.monotonic() < deadline:
-            for number, probe in enumerate(probes):
-                if probe.has_readers:
-                    return number
-            time.sleep(0.02)
-    return None
+        publishers = [session.zenoh.declare_publisher(lobby_key(number)) for number in range(count)]
+        for publisher in publishers:
+            opened.callback(session.release, publisher)
+            opened.callback(session.release, publisher.declare_matching_listener(waiter.notify))
+
+        def met() -> list[int]:
+            # The stub of zenoh says bool; it is an object that is always true.
+            return [number for number, one in enumerate(publishers) if one.matching_status.matching]  # pyright: ignore
+
+        waiter.wait_for(met, _MET_WITHIN_S)
+        return next(iter(met()), None)
 
 
 def access_check(session: Session, network: Network, robot: str) -> Check | None:
@@ -146,7 +146,7 @@ def elsewhere(network: Network) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Options with which other robots than now would be seen, and which."""
     router = Network("client", (ROUTER_ENDPOINT,))
     others = [("", Network())] if network.is_given else []
-    if ROUTER_ENDPOINT not in network.connect and is_open(ROUTER_ENDPOINT):
+    if ROUTER_ENDPOINT not in network.connect and accepts_tcp(ROUTER_ENDPOINT):
         others.append((f" --connect {ROUTER_ENDPOINT}", router))
     for options, other in others:
         try:

@@ -10,7 +10,7 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
 from zstate.cli.doctor.ear import Ear
 from zstate.cli.doctor.samples import Ranges
-from zstate.cli.target_frames import near_frames, without_advice
+from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text
@@ -61,7 +61,7 @@ def _writers_check(ear: Ear) -> Check:
             if _refused_static(ear) is None:  # which says more
                 return warning(
                     "writers",
-                    without_advice(event.text),
+                    without_program_advice(event.text),
                     f"zstate tree {ear.info.name}  # shows the edge that counts",
                 )
         elif event.kind == "conflict":
@@ -247,7 +247,7 @@ def statics_check(ear: Ear) -> Check:
     refused = _refused_static(ear) or _foreign_static(ear, owned)
     if refused is not None:
         then = f"zstate tree {ear.info.name}  # the frames without that edge; end its writer, or correct it"
-        return warning("tf_static", without_advice(refused), then)
+        return warning("tf_static", without_program_advice(refused), then)
     if silent:
         text = f"{others[silent[0]]} announces static edges as {silent[0]!r}, and places no frame"
         return warning("tf_static", text, f"zstate tree {ear.info.name}")
@@ -301,7 +301,7 @@ def _trees_check(ear: Ear, frames: Sequence[FrameInfo], roots: Sequence[str]) ->
     text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(roots)}"
     for frame in static_roots(ear):
         root = frame.parent or ""
-        near = near_frames(root, {frame.name for frame in frames} - {root})
+        near = similar_frames(root, {frame.name for frame in frames} - {root})
         if near:
             robot, _, bare = root.partition("/")
             text = f"{text}: {bare!r} is near {near[0]!r}, and {frame.name!r} is on it"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -22,7 +23,14 @@ from zstate.wire.protocol import SerializedSample, Wire
 class Samples(Closing):
     """Counts samples, with when they came and what they are stamped; durations in nanoseconds."""
 
-    def __init__(self, session: Session, robot: str, stream: Stream, wire: Wire) -> None:
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        stream: Stream,
+        wire: Wire,
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
         self.count = 0
         self.last_stamp: int | None = None
         self.delays: tuple[int, int] = (0, 0)
@@ -34,7 +42,7 @@ class Samples(Closing):
         self.ranges = Ranges()
         """Of the joint positions."""
         self._came: tuple[int, int] = (0, 0)
-        self._robot, self._wire = robot, wire
+        self._robot, self._wire, self._on_change = robot, wire, on_change
         self._stream: Stream = stream
         self._subscriber = StreamSubscriber(session, wire.expression(robot, stream), self._take)
 
@@ -58,6 +66,7 @@ class Samples(Closing):
                 for sample in self._wire.decode(self._stream, arrival, self._robot):
                     assert isinstance(sample, Sample)
                     self._note(sample)
+        self._on_change()
 
     def _note(self, sample: Sample) -> None:
         came, delay = time.monotonic_ns(), time.time_ns() - sample.stamp

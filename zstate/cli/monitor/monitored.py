@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
 from zstate.buffer.frames import FrameInfo
-from zstate.cli.awaited_pose import AwaitedPose
-from zstate.cli.console import fail, is_terminal, note, say, say_json, terminal_width
+from zstate.cli.console import fail, is_terminal, say, say_json, terminal_width
 from zstate.cli.monitor.meter import PathMeter
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
-from zstate.cli.roster import Roster
+from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.waiting import ConditionWaiter, PoseWaiter
 from zstate.errors import duration_text
 from zstate.listener import TransformListener
 from zstate.transform import Transform
-
-# Waiting is mentioned when it lasts longer than meeting everybody does.
-_GRACE_S = 0.5
-_LOOK_EVERY_S = 0.02
 
 
 class Monitored(ABC):
@@ -61,20 +56,15 @@ class Monitored(ABC):
 class MonitoredEdges(Monitored):
     """All edges."""
 
-    def __init__(self, listener: TransformListener, meter: PathMeter, roster: Roster) -> None:
+    def __init__(self, listener: TransformListener, meter: PathMeter, roster: RobotDirectory) -> None:
         super().__init__(listener, meter)
         self._roster = roster
 
     def wait(self, timeout_s: float | None) -> None:
-        began, said = time.monotonic(), ""
-        while not self._rows():
-            passed_s, reason = time.monotonic() - began, self._reason()
-            if timeout_s is not None and passed_s > timeout_s:
-                fail(f"gave up after {timeout_s:g} s: {reason}")
-            if passed_s > _GRACE_S and reason != said:
-                said = reason
-                note(f"waiting: {reason}")
-            time.sleep(_LOOK_EVERY_S)
+        waiter = ConditionWaiter()
+        self._listener.add_observer(waiter.notify)
+        if not waiter.wait_for(self._rows, timeout_s, self._reason):
+            fail(f"gave up after {timeout_s:g} s: {self._reason()}")
 
     def _reason(self) -> str:
         roster = self._roster
@@ -95,11 +85,11 @@ class MonitoredPose(Monitored):
     """One pose, and the edges on its path."""
 
     def __init__(
-        self, listener: TransformListener, meter: PathMeter, roster: Roster, frames: tuple[str, str]
+        self, listener: TransformListener, meter: PathMeter, roster: RobotDirectory, frames: tuple[str, str]
     ) -> None:
         super().__init__(listener, meter)
         self._target, self._source = frames
-        self._awaited = AwaitedPose(listener, roster, *frames)
+        self._awaited = PoseWaiter(listener, roster, *frames)
 
     def wait(self, timeout_s: float | None) -> None:
         self._awaited.answer(timeout_s=timeout_s)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.document_text import columns
 from zstate.errors import InvalidInput
 
@@ -104,6 +104,4 @@ def _oldest(buffer: TransformBuffer, target: str, source: str, newest: int) -> i
 
 
 def _no_joint(joint: str, names: Sequence[str]) -> str:
-    near = get_close_matches(joint, names, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return f"this robot has no joint {joint!r}{hint} (joints: {', '.join(names)})"
+    return f"this robot has no joint {joint!r}{did_you_mean(joint, names)} (joints: {', '.join(names)})"

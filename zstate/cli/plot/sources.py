@@ -7,13 +7,13 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from zstate.cli.awaited_pose import AwaitedPose
 from zstate.cli.console import fail, note
 from zstate.cli.documents import Document, DocumentWriter
 from zstate.cli.named_joints import Named
 from zstate.cli.plot.curves import Curves, joint_curves, path_curves
-from zstate.cli.roster import Roster
-from zstate.cli.tap import Tap
+from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.stream_reader import StreamReader
+from zstate.cli.waiting import PoseWaiter
 from zstate.cli.words import followed
 from zstate.following.recorded import check_recorded
 from zstate.listener import TransformListener
@@ -32,7 +32,7 @@ _LOG = logging.getLogger("zstate")
 
 def live_joints(session: Session, robot: str, wire: str, seconds: float) -> Curves:
     """The joints of ``robot`` for ``seconds`` from now on. Fails when no sample comes."""
-    with Named(session, robot, wire) as named, Tap(session, robot, "joint_states", wire) as tap:
+    with Named(session, robot, wire) as named, StreamReader(session, robot, "joint_states", wire) as tap:
         documents = [named.document(tap.first(_WAIT_S))]
         note(f"listening to {robot} for {seconds:g} s ...")
         deadline = time.monotonic() + seconds
@@ -46,7 +46,7 @@ def live_joints(session: Session, robot: str, wire: str, seconds: float) -> Curv
 def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], seconds: float) -> Curves:
     """The path of frame B in frame A for ``seconds`` from now on. Fails when no pose comes."""
     with (
-        Roster(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as roster,
         TransformListener(
             session,
             robot,
@@ -56,7 +56,7 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
             history_on_join=False,
         ) as listener,
     ):
-        AwaitedPose(listener, roster, *frames).answer(timeout_s=_WAIT_S)
+        PoseWaiter(listener, roster, *frames).answer(timeout_s=_WAIT_S)
         note(f"listening for {seconds:g} s ...")
         time.sleep(seconds)
         return path_curves(listener.buffer, *frames)

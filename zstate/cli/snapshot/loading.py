@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 
 from zstate.cli.console import count_text, fail, note, say
+from zstate.cli.processes import BackgroundCall
 from zstate.cli.snapshot.snapshot import RobotShot, Snapshot, StaticShot
-from zstate.cli.worker import Worker
 from zstate.clock import SystemClock
 from zstate.closing import Closing
 from zstate.net.session import Session
@@ -70,7 +70,7 @@ class Standing(Closing):
 
     def run(self, rate_hz: float, seconds: float | None) -> None:
         """Until ``seconds`` are over or a signal comes, which interrupts only the thread that waits."""
-        worker = Worker("zstate snapshot", lambda: self._go_on(rate_hz, seconds))
+        worker = BackgroundCall("zstate snapshot", lambda: self._go_on(rate_hz, seconds))
         try:
             worker.result()
         except SystemExit:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from datetime import datetime, timezone
@@ -13,8 +12,8 @@ from zstate import __version__
 from zstate.cli.console import fail, note
 from zstate.cli.network import Network
 from zstate.cli.snapshot.snapshot import FORMAT, Configuration, RobotShot, Snapshot, StaticShot
+from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import words_of
-from zstate.clock import wait_in_slices
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, RobotModel
@@ -28,8 +27,6 @@ from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import StaticTransforms, poses_from_block
 from zstate.wire.protocol import SerializedSample
 
-_LOOK_EVERY_S = 0.02
-
 
 def taken(session: Session, network: Network, robots: Sequence[str], wire: str, timeout_s: float) -> Snapshot:
     """The named robots, or all that are announced. Fails where there is none, and notes what did not come."""
@@ -42,11 +39,9 @@ def taken(session: Session, network: Network, robots: Sequence[str], wire: str, 
     if not wanted:
         fail(words.announced(announced))
     with ExitStack() as sitters:
-        sittings = [sitters.enter_context(_Sitting(session, info, wire)) for info in wanted]
-        over = threading.Event()
-        for _ in range(round(timeout_s / _LOOK_EVERY_S)):
-            if not any(sitting.lacking() for sitting in sittings) or wait_in_slices(over, _LOOK_EVERY_S):
-                break
+        waiter = ConditionWaiter()
+        sittings = [sitters.enter_context(_Sitting(session, info, wire, waiter)) for info in wanted]
+        waiter.wait_for(lambda: not any(sitting.lacking() for sitting in sittings), timeout_s)
         for sitting in sittings:
             for text in sitting.lacking():
                 note(f"{sitting.info.name}: {text} within {timeout_s:g} s", robot=sitting.info.name)
@@ -70,8 +65,9 @@ def taken(session: Session, network: Network, robots: Sequence[str], wire: str, 
 class _Sitting(Closing):
     """What has been heard of one robot so far."""
 
-    def __init__(self, session: Session, info: RobotInfo, wire: str) -> None:
+    def __init__(self, session: Session, info: RobotInfo, wire: str, waiter: ConditionWaiter) -> None:
         self.info = info
+        self._waiter = waiter
         self._session = session
         self._wire_name = wire
         self._wire = wire_named(wire)
@@ -93,9 +89,16 @@ class _Sitting(Closing):
         if self._source is not None:
             self._source.close()
         self._model = model
-        self._source = SubscribedSource(self._session, model, self.info.name, wire=self._wire_name)
+        self._source = SubscribedSource(
+            self._session, model, self.info.name, wire=self._wire_name, on_readings=self._waiter.notify
+        )
+        self._waiter.notify()
 
     def _take_statics(self, arrival: SerializedSample) -> None:
+        self._insert_statics(arrival)
+        self._waiter.notify()
+
+    def _insert_statics(self, arrival: SerializedSample) -> None:
         try:
             writer = self._wire.statics_writer(arrival.key) or arrival.key
         except InvalidInput as error:

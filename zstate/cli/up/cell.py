@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.up.parameters import parameter_scope
 from zstate.cli.up.sections import (
     NetworkSection,
@@ -17,7 +18,7 @@ from zstate.cli.up.sections import (
 )
 from zstate.cli.up.tables import LISTS, SINGLE, Placed, tables
 from zstate.cli.up.toml_file import TomlFile
-from zstate.cli.up.values import Scope, near_miss
+from zstate.cli.up.values import Scope
 from zstate.errors import InvalidInput
 
 _KNOWN = (*LISTS, *SINGLE, "parameters", "include")
@@ -75,7 +76,7 @@ def _with_includes(file: TomlFile, above: tuple[Path, ...], read: set[Path]) -> 
 def _check_names(file: TomlFile) -> None:
     for name, value in file.tables.items():
         if name not in _KNOWN:
-            raise file.error(name, f"there is no such table{near_miss(name, _KNOWN)}")
+            raise file.error(name, f"there is no such table{did_you_mean(name, _KNOWN)}")
         is_right = _is_list_of_tables(value) if name in LISTS else isinstance(value, dict)
         if name != "include" and not is_right:
             brackets = f"[[{name}]]" if name in LISTS else f"[{name}]"

@@ -6,8 +6,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.up.toml_file import TomlFile
-from zstate.cli.up.values import Scope, near_miss
+from zstate.cli.up.values import Scope
 from zstate.errors import ConfigError, InvalidInput
 
 if sys.version_info >= (3, 11):
@@ -41,7 +42,7 @@ def parameter_scope(files: Sequence[TomlFile], settings: Mapping[str, str]) -> S
         if name not in declared:
             known = ", ".join(declared) or "none"
             raise ConfigError(
-                f"{files[-1].shown} has no parameter {name!r}{near_miss(name, declared)}; "
+                f"{files[-1].shown} has no parameter {name!r}{did_you_mean(name, declared)}; "
                 f"its [parameters]: {known}",
                 path=f"parameters.{name}",
             )

@@ -10,13 +10,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from zstate._util.endpoint import format_host
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.options import load_robot, parsed_xacro_args
 from zstate.cli.up.cell import Cell
 from zstate.cli.up.edges import check_edges
 from zstate.cli.up.joining import options, router_options, session_options, session_variables
 from zstate.cli.up.sections import ProgramSection, Restart, RobotSection, in_a_list
 from zstate.cli.up.tables import Placed
-from zstate.cli.up.values import near_miss
 from zstate.errors import ConfigError, InvalidInput, ModelError
 from zstate.metrics.address import Address
 from zstate.model.catalog import is_path
@@ -134,7 +135,7 @@ def _metrics(placed: Placed[RobotSection]) -> tuple[str, ...]:
     if placed.section.metrics is None:
         return ()
     host, port = Address.parse(str(placed.section.metrics))
-    return ("--metrics", f"{f'[{host}]' if ':' in host else host}:{port + placed.turn if port else 0}")
+    return ("--metrics", f"{format_host(host)}:{port + placed.turn if port else 0}")
 
 
 def _program_start(placed: Placed[ProgramSection], cell: Cell, first: tuple[str, ...]) -> Start:
@@ -186,7 +187,7 @@ def _check_order(start: Start, starts: Mapping[str, Start], placed: Placed[Any])
     while new:
         for name in starts[new.pop()].after:
             if name not in starts:
-                known = near_miss(name, starts) or f"; there are {', '.join(starts)}"
+                known = did_you_mean(name, starts) or f"; there are {', '.join(starts)}"
                 raise placed.error(f"nothing here is called {name!r}{known}", "after")
             if name == start.name:
                 raise placed.error(f"{name!r} would wait for itself", "after")

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from zstate.cli.children import END_WITHIN_S, ChildCommand
 from zstate.cli.console import note
+from zstate.cli.processes import END_WITHIN_S, ChildProcess
 from zstate.cli.up.starts import Start
 from zstate.clock import LONGEST_WAIT_S
 
@@ -25,14 +25,14 @@ class Part:
 
     def __init__(self, start: Start) -> None:
         self.start = start
-        self.child: ChildCommand | None = None
+        self.child: ChildProcess | None = None
         self.is_ready = False
         self.is_over = False
         self.due = time.monotonic()
         self._began = 0.0
         self._pause_s = FIRST_PAUSE_S
 
-    def begin(self, child: ChildCommand) -> None:
+    def begin(self, child: ChildProcess) -> None:
         """It lives again."""
         self.child, self._began = child, time.monotonic()
         self.is_ready = self.is_ready or self.start.ready is None
@@ -79,7 +79,7 @@ class Supervisor:
             if is_due and not self._awaited(part):
                 part.begin(self._child(part))
 
-    def _child(self, part: Part) -> ChildCommand:
+    def _child(self, part: Part) -> ChildProcess:
         start = part.start
 
         def on_line(line: str, is_error: bool) -> None:
@@ -89,7 +89,7 @@ class Supervisor:
             if start.ready is not None and (start.ready in line if start.ready else not is_error):
                 self._events.put(("ready", part))
 
-        return ChildCommand(
+        return ChildProcess(
             start.name,
             start.arguments,
             on_end=lambda _: self._events.put(("end", part)),
@@ -153,5 +153,5 @@ class Supervisor:
             living = [part for part in living if part not in ending]
 
 
-def _end_text(child: ChildCommand) -> str:
+def _end_text(child: ChildProcess) -> str:
     return f"{child.name!r} ended with exit code {child.exit_code}: {child.last_error or 'it said nothing'}"

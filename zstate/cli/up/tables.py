@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
+from zstate._util.suggestions import did_you_mean
 from zstate.cli.up.sections import (
     NetworkSection,
     ProgramSection,
@@ -19,7 +20,7 @@ from zstate.cli.up.sections import (
     StaticSection,
 )
 from zstate.cli.up.toml_file import TomlFile
-from zstate.cli.up.values import Scope, holds, near_miss
+from zstate.cli.up.values import Scope, holds
 from zstate.errors import ConfigError, InvalidInput
 
 SINGLE = ("router", "network")
@@ -113,5 +114,5 @@ def _converted(file: TomlFile, place: str, values: dict[str, Any], section: type
         if unknown is None:
             raise file.error(f"{place}{inner.strip('`')}", text) from None
         known = (*section.__struct_fields__, *(_OWN_KEYS if place.startswith(_LOOPED) else ("when",)))
-        hint = near_miss(unknown[1], known) or f"; there are {', '.join(known)}"
+        hint = did_you_mean(unknown[1], known) or f"; there are {', '.join(known)}"
         raise file.error(f"{place}.{unknown[1]}", f"there is no such key{hint}") from None

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
-from difflib import get_close_matches
+from collections.abc import Mapping
 from typing import Any, cast
 
+from zstate._util.suggestions import did_you_mean
 from zstate.errors import InvalidInput
 
 _REFERENCE = re.compile(r"\$?\$\{(?P<name>[^{}:]*)(?::-(?P<default>[^{}]*))?\}")
@@ -60,7 +60,7 @@ class Scope:
         if value is None:
             raise InvalidInput(
                 f"${{{name}}} is neither a parameter nor set in the environment"
-                f"{near_miss(name, self.names)}; ${{{name}:-DEFAULT}} would have a default"
+                f"{did_you_mean(name, self.names)}; ${{{name}:-DEFAULT}} would have a default"
             )
         return value
 
@@ -77,12 +77,6 @@ def holds(condition: object) -> bool:
     if text.lower() not in _YES + _NO:
         raise InvalidInput(f"{text!r} is neither true nor false; write one of these, 'A == B' or 'A != B'")
     return text.lower() in _YES
-
-
-def near_miss(name: str, known: Iterable[str]) -> str:
-    """``; did you mean 'x'?``, or nothing where none is close."""
-    near = get_close_matches(name, list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _bare(text: str) -> str:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from difflib import get_close_matches
 from typing import Any, Literal
 
+from zstate._util.suggestions import did_you_mean
 from zstate.errors import InvalidInput
 from zstate.wire.keys import ANY, check_robot
 
@@ -93,8 +93,7 @@ class Ros2Options:
 def _check_key(key: str) -> str:
     names = _names()
     if key not in names:
-        near = get_close_matches(key, names, n=1)
-        hint = f", did you mean {near[0]!r}?" if near else ";"
+        hint = did_you_mean(key, names) or ";"
         raise InvalidInput(f"the ros2 wire has no option {key!r}{hint} {_known()}")
     return key
 

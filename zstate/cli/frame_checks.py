@@ -1,14 +1,15 @@
-"""Whether the frames on which static edges are put exist: near misses, and frames that are new."""
+"""Checks that the target frames of static edges exist; similar names of unknown frames."""
 
 from __future__ import annotations
 
 import re
-import time
+import threading
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
+from zstate.clock import wait_in_slices
 from zstate.closing import Closing
 from zstate.errors import MessageError, ModelError, ZStateError
 from zstate.model.urdf import parse_urdf
@@ -25,14 +26,15 @@ if TYPE_CHECKING:
     from zstate.wire.protocol import SerializedSample
 
 _MODEL_WITHIN_S = 1.5
-_LOOK_EVERY_S = 0.02
 
 
-def doubtful_edges(session: Session, publisher: StaticPublisher, edges: Sequence[Transform]) -> list[str]:
-    """Warnings about those of ``edges``, which ``publisher`` publishes, whose target is unknown.
+def unknown_target_warnings(
+    session: Session, publisher: StaticPublisher, edges: Sequence[Transform]
+) -> list[str]:
+    """Warnings about ``edges`` of ``publisher`` whose target frame is unknown.
 
-    Waits a second or so for the model of each robot after which a target is named; without one, or where
-    this identity may not read it, only near misses of other static frames are reported.
+    Waits up to 1.5 s for the model of each robot that a target belongs to. Without a model, or if access
+    control hides it, only similar names among other static frames are reported.
     """
     full = [
         Transform(
@@ -42,7 +44,7 @@ def doubtful_edges(session: Session, publisher: StaticPublisher, edges: Sequence
     ]
     warnings: list[str] = []
     for robot in dict.fromkeys(edge.target.partition("/")[0] for edge in full):
-        with suppress(ZStateError), RobotFrames(session, robot, publisher.writer) as frames:
+        with suppress(ZStateError), KnownFrames(session, robot, publisher.writer) as frames:
             frames.wait_for_model()
             own = [edge for edge in full if edge.target.startswith(f"{robot}/")]
             warnings += frames.warnings(own, {edge.source for edge in full})
@@ -53,43 +55,45 @@ def _pose(edge: Transform) -> tuple[Sequence[float], Sequence[float]]:
     return edge.translation.tolist(), edge.rotation.tolist()
 
 
-def near_frames(name: str, known: Collection[str]) -> list[str]:
-    """The frames of the same robot that were probably meant by ``name``, without the robot's name."""
+def similar_frames(name: str, known: Collection[str]) -> list[str]:
+    """Frames of the same robot with a name similar to ``name``, without the robot's name."""
     robot, _, bare = name.partition("/")
     others = [frame.removeprefix(f"{robot}/") for frame in known if frame.startswith(f"{robot}/")]
     return get_close_matches(bare, sorted(others), n=3)
 
 
-def without_advice(text: str) -> str:
-    """The text of a refused edge without the call that only a program can make."""
+def without_program_advice(text: str) -> str:
+    """The text of a refused edge without the advice to call ``withdraw``, which is for programs."""
     return re.sub(r"; withdraw\('[^']*'\) first if it really moved", "", text)
 
 
-class RobotFrames(Closing):
-    """The links of ``robot`` and the frames of its static writers, without those of the ``writer`` itself."""
+class KnownFrames(Closing):
+    """The links of ``robot`` and the frames of its static writers other than ``writer``."""
 
     def __init__(self, session: Session, robot: str, writer: str) -> None:
         self._robot, self._writer = robot, writer
         self._wire = wire_named("native")
         self._model: RobotModel | None = None
+        self._described = threading.Event()
         self._statics: dict[str, frozenset[str]] = {}
         with ExitStack() as opening:
             key = self._wire.expression(robot, "tf_static")
-            opening.enter_context(LatchedSubscriber(session, key, self._take_statics))
+            opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
             key = self._wire.expression(robot, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._describe))
+            opening.enter_context(LatchedSubscriber(session, key, self._on_description))
             self._opened = opening.pop_all()
 
     def close(self) -> None:
         self._opened.close()
 
-    def _describe(self, arrival: SerializedSample) -> None:
+    def _on_description(self, arrival: SerializedSample) -> None:
         with suppress(MessageError, ModelError):
             for message in self._wire.decode("robot_description", arrival, self._robot):
                 if isinstance(message, RobotDescription):
                     self._model = parse_urdf(message.urdf, f"the URDF of {self._robot!r}")
+                    self._described.set()
 
-    def _take_statics(self, arrival: SerializedSample) -> None:
+    def _on_statics(self, arrival: SerializedSample) -> None:
         writer = self._wire.statics_writer(arrival.key) or ""
         if writer in (MODEL_WRITER, self._writer):
             return
@@ -100,13 +104,11 @@ class RobotFrames(Closing):
                     self._statics[writer] = frozenset(names)
 
     def wait_for_model(self) -> None:
-        """Return when the model has arrived, or after a second or so without one."""
-        deadline = time.monotonic() + _MODEL_WITHIN_S
-        while self._model is None and time.monotonic() < deadline:
-            time.sleep(_LOOK_EVERY_S)
+        """Wait until the model has arrived, at most 1.5 s."""
+        wait_in_slices(self._described, _MODEL_WITHIN_S)
 
     def warnings(self, edges: Sequence[Transform], placed: Collection[str]) -> list[str]:
-        """What is doubtful about ``edges``; frames that are ``placed`` with them exist."""
+        """Warnings about ``edges``; frames that are ``placed`` with them count as known."""
         links = () if self._model is None else self._model.links
         known = frozenset(full_name(self._robot, link) for link in links).union(*self._statics.values())
         targets = dict.fromkeys(edge.target for edge in edges if edge.target not in known.union(placed))
@@ -116,7 +118,7 @@ class RobotFrames(Closing):
 
     def _warning(self, target: str, source: str, known: frozenset[str]) -> str:
         bare, robot = target.removeprefix(f"{self._robot}/"), self._robot
-        near = near_frames(target, known)
+        near = similar_frames(target, known)
         if near:
             which = " or ".join(map(repr, near))
             return f"{robot!r} has no frame {bare!r}; did you mean {which}? (--new if it is a new frame)"

@@ -1,6 +1,6 @@
-"""What the shell offers for an argument when Tab is pressed: robots, models and files.
+"""Shell completion of arguments: robots, models, files and parameters.
 
-Commands are taught this only while the shell asks, so that others need not load it.
+Attached to commands only while a shell completes, so that other invocations do not load it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-# Who is announced on this host answers in a fraction of this; nobody waits longer at a prompt.
+# Robots of this host answer in a fraction of this; a longer delay is annoying at a prompt.
 _ROBOTS_WITHIN_S = 0.4
 
 _MODELS = {"check": "file", "demo": "robot", "init": "robot", "joints": "robot", "publish": "robot"}
@@ -21,7 +21,7 @@ _FILES = ("file", "folder")
 
 
 class ModelName(click.types.StringParamType):
-    """A name of the catalog, or a file."""
+    """A catalog name or a file."""
 
     name = "model"
 
@@ -35,7 +35,7 @@ class ModelName(click.types.StringParamType):
 
 
 class RobotName(click.types.StringParamType):
-    """A robot that is announced."""
+    """An announced robot."""
 
     name = "robot"
 
@@ -46,7 +46,7 @@ class RobotName(click.types.StringParamType):
 
 
 class ParameterSetting(click.types.StringParamType):
-    """KEY=VALUE of a parameter that the file of `zstate up` has, as it is there."""
+    """KEY=VALUE with the parameters of the file of `zstate up` and their present values."""
 
     name = "setting"
 
@@ -62,11 +62,11 @@ class ParameterSetting(click.types.StringParamType):
         return []
 
 
-def taught(command: click.Command) -> click.Command:
-    """``command``, whose arguments know what to offer."""
+def with_completion(command: click.Command) -> click.Command:
+    """``command`` with completion for its arguments."""
     if isinstance(command, click.Group):
         for inner in command.commands.values():
-            taught(inner)
+            with_completion(inner)
     for parameter in command.params:
         if isinstance(parameter, click.Argument):
             parameter.type = _kind(command.name or "", parameter)
@@ -89,9 +89,9 @@ def _announced(ctx: click.Context) -> Iterator[str]:
     from zstate.net.presence import discover
     from zstate.net.session import connect
 
-    said = {name: ctx.params.get(name) for name in ("mode", "connect", "listen", "config")}
-    network = Network(said["mode"], said["connect"] or (), said["listen"] or (), said["config"])
-    # Whatever is wrong, the command itself will tell.
+    given = {name: ctx.params.get(name) for name in ("mode", "connect", "listen", "config")}
+    network = Network(given["mode"], given["connect"] or (), given["listen"] or (), given["config"])
+    # Errors are left to the command itself.
     with (
         suppress(ZStateError),
         connect(

@@ -1,4 +1,4 @@
-"""Other processes of this one: their lines, their end, and ours with theirs."""
+"""Calls in background threads, and child processes. Ctrl-C interrupts every wait for them at once."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
-from typing import IO
+from typing import IO, Generic, TypeVar
 
 from zstate.cli.logs import text_in
+from zstate.clock import wait_in_slices
 from zstate.closing import Closing
+
+Result = TypeVar("Result")
 
 END_WITHIN_S = 0.8
 _PROGRAM_ENDS_WITHIN_S = 3.0
@@ -21,10 +25,10 @@ _LONGEST_ERROR = 500
 
 _LONGEST_LINE = 1 << 16
 
-# The parent of a user's program, in one process group with it and what it starts. When its standard input
-# ends, whoever started it is gone, however that ended: it ends the group, which a program that ignores
-# signals or has left others behind would survive. Signals to the group are for the program, and it ends
-# as the program does. Linux ends the program with it; the rest of POSIX does not offer that.
+# Parent of a user's program, in one process group with the program and its children. When its standard input
+# ends, zstate has exited, for whatever reason: it kills the group, because a program that ignores signals
+# or leaves children behind would survive. It ignores signals to the group, which are for the program, and
+# exits with the program's status. On Linux the kernel kills the program with it; POSIX has no such feature.
 _GUARDIAN = """
 import ctypes, os, select, signal, sys, threading, time
 for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
@@ -63,12 +67,35 @@ os.kill(guardian, -code)
 """.replace("PATIENCE", str(_PROGRAM_ENDS_WITHIN_S))
 
 
-class ChildCommand(Closing):
-    """``zstate ARGUMENTS`` in a process of its own, which ends with this one, however that ends.
+class BackgroundCall(Generic[Result]):
+    """A call of ``work`` in a daemon thread. Signals interrupt only the main thread, which waits for it."""
 
-    With ``is_program`` ARGUMENTS are a command of the user's own instead, in ``folder``. Each line it says
-    goes to ``on_line``, with whether it came on standard error, from a thread; ``on_end`` is called once it
-    is gone and all its lines are heard. ``last_error`` is its last error, in one line.
+    def __init__(self, name: str, work: Callable[[], Result]) -> None:
+        self._outcome: Future[Result] = Future()
+        self._is_done = threading.Event()
+        threading.Thread(target=self._run, args=(work,), name=name, daemon=True).start()
+
+    def _run(self, work: Callable[[], Result]) -> None:
+        try:
+            self._outcome.set_result(work())
+        except Exception as error:  # raised again by result()
+            self._outcome.set_exception(error)
+        finally:
+            self._is_done.set()
+
+    def result(self, timeout_s: float | None = None) -> Result:
+        """The value that ``work`` returned, or its exception. Raises TimeoutError after ``timeout_s``."""
+        if not wait_in_slices(self._is_done, timeout_s):
+            raise TimeoutError(f"the work took longer than {timeout_s} s")
+        return self._outcome.result()
+
+
+class ChildProcess(Closing):
+    """``zstate ARGUMENTS`` in a child process, which exits with this one, however this one exits.
+
+    With ``is_program`` ARGUMENTS are a user's command instead, run in ``folder``. ``on_line(text, is_error)``
+    is called for each line of output, from a thread; ``on_end(self)`` after it has exited and all its lines
+    were passed on. ``last_error`` is its last error message, in one line.
     """
 
     def __init__(
@@ -76,7 +103,7 @@ class ChildCommand(Closing):
         name: str,
         arguments: Sequence[str],
         *,
-        on_end: Callable[[ChildCommand], None],
+        on_end: Callable[[ChildProcess], None],
         on_line: Callable[[str, bool], None] = lambda _, __: None,
         is_program: bool = False,
         folder: str | None = None,
@@ -86,7 +113,7 @@ class ChildCommand(Closing):
         self.last_error = ""
         self._is_program = is_program
         own = ["-ISc", _GUARDIAN] if is_program else ["-m", "zstate", "--until-eof"]
-        # A session of its own: Ctrl-C at the terminal reaches this process alone, which ends the others.
+        # A session of its own: Ctrl-C at the terminal reaches this process alone, which stops its children.
         self._process = subprocess.Popen(
             [sys.executable, *own, *arguments],
             stdin=subprocess.PIPE,
@@ -96,7 +123,7 @@ class ChildCommand(Closing):
             errors="replace",
             start_new_session=True,
             cwd=folder,
-            # Lines are to come when they are said.
+            # Unbuffered: each line arrives when it is printed.
             env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
         )
         self.pid = self._process.pid
@@ -111,21 +138,21 @@ class ChildCommand(Closing):
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs."""
+        """The exit code; None while it runs."""
         return self._process.poll()
 
     def close(self) -> None:
-        """End it and wait for that, less than a second; a program of the user's has three."""
+        """Stop it and wait, less than 1 s; a user's program gets 3 s more."""
         self.ask_to_end()
         self.wait(time.monotonic() + END_WITHIN_S)
 
     def ask_to_end(self) -> None:
-        """End it without waiting: as Ctrl-C does, for programs of the user's."""
+        """Request its exit without waiting: SIGTERM, or SIGINT for a user's program."""
         if self._process.poll() is None:
             self._signal(signal.SIGINT if self._is_program else signal.SIGTERM)
 
     def wait(self, deadline: float) -> None:
-        """Wait until it has ended, which it was asked to, and make it end after ``deadline`` (monotonic)."""
+        """Wait for its exit; kill it after ``deadline`` (monotonic), a user's program 3 s later."""
         later_s = _PROGRAM_ENDS_WITHIN_S if self._is_program else 0.0
         try:
             self._process.wait(max(0.0, deadline - time.monotonic()) + later_s)
@@ -135,12 +162,12 @@ class ChildCommand(Closing):
 
     def _signal(self, number: signal.Signals) -> None:
         with suppress(ProcessLookupError):
-            # The whole group: a shell does not hand signals on to what it runs.
+            # The whole group: a shell does not forward signals to its children.
             os.killpg(self.pid, number)
 
     def _follow(self) -> None:
         self._process.wait()
-        # What it has started and left behind would hold its output open, and go on without it.
+        # Children that it left behind would hold its output open and run on.
         self._signal(signal.SIGTERM)
         for reader in self._readers:
             reader.join(END_WITHIN_S)
@@ -153,14 +180,14 @@ class ChildCommand(Closing):
     def _follow_errors(self) -> None:
         for line in _lines(self._process.stderr):
             if line.strip():
-                # What is indented goes on with what was said before it, as findings and Python's errors do.
+                # An indented line continues the one before, as in findings and Python's tracebacks.
                 goes_on = line[0].isspace() and len(self.last_error) < _LONGEST_ERROR
                 self.last_error = f"{self.last_error} {line.strip()}".strip() if goes_on else text_in(line)
                 self._on_line(line, True)
 
 
 def _lines(stream: IO[str] | None) -> Iterator[str]:
-    """The lines of ``stream``, cut where they are too long: one without an end would fill the memory."""
+    """The lines of ``stream``, cut at ``_LONGEST_LINE``: an endless line would fill the memory."""
     while stream is not None and (line := stream.readline(_LONGEST_LINE)):
         is_cut = len(line) == _LONGEST_LINE and not line.endswith("\n")
         yield f"{line} ... (cut at {_LONGEST_LINE} characters)" if is_cut else line.rstrip("\n")
@@ -169,14 +196,14 @@ def _lines(stream: IO[str] | None) -> Iterator[str]:
 
 
 def end_with_parent() -> None:
-    """End this process when its standard input does: whoever started it is gone."""
+    """Exit when standard input ends: the parent process has exited."""
 
     main = threading.get_ident()
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 1024):
             pass
-        # To the process, it could reach this thread, and the main thread would go on waiting.
+        # A signal to the process could be delivered to this thread, and the main thread would keep waiting.
         signal.pthread_kill(main, signal.SIGTERM)
 
     threading.Thread(target=watch, name="zstate parent", daemon=True).start()

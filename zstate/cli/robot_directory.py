@@ -1,7 +1,8 @@
-"""Roster: which robots are announced, and what to say of one that is not."""
+"""Directory of announced robots, and messages about robots that are not announced."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from zstate.cli.console import fail
@@ -16,58 +17,67 @@ if TYPE_CHECKING:
 
 
 def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
-    """``robot`` as it is announced, or all robots for "*". Fails when there is none."""
+    """``robot`` as it is announced, or all robots for "*". Fails if there is none."""
     from zstate.net.presence import discover
     from zstate.wire.keys import ANY, check_robot
 
     if robot != ANY:
         check_robot(robot)
     robots = discover(session)
-    wanted = tuple(info for info in robots if robot in (ANY, info.name))
-    if not wanted:
+    selected = tuple(info for info in robots if robot in (ANY, info.name))
+    if not selected:
         words = words_of("native")
         fail(words.announced(robots) if robot == ANY else words.unknown(robot, robots))
-    return wanted
+    return selected
 
 
 def only_robot(session: Session) -> str:
-    """The robot that is announced, if it is the only one. Fails with the candidates for several or none."""
+    """The name of the only announced robot. Fails with the candidates if there are several or none."""
     first, *others = announced_robots(session, "*")
     if others:
         fail(f"which robot? {words_of('native').announced((first, *others))}")
     return first.name
 
 
-class Roster(Closing):
-    """The robots that are announced now, kept up to date.
+class RobotDirectory(Closing):
+    """The robots that are announced now, kept up to date by liveliness tokens.
 
-    On a ROS wire those that ``robot`` can mean there, and by that name: ROS itself has topics only.
+    On a ROS wire, which has topics only, it holds the robots that ``robot`` can mean there, by that name.
+    ``on_change()`` is called, from one thread, after each writer that joins or leaves.
     """
 
-    def __init__(self, session: Session, robot: str = "*", wire: str = "native") -> None:
+    def __init__(
+        self,
+        session: Session,
+        robot: str = "*",
+        wire: str = "native",
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
         from zstate.net.presence import watch
 
         self.words = words_of(wire)
         self._announced: set[Announced] = set()
-        self._watch = watch(session, robot if is_ros(wire) else "*", self._note, wire)
+        self._on_change = on_change
+        self._watch = watch(session, robot if is_ros(wire) else "*", self._update, wire)
 
     def close(self) -> None:
         self._watch.close()
 
-    def _note(self, announced: Announced, alive: bool) -> None:
+    def _update(self, announced: Announced, alive: bool) -> None:
         change = self._announced.add if alive else self._announced.discard
         change(announced)
+        self._on_change()
 
     def robots(self) -> tuple[RobotInfo, ...]:
-        """The robots that somebody writes for, as ``discover`` gives them."""
+        """Robots with at least one writer, as ``discover`` returns them."""
         from zstate.net.presence import by_robot
 
         return by_robot(self._announced.copy())
 
     def streams(self, robot: str) -> frozenset[Stream]:
-        """What somebody writes for ``robot``."""
-        return frozenset(said.stream for said in self._announced.copy() if said.robot == robot)
+        """The streams of ``robot`` that have a writer."""
+        return frozenset(one.stream for one in self._announced.copy() if one.robot == robot)
 
     def silence(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
-        """Why no sample of ``stream`` comes (any more, if ``ended``), as far as one can tell from here."""
+        """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
         return self.words.silence(robot, stream, self.robots(), ended=ended)

@@ -1,0 +1,14 @@
+from __future__ import annotations
+
+from zstate._util.suggestions import did_you_mean, suggestion_text
+
+
+def test_similar_names_are_suggested_and_others_are_not():
+    assert did_you_mean("elbov", ["shoulder", "elbow"]) == "; did you mean 'elbow'?"
+    assert not did_you_mean("wrist", ["shoulder", "elbow"])
+    assert did_you_mean("arm_1", ["arm_2", "arm_3", "hand"], count=2) == "; did you mean 'arm_3' or 'arm_2'?"
+
+
+def test_no_name_is_no_suggestion():
+    assert not suggestion_text()
+    assert not suggestion_text(None)

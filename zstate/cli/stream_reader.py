@@ -1,0 +1,98 @@
+"""Reader of one stream of one robot, sample by sample."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+from zstate.cli.console import fail, note
+from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.waiting import ConditionWaiter
+from zstate.clock import LONGEST_WAIT_S
+from zstate.closing import Closing
+from zstate.errors import MessageError
+from zstate.net.presence import announce_reader
+from zstate.net.streams import CAPACITY, StreamSubscriber
+from zstate.net.wires import wire_named
+from zstate.wire.keys import Stream, check_robot
+from zstate.wire.messages import Message, Sample
+from zstate.wire.protocol import SerializedSample
+
+if TYPE_CHECKING:
+    from zstate.net.session import Session
+
+
+class TimedSample(NamedTuple):
+    """A sample, and its arrival ``came`` [ns] by the monotonic clock."""
+
+    came: int
+    sample: Sample
+
+
+class StreamReader(Closing):
+    """Samples of ``stream`` of ``robot`` in order of arrival, for one reading thread.
+
+    Messages that cannot be decoded are skipped; the first of each kind is noted.
+    """
+
+    def __init__(self, session: Session, robot: str, stream: Stream, wire: str = "native") -> None:
+        self.robot = check_robot(robot)
+        self._stream: Stream = stream
+        self._wire = wire_named(wire)
+        self._refused: set[str] = set()
+        self._samples: queue.SimpleQueue[TimedSample] = queue.SimpleQueue()
+        self._waiter = ConditionWaiter()
+        self._directory = RobotDirectory(session, robot, wire, self._waiter.notify)
+        key = self._wire.expression(robot, stream)
+        self._subscriber = StreamSubscriber(session, key, self._on_samples)
+        self._announcements = announce_reader(session, self._wire, robot, (stream,))
+
+    def close(self) -> None:
+        for announcement in self._announcements:
+            announcement.close()
+        self._subscriber.close()
+        self._directory.close()
+
+    def _on_samples(self, arrivals: list[SerializedSample]) -> None:
+        came = time.monotonic_ns()
+        for arrival in arrivals:
+            for sample in self._decode(arrival):
+                assert isinstance(sample, Sample)
+                # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
+                if self._samples.qsize() < CAPACITY:
+                    self._samples.put(TimedSample(came, sample))
+        self._waiter.notify()
+
+    def _decode(self, arrival: SerializedSample) -> Sequence[Message]:
+        try:
+            return self._wire.decode(self._stream, arrival, self.robot)
+        except MessageError as error:
+            if error.reason not in self._refused:
+                self._refused.add(error.reason)
+                note(f"{arrival.key}: {error}; further ones are passed over in silence")
+            return ()
+
+    def next(self, timeout_s: float) -> TimedSample | None:
+        """The next sample, or None if none arrives within ``timeout_s``, at most 0.5 s."""
+        try:
+            return self._samples.get(timeout=min(timeout_s, LONGEST_WAIT_S))
+        except queue.Empty:
+            return None
+
+    def first(self, timeout_s: float | None = None) -> TimedSample:
+        """The first sample. Notes what it waits for; fails after ``timeout_s``."""
+        waiter = self._waiter
+        if not waiter.wait_for(self._samples.qsize, timeout_s, self._reason):
+            fail(f"gave up after {timeout_s:g} s: {self._reason()}")
+        if waiter.noted:
+            note(f"heard {self._directory.words.place(self.robot, (self._stream,))}")
+        return self._samples.get_nowait()
+
+    def silence(self) -> str:
+        """Why no more samples arrive."""
+        return self._directory.silence(self.robot, self._stream, ended=True)
+
+    def _reason(self) -> str:
+        return self._directory.silence(self.robot, self._stream)

@@ -1,0 +1,318 @@
+"""Waiting for robots, poses and other conditions, with a note about what is missing.
+
+Callbacks of subscriptions wake the waiting main thread; no state is polled. Ctrl-C ends every wait at once.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING, NoReturn
+
+from zstate.cli.console import GRACE_S, fail, note
+from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.words import is_ros
+from zstate.clock import wait_in_slices
+from zstate.closing import Closing
+from zstate.errors import (
+    InFuture,
+    InPast,
+    InvalidInput,
+    LookupFailed,
+    MessageError,
+    NoData,
+    UnknownFrame,
+    WaitTimeout,
+    duration_text,
+)
+
+if TYPE_CHECKING:
+    from zstate.buffer.frames import FrameInfo
+    from zstate.listener import Follow, TransformListener
+    from zstate.net.session import Session
+    from zstate.transform import Transform
+    from zstate.wire.keys import Stream
+    from zstate.wire.protocol import SerializedSample
+
+# A burst of notifications costs one check: conditions on a large fleet take milliseconds.
+_CHECK_INTERVAL_S = 0.02
+
+_LEAVE_OUT = "leave --at out for the newest pose"
+_NOT_RECEIVED = (
+    "this command knows what it receives while it runs, and what publishers still have of the last seconds: "
+    f"{_LEAVE_OUT}, or name an instant to come"
+)
+
+
+class ConditionWaiter:
+    """Wakes the waiting main thread when a condition may have become true.
+
+    ``notify`` is a callback for subscriptions: any thread, any arguments. ``noted`` is the last reason that
+    the latest ``wait_for`` printed, empty if it ended without.
+    """
+
+    def __init__(self) -> None:
+        self.noted = ""
+        self._changed = threading.Event()
+
+    def notify(self, *_: object) -> None:
+        """Have waiting conditions checked again."""
+        self._changed.set()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait for a notification since the last call, at least 20 ms; False after ``timeout_s``."""
+        began = time.monotonic()
+        if not wait_in_slices(self._changed, timeout_s):
+            return False
+        time.sleep(max(0.0, began + _CHECK_INTERVAL_S - time.monotonic()))
+        self._changed.clear()
+        return True
+
+    def wait_for(
+        self,
+        condition: Callable[[], object],
+        timeout_s: float | None = None,
+        reason: Callable[[], str] | None = None,
+    ) -> bool:
+        """Wait until ``condition()`` is true; False after ``timeout_s``.
+
+        A wait of more than 0.5 s prints ``reason()`` as a note, again whenever it changes.
+        """
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        note_at: float | None = None
+        self.noted = ""
+        while not condition():
+            now = time.monotonic()
+            if deadline is not None and now >= deadline:
+                return False
+            if reason is not None and note_at is None:
+                note_at = now + GRACE_S  # from the first check on, which may have loaded modules
+            elif reason is not None and note_at is not None and now >= note_at:
+                # Not every cause of a reason notifies, so it is evaluated twice a second as well.
+                note_at = now + GRACE_S
+                if (text := reason()) != self.noted:
+                    self.noted = text
+                    note(f"waiting: {text}", event="waiting")
+            wake_at = min((one for one in (deadline, note_at) if one is not None), default=None)
+            self.wait(None if wake_at is None else wake_at - now)
+        return True
+
+    def wait_until_stable(
+        self,
+        state: Callable[[], object],
+        is_complete: Callable[[bool], bool],
+        *,
+        quiet_s: float,
+        timeout_s: float,
+    ) -> None:
+        """Wait until ``is_complete(stable)``, for at most ``timeout_s``.
+
+        ``stable`` is True if ``state()`` has had the same value for ``quiet_s``.
+        """
+        began = changed = time.monotonic()
+        value = state()
+        while (now := time.monotonic()) < began + timeout_s:
+            if (current := state()) != value:
+                value, changed = current, now
+            is_stable = now >= changed + quiet_s
+            if is_complete(is_stable):
+                return
+            self.wait((began + timeout_s if is_stable else min(began + timeout_s, changed + quiet_s)) - now)
+
+
+class RobotReadiness(Closing):
+    """Readiness of ``robots``: a robot is ready when every moving edge has a sample."""
+
+    def __init__(self, session: Session, robots: Sequence[str], wire: str) -> None:
+        from zstate.net.latched import LatchedSubscriber
+        from zstate.net.wires import wire_named
+
+        self._session, self._wire = session, wire
+        self._robots = tuple(dict.fromkeys(robots))
+        self._format = wire_named(wire)
+        self._rigid: set[str] = set()
+        self._listeners: dict[str, list[TransformListener]] = {}
+        self._waiter = ConditionWaiter()
+        self._missing = ""
+        with ExitStack() as opening:
+            robot = self._robots[0] if len(self._robots) == 1 else "*"
+            directory = RobotDirectory(session, robot, wire, self._waiter.notify)
+            self._directory = opening.enter_context(directory)
+            if not is_ros(wire):
+                key = self._format.expression(robot, "robot_description")
+                opening.enter_context(LatchedSubscriber(session, key, self._on_description))
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def frames(self, robot: str) -> tuple[FrameInfo, ...]:
+        """The known frames of ``robot``."""
+        return max((one.buffer.frames() for one in self._listeners.get(robot, ())), key=len, default=())
+
+    def wait(self, timeout_s: float) -> str:
+        """Wait until all robots are ready; what is missing after ``timeout_s``, empty if nothing is."""
+        self._waiter.wait_for(self._are_ready, timeout_s, lambda: self._missing)
+        return self._missing
+
+    def _are_ready(self) -> bool:
+        self._missing = next((text for robot in self._robots if (text := self._missing_of(robot))), "")
+        return not self._missing
+
+    def _missing_of(self, robot: str) -> str:
+        streams, words = self._directory.streams(robot), self._directory.words
+        if not streams:
+            return words.unknown(robot, self._directory.robots())
+        if robot not in self._listeners:
+            self._listeners[robot] = [self._listen(robot, follow) for follow in self._followed(streams)]
+        if self._is_ready(robot):
+            return ""
+        refused = "; ".join(text for one in self._listeners[robot] for text in one.refusals.values())
+        stream = self._first_missing(streams)
+        return refused or words.silence(robot, stream, self._directory.robots(), ended=False)
+
+    def _is_ready(self, robot: str) -> bool:
+        for listener in self._listeners[robot]:
+            moving = [frame for frame in listener.buffer.frames() if frame.kind in ("joint", "pose")]
+            if (moving or robot in self._rigid) and all(frame.count for frame in moving):
+                return True
+        return False
+
+    def _on_description(self, arrival: SerializedSample) -> None:
+        """Register robots without moving joints: they publish no samples."""
+        from zstate.wire.messages import RobotDescription
+
+        with suppress(MessageError, InvalidInput):  # withdrawn; or broken, which the listener reports
+            robot = self._format.robot_of(arrival.key)
+            for message in self._format.decode("robot_description", arrival, robot):
+                if isinstance(message, RobotDescription) and not message.moving_edges:
+                    self._rigid.add(robot)
+                    self._waiter.notify()
+
+    def _first_missing(self, streams: Collection[Stream]) -> Stream:
+        """The missing stream on which the others depend."""
+        if is_ros(self._wire):
+            return "tf"
+        return "joint_states" if "robot_description" in streams else "robot_description"
+
+    def _followed(self, streams: Collection[Stream]) -> list[Follow]:
+        if is_ros(self._wire):
+            return ["tf"]
+        # Without a writer of joint states, transforms may be published instead.
+        return ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
+
+    def _listen(self, robot: str, follow: Follow) -> TransformListener:
+        from zstate.listener import TransformListener
+
+        listener = TransformListener(
+            self._session, robot, wire=self._wire, follow=follow, history_on_join=False
+        )
+        listener.add_observer(self._waiter.notify)
+        return self._opened.enter_context(listener)
+
+
+class PoseWaiter:
+    """Waits for poses of ``source`` in ``target``, and notes on standard error what is missing."""
+
+    def __init__(
+        self, listener: TransformListener, directory: RobotDirectory, target: str, source: str
+    ) -> None:
+        self._listener = listener
+        self._directory = directory
+        self._words = directory.words
+        self._frames = (target, source)
+        self._noted: tuple[object, ...] | None = None
+
+    def answer(self, at: int | None = None, *, timeout_s: float | None = None) -> Transform:
+        """The pose at ``at``, or the newest, as soon as it is known.
+
+        Raises LookupFailed for what waiting cannot mend. Fails after ``timeout_s``.
+        """
+        began = time.monotonic()
+        while True:
+            left_s = GRACE_S if timeout_s is None else began + timeout_s - time.monotonic()
+            try:
+                transform = self._listener.buffer.wait(*self._frames, at, max(0.0, min(left_s, GRACE_S)))
+            except WaitTimeout as reason:
+                if timeout_s is not None and left_s <= GRACE_S:
+                    self._fail_after(timeout_s, reason)
+                self._note_once(reason)
+            except InPast as reason:
+                self._fail_in_past(reason)
+            else:
+                self._note_end()
+                return transform
+
+    def silence(self) -> str:
+        """Why no newer pose arrives: the edge with the oldest samples."""
+        transform = self._listener.buffer.lookup(*self._frames)
+        assert transform.stamp is not None
+        reason = self._listener.buffer.explain(*self._frames, transform.stamp + 1)
+        edge = writer = ""
+        if isinstance(reason, LookupFailed):
+            edge = "" if reason.edge is None else f" of {' -> '.join(map(repr, reason.edge))}"
+            writer = "" if reason.writer is None else f", which {reason.writer} wrote"
+        age_s = self.age_s(transform)
+        old = "" if age_s is None else f": the newest is {duration_text(round(age_s * 1e9))} old"
+        return self.explained(f"no new sample{edge}{writer}{old}")
+
+    def age_s(self, transform: Transform) -> float | None:
+        """Age of a pose [s]; None if it is static, or stamped by another clock than the buffer's."""
+        buffer = self._listener.buffer
+        if transform.stamp is None:
+            return None
+        if (buffer.domain_between(*self._frames) or buffer.clock.domain) != buffer.clock.domain:
+            return None
+        return transform.age(buffer.clock)
+
+    def explained(self, text: str) -> str:
+        """A text of the library about these frames, with the names and commands of the wire."""
+        return self._words.explained(text)
+
+    def _note_once(self, reason: LookupFailed) -> None:
+        hint = self._hint(reason)
+        key = (type(reason), reason.edge, getattr(reason, "name", ""), hint)
+        if key != self._noted:
+            self._noted = key
+            note(f"waiting: {self._reason_text(reason, hint)}")
+
+    def _note_end(self) -> None:
+        """Note that the robots are received, if a wait for them was noted."""
+        if self._noted is None:
+            return
+        self._noted = None
+        frames = self._listener.buffer.frames()
+        for robot in self._listener.robots():
+            note(self._words.heard(robot, frames))
+
+    def _fail_in_past(self, reason: InPast) -> NoReturn:
+        advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED
+        fail(f"{self.explained(reason.happening)}; {advice}")
+
+    def _fail_after(self, timeout_s: float, reason: WaitTimeout) -> NoReturn:
+        advice = ""
+        if isinstance(reason, InFuture | InPast) and reason.is_of_another_time:
+            advice = f"; {_LEAVE_OUT}"
+        elif isinstance(reason, InFuture):
+            advice = f"; wait longer (--timeout), or {_LEAVE_OUT}"
+        elif isinstance(reason, InPast):
+            advice = f"; {_NOT_RECEIVED}"
+        fail(f"gave up after {timeout_s:g} s: {self._reason_text(reason, self._hint(reason))}{advice}")
+
+    def _reason_text(self, reason: LookupFailed, hint: str) -> str:
+        if isinstance(reason, UnknownFrame) and not reason.frame_count:
+            return hint  # no frame at all is known: that is not about this one
+        if isinstance(reason, InFuture | InPast):
+            return self.explained(reason.happening)  # without the advice for programs
+        return f"{self.explained(reason.explanation())}{f' ({hint})' if hint else ''}"
+
+    def _hint(self, reason: LookupFailed) -> str:
+        """What the directory of robots adds to the buffer's reason."""
+        robot, robots = self._listener.robot, self._directory.robots()
+        if isinstance(reason, UnknownFrame) and not reason.near_misses:
+            return self._words.lacking(robot, "robot_description", robots, heard=bool(reason.frame_count))
+        if isinstance(reason, NoData):
+            return self._words.lacking(robot, "joint_states", robots, heard=True)
+        return ""
