@@ -17,17 +17,17 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
     {"closing", "errors", "locks", "_kernel"},
-    {"checks", "extension"},
+    {"checks", "extension", "_util"},
     {"clock"},
     {"se3", "rate", "facts"},
     {"transform", "twist"},
     {"model", "buffer", "wire"},
-    {"net", "record"},
-    {"sources", "following", "moving_edges", "status", "lookup_service"},
+    {"net", "record", "following"},
+    {"sources", "ingest", "moving_edges", "status"},
+    {"nodes"},
     {
         "publisher",
         "statics",
-        "listener",
         "recorder",
         "recording",
         "clock_publisher",
@@ -47,7 +47,7 @@ NEIGHBOURS = {
 
 # Constructors that users look for on the class, and that are made elsewhere, loaded when they are called.
 CONSTRUCTORS = {
-    ("buffer/buffer.py", "following"),  # TransformBuffer.from_recording
+    ("buffer/buffer.py", "recording"),  # TransformBuffer.from_recording
     ("buffer/buffer.py", "record"),
 }
 

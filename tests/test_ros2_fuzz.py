@@ -21,8 +21,8 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import MessageError
-from zstate.listener import TransformListener
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 from zstate.publisher import StatePublisher
 from zstate.wire.ros2.wire import Ros2Wire
 from zstate.wire.wire import Arrival

@@ -12,9 +12,9 @@ from support import until
 
 from zstate.clock_publisher import ClockPublisher
 from zstate.errors import Closed, NoClock
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.net.streams import StreamPublisher
+from zstate.nodes.listener import TransformListener
 from zstate.publisher import StatePublisher
 from zstate.rate import Rate
 from zstate.simulated_clock import SimulatedClock

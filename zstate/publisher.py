@@ -13,7 +13,6 @@ from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock, outlive_fork
-from zstate.lookup_service import LookupService, RecentBuffer
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.limits import JointLimits
 from zstate.model.robot import RobotModel
@@ -26,6 +25,7 @@ from zstate.net.presence import writer_here
 from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
 from zstate.net.wires import wire_named, wire_names
+from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.rate import Rate, RateReport
 from zstate.sources.source import JointSource
 from zstate.status import Beat, LimitWatch, PublisherStats, StreamStats
@@ -64,7 +64,7 @@ class StatePublisher(Closing):
     those who ask (``zstate.net.status``); it remembers the last ``cache_s`` seconds of samples for
     listeners that join (``zstate.net.history``; 0 for none); and it answers lookups of its own frames on
     ``zstate/<robot>/lookup`` from these, or from the newest sample without a cache
-    (``zstate.lookup_service``). A context manager; safe from any thread.
+    (``zstate.nodes.lookup_service``). A context manager; safe from any thread.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class StatePublisher(Closing):
             self.memory = self._kept if cache_s else None
             if self._kept is not None and {"joint_states", "tf"}.intersection(streams):
                 recent = RecentBuffer(model, self.robot, self._kept)
-                opening.enter_context(LookupService(session, recent.filled, self.robot))
+                opening.enter_context(LookupService(session, recent.buffer, self.robot))
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:

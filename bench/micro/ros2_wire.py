@@ -19,8 +19,8 @@ from itertools import count
 import numpy as np
 
 from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_model
-from zstate.following.joints import JointFollower
-from zstate.following.tally import Tally
+from zstate.ingest.counters import Counters
+from zstate.ingest.joint_states import JointStateIngest
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.net.outlets import Outlets
 from zstate.net.presence import writer_here
@@ -93,7 +93,7 @@ def reading(wire: str, model: RobotModel) -> dict[str, Call]:
         payloads = [outlet.encode(sample(model, next(stamps))) for _ in range((ROUNDS + 1) * CALLS)]
         return [Arrival(outlet.key, one, outlet.encoding, outlet.attachment(STAMP)) for one in payloads]
 
-    follower = JointFollower("r1", TransformBuffer(), Tally())
+    follower = JointStateIngest("r1", TransformBuffer(), Counters())
     follower.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
     plain, whole = iter(arrivals()), iter(arrivals())
 

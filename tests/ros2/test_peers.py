@@ -17,8 +17,8 @@ from ros_messages import (
 )
 from support import until
 
-from zstate.listener import TransformListener
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 from zstate.publisher import StatePublisher
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform

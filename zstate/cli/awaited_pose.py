@@ -10,7 +10,7 @@ from zstate.cli.roster import Roster
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
 
 if TYPE_CHECKING:
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
     from zstate.transform import Transform
 
 # Whoever has answers usually gives the first one sooner; waiting is mentioned only afterwards.

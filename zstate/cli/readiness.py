@@ -19,8 +19,8 @@ from zstate.wire.wire import Arrival
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
-    from zstate.listener import Follow, TransformListener
     from zstate.net.session import Session
+    from zstate.nodes.listener import Follow, TransformListener
     from zstate.wire.keys import Stream
 
 # Who is ready is usually found so sooner; waiting is mentioned only afterwards.
@@ -108,7 +108,7 @@ class Readiness(Closing):
         return ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
 
     def _listen(self, robot: str, follow: Follow) -> TransformListener:
-        from zstate.listener import TransformListener
+        from zstate.nodes.listener import TransformListener
 
         listener = TransformListener(
             self._session, robot, wire=self._wire, follow=follow, history_on_join=False

@@ -5,9 +5,9 @@ from __future__ import annotations
 from contextlib import ExitStack, suppress
 from typing import Protocol
 
+from zstate._util.refusals import Refusals
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
-from zstate.following.tally import Tally
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
@@ -36,10 +36,10 @@ class Hearer(Protocol):
 class Hearing(Closing):
     """Hands ``hearer`` what is said of ``robot``, each stream on a thread of its own."""
 
-    def __init__(self, session: Session, robot: str, hearer: Hearer, tally: Tally) -> None:
+    def __init__(self, session: Session, robot: str, hearer: Hearer, refusals: Refusals) -> None:
         self._robot = robot
         self._hearer = hearer
-        self._tally = tally
+        self._refusals = refusals
         self._wire = NativeWire()
         expression = self._wire.expression
         with ExitStack() as opening:
@@ -71,9 +71,9 @@ class Hearing(Closing):
             for message in self._wire.decode(stream, arrival, self._robot):
                 self._tell(arrival.key, message)
         except MessageError as error:
-            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
+            self._refusals.count(error.reason, f"{arrival.key}: {error}")
         except InvalidInput as error:
-            self._tally.refuse("bad numbers", f"{arrival.key}: {error}")
+            self._refusals.count("bad numbers", f"{arrival.key}: {error}")
 
     def _tell(self, key: str, message: Message) -> None:
         if isinstance(message, JointState):

@@ -26,7 +26,7 @@ from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
     from zstate.cli.awaited_pose import AwaitedPose
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
     from zstate.transform import Transform
     from zstate.twist import Twist
 
@@ -112,7 +112,7 @@ def tf_command(
     """
     from zstate.cli.awaited_pose import AwaitedPose
     from zstate.cli.clocks import open_clock
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     ends = once or at is not None
     with (

@@ -89,7 +89,7 @@ def _await_frame(network: Network, names: tuple[str, ...], wire: str, timeout_s:
     from zstate.cli.awaited_pose import AwaitedPose
     from zstate.cli.roster import Roster
     from zstate.cli.words import followed
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     target, source = names
     deadline = time.monotonic() + timeout_s

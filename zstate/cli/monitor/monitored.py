@@ -15,7 +15,7 @@ from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
 from zstate.cli.roster import Roster
 from zstate.errors import duration_text
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 from zstate.transform import Transform
 
 # Waiting is mentioned when it lasts longer than meeting everybody does.

@@ -1,0 +1,1 @@
+"""Nodes: the objects that publish and listen."""
