@@ -20,6 +20,7 @@ import numpy as np
 
 from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_model
 from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.net.outlets import Outlets
@@ -93,14 +94,14 @@ def reading(wire: str, model: RobotModel) -> dict[str, Call]:
         payloads = [outlet.encode(sample(model, next(stamps))) for _ in range((ROUNDS + 1) * CALLS)]
         return [Arrival(outlet.key, one, outlet.encoding, outlet.attachment(STAMP)) for one in payloads]
 
-    follower = JointStateIngest("r1", TransformBuffer(), Counters())
-    follower.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
+    ingest = JointStateIngest("r1", FrameOwnership(TransformBuffer(), Counters()))
+    ingest.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
     plain, whole = iter(arrivals()), iter(arrivals())
 
     def into_buffer() -> None:
         for message in spoken.decode("joint_states", next(whole), "r1"):
             assert isinstance(message, Sample)
-            follower.take(message, overflowed=False)
+            ingest.insert_sample(message, overflowed=False)
 
     return {
         "decode": lambda: spoken.decode("joint_states", next(plain), "r1"),

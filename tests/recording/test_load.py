@@ -1,4 +1,4 @@
-"""A buffer made of a recording answers as a listener's did: the same followers, the same messages."""
+"""A buffer made of a recording answers as a listener's did: the same ingest, the same messages."""
 
 from __future__ import annotations
 

@@ -26,8 +26,9 @@ class TransformIngest(StreamIngest):
         self, robot: str, ownership: FrameOwnership, on_set_back: ClockSetBack | None = None
     ) -> None:
         super().__init__(robot, ownership, on_set_back)
-        # The newest stamp [ns] by the digest of a sample's edges; ``_newest`` is not used here.
-        self._newest_by_order: BoundedDict[bytes, int] = BoundedDict()
+        # The newest stamp [ns], in a list that is updated, by the digest of a sample's edges. ``_newest`` is
+        # not used here.
+        self._newest_by_order: BoundedDict[bytes, list[int]] = BoundedDict()
         self._edges: Edges = ()
         self._order = b""
         self._described = EdgeSource(robot, "", is_model=True)
@@ -117,13 +118,17 @@ class TransformIngest(StreamIngest):
     def _advance(self, sample: Sample) -> bool:
         # One writer may stamp one edge later than another, for instance one from a slow camera.
         newest = self._newest_by_order.get(sample.order)
-        if newest is None or sample.stamp >= newest:
-            self._newest_by_order[sample.order] = sample.stamp
+        if newest is None:
+            self._newest_by_order[sample.order] = [sample.stamp]
             return False
-        return sample.stamp < newest - SET_BACK_NS
+        if sample.stamp >= newest[0]:
+            newest[0] = sample.stamp
+            return False
+        return sample.stamp < newest[0] - SET_BACK_NS
 
     def _newest_of(self, sample: Sample) -> int | None:
-        return self._newest_by_order.get(sample.order)
+        newest = self._newest_by_order.get(sample.order)
+        return None if newest is None else newest[0]
 
     def _drop_history(self) -> None:
         self._newest_by_order.clear()
