@@ -23,8 +23,8 @@ FLOORS = (
     {"transform", "twist"},
     {"model", "buffer", "wire"},
     {"net", "record"},
-    {"sources", "following", "lookup_service"},
-    {"nodes", "listener", "recorder", "recording"},
+    {"sources", "following", "ingest"},
+    {"nodes", "recorder", "recording"},
     {"ros1", "bridge", "replaying"},
     {"replayer"},
     {"zstate"},
@@ -39,7 +39,7 @@ NEIGHBOURS = {
 
 # Constructors that users look for on the class, and that are made elsewhere, loaded when they are called.
 CONSTRUCTORS = {
-    ("buffer/buffer.py", "following"),  # TransformBuffer.from_recording
+    ("buffer/buffer.py", "recording"),  # TransformBuffer.from_recording
     ("buffer/buffer.py", "record"),
 }
 

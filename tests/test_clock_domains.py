@@ -15,13 +15,13 @@ from tales import START, Tale
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock, SystemClock
 from zstate.errors import ClockMismatch, InvalidInput
-from zstate.following.joints import JointFollower
-from zstate.following.off_clock import OffClock, likely_cause
-from zstate.following.ownership import FrameOwnership
-from zstate.following.tally import Tally
-from zstate.listener import TransformListener
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
+from zstate.ingest.stamp_checks import StampCheck, likely_cause
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.clock import ClockPublisher, SimulatedClock
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.replayer import Replayer
@@ -318,41 +318,43 @@ def test_a_clock_set_back_by_less_than_the_history_begins_a_new_history_of_that_
         assert not buffer.can_lookup("r1/world", "r1/tool", NOW)
         assert buffer.can_lookup("r2/world", "r2/tool", NOW)
         until(lambda: [one.robot for one in listener.events() if one.kind == "set back"] == ["r1"])
-    assert caplog.text.count("the clock of 'r1' went back by 5.0 s: its history begins anew") == 1
+    assert caplog.text.count("the clock of 'r1' went back by 5.0 s: its history restarts") == 1
     assert "'r2'" not in caplog.text
 
 
-def a_follower(history_s: float = 10.0) -> tuple[TransformBuffer, JointFollower]:
+def a_follower(history_s: float = 10.0) -> tuple[TransformBuffer, JointStateIngest]:
     buffer = TransformBuffer(history_s)
-    follower = JointFollower("r1", FrameOwnership(buffer, Tally()))
-    follower.describe(RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ()))
-    return buffer, follower
+    ingest = JointStateIngest("r1", FrameOwnership(buffer, Counters()))
+    ingest.describe(RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ()))
+    return buffer, ingest
 
 
-def take(follower: JointFollower, *samples: tuple[int, int]) -> None:
+def take(ingest: JointStateIngest, *samples: tuple[int, int]) -> None:
     """Take samples of these numbers and stamps [ms after NOW]."""
     for seq, stamp in samples:
         order = order_digest(RRBOT.joint_names)
-        follower.take(JointState(NOW + stamp * MS, seq, 1, order, to_block([0.1, 0.2])), overflowed=False)
+        ingest.insert_sample(
+            JointState(NOW + stamp * MS, seq, 1, order, to_block([0.1, 0.2])), overflowed=False
+        )
 
 
 def test_samples_that_the_network_reorders_are_sorted_in():
-    buffer, follower = a_follower()
-    take(follower, (0, 0), (1, 1_000), (5, 5_000), (2, 2_000), (3, 3_000), (4, 4_000), (6, 6_000))
+    buffer, ingest = a_follower()
+    take(ingest, (0, 0), (1, 1_000), (5, 5_000), (2, 2_000), (3, 3_000), (4, 4_000), (6, 6_000))
     for stamp in range(0, 7_000, 1_000):
         assert buffer.lookup("world", "tool", NOW + stamp * MS).kind == "exact"
 
 
 def test_one_wrong_stamp_does_not_end_a_history():
-    buffer, follower = a_follower()
-    take(follower, (0, 0), (1, 10), (2, -5_000), (3, 20), (4, 30))
+    buffer, ingest = a_follower()
+    take(ingest, (0, 0), (1, 10), (2, -5_000), (3, 20), (4, 30))
     assert buffer.can_lookup("world", "tool", NOW)
     assert buffer.latest("world", "tool") == NOW + 30 * MS
 
 
 def test_a_clock_set_back_is_noticed_though_samples_are_lost_at_that_moment():
-    buffer, follower = a_follower()
-    take(follower, (0, 0), (1, 10), (9, -5_000), (10, -4_990))
+    buffer, ingest = a_follower()
+    take(ingest, (0, 0), (1, 10), (9, -5_000), (10, -4_990))
     assert buffer.latest("world", "tool") == NOW - 4_990 * MS
     assert not buffer.can_lookup("world", "tool", NOW)
 
@@ -397,13 +399,13 @@ def test_stamps_far_off_are_used_counted_and_named_once_for_each_program(session
 
 
 def test_a_writer_that_starts_again_with_each_sample_is_named_once(caplog):
-    buffer, tally = TransformBuffer(clock=ManualClock(NOW)), Tally()
+    buffer, counters = TransformBuffer(clock=ManualClock(NOW)), Counters()
     buffer.set_domain("r1", "system")
-    off_clock = OffClock(buffer, tally, is_described=True)
+    off_clock = StampCheck(buffer, counters, is_described=True)
     with caplog.at_level(logging.WARNING, "zstate"):
         for session in range(100):
-            off_clock.note("r1", f"driver@host pid {session}", JointState(5, 0, session, b"", b""))
-    assert tally.stats().off_clock == 100
+            off_clock.check("r1", f"driver@host pid {session}", JointState(5, 0, session, b"", b""))
+    assert counters.stats().off_clock == 100
     assert len(caplog.records) == 1
 
 

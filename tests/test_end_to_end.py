@@ -13,9 +13,9 @@ from live import RRBOT
 from support import SOON_S, Child, until
 
 from zstate.buffer.frames import FrameInfo
-from zstate.listener import TransformListener
 from zstate.model.kinematics import Kinematics
 from zstate.net.session import connect
+from zstate.nodes.listener import TransformListener
 from zstate.sources import SineSource
 
 pytestmark = pytest.mark.processes

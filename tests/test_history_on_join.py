@@ -15,12 +15,12 @@ from support import DEADLINE_S, Child, until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InPast, InvalidInput
-from zstate.listener import TransformListener
-from zstate.lookup_service import RecentBuffer
 from zstate.model.catalog import load_model
 from zstate.net.history import Memory, PastReader, answer_past
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.lookup_service import RecentBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
@@ -143,7 +143,7 @@ def test_a_wait_for_the_recent_past_right_after_joining_ends_with_the_exact_pose
                 with TransformListener(reader, "r1") as listener:
                     asked = time.time_ns() - PAST_NS
                     # Bit for bit: no neighbour of that instant was still missing.
-                    assert waited(how, listener.buffer, asked) == sent.filled().lookup("world", "tool", asked)
+                    assert waited(how, listener.buffer, asked) == sent.buffer().lookup("world", "tool", asked)
         finally:
             publisher.close()
             runner.join()

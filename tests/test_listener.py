@@ -12,11 +12,11 @@ from support import SOON_S, Child, until
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
 from zstate.errors import AmbiguousFrame, InvalidInput
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.presence import discover
 from zstate.net.streams import StreamPublisher
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource

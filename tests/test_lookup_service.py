@@ -11,9 +11,9 @@ from support import Child, until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, UnknownFrame, Unreachable
-from zstate.lookup_service import LookupService, RecentBuffer
 from zstate.net.service import ask_lookup
 from zstate.net.session import Session, connect
+from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.transform import Transform
 from zstate.wire.json import to_json
@@ -181,11 +181,11 @@ def test_a_publisher_whose_clock_was_set_back_answers_of_the_time_since(sessions
         assert publisher.cache is not None
         recent = RecentBuffer(RRBOT, "r1", publisher.cache)
         publisher.publish([0.0, 0.0], stamp=STAMP)
-        assert recent.filled().latest("world", "tool") == STAMP
+        assert recent.buffer().latest("world", "tool") == STAMP
         for number in range(2):
             publisher.publish([0.5, 0.0], stamp=number)
-        assert recent.filled().latest("world", "tool") == 1
-        assert recent.filled().lookup("world", "tool", 0).kind == "exact"
+        assert recent.buffer().latest("world", "tool") == 1
+        assert recent.buffer().lookup("world", "tool", 0).kind == "exact"
 
 
 def test_a_stranger_in_another_process_asks_through_a_router(spawn: Callable[..., Child], free_port: int):

@@ -67,7 +67,7 @@ def wild(path: Path, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_many_instants_are_answered_as_a_buffer_of_it_all_answers(tmp_path: Path, seed: int, monkeypatch):
-    monkeypatch.setattr("zstate.following.recorded._BATCH", 37)
+    monkeypatch.setattr("zstate.recording.load._BATCH", 37)
     wild(tmp_path / "r.mcap", seed)
     dice = np.random.default_rng(seed)
     begin = START - 3600 * S

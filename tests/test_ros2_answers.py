@@ -21,10 +21,10 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import InvalidInput
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.model.coordinates import velocity_slots
 from zstate.net.presence import discover
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SubscribedSource

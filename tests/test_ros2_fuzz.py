@@ -21,8 +21,8 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import MessageError
-from zstate.listener import TransformListener
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.ros2.wire import Ros2Wire

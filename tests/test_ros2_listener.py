@@ -19,7 +19,7 @@ from wire.ros2.raw_nodes import (
     moved,
 )
 
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 
 SECOND = 10**9

@@ -8,8 +8,8 @@ import pytest
 from support import until
 from wire.ros2.raw_nodes import tokens
 
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
+from zstate.nodes.listener import TransformListener
 from zstate.sources import SubscribedSource
 
 

@@ -13,7 +13,7 @@ from wire.ros2.raw_nodes import (
     moved,
 )
 
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 
 NAMES = RRBOT.joint_names
 FIXED = {(joint.parent, joint.child): joint.origin for joint in RRBOT.joints if joint.type == "fixed"}

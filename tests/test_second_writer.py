@@ -12,10 +12,10 @@ from msgspec.structs import replace
 from support import a_free_port, until
 
 from zstate.errors import InvalidInput, SecondWriter
-from zstate.following.events import Event
-from zstate.listener import TransformListener
+from zstate.ingest.events import WriterEvent
 from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
@@ -179,7 +179,7 @@ def test_parts_of_a_robot_may_have_a_writer_each(sessions):
 
 
 def test_with_takeover_the_newest_is_followed_and_readers_are_told_once(sessions):
-    told: list[Event] = []
+    told: list[WriterEvent] = []
     with (
         TransformListener(sessions[1], "r1", on_event=told.append) as listener,
         StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"], program="driver") as first,

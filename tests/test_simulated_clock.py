@@ -11,10 +11,10 @@ from live import await_reader
 from support import until
 
 from zstate.errors import Closed, NoClock
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.clock import ClockPublisher, SimulatedClock
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.rate import Rate
 from zstate.sources import SineSource

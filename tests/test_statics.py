@@ -7,9 +7,9 @@ from support import SOON_S, until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Closed, InsertRefused, InvalidInput
-from zstate.listener import TransformListener
 from zstate.net.presence import discover
 from zstate.net.session import connect
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform

@@ -35,16 +35,16 @@ if TYPE_CHECKING:
         ZStateError,
     )
     from zstate.extension import kernel
-    from zstate.listener import TransformListener
     from zstate.model.catalog import load_model
     from zstate.model.kinematics import Kinematics
     from zstate.model.robot import RobotModel
     from zstate.net.presence import discover
     from zstate.net.session import connect
     from zstate.nodes.clock import SimulatedClock
+    from zstate.nodes.listener import TransformListener
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.static_publisher import StaticPublisher
-    from zstate.recording import Recording
+    from zstate.recording.recording import Recording
     from zstate.sources import JointReading, SineSource
     from zstate.transform import Transform
     from zstate.twist import Twist
@@ -91,7 +91,7 @@ __all__ = [
 _HOMES = {
     "JointReading": "sources",
     "Kinematics": "model.kinematics",
-    "Recording": "recording",
+    "Recording": "recording.recording",
     "RobotModel": "model.robot",
     "SimulatedClock": "nodes.clock",
     "SineSource": "sources",
@@ -99,7 +99,7 @@ _HOMES = {
     "StaticPublisher": "nodes.static_publisher",
     "Transform": "transform",
     "TransformBuffer": "buffer.buffer",
-    "TransformListener": "listener",
+    "TransformListener": "nodes.listener",
     "Twist": "twist",
     "connect": "net.session",
     "discover": "net.presence",

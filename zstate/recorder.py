@@ -13,12 +13,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.clock import SystemClock, wait_in_slices
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
-from zstate.following.bounded import remember
-from zstate.following.gaps import Gaps
-from zstate.following.tally import Tally
+from zstate.ingest.counters import Counters
+from zstate.ingest.sequence import GapCounter
 from zstate.locks import new_lock, outlive_fork
 from zstate.net.forked import forked_text
 from zstate.net.inbox import Heard, Inbox
@@ -99,9 +99,9 @@ class Recorder(Closing):
         chosen = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
         self._chosen = tuple(map(check_robot, chosen))
         self._wire = wire_named(wire)
-        self._tally = Tally()
-        self._gaps = Gaps(self._tally)
-        self._programs: dict[int, str] = {}
+        self._counters = Counters()
+        self._gaps = GapCounter(self._counters)
+        self._programs: BoundedDict[int, str] = BoundedDict()
         self._announced: set[str] = set()
         self._held: list[Heard] = []
         self._ends_at = math.inf
@@ -110,7 +110,7 @@ class Recorder(Closing):
         self._closing = new_lock()
         self._stop = outlive_fork(threading.Event())
         self._ended = outlive_fork(threading.Event())
-        self._large = _Large(self._write_large, self._tally)
+        self._large = _Large(self._write_large, self._counters)
         with ExitStack() as opening:
             self._inbox = opening.enter_context(Inbox(session))
             robot = self._chosen[0] if len(self._chosen) == 1 else ANY
@@ -132,7 +132,7 @@ class Recorder(Closing):
     @property
     def stats(self) -> RecorderStats:
         """What has been written, lost and refused so far."""
-        heard, scribe, writer = self._tally.stats(), self._scribe, self._writer
+        heard, scribe, writer = self._counters.stats(), self._scribe, self._writer
         return RecorderStats(
             messages={} if scribe is None else scribe.messages,
             bytes=writer.size,
@@ -166,7 +166,7 @@ class Recorder(Closing):
 
     def _on_writer(self, announced: Announced, alive: bool) -> None:
         if alive:
-            remember(self._programs, announced.writer.session, str(announced.writer))
+            self._programs[announced.writer.session] = str(announced.writer)
             if not self._chosen:
                 self._announced.add(announced.robot)
 
@@ -214,7 +214,7 @@ class Recorder(Closing):
                 return None
         named = robots - {SHARED}
         alone = named.pop() if len(named) == 1 else None
-        return Scribe(self._writer, self._tally.refuse, alone=alone, programs=self._programs)
+        return Scribe(self._writer, self._counters.count_refusal, alone=alone, programs=self._programs)
 
     def _robots_so_far(self) -> set[str]:
         held = (heard for heard in self._held if heard.stream != "clock")
@@ -222,10 +222,10 @@ class Recorder(Closing):
         return {robot for robot in robots if robot is not None} | self._announced.copy()
 
     def _write(self, scribe: Scribe, heard: Heard) -> None:
-        self._gaps.begin(overflowed=heard.overflowed)
+        self._gaps.start_batch(overflowed=heard.overflowed)
         for arrival in heard.arrivals:
             if time.monotonic() > self._ends_at:
-                self._tally.count("dropped")
+                self._counters.count("dropped")
                 continue
             robot = self._robot(heard, arrival)
             if robot is None:
@@ -249,7 +249,7 @@ class Recorder(Closing):
         for message in self._decode(stream, arrival, robot):
             is_known = scribe.take(robot, message, stamp, static_writer)
             if is_known and isinstance(message, Sample | Clock):
-                self._gaps.note((robot, stream, message.session), message.seq)
+                self._gaps.add((robot, stream, message.session), message.seq)
 
     def _robot(self, heard: Heard, arrival: SerializedSample) -> str | None:
         try:
@@ -257,14 +257,14 @@ class Recorder(Closing):
                 self._wire.statics_writer(arrival.key)  # refuses a key that has none
             return self._wire.robot_of(arrival.key) if heard.robot is None else heard.robot
         except InvalidInput as error:
-            self._tally.refuse("foreign", str(error))
+            self._counters.count_refusal("foreign", str(error))
             return None
 
     def _decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         try:
             return self._wire.decode(stream, arrival, robot)
         except MessageError as error:
-            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
+            self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
             return ()
 
 
@@ -275,10 +275,10 @@ class _Large:
     can wait, the oldest values are dropped and counted.
     """
 
-    def __init__(self, write: Callable[[str, Heard, SerializedSample], None], tally: Tally) -> None:
+    def __init__(self, write: Callable[[str, Heard, SerializedSample], None], counters: Counters) -> None:
         self.failure: Exception | None = None
         self._write = write
-        self._tally = tally
+        self._counters = counters
         self._waiting: deque[tuple[str, Heard, SerializedSample]] = deque()
         self._bytes = 0
         self._behind: Counter[str] = Counter()
@@ -323,7 +323,7 @@ class _Large:
         robot, _, arrival = self._waiting.popleft()
         self._bytes -= len(arrival.payload)
         self._behind[robot] -= 1
-        self._tally.count("dropped")
+        self._counters.count("dropped")
 
     def _run(self) -> None:
         while (taken := self._take()) is not None:
@@ -333,7 +333,7 @@ class _Large:
             except RecordingError as error:
                 if self._is_open:  # else the recording ended first
                     self.failure = error
-                self._tally.count("dropped")
+                self._counters.count("dropped")
             except Exception as error:  # it ends the recording, as it would in its own thread
                 self.failure = error
             with self._changed:

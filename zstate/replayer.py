@@ -8,11 +8,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from zstate._util.refusals import Refusals
 from zstate.clock import Clock, SystemClock
 from zstate.closing import Closing
 from zstate.errors import InvalidInput
-from zstate.following.recorded import check_recorded
-from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.net.wires import wire_names
@@ -20,6 +19,7 @@ from zstate.nodes.clock import ClockPublisher
 from zstate.record.models import first_descriptions, model_of
 from zstate.record.reader import RecordReader
 from zstate.record.transcript import LATCHED, Said, Transcript
+from zstate.recording.load import check_has_robot
 from zstate.replaying.cast import Cast
 from zstate.replaying.pace import Lateness, Pace
 from zstate.replaying.standing import Standing
@@ -88,15 +88,15 @@ class Replayer(Closing):
         self._clock: Clock = clock or SystemClock()
         self._pace = Pace(self._clock, rate)
         self._lateness = Lateness()
-        self._tally = Tally()
+        self._refusals = Refusals()
         self._wake, self._running = threading.Event(), threading.Lock()
         self._is_open, self._is_paused = True, False
         self._target: int | None = None
         self._samples = self._passes = 0
         self._reader = RecordReader(path)
         try:
-            self._transcript = Transcript(self._reader, self._tally.refuse)
-            chosen = tuple(check_recorded(self._transcript, robot) for robot in robots)
+            self._transcript = Transcript(self._reader, self._refusals.count)
+            chosen = tuple(check_has_robot(self._transcript, robot) for robot in robots)
             self.robots = chosen or self._transcript.robots
             self._begin, self._end = self._bounds(path, start_s, duration_s)
             self._models = dict(self._read_models())
@@ -120,7 +120,7 @@ class Replayer(Closing):
 
     def _read_models(self) -> Collection[tuple[str, RobotModel]]:
         described = first_descriptions(self._transcript, self.robots)
-        models = {r: model_of(self._transcript, said, self._tally.refuse) for r, said in described.items()}
+        models = {r: model_of(self._transcript, said, self._refusals.count) for r, said in described.items()}
         return [(robot, model) for robot, model in models.items() if model is not None]
 
     @property
@@ -149,7 +149,7 @@ class Replayer(Closing):
             lateness_p99=lateness.quantile(0.99),
             lateness_max=lateness.largest,
             delays=self._pace.delays,
-            refused=self._tally.stats().refused,
+            refused=dict(self._refusals.counts),
         )
 
     def run(self) -> ReplayReport:
@@ -202,7 +202,7 @@ class Replayer(Closing):
                 speakers,
                 models=self._models,
                 standing=standing,
-                tally=self._tally,
+                refusals=self._refusals,
                 takeover=self._takeover,
             ) as cast,
             ClockPublisher(self._session, self._wires) as clock,

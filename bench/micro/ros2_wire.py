@@ -19,8 +19,9 @@ from itertools import count
 import numpy as np
 
 from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_model
-from zstate.following.joints import JointFollower
-from zstate.following.tally import Tally
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.net.presence import writer_here
 from zstate.net.session import Session
@@ -98,14 +99,14 @@ def reading(wire: str, model: RobotModel) -> dict[str, Call]:
             for one in payloads
         ]
 
-    follower = JointFollower("r1", TransformBuffer(), Tally())
-    follower.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
+    ingest = JointStateIngest("r1", FrameOwnership(TransformBuffer(), Counters()))
+    ingest.describe(RobotDescription(1, model.urdf, model.digest, model.joint_names, ()))
     plain, whole = iter(arrivals()), iter(arrivals())
 
     def into_buffer() -> None:
         for message in spoken.decode("joint_states", next(whole), "r1"):
             assert isinstance(message, Sample)
-            follower.take(message, overflowed=False)
+            ingest.insert_sample(message, overflowed=False)
 
     return {
         "decode": lambda: spoken.decode("joint_states", next(plain), "r1"),

@@ -15,12 +15,12 @@ from support import a_free_port, until
 
 from zstate.bridge import Bridge
 from zstate.errors import InvalidInput
-from zstate.listener import TransformListener
 from zstate.model.catalog import load_model
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource, SubscribedSource

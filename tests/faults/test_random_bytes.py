@@ -18,10 +18,10 @@ import zenoh
 from live import RRBOT, await_reader
 from support import until
 
-from zstate.listener import Follow, TransformListener
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
 from zstate.net.wires import wire_named
+from zstate.nodes.listener import Follow, TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.keys import Stream
 from zstate.wire.native import ENCODINGS

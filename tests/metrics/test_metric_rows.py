@@ -12,7 +12,6 @@ from prometheus_client.core import CounterMetricFamily
 from support import until
 
 from zstate.errors import InFuture, InvalidInput
-from zstate.listener import TransformListener
 from zstate.metrics.endpoint import MetricsEndpoint
 from zstate.metrics.families import MOST_ROBOTS, Families
 from zstate.metrics.listening import ListenerMetrics
@@ -23,6 +22,7 @@ from zstate.net.connections import connections
 from zstate.net.presence import RobotInfo, discover, writer_here
 from zstate.net.session import connect
 from zstate.net.streams import StreamPublisher
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import SineSource
 from zstate.wire.messages import JointState

@@ -11,10 +11,10 @@ from support import SOON_S, a_free_port, until
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
-from zstate.listener import TransformListener
 from zstate.net.clock_offset import OffsetMeter, measure_offsets
 from zstate.net.service import Answer, Service
 from zstate.net.session import connect
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
 from zstate.wire.messages import Clock

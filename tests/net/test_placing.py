@@ -14,9 +14,9 @@ from live import RRBOT
 from support import Child, until
 
 from zstate.errors import SecondWriter
-from zstate.listener import TransformListener
 from zstate.net.presence import announce, tokens_now
 from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform

@@ -17,8 +17,8 @@ from ros_messages import (
 )
 from support import until
 
-from zstate.listener import TransformListener
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform

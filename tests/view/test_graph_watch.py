@@ -7,7 +7,7 @@ import os
 from live import RRBOT
 from support import until
 
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.view.graph_watch import GraphWatch
 

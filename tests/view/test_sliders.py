@@ -11,9 +11,9 @@ from live import RRBOT, Tap
 from support import SOON_S, until
 
 from zstate.errors import InvalidInput
-from zstate.listener import TransformListener
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.view.sliders import Sliders
 from zstate.wire.messages import from_block

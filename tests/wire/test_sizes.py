@@ -10,18 +10,19 @@ from support import again_and_again, until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import MessageError
-from zstate.following.joints import JointFollower
-from zstate.following.ownership import FrameOwnership
-from zstate.following.tally import Tally
-from zstate.listener import TransformListener
+from zstate.ingest.base import EARLY_BYTES
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
 from zstate.net.wires import wire_named
+from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.sizes import EARLY_BYTES, MOST_BYTES, STATIC_EDGES, Waiting
+from zstate.wire.sizes import MOST_BYTES, STATIC_EDGES
 
 ORDER = order_digest(("a",))
 
@@ -59,23 +60,13 @@ def test_what_travels_on_no_stream_is_bounded_too():
     assert caught.value.reason == "too large"
 
 
-def test_the_oldest_give_way_by_number_and_by_bytes():
-    waiting: Waiting[int] = Waiting(3, most_bytes=100)
-    assert [waiting.append(number, 10) for number in range(4)] == [0, 0, 0, 1]
-    assert list(waiting) == [1, 2, 3]
-    assert waiting.append(4, 95) == 3
-    assert list(waiting) == [4]
-    assert waiting.append(5, 101) == 2
-    assert len(waiting) == 0
-
-
 def test_samples_that_wait_for_a_description_are_bounded_in_bytes():
-    tally = Tally()
-    follower = JointFollower("r1", FrameOwnership(TransformBuffer(), tally))
+    counters = Counters()
+    ingest = JointStateIngest("r1", FrameOwnership(TransformBuffer(), counters))
     block, count = bytes(200_000), 2 * EARLY_BYTES // 200_000
     for seq in range(count):
-        follower.take(JointState(seq, seq, 1, ORDER, block), overflowed=False)
-    given_up = tally.stats().refused["no description"]
+        ingest.insert_sample(JointState(seq, seq, 1, ORDER, block), overflowed=False)
+    given_up = counters.stats().refused["no description"]
     assert (count - given_up) * len(block) <= EARLY_BYTES
 
 

@@ -1,1 +1,1 @@
-"""Utilities without a subject of their own, used by every package."""
+"""Utilities that no package owns: bounded containers, callback threads, refusal counters."""

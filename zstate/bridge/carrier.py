@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from zstate.bridge.statics import StaticCarrier
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, ZStateError
-from zstate.following.tally import Tally
+from zstate.ingest.counters import Counters
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
@@ -47,7 +47,7 @@ class Carrier(Closing):
         self.target = target
         self.has_begun = False
         self._on_begin = on_begin
-        self._tally = Tally()
+        self._counters = Counters()
         self._lock = threading.Lock()
         self._closed = False
         self._carrying = ExitStack()
@@ -56,7 +56,7 @@ class Carrier(Closing):
     @property
     def refused(self) -> dict[str, int]:
         """How many joint states, static edges and models could not be carried."""
-        return self._tally.stats().refused
+        return self._counters.stats().refused
 
     def _carry(self, robot: str, model: RobotModel) -> None:
         with self._lock:
@@ -66,7 +66,7 @@ class Carrier(Closing):
             try:
                 self._begin(model)
             except ZStateError as error:
-                self._tally.refuse("model", f"{robot!r} is not carried: {error}")
+                self._counters.count_refusal("model", f"{robot!r} is not carried: {error}")
                 return
         self.has_begun = True
         self._on_begin()
@@ -81,7 +81,7 @@ class Carrier(Closing):
             statics = opening.enter_context(
                 StaticPublisher(target.session, robot, wires=(target.wire,), program=PROGRAM, takeover=True)
             )
-            opening.enter_context(StaticCarrier(source.session, model, statics, self._tally, source.wire))
+            opening.enter_context(StaticCarrier(source.session, model, statics, self._counters, source.wire))
             readings = opening.enter_context(SubscribedSource(source.session, model, robot, wire=source.wire))
             self._carrying = opening.pop_all()
         threading.Thread(
@@ -97,7 +97,7 @@ class Carrier(Closing):
         try:
             publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
         except InvalidInput as error:
-            self._tally.refuse("joint state", f"{self.robot!r}: {error}")
+            self._counters.count_refusal("joint state", f"{self.robot!r}: {error}")
 
     def close(self) -> None:
         """Carry no more, and withdraw what was written. A second call does nothing."""

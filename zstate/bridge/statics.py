@@ -7,9 +7,9 @@ from contextlib import suppress
 from zstate.buffer.buffer import TransformBuffer
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
-from zstate.following.ownership import FrameOwnership
-from zstate.following.statics import StaticFollower
-from zstate.following.tally import Tally
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.static_transforms import StaticTransformIngest
 from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
@@ -29,14 +29,14 @@ class StaticCarrier(Closing):
     """
 
     def __init__(
-        self, session: Session, model: RobotModel, publisher: StaticPublisher, tally: Tally, wire: str
+        self, session: Session, model: RobotModel, publisher: StaticPublisher, counters: Counters, wire: str
     ) -> None:
         self._robot = publisher.robot
-        self._tally = tally
+        self._counters = counters
         self._buffer = _PublishedBuffer(publisher)
         self._buffer.add_robot(model, self._robot)
-        self._ownership = FrameOwnership(self._buffer, tally, is_shared=True)
-        self._followers: dict[str, StaticFollower] = {}
+        self._ownership = FrameOwnership(self._buffer, counters, is_shared=True)
+        self._ingests: dict[str, StaticTransformIngest] = {}
         self._wire = wire_named(wire)
         key = self._wire.expression(self._robot, "tf_static")
         self._subscriber = LatchedSubscriber(session, key, self._take)
@@ -49,24 +49,24 @@ class StaticCarrier(Closing):
         try:
             writer = self._wire.statics_writer(arrival.key)
         except InvalidInput as error:
-            self._tally.refuse("foreign", str(error))
+            self._counters.count_refusal("foreign", str(error))
             return
         if writer == MODEL_WRITER:
             return
-        make = StaticFollower(self._robot, writer or self._wire.name, self._ownership)
-        follower = self._followers.setdefault(arrival.key, make)
+        make = StaticTransformIngest(self._robot, writer or self._wire.name, self._ownership)
+        ingest = self._ingests.setdefault(arrival.key, make)
         try:
             messages = self._wire.decode("tf_static", arrival, self._robot) if arrival.payload else ()
         except MessageError as error:
-            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
+            self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
             return
         # The publisher may have gone with its session.
         with suppress(Closed):
             if not arrival.payload:
-                follower.withdraw()
+                ingest.withdraw()
             for message in messages:
                 assert isinstance(message, StaticTransforms)
-                follower.add(self._ours(message)) if writer is None else follower.replace(message)
+                ingest.add(self._ours(message)) if writer is None else ingest.replace(message)
 
     def _ours(self, message: StaticTransforms) -> StaticTransforms:
         is_ours = [child.partition("/")[0] == self._robot or "/" not in child for _, child in message.edges]

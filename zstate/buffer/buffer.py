@@ -49,16 +49,16 @@ class TransformBuffer(Questions):
     ) -> TransformBuffer:
         """A buffer that holds a whole recording, an MCAP file or a bag, of ``robot`` or of all robots.
 
-        It answers as a listener's buffer did while that was recorded; ``zstate.following.recorded``
+        It answers as a listener's buffer did while that was recorded; ``zstate.recording.load``
         tells what becomes of restarts. Messages that cannot be used are left out, and logged once for
         each reason. Raises RecordingError, and InvalidInput when there is nothing of ``robot`` in it.
         """
-        from zstate.following.recorded import HISTORY_S, fill  # noqa: PLC0415 - looked for here, made there
         from zstate.record.reader import RecordReader  # noqa: PLC0415 - as above
+        from zstate.recording.load import HISTORY_S, load_into  # noqa: PLC0415 - looked for here, made there
 
         buffer = cls(HISTORY_S, clock)
         with RecordReader(path) as reader:
-            fill(buffer, reader, robot)
+            load_into(buffer, reader, robot)
         return buffer
 
     def lookup(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import pstdev
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.cli.stream_reader import TimedSample
-from zstate.following.bounded import remember
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Arrivals:
         self._came: deque[int] = deque(maxlen=window)
         self._missed = 0
         self._of_all = of_all
-        self._last: dict[int, int] = {}
+        self._last: BoundedDict[int, int] = BoundedDict()
 
     def note(self, tapped: TimedSample) -> None:
         """Another arrival. Several samples of one message are one."""
@@ -50,7 +50,7 @@ class Arrivals:
         elif not self._of_all:
             self._came.clear()
             self._last.clear()
-        remember(self._last, session, seq)
+        self._last[session] = seq
         self._came.append(tapped.came)
 
     def intervals(self) -> Intervals | None:

@@ -13,7 +13,7 @@ from zstate.cli.console import count_text, duration_or_dash, is_terminal, say, t
 from zstate.cli.metered_buffer import Measure, MeteredBuffer
 from zstate.clock import wait_in_slices
 from zstate.errors import LookupFailed, duration_text
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 
 if TYPE_CHECKING:
     from rich.table import Table

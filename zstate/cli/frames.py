@@ -12,9 +12,9 @@ from zstate.cli.words import words_of
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
-    from zstate.listener import TransformListener
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.nodes.listener import TransformListener
 
 _NO_FRAMES = "announced, but without any frame: who publishes the model? `zstate publish ROBOT` does"
 _MODELS_WITHIN_S = 3.0
@@ -38,7 +38,7 @@ def gathered_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
         "zstate announced",
         lambda: discover(session) if robot == ANY else announced_robots(session, robot),
     )
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     waiter = ConditionWaiter()
     with TransformListener(session, robot) as listener:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from statistics import median
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.clock import Clock, SystemClock
-from zstate.following.bounded import remember
 from zstate.metrics.histogram import Histogram
 from zstate.metrics.measured_buffer import LATENCY_BOUNDS_S, MeasuredBuffer
 
@@ -81,22 +81,22 @@ class MeteredBuffer(MeasuredBuffer):
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
-        self._meters: dict[str, Meter] = {}
-        self._latencies: dict[str, Histogram] = {}
+        self._meters: BoundedDict[str, Meter] = BoundedDict()
+        self._latencies: BoundedDict[str, Histogram] = BoundedDict()
 
     def meter_of(self, robot: str) -> Meter:
         """What measures the samples of one robot."""
         meter = self._meters.get(robot)
         if meter is None:
             meter = Meter(self.clock)
-            remember(self._meters, robot, meter)
+            self._meters[robot] = meter
         return meter
 
     def latency_of(self, robot: str) -> Histogram:
         latency = self._latencies.get(robot)
         if latency is None:
             latency = Histogram(LATENCY_BOUNDS_S)
-            remember(self._latencies, robot, latency)
+            self._latencies[robot] = latency
         return latency
 
     def _note_sample(self, robot: str, stamp: int) -> None:

@@ -11,8 +11,8 @@ from zstate.cli.waiting import ConditionWaiter
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
-    from zstate.listener import TransformListener
     from zstate.net.session import Session
+    from zstate.nodes.listener import TransformListener
 
 # Nodes that publish transforms do so at 1 Hz at least; those that go on saying nothing are named.
 _SPOKEN_WITHIN_S = 2.0
@@ -24,7 +24,7 @@ def gathered_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
 
     Says on standard error which node publishes transforms, but has sent none. Fails when nobody does.
     """
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     waiter = ConditionWaiter()
     with (

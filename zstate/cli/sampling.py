@@ -8,9 +8,9 @@ from collections.abc import Collection
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, NamedTuple
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
-from zstate.following.bounded import remember
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream
@@ -54,7 +54,7 @@ class Sampler(Closing):
     def __init__(self, session: Session) -> None:
         self._session = session
         self._wire = wire_named("native")
-        self._heard: dict[Source, deque[_Heard]] = {}
+        self._heard: BoundedDict[Source, deque[_Heard]] = BoundedDict()
         self._opened = ExitStack()
 
     def hear(self, stream: Stream, robot: str = "*") -> None:
@@ -80,7 +80,7 @@ class Sampler(Closing):
                 heard = self._heard.get(source)
                 if heard is None:
                     heard = deque[_Heard](maxlen=_KEPT)
-                    remember(self._heard, source, heard)
+                    self._heard[source] = heard
                 heard.append(_Heard(came, sample.stamp, sample.seq))
 
     def wait(self, sources: Collection[Source], timeout_s: float) -> None:

@@ -30,8 +30,8 @@ from zstate.errors import (
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
-    from zstate.listener import Follow, TransformListener
     from zstate.net.session import Session
+    from zstate.nodes.listener import Follow, TransformListener
     from zstate.transform import Transform
     from zstate.wire.keys import Stream
     from zstate.wire.protocol import SerializedSample
@@ -204,7 +204,7 @@ class RobotReadiness(Closing):
         return ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
 
     def _listen(self, robot: str, follow: Follow) -> TransformListener:
-        from zstate.listener import TransformListener
+        from zstate.nodes.listener import TransformListener
 
         listener = TransformListener(
             self._session, robot, wire=self._wire, follow=follow, history_on_join=False

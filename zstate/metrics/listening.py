@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Protocol
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.following.tally import Stats
+from zstate.ingest.counters import ListenerStats
 from zstate.metrics.families import MOST_ROBOTS, Families
 from zstate.metrics.library import Collector, Metric
 from zstate.metrics.measured_buffer import MeasuredBuffer
@@ -21,7 +21,7 @@ class Listened(Protocol):
     @property
     def robot(self) -> str: ...
     @property
-    def stats(self) -> Stats: ...
+    def stats(self) -> ListenerStats: ...
     @property
     def buffer(self) -> TransformBuffer: ...
 

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable
 
-from zstate.following.bounded import remember
+from zstate._util.bounded_dict import BoundedDict
 
 WINDOW_S = 10.0
 EVERY_S = 1.0
@@ -24,7 +24,7 @@ class Paces:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._marks: dict[Hashable, _Marks] = {}
+        self._marks: BoundedDict[Hashable, _Marks] = BoundedDict()
         self._lock = threading.Lock()
 
     def note(self, key: Hashable, count: float) -> None:
@@ -44,7 +44,7 @@ class Paces:
         marks = self._marks.get(key)
         if marks is None:
             marks = _Marks()
-            remember(self._marks, key, marks)
+            self._marks[key] = marks
         if marks and count < marks[-1][1]:
             marks.clear()  # it counts from the beginning again
         if not marks or now - marks[-1][0] >= EVERY_S:

@@ -13,7 +13,6 @@ from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.locks import new_lock, outlive_fork
-from zstate.lookup_service import LookupService, RecentBuffer
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.limits import JointLimits
 from zstate.model.robot import RobotModel
@@ -25,6 +24,7 @@ from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
 from zstate.net.wires import wire_named, wire_names
 from zstate.net.writer import SampleWriter, WireWriter, write_all
+from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
 from zstate.nodes.robot_encoder import Positions, RobotEncoder
 from zstate.rate import Rate, RateReport
@@ -66,7 +66,7 @@ class StatePublisher(Closing):
     (``zstate.net.status``), caches the last ``cache_s`` seconds of samples for joining listeners
     (``zstate.net.history``; 0 for none), and answers lookups of its own frames on
     ``zstate/<robot>/lookup`` from that cache, or from the newest sample without one
-    (``zstate.lookup_service``). A context manager; safe from any thread.
+    (``zstate.nodes.lookup_service``). A context manager; safe from any thread.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class StatePublisher(Closing):
             self.cache = self._recent if cache_s else None
             if self._recent is not None and self._writers:
                 recent = RecentBuffer(model, self.robot, self._recent)
-                opening.enter_context(LookupService(session, recent.filled, self.robot))
+                opening.enter_context(LookupService(session, recent.buffer, self.robot))
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable
 
+from zstate._util.bounded_queue import BoundedQueue
 from zstate.model.coordinates import coordinate_names, velocity_slots
 from zstate.model.urdf import parse_urdf
 from zstate.wire.messages import Clock, JointState, RobotDescription, Sample, TransformSample, order_digest
@@ -51,8 +51,7 @@ class EarlySamples:
 
     def __init__(self) -> None:
         self.given_up = 0
-        self._robots: dict[str, deque[tuple[Sample | Clock, int]]] = {}
-        self._bytes: dict[str, int] = {}
+        self._robots: dict[str, BoundedQueue[tuple[Sample | Clock, int]]] = {}
 
     @property
     def waiting(self) -> int:
@@ -61,17 +60,11 @@ class EarlySamples:
 
     def keep(self, robot: str, sample: Sample | Clock, log_time: int) -> None:
         """Keep a sample that was heard at ``log_time``, unless it is too large by itself."""
-        early = self._robots.setdefault(robot, deque())
-        early.append((sample, log_time))
-        self._bytes[robot] = self._bytes.get(robot, 0) + _size(sample)
-        while len(early) > EARLY or self._bytes[robot] > EARLY_BYTES:
-            dropped, _ = early.popleft()
-            self._bytes[robot] -= _size(dropped)
-            self.given_up += 1
+        early = self._robots.setdefault(robot, BoundedQueue(EARLY, EARLY_BYTES))
+        self.given_up += early.append((sample, log_time), _size(sample))
 
     def pop(self, robot: str) -> Iterable[tuple[Sample | Clock, int]]:
         """Those of ``robot`` with their log times, which are kept no longer."""
-        self._bytes.pop(robot, None)
         return self._robots.pop(robot, ())
 
 

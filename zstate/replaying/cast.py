@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 
+from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.following.tally import Tally
-from zstate.following.unmodelled import Unmodelled
+from zstate.ingest.model_filter import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
@@ -33,7 +33,7 @@ class Cast(Closing):
 
     Robots with one of ``models`` get a StatePublisher, which recomputes their transforms if their own
     publisher wrote them; everything else is republished unchanged. ``standing`` are the latched messages
-    at the start of the pass. Messages that cannot be published are counted in ``tally``.
+    at the start of the pass. Messages that cannot be published are counted in ``refusals``.
     Raises SecondWriter if another writer of the same is active now; not with ``takeover``.
     """
 
@@ -45,15 +45,15 @@ class Cast(Closing):
         *,
         models: Mapping[str, RobotModel],
         standing: Standing,
-        tally: Tally,
+        refusals: Refusals,
         takeover: bool = False,
     ) -> None:
         self._session = session
         self._wires = wires
         self._takeover = takeover
-        self._tally = tally
+        self._refusals = refusals
         self._standing = standing
-        self._modelled, self._computed = Unmodelled(), Unmodelled()
+        self._modelled, self._computed = ModelEdgeFilter(), ModelEdgeFilter()
         self._sessions: set[int] = set()
         self._robots: dict[str, _Robot] = {}
         self._others: dict[str, Verbatim] = {}
@@ -71,9 +71,9 @@ class Cast(Closing):
             self._opened = opening.pop_all()
 
     def _open(self, robot: str, model: RobotModel, is_computed: bool) -> _Robot:
-        self._modelled.learn(robot, model)
+        self._modelled.set_model(robot, model)
         if is_computed:
-            self._computed.learn(robot, model)
+            self._computed.set_model(robot, model)
         opened = _Robot(self._session, self._wires, robot, model, is_computed, self._takeover)
         self._sessions.add(opened.session_id)
         return opened
@@ -100,11 +100,11 @@ class Cast(Closing):
         try:
             return self._say(said.speaker, said.message)
         except MessageError as error:
-            self._tally.refuse(error.reason, f"{said.speaker.robot!r}: {error}")
+            self._refusals.count(error.reason, f"{said.speaker.robot!r}: {error}")
         except InvalidInput as error:
-            self._tally.refuse("not sayable", f"{said.speaker.robot!r}: {error}")
+            self._refusals.count("not sayable", f"{said.speaker.robot!r}: {error}")
         except ModelError as error:
-            self._tally.refuse("robot description", f"{said.speaker.robot!r}: {error}")
+            self._refusals.count("robot description", f"{said.speaker.robot!r}: {error}")
         return False
 
     def _say(self, speaker: Speaker, message: Message) -> bool:
@@ -116,7 +116,7 @@ class Cast(Closing):
         if isinstance(message, JointState) and robot is not None:
             robot.publish(message)
         elif isinstance(message, TransformSample):
-            rest = self._computed.sample(speaker.robot, message)
+            rest = self._computed.filter_sample(speaker.robot, message)
             if rest is None or (robot is not None and "tf" in robot.streams):
                 return False
             self._others[speaker.robot].say(rest)
@@ -137,7 +137,7 @@ class Cast(Closing):
     def _fix(self, speaker: Speaker, statics: StaticTransforms) -> bool:
         if speaker.static_writer == MODEL_WRITER and speaker.robot in self._robots:
             return False
-        rest = self._modelled.statics(speaker.robot, statics)
+        rest = self._modelled.filter_statics(speaker.robot, statics)
         self._others[speaker.robot].fix(rest, static_key(speaker)[1])
         return True
 

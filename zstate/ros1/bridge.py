@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from contextlib import ExitStack
 
+from zstate._util.refusals import Refusals
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, NetworkError, Unreachable
-from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
@@ -48,7 +48,7 @@ class Ros1Bridge(Closing):
         self._node = node
         self._model = model
         self._names = FrameNames(robot, frame_prefix)
-        self._tally = Tally()
+        self._refusals = Refusals()
         self._wants_from_ros = from_ros
         self._lost_master = False
         self._from_ros: FromRos | None = None
@@ -68,7 +68,7 @@ class Ros1Bridge(Closing):
                 self._session,
                 self._node,
                 self._names,
-                self._tally,
+                self._refusals,
                 is_ours=self._is_ours,
                 with_description=with_description,
             )
@@ -85,7 +85,7 @@ class Ros1Bridge(Closing):
     @property
     def refused(self) -> dict[str, int]:
         """What was not carried, by reason; the first of each is also logged."""
-        return self._tally.stats().refused
+        return dict(self._refusals.counts)
 
     def waits_for(self) -> str:
         """What must come before anything is carried; empty when nothing is missing."""
@@ -124,7 +124,12 @@ class Ros1Bridge(Closing):
         if model is not None:
             self._from_ros = self._opened.enter_context(
                 FromRos(
-                    self._session, self._node, model, self._names, self._tally, at_once=self._to_ros is None
+                    self._session,
+                    self._node,
+                    model,
+                    self._names,
+                    self._refusals,
+                    at_once=self._to_ros is None,
                 )
             )
 

@@ -7,9 +7,9 @@ import time
 from contextlib import ExitStack
 from typing import Any
 
+from zstate._util.refusals import Refusals
 from zstate.closing import Closing
 from zstate.errors import Closed, InsertRefused, InvalidInput, MessageError, SecondWriter
-from zstate.following.tally import Tally
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
@@ -38,7 +38,7 @@ class FromRos(Closing):
         node: Node,
         model: RobotModel,
         names: FrameNames,
-        tally: Tally,
+        refusals: Refusals,
         *,
         at_once: bool,
     ) -> None:
@@ -47,7 +47,7 @@ class FromRos(Closing):
         self._node = node
         self._model = model
         self._names = names
-        self._tally = tally
+        self._refusals = refusals
         # Whoever carries both ways has been told that the robot is written on both sides.
         self._beside_others = not at_once
         self._links = frozenset(model.links)
@@ -92,7 +92,7 @@ class FromRos(Closing):
         if writer == self._node.name:
             return True
         if writer.rpartition("/")[2].startswith(f"{NAME}_"):
-            self._tally.refuse("another bridge", f"{writer!r} is a bridge too; what it says came from zstate")
+            self._refusals.count("another bridge", f"{writer!r} is a bridge too; its messages are zstate's")
             return True
         return False
 
@@ -114,7 +114,7 @@ class FromRos(Closing):
             pass  # it came while we were leaving
 
     def _refuse(self, reason: str, message: Any, error: Exception) -> None:
-        self._tally.refuse(reason, f"joint_states of {writer_of(message)!r}: {error}")
+        self._refusals.count(reason, f"joint_states of {writer_of(message)!r}: {error}")
 
     def _mention_unknown(self, message: Any) -> None:
         if message.name != self._joints_seen:
@@ -122,7 +122,7 @@ class FromRos(Closing):
             unknown = self._reader.unknown(message)
             if unknown:
                 names = ", ".join(map(repr, unknown))
-                self._tally.refuse("unknown joints", f"{self._model.name!r} has no {names}, left out")
+                self._refusals.count("unknown joints", f"{self._model.name!r} has no {names}, left out")
 
     def _on_statics(self, message: Any) -> None:
         if self._is_of_a_bridge(message):
@@ -132,11 +132,11 @@ class FromRos(Closing):
                 try:
                     self._place(transform)
                 except InsertRefused as error:
-                    self._tally.refuse(error.reason, f"/tf_static of {writer_of(message)!r}: {error}")
+                    self._refusals.count(error.reason, f"/tf_static of {writer_of(message)!r}: {error}")
                 except InvalidInput as error:
-                    self._tally.refuse("bad numbers", f"/tf_static of {writer_of(message)!r}: {error}")
+                    self._refusals.count("bad numbers", f"/tf_static of {writer_of(message)!r}: {error}")
                 except SecondWriter as error:
-                    self._tally.refuse("second writer", f"/tf_static of {writer_of(message)!r}: {error}")
+                    self._refusals.count("second writer", f"/tf_static of {writer_of(message)!r}: {error}")
                 except Closed:
                     return
 
@@ -175,7 +175,7 @@ class FromRos(Closing):
             edge = (transform.header.frame_id, transform.child_frame_id)
             if edge not in self._not_carried and self._names.bare(edge[1]) not in self._placed_by_model:
                 self._not_carried.add(edge)
-                self._tally.refuse(
+                self._refusals.count(
                     "not carried",
                     f"{edge[0]!r} -> {edge[1]!r} of {writer!r} moves on /tf and is not a joint of the model",
                 )

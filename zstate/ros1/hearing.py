@@ -5,16 +5,13 @@ from __future__ import annotations
 from contextlib import ExitStack, suppress
 from typing import Protocol
 
+from zstate._util.refusals import Refusals
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
-from zstate.following.tally import Tally
-from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
-from zstate.net.streams import StreamSubscriber
-from zstate.wire.keys import Stream
-from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
+from zstate.net.subscription import Received, subscribe
+from zstate.wire.messages import JointState, RobotDescription, StaticTransforms
 from zstate.wire.native import NativeWire
-from zstate.wire.protocol import SerializedSample
 
 
 class Hearer(Protocol):
@@ -34,54 +31,44 @@ class Hearer(Protocol):
 
 
 class Hearing(Closing):
-    """Hands ``hearer`` what is said of ``robot``, each stream on a thread of its own."""
+    """Calls ``hearer`` with the messages of ``robot``, each stream on a thread of its own."""
 
-    def __init__(self, session: Session, robot: str, hearer: Hearer, tally: Tally) -> None:
-        self._robot = robot
+    def __init__(self, session: Session, robot: str, hearer: Hearer, refusals: Refusals) -> None:
         self._hearer = hearer
-        self._tally = tally
-        self._wire = NativeWire()
-        expression = self._wire.expression
+        self._refusals = refusals
+        self._wire = wire = NativeWire()
         with ExitStack() as opening:
-            key = expression(robot, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._on_description))
-            key = expression(robot, "tf_static")
-            opening.enter_context(LatchedSubscriber(session, key, self._on_statics))
-            key = expression(robot, "joint_states")
-            opening.enter_context(StreamSubscriber(session, key, self._on_joints))
+            for stream in ("robot_description", "tf_static", "joint_states"):
+                on_withdrawn = self._on_withdrawn if stream == "tf_static" else None
+                opening.enter_context(
+                    subscribe(
+                        session,
+                        wire,
+                        robot,
+                        stream,
+                        self._on_messages,
+                        on_error=refusals.count,
+                        on_withdrawn=on_withdrawn,
+                    )
+                )
             self._opened = opening.pop_all()
 
-    def _on_description(self, arrival: SerializedSample) -> None:
-        if arrival.payload:
-            self._hand_over("robot_description", arrival)
+    def _on_messages(self, received: list[Received]) -> None:
+        for _, key, message in received:
+            try:
+                if isinstance(message, JointState):
+                    self._hearer.move(message)
+                elif isinstance(message, StaticTransforms):
+                    self._hearer.place(self._wire.statics_writer(key), message)
+                elif isinstance(message, RobotDescription):
+                    self._hearer.describe(message)
+            except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other messages may be good
+                reason = error.reason if isinstance(error, MessageError) else "bad numbers"
+                self._refusals.count(reason, f"{key}: {error}")
 
-    def _on_statics(self, arrival: SerializedSample) -> None:
-        if arrival.payload:
-            self._hand_over("tf_static", arrival)
-        else:
-            with suppress(InvalidInput):  # a key that no writer has
-                self._hearer.place(self._wire.statics_writer(arrival.key), None)
-
-    def _on_joints(self, arrivals: list[SerializedSample]) -> None:
-        for arrival in arrivals:
-            self._hand_over("joint_states", arrival)
-
-    def _hand_over(self, stream: Stream, arrival: SerializedSample) -> None:
-        try:
-            for message in self._wire.decode(stream, arrival, self._robot):
-                self._tell(arrival.key, message)
-        except MessageError as error:
-            self._tally.refuse(error.reason, f"{arrival.key}: {error}")
-        except InvalidInput as error:
-            self._tally.refuse("bad numbers", f"{arrival.key}: {error}")
-
-    def _tell(self, key: str, message: Message) -> None:
-        if isinstance(message, JointState):
-            self._hearer.move(message)
-        elif isinstance(message, StaticTransforms):
-            self._hearer.place(self._wire.statics_writer(key), message)
-        elif isinstance(message, RobotDescription):
-            self._hearer.describe(message)
+    def _on_withdrawn(self, key: str) -> None:
+        with suppress(InvalidInput):  # a key without a writer's name
+            self._hearer.place(self._wire.statics_writer(key), None)
 
     def close(self) -> None:
         """Stop. A second call does nothing."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zstate._util.refusals import Refusals
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, ModelError, Unreachable
-from zstate.following.tally import Tally
 from zstate.model.edges import EdgeTable
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -43,7 +43,7 @@ class ToRos(Closing):
         session: Session,
         node: Node,
         names: FrameNames,
-        tally: Tally,
+        refusals: Refusals,
         *,
         is_ours: Callable[[int, str], bool],
         with_description: bool = True,
@@ -54,12 +54,12 @@ class ToRos(Closing):
         self._names = names
         self._is_ours = is_ours
         self._with_description = with_description
-        self._tally = tally
+        self._refusals = refusals
         self._statics: dict[str, dict[Edge, NDArray[np.float64]]] = {}
         self._joints = node.publisher("joint_states", node.ros.JointState)
         self._moving = node.publisher("/tf", node.ros.TFMessage)
         self._fixed = node.publisher("/tf_static", node.ros.TFMessage, latch=True)
-        self._hearing = Hearing(session, names.robot, self, tally)
+        self._hearing = Hearing(session, names.robot, self, refusals)
 
     def describe(self, description: RobotDescription) -> None:
         """Learn what the robot is; the newest to say so is believed."""
@@ -70,7 +70,7 @@ class ToRos(Closing):
         try:
             model = parse_urdf(description.urdf, f"the URDF of {self._names.robot!r}")
         except ModelError as error:
-            self._tally.refuse("robot description", str(error))
+            self._refusals.count("robot description", str(error))
             return
         self.robot = _Robot(model, self._node.ros, self._names)
         if self._with_description:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-from collections import Counter
 from pathlib import Path
 
+from zstate._util.refusals import Refusals
 from zstate.closing import Closing
-from zstate.errors import InvalidInput, MessageError, ZStateError
+from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import RobotModel
 from zstate.record.reader import RecordReader
 from zstate.record.transcript import Said, Transcript
@@ -15,8 +14,6 @@ from zstate.sources.source import JointReading
 from zstate.sources.states import StateReader
 from zstate.wire.joint_order import JointNumbers
 from zstate.wire.messages import JointState
-
-_LOG = logging.getLogger("zstate")
 
 # Stamps that go so far back are those of a clock that began anew; a late sample is passed over.
 _LATE_NS = 10_000_000_000
@@ -34,11 +31,12 @@ class RecordedSource(Closing):
     """
 
     def __init__(self, path: str | Path, robot: str | None, model: RobotModel) -> None:
-        self.refused: Counter[str] = Counter()
+        self._refusals = Refusals("recorded joint_states")
+        self.refused = self._refusals.counts
         self._states = StateReader(model)
         self._reader = RecordReader(path)
         try:
-            transcript = Transcript(self._reader, self._count)
+            transcript = Transcript(self._reader, self._refusals.count)
             self.robot = _told(transcript, robot)
         except BaseException:
             self.close()
@@ -76,20 +74,12 @@ class RecordedSource(Closing):
             try:
                 numbers = self._states.read(said.message)
             except MessageError as error:
-                self._refuse(error.reason, error)
+                self._refusals.count(error.reason, error)
             except InvalidInput as error:
-                self._refuse("bad numbers", error)
+                self._refusals.count("bad numbers", error)
             else:
                 return said, numbers
         return None
-
-    def _refuse(self, reason: str, error: ZStateError) -> None:
-        self._count(reason, str(error))
-
-    def _count(self, reason: str, text: str) -> None:
-        self.refused[reason] += 1
-        if self.refused[reason] == 1:
-            _LOG.warning("recorded joint_states refused (%s): %s; further ones are counted", reason, text)
 
     def close(self) -> None:
         """Let go of the file. A second call does nothing."""

@@ -7,9 +7,9 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.closing import Closing
 from zstate.errors import NetworkError
-from zstate.following.bounded import remember
 from zstate.net.presence import RobotInfo, discover, discover_readers
 from zstate.net.session import Session
 from zstate.net.status import watch_status
@@ -49,7 +49,7 @@ class GraphWatch(Closing):
     def __init__(self, session: Session) -> None:
         self._session = session
         self._uses: tuple[StreamUse, ...] = ()
-        self._said: dict[tuple[str, int], tuple[Status, float]] = {}
+        self._said: BoundedDict[tuple[str, int], tuple[Status, float]] = BoundedDict()
         self._asked_at = -_ASKED_WITHIN_S
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -72,7 +72,7 @@ class GraphWatch(Closing):
 
     def _hear(self, robot: str, status: Status) -> None:
         with self._lock:
-            remember(self._said, (robot, status.session), (status, time.monotonic()))
+            self._said[robot, status.session] = (status, time.monotonic())
 
     def _run(self) -> None:
         while not self._stop.wait(_EVERY_S if self._uses else _SOON_S):

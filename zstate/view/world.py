@@ -11,9 +11,9 @@ from zstate.buffer.layout import Layout
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock
 from zstate.closing import Closing
-from zstate.listener import TransformListener
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 from zstate.view.moment import Moment
 from zstate.view.readings import Readings, readings_of, tracks_of
 from zstate.wire.keys import ANY

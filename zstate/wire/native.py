@@ -142,8 +142,7 @@ class NativeWire:
     def expression(self, robot: str, stream: Stream) -> str:
         return stream_expression(robot, stream)
 
-    def robot_of(self, key: str) -> str:
-        return robot_of(key)
+    robot_of = staticmethod(robot_of)
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         if arrival.size or len(arrival.payload) > _LEAST_BYTES:

@@ -1,16 +1,12 @@
-"""How large messages may be, and how much may wait: bounds on what anybody can make a reader keep."""
+"""Size limits of messages, which bound the memory that a writer can make a reader use."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Mapping
-from typing import Generic, TypeVar
+from collections.abc import Mapping
 
 from zstate.errors import MessageError
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Message, StaticTransforms, TransformSample
-
-T = TypeVar("T")
 
 SAMPLE_BYTES = 256_000
 """The transforms of 2000 links, names included, take less; in CDR they take up to four times as many."""
@@ -27,9 +23,6 @@ MOST_BYTES: Mapping[Stream, int] = {
     "robot_description": LATCHED_BYTES,
     "clock": 1_000,
 }
-
-EARLY_BYTES = 4 * 2**20
-"""So much may wait of one robot until it is described."""
 
 _OVERHEAD = 200
 """What a decoded message takes beside its numbers and names [bytes], at least."""
@@ -57,32 +50,3 @@ def size_of(message: Message) -> int:
     if isinstance(message, TransformSample):
         return _OVERHEAD + len(message.poses) + 200 * len(message.edges or ())
     return _OVERHEAD
-
-
-class Waiting(Generic[T]):
-    """A queue of at most ``most`` things and ``most_bytes`` bytes, for one thread; the oldest give way."""
-
-    def __init__(self, most: int, most_bytes: int = EARLY_BYTES) -> None:
-        self._most, self._most_bytes = most, most_bytes
-        self._kept: deque[tuple[T, int]] = deque()
-        self._bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def __iter__(self) -> Iterator[T]:
-        return (one for one, _ in self._kept)
-
-    def append(self, one: T, size: int) -> int:
-        """Add ``one`` of ``size`` bytes. Returns how many gave way."""
-        self._kept.append((one, size))
-        self._bytes += size
-        count = len(self._kept)
-        while len(self._kept) > self._most or self._bytes > self._most_bytes:
-            self._bytes -= self._kept.popleft()[1]
-        return count - len(self._kept)
-
-    def clear(self) -> None:
-        """Forget all of it."""
-        self._kept.clear()
-        self._bytes = 0

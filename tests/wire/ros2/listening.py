@@ -11,8 +11,8 @@ from wire.ros2.raw_nodes import (
     RosPublisher,
 )
 
-from zstate.listener import TransformListener
 from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
 
 
 def writers(listener: TransformListener) -> dict[str, str | None]:

@@ -107,7 +107,7 @@ def _look(
     from zstate.cli.demo_table import DemoTable
     from zstate.cli.metered_buffer import MeteredBuffer
     from zstate.cli.telling_links import telling_links
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     buffer = MeteredBuffer()
     with (

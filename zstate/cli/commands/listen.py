@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.cli.console import note, say_fitted, say_json
 from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
@@ -25,15 +26,14 @@ from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
 from zstate.errors import duration_text
-from zstate.following.bounded import remember
 
 if TYPE_CHECKING:
     from zstate.cli.metered_buffer import Mark, Measure, MeteredBuffer
     from zstate.clock import Clock
-    from zstate.following.tally import Stats
-    from zstate.listener import Follow, TransformListener
+    from zstate.ingest.counters import ListenerStats
     from zstate.metrics.address import Address
     from zstate.net.session import Session
+    from zstate.nodes.listener import Follow, TransformListener
     from zstate.wire.keys import Stream
 
 # Meeting everybody takes less.
@@ -97,7 +97,7 @@ class Ear:
     mark: Mark
 
     @property
-    def stats(self) -> Stats:
+    def stats(self) -> ListenerStats:
         """The counts of its samples."""
         return self.listener.stats_of(self.robot)
 
@@ -123,7 +123,7 @@ class Ears(Closing):
         self._clock = clock
         self._said = ""
         self._listeners: dict[Follow, tuple[TransformListener, MeteredBuffer]] = {}
-        self._ears: dict[str, Ear] = {}
+        self._ears: BoundedDict[str, Ear] = BoundedDict()
         self._opened = ExitStack()
 
     def close(self) -> None:
@@ -147,12 +147,12 @@ class Ears(Closing):
         follow = self._followed(streams)
         if follow in streams:
             listener, buffer = self._listeners.get(follow) or self._listen(follow)
-            remember(self._ears, robot, Ear(robot, listener, buffer, buffer.meter_of(robot).mark()))
+            self._ears[robot] = Ear(robot, listener, buffer, buffer.meter_of(robot).mark())
             note(f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot)
 
     def _listen(self, follow: Follow) -> tuple[TransformListener, MeteredBuffer]:
         from zstate.cli.metered_buffer import MeteredBuffer
-        from zstate.listener import TransformListener
+        from zstate.nodes.listener import TransformListener
 
         buffer = MeteredBuffer(self._clock)
         listener = self._opened.enter_context(
@@ -174,13 +174,13 @@ class Ears(Closing):
         robots = self._roster.robots()
         return self._roster.words.announced(robots) + ", but nothing that moves" * bool(robots)
 
-    def measures(self) -> Iterator[tuple[str, Measure, Stats]]:
+    def measures(self) -> Iterator[tuple[str, Measure, ListenerStats]]:
         """How the samples of each robot came in since the last call."""
         for robot, ear in sorted(self._ears.items()):
             yield robot, ear.measure(), ear.stats
 
 
-def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:
+def _show(robot: str, measure: Measure, stats: ListenerStats, *, as_json: bool) -> None:
     if as_json:
         say_json({"robot": robot, **asdict(measure), **asdict(stats)})
         return

@@ -66,7 +66,7 @@ def monitor_command(
     from zstate.cli.monitor.meter import PathMeter
     from zstate.cli.monitor.monitored import MonitoredEdges, MonitoredPose
     from zstate.clock import SystemClock
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
     from zstate.rate import Rate
 
     if target is not None and source is None:

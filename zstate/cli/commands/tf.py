@@ -27,7 +27,7 @@ from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
     from zstate.cli.waiting import PoseWaiter
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
     from zstate.transform import Transform
     from zstate.twist import Twist
 
@@ -111,7 +111,7 @@ def tf_command(
     zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
     """
     from zstate.cli.waiting import PoseWaiter
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     ends = once or at is not None
     with (

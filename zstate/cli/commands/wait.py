@@ -87,7 +87,7 @@ def _wait_for_pose(network: Network, names: tuple[str, ...], wire: str, timeout_
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.cli.waiting import PoseWaiter
     from zstate.cli.words import followed
-    from zstate.listener import TransformListener
+    from zstate.nodes.listener import TransformListener
 
     target, source = names
     deadline = time.monotonic() + timeout_s

@@ -8,7 +8,7 @@ from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.ear import Ear
 from zstate.clock import SYSTEM, stamp_text
 from zstate.errors import NoClock, duration_text
-from zstate.following.off_clock import FAR_NS, likely_cause
+from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import ClockOffset
 from zstate.net.session import Session
 

@@ -11,8 +11,7 @@ from zstate.cli.doctor.samples import Samples
 from zstate.cli.waiting import ConditionWaiter
 from zstate.closing import Closing
 from zstate.errors import MessageError
-from zstate.following.events import Event
-from zstate.listener import Follow, TransformListener
+from zstate.ingest.events import WriterEvent
 from zstate.net.clock_offset import ClockOffset
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
@@ -20,6 +19,7 @@ from zstate.net.replies import query
 from zstate.net.session import Session
 from zstate.net.status import watch_status
 from zstate.net.wires import wire_named
+from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.keys import Stream, clock_key
 from zstate.wire.messages import RobotDescription, Status
 from zstate.wire.protocol import SerializedSample
@@ -52,7 +52,7 @@ class Ear(Closing):
         self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
         self.description: RobotDescription | None = None
         self.statuses: dict[int, Status] = {}
-        self.events: list[Event] = []
+        self.events: list[WriterEvent] = []
         self.offsets: tuple[ClockOffset, ...] = ()
         self.stuck: set[Writer] = set()
         self._session, self._wire = session, wire_named(wire)

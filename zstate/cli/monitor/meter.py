@@ -12,9 +12,9 @@ from itertools import pairwise
 from statistics import median, pstdev
 from typing import TYPE_CHECKING, NamedTuple
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
-from zstate.following.bounded import remember
 from zstate.net.streams import StreamSubscriber
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, Stream, full_name
@@ -72,8 +72,8 @@ class PathMeter(Closing):
         self._clock = clock
         self._lock = threading.Lock()
         self._records: defaultdict[str, _Record] = defaultdict(_Record)
-        self._seqs: dict[int, int] = {}
-        self._missed: dict[int, int] = {}
+        self._seqs: BoundedDict[int, int] = BoundedDict()
+        self._missed: BoundedDict[int, int] = BoundedDict()
         expression = self._wire.expression(robot, stream)
         self._subscriber = StreamSubscriber(session, expression, self._take)
 
@@ -127,10 +127,10 @@ class PathMeter(Closing):
         before = self._seqs.get(sample.session)
         if before is None:
             before = sample.seq
-            remember(self._missed, sample.session, 0)
+            self._missed[sample.session] = 0
         elif sample.seq > before + 1:
             self._missed[sample.session] = self._missed.get(sample.session, 0) + sample.seq - before - 1
-        remember(self._seqs, sample.session, max(sample.seq, before))
+        self._seqs[sample.session] = max(sample.seq, before)
         for source in _sources(robot, sample):
             record = self._records[source]
             record.session = sample.session

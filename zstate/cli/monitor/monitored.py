@@ -14,7 +14,7 @@ from zstate.cli.monitor.report import Row, report_text
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.waiting import ConditionWaiter, PoseWaiter
 from zstate.errors import duration_text
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 from zstate.transform import Transform
 
 

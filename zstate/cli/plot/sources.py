@@ -15,12 +15,12 @@ from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.stream_reader import StreamReader
 from zstate.cli.waiting import PoseWaiter
 from zstate.cli.words import followed
-from zstate.following.recorded import check_recorded
-from zstate.listener import TransformListener
+from zstate.nodes.listener import TransformListener
 from zstate.record.models import first_descriptions
 from zstate.record.reader import RecordReader
 from zstate.record.transcript import Transcript
-from zstate.recording import Recording
+from zstate.recording.load import check_has_robot
+from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, RobotDescription
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def recorded_joints(path: str, robot: str | None, start_s: float, seconds: float
     """The joints of ``robot``, or of the only one, in a recording. Raises RecordingError and InvalidInput."""
     with RecordReader(path) as reader:
         transcript = Transcript(reader, _refuse)
-        name = _only(transcript.robots) if robot is None else check_recorded(transcript, robot)
+        name = _only(transcript.robots) if robot is None else check_has_robot(transcript, robot)
         writer = DocumentWriter()
         for described in first_descriptions(transcript, (name,)).values():
             if isinstance(described.message, RobotDescription):

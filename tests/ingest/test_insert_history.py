@@ -1,0 +1,127 @@
+"""What a writer said before, on its way into a buffer that hears it live."""
+
+from __future__ import annotations
+
+from live import RRBOT, STAMP
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
+from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
+
+PERIOD = 10_000_000
+ORDER = order_digest(RRBOT.joint_names)
+DESCRIPTION = RobotDescription(7, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ())
+
+
+def states(first: int, end: int, session: int = 7) -> list[JointState]:
+    """Samples ``first`` up to ``end``; the shoulder tells which it is."""
+    return [
+        JointState(STAMP + seq * PERIOD, seq, session, ORDER, to_block([0.01 * seq, 0.0]))
+        for seq in range(first, end)
+    ]
+
+
+class World:
+    """A ingest, and what has become of the samples."""
+
+    def __init__(self, *, described: bool = True, history_s: float = 10.0) -> None:
+        self.buffer = TransformBuffer(history_s)
+        self.counters = Counters()
+        self.ingest = JointStateIngest("r1", FrameOwnership(self.buffer, self.counters))
+        if described:
+            self.ingest.describe(DESCRIPTION)
+
+    def hear(self, *samples: JointState) -> None:
+        for sample in samples:
+            self.ingest.insert_sample(sample, overflowed=False)
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Received, missed and recalled."""
+        stats = self.counters.stats()
+        return stats.received, stats.missed, stats.recalled
+
+    @property
+    def known(self) -> list[int]:
+        """The numbers of the samples in the buffer."""
+        stamps = [STAMP + number * PERIOD for number in range(-1, 60)]
+        looked = [self.buffer.explain("world", "tool", stamp) for stamp in stamps]
+        return [
+            (stamp - STAMP) // PERIOD
+            for stamp, reason in zip(stamps, looked, strict=True)
+            if reason is None and self.buffer.lookup("world", "tool", stamp).kind == "exact"
+        ]
+
+
+def test_what_was_heard_is_not_taken_again():
+    world = World()
+    world.hear(*states(5, 10))
+    assert world.ingest.insert_history(states(3, 10))
+    assert (world.counts, world.known) == ((5, 0, 2), list(range(3, 10)))
+    assert not world.ingest.insert_history(states(0, 3))
+    assert (world.counts, world.known) == ((5, 0, 5), list(range(10)))
+
+
+def test_nothing_older_is_wanted_where_everything_was_heard():
+    world = World()
+    world.hear(*states(0, 5))
+    assert not world.ingest.insert_history(states(2, 5))
+    assert world.counts == (5, 0, 0)
+
+
+def test_the_past_may_come_before_the_first_live_sample():
+    world = World()
+    assert world.ingest.insert_history(states(5, 10))
+    world.hear(*states(10, 12))
+    assert not world.ingest.insert_history(states(0, 5))
+    assert (world.counts, world.known) == ((2, 0, 10), list(range(12)))
+
+
+def test_a_gap_is_filled_whether_or_not_it_has_shown_already():
+    for shows_first in (True, False):
+        world = World()
+        world.hear(*states(0, 5))
+        if shows_first:
+            world.hear(*states(20, 21))
+        assert world.ingest.insert_history(states(10, 20))
+        assert not world.ingest.insert_history(states(3, 10))
+        if not shows_first:
+            world.hear(*states(20, 21))
+        assert world.known == list(range(21))
+        # It was missed all the same: a reader in a control loop did not have it in time.
+        assert world.counts == (6, 15, 15)
+
+
+def test_the_past_waits_for_the_description():
+    world = World(described=False)
+    assert world.ingest.insert_history(states(5, 10))
+    assert world.ingest.insert_history(states(0, 5)) is False
+    world.hear(*states(10, 12))
+    assert world.counts == (0, 0, 0)
+    world.ingest.describe(DESCRIPTION)
+    assert (world.counts, world.known) == ((2, 0, 10), list(range(12)))
+
+
+def test_the_past_of_a_writer_that_has_ended_is_not_taken():
+    world = World()
+    world.hear(*states(0, 5))
+    world.hear(*states(20, 21, session=8))
+    assert not world.ingest.insert_history(states(0, 5))
+    assert (world.counts, world.known) == ((6, 0, 0), [20])
+
+
+def test_nothing_older_is_wanted_than_the_history_reaches():
+    world = World(history_s=0.1)
+    world.hear(*states(30, 31))
+    assert not world.ingest.insert_history(states(0, 30))
+    assert world.known == list(range(20, 31))
+
+
+def test_a_past_that_cannot_be_used_is_counted_once_for_its_page():
+    world = World()
+    world.hear(*states(30, 31))
+    bad = [JointState(STAMP + seq * PERIOD, seq, 7, ORDER, to_block([0.0])) for seq in range(30)]
+    assert not world.ingest.insert_history(bad)
+    assert (world.counters.stats().refused, world.counts) == ({"bad numbers": 1}, (1, 0, 0))

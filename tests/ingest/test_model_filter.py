@@ -1,0 +1,82 @@
+"""What is left of transforms when models place their links themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+from live import RRBOT
+from tales import START, pose
+
+from zstate.ingest.model_filter import ModelEdgeFilter
+from zstate.wire.messages import (
+    Edges,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+    poses_from_block,
+    to_block,
+)
+
+
+def sample(edges: Edges) -> TransformSample:
+    block = to_block([pose(x=n) for n in range(len(edges))])
+    return TransformSample(START, 4, 5, order_digest(edges), block, edges)
+
+
+def known(robot: str = "arm") -> ModelEdgeFilter:
+    model_filter = ModelEdgeFilter()
+    model_filter.set_model(robot, RRBOT)
+    return model_filter
+
+
+def test_only_edges_that_no_model_has_are_left():
+    said = sample((("base", "upper"), ("odom", "world"), ("tool", "lens")))
+    rest = known().filter_sample("arm", said)
+    assert rest is not None
+    assert rest.edges == (("odom", "world"), ("tool", "lens"))
+    assert poses_from_block(rest.poses)[:, 0].tolist() == [1.0, 2.0]
+    assert (rest.stamp, rest.seq, rest.session) == (START, 4, 5)
+
+
+def test_nothing_is_left_of_a_model():
+    assert known().filter_sample("arm", sample((("base", "upper"),))) is None
+    assert known().filter_sample("arm", sample(())) is None
+
+
+def test_what_is_all_new_is_the_very_same():
+    said = sample((("odom", "world"),))
+    assert known().filter_sample("arm", said) is said
+
+
+def test_links_are_known_by_their_full_names_too():
+    said = sample((("arm/base", "arm/upper"), ("leg/base", "leg/upper")))
+    rest = known().filter_sample("ros", said)
+    assert rest is not None
+    assert rest.edges == (("leg/base", "leg/upper"),)
+
+
+def test_a_link_of_another_robot_of_that_name_is_not_meant():
+    said = sample((("base", "upper"),))
+    assert known().filter_sample("leg", said) is said
+
+
+def test_names_that_cannot_be_are_left_to_whoever_uses_them():
+    said = sample((("a", "/b"), ("a", "")))
+    assert known().filter_sample("arm", said) is said
+
+
+def test_static_edges_likewise():
+    edges = (("world", "base"), ("tool", "lens"))
+    statics = StaticTransforms(7, edges, to_block([pose(1.0), pose(2.0)]))
+    rest = known().filter_statics("arm", statics)
+    assert (rest.session, rest.edges) == (7, (("tool", "lens"),))
+    assert np.array_equal(poses_from_block(rest.poses), [pose(2.0)])
+
+
+def test_a_model_that_is_replaced_is_forgotten():
+    model_filter = known()
+    said = sample((("odom", "lens"), ("base", "upper")))
+    assert model_filter.filter_sample("arm", said) is not None
+    model_filter.set_model("arm", RRBOT)
+    rest = model_filter.filter_sample("arm", said)
+    assert rest is not None
+    assert rest.edges == (("odom", "lens"),)

@@ -1,0 +1,45 @@
+"""LagDetector: a backlog is told from clocks that disagree, and from the burst after a cut."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from zstate.ingest.counters import Counters
+from zstate.ingest.stamp_checks import LagDetector
+
+MS = 1_000_000
+S = 1_000 * MS
+
+
+def told(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.1) -> int:
+    """How often a lag is told of when samples with these ages at arrival come."""
+    lag = LagDetector(Counters())
+    with caplog.at_level(logging.WARNING, "zstate"):
+        for number, age_s in enumerate(ages_s):
+            lag.add("r1", "driver", round(age_s * S), round(number * every_s * S))
+    return len(caplog.records)
+
+
+def test_samples_that_come_ever_later_are_told_of_once(caplog):
+    assert told(caplog, [1.0 + 0.1 * number for number in range(50)]) == 1
+    assert "samples of 'r1', which driver writes, come 2.1 s after their stamps" in caplog.text
+    assert "1.0 s shortly before" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "ages_s",
+    [
+        [30.0, 30.1, 29.9] * 20,
+        [5.0 - 0.1 * number for number in range(40)],
+        [1.0, 1.9] * 20,
+    ],
+    ids=["a clock that is off", "a burst after a cut", "an unsteady network"],
+)
+def test_what_does_not_grow_by_a_second_is_not_told(caplog, ages_s):
+    assert told(caplog, ages_s) == 0
+
+
+def test_another_backlog_after_a_pause_begins_with_its_own_least_age(caplog):
+    assert told(caplog, [1.0, 4.0, 7.0], every_s=2.5) == 0

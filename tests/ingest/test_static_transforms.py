@@ -1,0 +1,169 @@
+import pytest
+from live import RRBOT
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.static_transforms import StaticTransformIngest
+from zstate.wire.messages import StaticTransforms, to_block
+
+
+class Following:
+    """Static writers of one robot on one buffer."""
+
+    def __init__(self) -> None:
+        self.buffer, self.counters = TransformBuffer(), Counters()
+        self.ownership = FrameOwnership(self.buffer, self.counters)
+
+    def writer(self, name: str) -> StaticTransformIngest:
+        return StaticTransformIngest("r1", name, self.ownership)
+
+    def edges(self) -> dict[str, tuple[str, str | None]]:
+        return {f.name: (f.parent, f.writer) for f in self.buffer.frames() if f.parent is not None}
+
+
+@pytest.fixture
+def following() -> Following:
+    return Following()
+
+
+def statics(
+    *edges: tuple[str, str], pose=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), session: int = 3
+) -> StaticTransforms:
+    return StaticTransforms(session, edges, to_block([pose] * len(edges)))
+
+
+def test_the_buffer_holds_what_the_writer_says_now_no_more_and_no_less(following: Following):
+    mount = following.writer("mount")
+    mount.replace(statics(("tool", "camera"), ("camera", "lens")))
+    mount.replace(statics(("tool", "camera"), ("tool", "laser")))
+    assert following.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "mount")}
+    mount.replace(statics())
+    assert following.edges() == {}
+
+
+def test_one_message_may_move_a_child_to_another_parent_and_turn_an_edge_round(following: Following):
+    mount = following.writer("mount")
+    mount.replace(statics(("tool", "camera"), ("tool", "laser")))
+    mount.replace(statics(("camera", "tool"), ("base", "laser")))
+    assert following.edges() == {"r1/tool": ("r1/camera", "mount"), "r1/laser": ("r1/base", "mount")}
+    assert following.counters.stats().refused == {}
+
+
+@pytest.mark.parametrize(
+    ("bad", "pose", "reason"),
+    [
+        (("tool", "tool"), (0, 0, 0, 0, 0, 0, 1), "self edge"),
+        (("camera", "tool"), (0, 0, 0, 0, 0, 0, 1), "loop"),
+        (("base", "camera"), (0, 0, 0, 0, 0, 0, 1), "second parent"),
+        (("tool", "/lens"), (0, 0, 0, 0, 0, 0, 1), "frame name"),
+        (("tool", ""), (0, 0, 0, 0, 0, 0, 1), "frame name"),
+        (("tool", "lens"), (float("nan"), 0, 0, 0, 0, 0, 1), "bad numbers"),
+        (("tool", "lens"), (0, 0, 0, 0, 0, 0, 0.5), "bad numbers"),
+        (("tool", "lens"), (0, 0, 0, 0, 0, 0, 0), "bad numbers"),
+    ],
+)
+def test_an_impossible_edge_is_counted_and_the_others_are_taken(following: Following, bad, pose, reason: str):
+    following.writer("mount").replace(statics(("tool", "camera")))
+    following.writer("bad").replace(statics(bad, pose=pose))
+    following.writer("good").replace(statics(("tool", "laser")))
+    assert following.counters.stats().refused == {reason: 1}
+    assert following.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "good")}
+
+
+def test_a_writer_withdraws_only_what_is_still_its_own(following: Following):
+    old, new = following.writer("old"), following.writer("new")
+    old.replace(statics(("tool", "camera"), ("tool", "laser")))
+    new.replace(statics(("tool", "camera")))
+    old.withdraw()
+    assert following.edges() == {"r1/camera": ("r1/tool", "new")}
+    new.withdraw()
+    new.withdraw()
+    assert following.edges() == {}
+
+
+def test_a_full_name_may_belong_to_another_robot(following: Following):
+    following.writer("site").replace(statics(("fleet/map", "odom")))
+    assert following.edges() == {"r1/odom": ("fleet/map", "site")}
+
+
+def xs(following: Following) -> dict[str, float]:
+    statics = [frame for frame in following.buffer.frames() if frame.kind == "static"]
+    return {f.name: following.buffer.lookup(f.parent or "", f.name).translation[0] for f in statics}
+
+
+def at(x: float) -> tuple[float, ...]:
+    return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def test_in_ros_edges_add_up_and_the_newest_pose_counts_whoever_says_it(following: Following):
+    one, other = following.writer("one"), following.writer("other")
+    one.add(statics(("tool", "camera"), pose=at(1.0)))
+    one.add(statics(("tool", "laser"), pose=at(2.0)))
+    other.add(statics(("tool", "camera"), pose=at(3.0)))
+    assert xs(following) == {"r1/camera": 3.0, "r1/laser": 2.0}
+    one.add(statics(("tool", "camera"), pose=at(4.0)))
+    assert xs(following) == {"r1/camera": 4.0, "r1/laser": 2.0}
+    assert following.counters.stats().refused == {}
+
+
+def test_in_ros_a_writer_may_move_its_child_to_another_parent(following: Following):
+    mount = following.writer("mount")
+    mount.add(statics(("tool", "camera"), ("camera", "lens")))
+    mount.add(statics(("base", "camera")))
+    assert following.edges() == {"r1/camera": ("r1/base", "mount"), "r1/lens": ("r1/camera", "mount")}
+    assert following.counters.stats().refused == {}
+
+
+def test_in_ros_a_child_of_another_writer_is_moved_only_when_that_one_has_left(following: Following):
+    old, new = following.writer("old"), following.writer("new")
+    old.add(statics(("tool", "camera"), ("tool", "laser"), session=3))
+    new.add(statics(("base", "camera"), session=4))
+    assert following.counters.stats().refused == {"second parent": 1}
+    following.ownership.remove_writer("r1", 3)
+    assert following.edges() == {"r1/camera": ("r1/base", "new"), "r1/laser": ("r1/tool", "old")}
+    assert following.counters.stats().refused == {"second parent": 2}
+
+
+def test_a_name_that_is_learned_late_is_put_on_what_is_still_this_writers(following: Following):
+    one, other = following.writer("a ROS node 1"), following.writer("a ROS node 2")
+    one.add(statics(("tool", "camera"), ("tool", "laser"), pose=at(1.0)))
+    other.add(statics(("tool", "camera"), pose=at(2.0)))
+    one.name_writer("/one")
+    assert following.edges() == {"r1/camera": ("r1/tool", "a ROS node 2"), "r1/laser": ("r1/tool", "/one")}
+    other.name_writer("/other")
+    assert following.edges()["r1/camera"] == ("r1/tool", "/other")
+    assert xs(following) == {"r1/camera": 2.0, "r1/laser": 1.0}
+
+
+FIXED = [joint for joint in RRBOT.joints if joint.type == "fixed"]
+
+
+def own_edges(turned: float = 1.0) -> StaticTransforms:
+    poses = [[*joint.origin[:3], *(turned * number for number in joint.origin[3:])] for joint in FIXED]
+    return StaticTransforms(3, tuple((j.parent, j.child) for j in FIXED), to_block(poses))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_in_ros_what_the_model_says_too_is_neither_taken_nor_counted(following: Following, sign: float):
+    following.buffer.add_robot(RRBOT, "r1")
+    before = following.edges()
+    following.writer("rsp").add(own_edges(sign))
+    assert following.edges() == before
+    assert following.counters.stats().refused == {}
+
+
+@pytest.mark.parametrize(
+    ("edge", "reason"),
+    [
+        (("world", "base"), "second writer"),
+        (("base", "upper"), "second writer"),
+        (("cart", "base"), "second parent"),
+    ],
+)
+def test_what_contradicts_the_model_is_counted_and_not_taken(following: Following, edge, reason: str):
+    following.buffer.add_robot(RRBOT, "r1")
+    before = following.edges()
+    following.writer("wrong").add(statics(edge, pose=at(9.0)))
+    assert following.edges() == before
+    assert following.counters.stats().refused == {reason: 1}

@@ -1,0 +1,38 @@
+"""Queue bounded in items and bytes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class BoundedQueue(Generic[T]):
+    """A queue of at most ``max_items`` items and ``max_bytes`` bytes; drops its oldest. Not thread-safe."""
+
+    def __init__(self, max_items: int, max_bytes: int) -> None:
+        self._max_items, self._max_bytes = max_items, max_bytes
+        self._items: deque[tuple[T, int]] = deque()
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[T]:
+        return (item for item, _ in self._items)
+
+    def append(self, item: T, size: int) -> int:
+        """Add ``item`` of ``size`` bytes. Returns how many items were dropped for it."""
+        self._items.append((item, size))
+        self._bytes += size
+        count = len(self._items)
+        while len(self._items) > self._max_items or self._bytes > self._max_bytes:
+            self._bytes -= self._items.popleft()[1]
+        return count - len(self._items)
+
+    def clear(self) -> None:
+        """Drop all items."""
+        self._items.clear()
+        self._bytes = 0

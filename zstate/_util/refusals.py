@@ -1,0 +1,43 @@
+"""Counter of input that was refused, which logs the first refusal of each reason."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+
+from zstate.locks import new_lock
+
+_LOG = logging.getLogger("zstate")
+
+
+class Refusals:
+    """Counts refusals by reason and logs the first of each. Any thread may count.
+
+    ``subject`` names the refused input in the log. With a ``parent``, a refusal is logged only if it is the
+    first of its reason there, too, and ``parent.first`` has it as well; ``parent.counts`` does not.
+    """
+
+    def __init__(self, subject: str = "", parent: Refusals | None = None) -> None:
+        self.counts: Counter[str] = Counter()
+        self.first: dict[str, str] = {}
+        """The text of the first refusal of each reason."""
+        self._prefix = f"{subject} " if subject else ""
+        self._parent = parent
+        self._lock = new_lock()
+
+    def count(self, reason: str, text: object) -> None:
+        """Count one refusal for ``reason``; ``text`` explains it."""
+        with self._lock:
+            self.counts[reason] += 1
+            is_known = reason in self.first
+        if not is_known and self._is_first(reason, str(text)):
+            facts = {"event": "refused", "reason": reason}
+            text = f"{self._prefix}refused ({reason}): {text}; further ones are only counted"
+            _LOG.warning("%s", text, extra=facts)
+
+    def _is_first(self, reason: str, text: str) -> bool:
+        with self._lock:
+            if reason in self.first:
+                return False
+            self.first[reason] = text
+        return self._parent is None or self._parent._is_first(reason, text)

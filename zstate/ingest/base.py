@@ -1,0 +1,297 @@
+"""Base of the ingest of one robot's samples: writers, sequence numbers, early samples, epochs."""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded_queue import BoundedQueue
+from zstate.clock import SET_BACK_NS
+from zstate.errors import InsertRefused, InvalidInput, MessageError, duration_text
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.sequence import MissingSamples
+from zstate.locks import outlive_fork
+from zstate.wire.messages import RobotDescription, Sample
+from zstate.wire.sizes import size_of
+
+# Bounds on the samples that wait for the robot's description, which takes milliseconds.
+_EARLY = 1024
+EARLY_BYTES = 4 * 2**20
+_EARLY_HISTORY = 20_000
+_EARLY_HISTORY_BYTES = 16 * 2**20
+
+ClockSetBack: TypeAlias = Callable[[str, int, str], None]
+"""Called with a robot, the session of its writer, and a description of what happened."""
+
+
+class StreamIngest(ABC):
+    """Inserts one robot's samples into the buffer of ``ownership``. Any thread may call it.
+
+    Only samples of the newest writer are inserted. If that writer's clock is set back, a new epoch begins,
+    and ``on_set_back(robot, session, text)`` is called.
+    """
+
+    def __init__(
+        self, robot: str, ownership: FrameOwnership, on_set_back: ClockSetBack | None = None
+    ) -> None:
+        self.robot = robot
+        self.has_data = False
+        """Whether any message of this robot has arrived."""
+        self._ownership = ownership
+        self._buffer = ownership.buffer
+        self._counters = ownership.counters.for_robot(robot)
+        self._on_set_back = on_set_back
+        self._writers: BoundedDict[int, str] = BoundedDict()
+        self._session: int | None = None
+        self._ended_sessions: BoundedDict[int, None] = BoundedDict()
+        self._next_seq: int | None = None
+        self._newest: int | None = None
+        self._last_late: Sample | None = None
+        self._missing = MissingSamples()
+        self._early: BoundedQueue[Sample] = BoundedQueue(_EARLY, EARLY_BYTES)
+        self._early_history: list[Sample] = []
+        self._early_history_bytes = 0
+        # The clock domain of each session, by its description, and the last one described.
+        self._domains: BoundedDict[int, str] = BoundedDict()
+        self._domain: str | None = None
+        self._has_joined_domain = False
+        self._departed_session: int | None = None
+        self._lock = outlive_fork(threading.RLock())
+        self._buffer.name_robot(robot)
+
+    @property
+    def writer(self) -> str | None:
+        """The writer whose samples are inserted now, if it is announced."""
+        return None if self._session is None else self._writers.get(self._session)
+
+    def name_writer(self, session: int, writer: str) -> None:
+        """Set the printed name of the writer of a session, as announced."""
+        with self._lock:
+            self._writers[session] = writer
+            if session == self._departed_session:
+                self._departed_session = None
+            self._on_writer_changed()
+
+    def writer_left(self, session: int) -> None:
+        """Handle the end of a writer: a writer that it replaced may be accepted again."""
+        with self._lock:
+            if session == self._session:
+                self._ended_sessions.clear()
+                self._departed_session = session
+                self._has_joined_domain = False
+                self._buffer.domain.leave(self.robot)
+
+    def insert_sample(self, sample: Sample, *, overflowed: bool) -> None:
+        """Insert a live sample; ``overflowed`` if the receiver's ring lost samples before it."""
+        self.has_data = True
+        with self._lock:
+            if sample.session != self._session and not self._accept_session(sample):
+                self._counters.count_refusal(
+                    "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
+                )
+                return
+            is_in_order = True
+            if sample.seq == self._next_seq:
+                self._next_seq = sample.seq + 1
+            else:
+                # The network reorders only samples after a larger number. The samples of one ROS message
+                # have the same number.
+                is_in_order = sample.seq >= (self._next_seq or 0) - 1
+                self._count_gap(sample.seq, overflowed)
+            if not self._insert_counted(sample, is_in_order=is_in_order):
+                for _ in range(self._early.append(sample, size_of(sample))):
+                    self._refuse_undescribed()
+
+    def insert_history(self, samples: Sequence[Sample]) -> bool:
+        """Insert samples from the writer's cache, oldest first; True if still older ones are wanted.
+
+        Inserts only missing samples, counted as "recalled". They are inserted newest first: the known
+        history grows backwards, so that it never has a gap that is about to be filled.
+        """
+        self.has_data = True
+        for sample in reversed(samples):
+            with self._lock:  # for each, so that live samples need not wait for all
+                if not self._accept_session(sample):
+                    return False
+                if self._is_missing(sample.seq) and not self._insert_old(sample):
+                    return False
+                self._missing.stop_at(sample.seq)
+        return bool(self._missing) or self._is_missing(samples[0].seq - 1)
+
+    def _is_missing(self, seq: int) -> bool:
+        # After a network cut, history may arrive before the first live sample, which shows the gap.
+        return seq in self._missing or (self._next_seq is not None and seq >= self._next_seq)
+
+    def _insert_old(self, sample: Sample) -> bool:
+        """Insert a sample of the history; True if an older one would be inserted, too."""
+        try:
+            inserted = self._insert(sample)
+        except (InvalidInput, MessageError) as error:
+            self._count_refusal(error)
+            return False
+        if inserted is None:
+            self._early_history.append(sample)
+            self._early_history_bytes += size_of(sample)
+            is_full = self._early_history_bytes >= _EARLY_HISTORY_BYTES
+            return not is_full and len(self._early_history) < _EARLY_HISTORY
+        if inserted:
+            self._advance(sample)
+        self._counters.count("recalled", int(inserted))
+        return inserted
+
+    def _insert_early(self) -> None:
+        """Insert the samples that arrived before the robot's description."""
+        early, self._early = self._early, BoundedQueue(_EARLY, EARLY_BYTES)
+        largest = 0
+        for sample in early:
+            if self._insert_counted(sample, is_in_order=sample.seq >= largest):
+                largest = max(largest, sample.seq)
+            else:
+                self._refuse_undescribed()
+        history = self._early_history
+        self._clear_early_history()
+        for sample in history:
+            if not self._insert_old(sample):
+                break
+
+    def _clear_early_history(self) -> None:
+        self._early_history = []
+        self._early_history_bytes = 0
+
+    def _refuse_undescribed(self) -> None:
+        self._counters.count_refusal(
+            "no description", f"{self.robot!r}: no robot_description fits its samples"
+        )
+
+    def _insert_counted(self, sample: Sample, *, is_in_order: bool) -> bool:
+        """Insert a sample and count it; False if its description has not arrived yet."""
+        try:
+            inserted = self._insert(sample)
+            if inserted is None:
+                return False
+            newest, stamp = self._newest, sample.stamp
+            if inserted and newest is not None and stamp >= newest:
+                self._newest = stamp  # nearly always; saves the calls below
+            elif (self._advance(sample) and is_in_order) or not inserted:
+                inserted = self._restart_epoch(sample) or inserted
+        except (InvalidInput, MessageError) as error:
+            self._count_refusal(error)
+        else:
+            self._counters.count("received" if inserted else "late")
+            if not self._has_joined_domain and sample.session != self._departed_session:
+                self._has_joined_domain = True
+                self._buffer.domain.join(self.robot)
+        return True
+
+    def _count_refusal(self, error: InvalidInput | MessageError) -> None:
+        reason = error.reason if isinstance(error, InsertRefused | MessageError) else "bad numbers"
+        self._counters.count_refusal(reason, f"{self.robot!r}: {error}")
+
+    def _set_domain(self, description: RobotDescription) -> None:
+        """Set the clock domain that stamps the samples of the writer of ``description``."""
+        with self._lock:
+            self._domain = description.clock
+            self._domains[description.session] = description.clock
+            self._update_domain()
+
+    def _update_domain(self) -> bool:
+        """Pass the clock domain of the current writer to the buffer; True if it replaces another one."""
+        # The description may come from another program than the samples.
+        domain = self._domain if self._session is None else self._domains.get(self._session, self._domain)
+        before = self._buffer.domain.of(self.robot)
+        return domain is not None and self._buffer.set_domain(self.robot, domain) and bool(before)
+
+    def _advance(self, sample: Sample) -> bool:
+        """Update the newest stamp; True if the sample is so old that the clock may have been set back."""
+        newest, stamp = self._newest, sample.stamp
+        if newest is None or stamp >= newest:
+            self._newest = stamp
+            return False
+        return stamp < newest - SET_BACK_NS
+
+    def _restart_epoch(self, sample: Sample) -> bool:
+        """Begin a new epoch with this sample if the clock was set back; True if it was inserted.
+
+        A single old sample may have a wrong stamp or have been delayed; two consecutive ones show that the
+        clock was set back.
+        """
+        before, self._last_late = self._last_late, sample
+        if before is None or sample.seq != before.seq + 1 or not before.stamp < sample.stamp:
+            return False
+        if not self._may_restart_epoch():
+            return False
+        newest = self._newest_of(sample)
+        size = "" if newest is None else f" by {duration_text(newest - before.stamp)}"
+        self._last_late = self._newest = None
+        self._missing.stop_at(0)  # samples missing so far belong to the old epoch
+        self._clear_early_history()
+        self._drop_history()
+        text = f"the clock of {self.robot!r} went back{size}: its history restarts; other robots keep theirs"
+        self._counters.warn_once(f"{self.robot} back", text)
+        if self._on_set_back is not None:
+            self._on_set_back(self.robot, sample.session, text)
+        inserted = bool(self._insert(sample))
+        self._advance(sample)
+        return inserted
+
+    def _newest_of(self, sample: Sample) -> int | None:
+        """The newest stamp before ``sample`` in its epoch, if known."""
+        return self._newest
+
+    def _accept_session(self, sample: Sample) -> bool:
+        """Whether samples of this session are inserted: those of the newest writer to appear."""
+        session = sample.session
+        if session in self._ended_sessions:
+            return False
+        if session != self._session:
+            if self._session is not None:
+                self._ended_sessions[self._session] = None
+                self._early.clear()
+                self._replace_session(sample)
+            self._session = session
+            self._clear_early_history()
+            self._missing = MissingSamples()
+            self._next_seq = None
+            self._last_late = self._newest = None
+            if self._update_domain():
+                self._drop_history()  # stamps of two clocks cannot be compared
+            self._on_writer_changed()
+        return True
+
+    def _replace_session(self, sample: Sample) -> None:
+        """Handle the first sample of another writer, which begins a new epoch."""
+        self._drop_history()
+
+    def _count_gap(self, seq: int, overflowed: bool) -> None:
+        if self._next_seq is None:
+            self._missing.stop_at(seq)
+        elif seq > self._next_seq:
+            self._missing.add(self._next_seq, seq)
+            self._counters.count("dropped" if overflowed else "missed", seq - self._next_seq)
+        self._next_seq = max(seq + 1, self._next_seq or 0)
+
+    @abstractmethod
+    def describe(self, description: RobotDescription) -> None:
+        """Use the robot's description from now on."""
+
+    @abstractmethod
+    def _insert(self, sample: Sample) -> bool | None:
+        """Decode and insert a sample: False if it is older than the history, None without a description.
+
+        Raises InvalidInput or MessageError if the sample cannot be used.
+        """
+
+    @abstractmethod
+    def _drop_history(self) -> None:
+        """Drop all samples inserted so far; a new epoch begins."""
+
+    @abstractmethod
+    def _may_restart_epoch(self) -> bool:
+        """Whether dropping the history would drop no samples of other writers."""
+
+    @abstractmethod
+    def _on_writer_changed(self) -> None:
+        """Called when the current writer, or its name, has changed."""

@@ -1,0 +1,254 @@
+"""Events of the writers that a listener follows: they join, leave, restart, conflict, fall silent."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Literal
+
+from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
+from zstate._util.callback_thread import CallbackThread
+from zstate.closing import Closing
+from zstate.errors import duration_text
+from zstate.following.vigil import Vigil
+from zstate.locks import new_lock
+from zstate.wire.keys import Stream
+from zstate.wire.writer import Announced, Writer
+
+Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
+
+KEPT = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class WriterEvent:
+    """An event of the ``writer`` of a stream of ``robot``, observed ``at`` [ns], system time.
+
+    - "joined": it publishes from now on; "restarted": as "joined", and the same program on the same host did
+      before;
+    - "left": it was closed, or its process ended, while the network is up;
+    - "cut off": the router that connected it is lost, or it was silent before it disappeared; it may still
+      publish. "back": the same writer is connected again;
+    - "stale": it is announced, but no sample came for ten of its periods (at least half a second): it is
+      frozen, or its source is. "resumed": samples come again;
+    - "set back": its clock was set back, so the robot's history begins with its next sample;
+    - "conflict": another writer publishes the same stream, or places the same frame.
+
+    ``writer`` is None if it is not announced; ``text`` describes the event in full.
+    """
+
+    kind: Kind
+    robot: str
+    stream: Stream
+    writer: Writer | None
+    at: int
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+StaticWriter = tuple[str, str]
+"""A robot, and the name under which some of its static edges are published."""
+
+
+class StaticEdgeOwners:
+    """The child frames of each static writer, and the other writers of the same frames."""
+
+    def __init__(self) -> None:
+        self._children: dict[StaticWriter, frozenset[str]] = {}
+        self._writers: dict[str, set[StaticWriter]] = {}
+
+    def replace(self, writer: StaticWriter, children: frozenset[str]) -> list[tuple[str, list[StaticWriter]]]:
+        """Set the frames that ``writer`` places; returns those that others place, too, with these writers."""
+        for child in self._children.pop(writer, frozenset()) - children:
+            self._writers[child].discard(writer)
+            if not self._writers[child]:
+                del self._writers[child]
+        for child in children:
+            self._writers.setdefault(child, set()).add(writer)
+        if children:
+            self._children[writer] = children
+            while len(self._children) > MAX_ENTRIES:
+                self.replace(next(iter(self._children)), frozenset())
+        others = [(child, sorted(self._writers[child] - {writer})) for child in sorted(children)]
+        return [(child, writers) for child, writers in others if writers]
+
+
+_Place = tuple[str, Stream, str]
+
+
+class EventLog(Closing):
+    """The events of one listener, which receives ``streams`` and inserts the samples of ``followed``.
+
+    ``on_event`` is called with each event on a thread of its own. Without it there are no "stale" events, and
+    a writer that falls silent before it disappears has "left". Any thread may call the methods.
+    """
+
+    def __init__(
+        self,
+        streams: Collection[Stream],
+        followed: Stream,
+        shared: Collection[Stream],
+        on_event: Callable[[WriterEvent], None] | None = None,
+    ) -> None:
+        self._streams = frozenset(streams)
+        self._followed: Stream = followed
+        # In ROS many programs publish parts of tf, but only one publishes a robot's joints.
+        self._exclusive = self._streams - (frozenset(shared) - {"joint_states"})
+        self._events: deque[WriterEvent] = deque(maxlen=KEPT)
+        self._alive: dict[_Place, dict[int, Announced]] = {}
+        self._former: BoundedDict[tuple[_Place, str, str], Writer] = BoundedDict()
+        self._gone: BoundedDict[tuple[_Place, int], None] = BoundedDict()
+        self._conflicts: BoundedDict[tuple[str, str, int, str], None] = BoundedDict()
+        self._owners = StaticEdgeOwners()
+        self._lock = new_lock()
+        self._vigil = Vigil()
+        self._thread = None if on_event is None else CallbackThread(on_event, self._check_deadlines)
+
+    def recent(self) -> tuple[WriterEvent, ...]:
+        """The last 1024 events, oldest first."""
+        with self._lock:
+            return tuple(self._events)
+
+    @property
+    def failures(self) -> int:
+        """How often ``on_event`` raised."""
+        return 0 if self._thread is None else self._thread.failures
+
+    def close(self) -> None:
+        """Stop calling ``on_event``, also from inside it. A second call does nothing."""
+        if self._thread is not None:
+            self._thread.close()
+
+    def on_writer(self, announced: Announced, alive: bool) -> None:
+        """Add the event of a writer that is announced, or is not any more."""
+        if announced.stream in self._streams:
+            with self._lock:
+                if alive:
+                    self._on_joined(announced)
+                else:
+                    self._on_left(announced, "left")
+
+    def on_cut_off(self, announced: Announced) -> None:
+        """Add the event of a writer that disappeared together with the router that connected it."""
+        if announced.stream in self._streams:
+            with self._lock:
+                self._on_left(announced, "cut off")
+
+    def on_sample(self, robot: str, session: int) -> None:
+        """Record the arrival of a sample of the followed stream."""
+        if self._thread is not None:
+            silent_s = self._vigil.hear((robot, session), time.monotonic())
+            if silent_s is not None:
+                with self._lock:
+                    self._add_silence("resumed", robot, session, silent_s)
+
+    def add_set_back(self, robot: str, session: int, text: str) -> None:
+        """Add the event of a writer of the followed stream whose clock was set back."""
+        with self._lock:
+            announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+            writer = None if announced is None else announced.writer
+            self._add("set back", robot, self._followed, writer, text)
+
+    def add_second_edge(self, robot: str, name: str, child: str, text: str) -> None:
+        """Add the conflict of a refused static edge: ``child`` of the writer ``name`` has another owner."""
+        with self._lock:
+            self._add_conflict(robot, name, child, text)
+
+    def set_static_children(self, robot: str, name: str, children: frozenset[str]) -> None:
+        """Set the full names of the frames that the static writer ``name`` of ``robot`` places now."""
+        with self._lock:
+            for child, others in self._owners.replace((robot, name), children):
+                owners = " and ".join(f"{other!r} of {of!r}" for of, other in others)
+                text = f"{name!r} of {robot!r} places {child!r}, and so does {owners}"
+                self._add_conflict(robot, name, child, text)
+
+    def _add_conflict(self, robot: str, name: str, child: str, text: str) -> None:
+        announced = next(iter(self._alive.get((robot, "tf_static", name), {}).values()), None)
+        writer = None if announced is None else announced.writer
+        key = (robot, name, 0 if writer is None else writer.session, child)
+        if key not in self._conflicts:
+            self._add("conflict", robot, "tf_static", writer, text)
+        self._conflicts[key] = None
+
+    def _check_deadlines(self, now_s: float) -> float:
+        stale, next_s = self._vigil.look(now_s)
+        if stale:
+            with self._lock:
+                for (robot, session), silent_s in stale.items():
+                    self._add_silence("stale", robot, session, silent_s)
+        return next_s
+
+    def _on_joined(self, announced: Announced) -> None:
+        place, writer = _place(announced), announced.writer
+        others = self._alive.setdefault(place, {})
+        if writer.session in others:
+            return
+        rivals = [other.writer for other in others.values() if other.excludes(announced)]
+        others[writer.session] = announced
+        text = f"{announced.robot!r}: {writer} writes {_what(announced)}"
+        before = self._former.get((place, writer.program, writer.host))
+        if (place, writer.session) in self._gone:
+            self._add("back", announced.robot, announced.stream, writer, f"{text}: it is back")
+        elif before is None or rivals:
+            self._add("joined", announced.robot, announced.stream, writer, text)
+        else:
+            was = f", pid {before.pid} before" if before.pid else ""
+            restarted = f"{text} again: it was restarted{was}"
+            self._add("restarted", announced.robot, announced.stream, writer, restarted)
+        if rivals and announced.stream in self._exclusive:
+            text = f"{text}, and so does {rivals[-1]}; listeners use the newest writer"
+            self._add("conflict", announced.robot, announced.stream, writer, text)
+        self._vigil.begin((announced.robot, writer.session))
+
+    def _on_left(self, announced: Announced, kind: Literal["left", "cut off"]) -> None:
+        place, writer = _place(announced), announced.writer
+        others = self._alive.get(place, {})
+        if others.pop(writer.session, None) is None:
+            return
+        self._gone[place, writer.session] = None
+        self._former[place, writer.program, writer.host] = writer
+        if not others:
+            del self._alive[place]
+            self._owners.replace((announced.robot, announced.name), frozenset())
+        was_stale = self._vigil.end((announced.robot, writer.session))
+        who = f"{announced.robot!r}: {writer} "
+        what = _what(announced)
+        if kind == "cut off":
+            text = f"{who}is cut off: the router that carried its {what} is lost"
+        elif was_stale:
+            kind, text = "cut off", f"{who}fell silent and is gone: it froze, or was cut off from the network"
+        else:
+            text = f"{who}has left: it does not write {what} any more"
+        self._add(kind, announced.robot, announced.stream, writer, text)
+
+    def _add_silence(
+        self, kind: Literal["stale", "resumed"], robot: str, session: int, silent_s: float
+    ) -> None:
+        announced = self._alive.get((robot, self._followed, ""), {}).get(session)
+        if announced is None:
+            return
+        lasting = duration_text(round(silent_s * 1e9))
+        if kind == "stale":
+            text = f"for {lasting}, though it is announced: it is frozen, or its source is"
+        else:
+            text = f"for {lasting}; samples come again"
+        text = f"{robot!r}: {announced.writer} published nothing on {self._followed} {text}"
+        self._add(kind, robot, self._followed, announced.writer, text)
+
+    def _add(self, kind: Kind, robot: str, stream: Stream, writer: Writer | None, text: str) -> None:
+        event = WriterEvent(kind, robot, stream, writer, time.time_ns(), text)
+        self._events.append(event)
+        if self._thread is not None:
+            self._thread.submit(event)
+
+
+def _place(announced: Announced) -> _Place:
+    return announced.robot, announced.stream, announced.name
+
+
+def _what(announced: Announced) -> str:
+    return f"static edges as {announced.name!r}" if announced.name else announced.stream

@@ -1,0 +1,488 @@
+"""Ownership of frames: which writer places which frame, and which of two conflicting edges is accepted.
+
+Frames ``robot/...`` are placed by the writers of that robot, i.e. those whose samples arrive on the robot's
+keys, whatever name they announce. Other writers may place a robot's root, the frame that none of its own
+writers places, in frames of theirs. A prefix that is no robot on the network, such as the ``fleet`` of
+``fleet/map``, has no owner; every writer may place its frames.
+
+Of edges that exclude each other (a second parent, a loop) the first in this list is accepted, in whatever
+order they arrive:
+
+1. edges of a robot's own model,
+2. edges that the robot's own writers publish, and edges of frames without an owner,
+3. edges by which other writers place the robot's root.
+
+Among equals, an edge that places the root of a model yields to one that does not, then an edge of a writer
+that has left to one of a writer that is announced, then a static edge to a moving one, then the later edge
+to the earlier one. Refused edges are kept, and accepted once nothing conflicts with them: the buffer depends
+on what is published, not on the order of arrival.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import count
+from typing import NamedTuple
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.edge import Edge
+from zstate.buffer.tracks import JointTrack
+from zstate.errors import InsertRefused
+from zstate.ingest.counters import Counters
+from zstate.ingest.edge_claims import (
+    CONTESTED,
+    Admitted,
+    EdgeClaim,
+    EdgeSource,
+    is_same_pose,
+)
+from zstate.locks import outlive_fork
+from zstate.model.robot import RobotModel
+from zstate.transform import Transform
+from zstate.wire.keys import FOREIGN, EdgeNames, foreign_objection, robot_in
+
+_MODEL, _OWN, _OTHERS = range(3)
+
+
+class _AcceptedEdge(NamedTuple):
+    """An edge accepted so far, while conflicts are resolved; ``claim`` is None for the caller's own edges."""
+
+    parent: str
+    writer: str
+    claim: EdgeClaim | None
+    pose: Transform | None
+    is_model: bool = False
+
+    def is_as_good_as(self, claim: EdgeClaim) -> bool:
+        """Whether both fix the child at the same pose, as a ROS robot_state_publisher repeats the model."""
+        return self.pose is not None and claim.pose is not None and is_same_pose(self.pose, claim.pose)
+
+
+class FrameOwnership:
+    """Decides which published edges are inserted into ``buffer``. Any thread may call it.
+
+    ``is_shared`` means that all writers share all frames, as in ROS: no frame belongs to a robot. ``placers``
+    are the robots whose writers may place other robots' roots, None: all. If a static edge is refused,
+    ``on_conflict(robot, writer, child, text)`` is called.
+    """
+
+    def __init__(
+        self,
+        buffer: TransformBuffer,
+        counters: Counters,
+        *,
+        is_shared: bool = False,
+        placers: Collection[str] | None = None,
+        on_conflict: Callable[[str, str, str, str], None] | None = None,
+    ) -> None:
+        self.buffer = buffer
+        self.counters = counters
+        self.version = 0
+        """Increases when the set of accepted moving edges may have changed."""
+        self.live: dict[tuple[str, int], str] = {}
+        """Printed names of the announced writers, by robot and session."""
+        self._is_shared = is_shared
+        self._placers = placers
+        self._on_conflict = on_conflict
+        self._robots: set[str] = set()
+        self._departed: BoundedDict[tuple[str, int], None] = BoundedDict()
+        self._claims: dict[str, list[EdgeClaim]] = {}
+        self._outside: dict[EdgeClaim, None] = {}
+        self._refused: dict[EdgeClaim, None] = {}
+        self._placed: dict[str, EdgeClaim] = {}
+        self._is_resolved = True
+        self._counter = count(1)
+        self._lock = outlive_fork(threading.RLock())
+
+    def add_robot(self, robot: str) -> None:
+        """Add a robot on the network, which owns the frames ``robot/...``."""
+        if robot in self._robots:
+            return
+        with self._lock:
+            self._robots.add(robot)
+            if any(robot in map(robot_in, claim.names) for claim in self._outside):
+                self.resolve()
+
+    def add_writer(self, robot: str, session: int) -> None:
+        """Add an announced writer of static edges."""
+        with self._lock:
+            self._departed.pop((robot, session), None)
+
+    def remove_writer(self, robot: str, session: int) -> None:
+        """Remove a writer that has left. Its edges stay until they conflict with an announced one's."""
+        with self._lock:
+            self._departed[robot, session] = None
+            if self._refused:
+                self.resolve()
+
+    def rename(self, source: EdgeSource, name: str) -> None:
+        """Set the printed name of a source, if it is announced later than its edges."""
+        with self._lock:
+            ours = [claim for claim in source.claims.values() if self._is_in_buffer(claim)]
+            source.name = name
+            for claim in ours:
+                self._insert(claim)
+
+    def place_model(self, robot: str, model: RobotModel, before: JointTrack | None) -> JointTrack:
+        """Add a robot's model to the buffer, replacing the track ``before``.
+
+        Conflicting edges of any writer are withdrawn. Raises InsertRefused.
+        """
+        with self._lock:
+            if before is not None:
+                self.buffer.remove_robot(before)
+            has_withdrawn = self._withdraw_overlapping(robot, model)
+            try:
+                return self.buffer.add_robot(model, robot)
+            finally:
+                self.version += self._is_shared
+                if has_withdrawn or before is not None or self._refused:
+                    self.resolve()
+
+    def _withdraw_overlapping(self, robot: str, model: RobotModel) -> bool:
+        """Withdraw the edges that conflict with a model; True if there were any."""
+        links = {f"{robot}/{link}" for link in model.links}
+        joints = {f"{robot}/{joint.child}": joint for joint in model.joints}
+        taken = [frame for frame in self.buffer.frames(joints) if frame.parent is not None]
+        for frame in taken:
+            self.buffer.withdraw(frame.name)
+            if frame.name not in self._claims:  # claims are reported when they are resolved
+                text = f"{frame.writer or 'hand'!r} placed {frame.name!r}, a link of the model"
+                self.counters.count_refusal("second writer", text)
+        root = f"{robot}/{model.root}"
+        top = self._root_above(root)
+        if top in links and top != root:
+            # The edges between are valid children of the model; the one that places its root closes the loop.
+            (frame,) = self.buffer.frames((root,))
+            self.buffer.withdraw(root)
+            if root not in self._claims:
+                text = f"{frame.writer or 'hand'!r} placed {root!r}, the root of the model, below the model"
+                self.counters.count_refusal("loop", text)
+            return True
+        return bool(taken)
+
+    def _root_above(self, frame: str) -> str:
+        """The frame above ``frame`` that has no parent."""
+        known = self.buffer.frames((frame,))
+        while known and known[0].parent is not None:
+            frame = known[0].parent
+            known = self.buffer.frames((frame,))
+        return frame
+
+    def set_statics(
+        self, source: EdgeSource, edges: Mapping[EdgeNames, Transform], *, adds: bool = False
+    ) -> None:
+        """Replace the static edges of ``source``.
+
+        With ``adds``, as in ROS, only earlier edges of the same children are replaced.
+        """
+        with self._lock:
+            edges = {self._named(names): pose for names, pose in edges.items()}
+            children = {child for _, child in edges}
+            for names, claim in list(source.claims.items()):
+                if names not in edges and (not adds or names[1] in children):
+                    self._drop(claim)
+            published: list[EdgeClaim] = []
+            for names, pose in edges.items():
+                if names[0] == names[1]:
+                    text = f"{names[0]!r} -> {names[1]!r}: a frame cannot be placed on itself"
+                    self._report(source, InsertRefused(text, reason="self edge", edge=names))
+                    continue
+                claim = self._claim(source, names)
+                claim.pose, claim.published = pose, next(self._counter)
+                published.append(claim)
+            alone = [self._insert_uncontested(claim) for claim in published]
+            if self._refused or not self._is_resolved or not all(alone):
+                self.resolve(published)
+
+    def _insert_uncontested(self, claim: EdgeClaim) -> bool:
+        """Insert a claim that conflicts with nothing; False if conflicts must be resolved first."""
+        if self._refused or not self._is_uncontested(claim):
+            return False
+        try:
+            self._insert(claim)
+        except InsertRefused as error:
+            if error.reason in CONTESTED:
+                return False
+            self._drop(claim)
+            self._report(claim.source, error)
+        return True
+
+    def _is_uncontested(self, claim: EdgeClaim) -> bool:
+        """Whether no rule and no other source conflicts with it; the buffer still may."""
+        return self._is_resolved and len(self._claims[claim.child]) == 1 and self._rank(claim) != _OTHERS
+
+    def admit(self, source: EdgeSource, edges: Sequence[EdgeNames]) -> Admitted:
+        """Decide which of these moving edges of ``source`` may be inserted.
+
+        If all writers share all frames, one refused edge refuses the whole sample.
+        """
+        with self._lock:
+            named = [self._named(names) for names in edges]
+            fresh = [
+                self._claim(source, names) for names in dict.fromkeys(named) if names not in source.claims
+            ]
+            if self._refused or not all(self._is_uncontested(claim) for claim in fresh):
+                self.resolve()
+            else:
+                for claim in fresh:
+                    claim.is_accepted = True
+            claims = [source.claims[names] for names in named]
+            refusal = next((claim.refusal for claim in claims if claim.refusal is not None), None)
+            if refusal is not None and self._is_shared:
+                for claim in fresh:
+                    self._drop(claim)
+                return Admitted((), refusal)
+            for claim in fresh:
+                if claim.is_accepted:
+                    self._add_frames(claim)
+            rows = [row for row, claim in enumerate(claims) if claim.is_accepted]
+            return Admitted(None if refusal is None else tuple(rows), refusal)
+
+    def release(self, source: EdgeSource) -> None:
+        """Remove all edges of ``source``."""
+        with self._lock:
+            for claim in list(source.claims.values()):
+                self._drop(claim)
+            if self._refused or not self._is_resolved:
+                self.resolve()
+
+    def remove_child(self, child: str) -> None:
+        """Remove all published edges of ``child``."""
+        with self._lock:
+            for claim in list(self._claims.get(child, ())):
+                self._drop(claim)
+
+    def replace_departed(self, source: EdgeSource, children: Collection[str]) -> None:
+        """Remove the moving edges of ``children`` by writers of the same robot that have left."""
+        with self._lock:
+            for child in children:
+                for claim in list(self._claims.get(child, ())):
+                    other = claim.source
+                    is_another = other is not source and other.robot == source.robot
+                    if claim.pose is None and is_another and not self._is_live(other):
+                        self._drop(claim)
+
+    def others_move(self, source: EdgeSource) -> bool:
+        """Whether another announced writer moves one of the same frames."""
+        with self._lock:
+            return any(
+                other.pose is None and other.source.session != source.session and self._is_live(other.source)
+                for _, child in source.claims
+                for other in self._claims[child]
+            )
+
+    def _is_live(self, source: EdgeSource) -> bool:
+        return (source.robot, source.session) in self.live
+
+    def _named(self, names: EdgeNames) -> EdgeNames:
+        # In ROS a slash in a name has no meaning, and the name may be that of a link of the robot.
+        return self.buffer.edge_named(names) if self._is_shared else names
+
+    def _claim(self, source: EdgeSource, names: EdgeNames) -> EdgeClaim:
+        claim = source.claims.get(names)
+        if claim is None:
+            claim = source.claims[names] = EdgeClaim(source, *names, next(self._counter))
+            self._claims.setdefault(names[1], []).append(claim)
+            if robot_in(names[1]) != source.robot:
+                self._outside[claim] = None
+        return claim
+
+    def _drop(self, claim: EdgeClaim) -> None:
+        del claim.source.claims[claim.names]
+        rest = self._claims[claim.child]
+        rest.remove(claim)
+        if not rest:
+            del self._claims[claim.child]
+        self._outside.pop(claim, None)
+        self._refused.pop(claim, None)
+        self.version += self._is_shared  # samples that are refused as a whole have no claims
+        if self._is_in_buffer(claim):
+            self.buffer.withdraw(claim.child)
+            self._is_resolved &= not rest
+        if self._placed.get(claim.child) is claim:
+            del self._placed[claim.child]
+
+    def _is_in_buffer(self, claim: EdgeClaim) -> bool:
+        """Whether it places its child there: the caller may have changed the buffer, too."""
+        if claim.pose is not None and self._placed.get(claim.child) is not claim:
+            return False
+        if not claim.is_accepted:
+            return False
+        kind = "pose" if claim.pose is None else "static"
+        for frame in self.buffer.frames((claim.child,)):
+            is_ours = claim.pose is None or frame.writer == claim.source.name
+            return (frame.parent, frame.kind) == (claim.parent, kind) and is_ours
+        return False
+
+    def _insert(self, claim: EdgeClaim) -> None:
+        assert claim.pose is not None
+        self._add_frames(claim)
+        self.buffer.insert_static(claim.pose, writer=claim.source.name)
+        self._placed[claim.child] = claim
+        claim.is_accepted, claim.refusal = True, None
+
+    def _add_frames(self, claim: EdgeClaim) -> None:
+        # Not if these are bare names of a robot's frames.
+        if self.buffer.edge_named(claim.names) != claim.names:
+            self.buffer.add_frames(claim.names)
+
+    def _rank(self, claim: EdgeClaim) -> int:
+        robot, owner = claim.source.robot, robot_in(claim.child)
+        if self._is_shared or owner == robot:
+            return _MODEL if claim.source.is_model else _OWN
+        return _OTHERS if owner in self._robots else _OWN
+
+    def _rank_of(self, there: _AcceptedEdge) -> int:
+        """The rank of an accepted edge; an edge inserted by the caller has the lowest."""
+        if there.claim is None:
+            return _MODEL if there.is_model else _OTHERS + 1
+        return self._rank(there.claim)
+
+    def resolve(self, published: Collection[EdgeClaim] = ()) -> None:
+        """Compare all edges, those in the buffer included, and make the buffer hold the accepted ones.
+
+        Reports refused static edges that were ``published`` just now, or accepted before.
+        """
+        with self._lock:
+            accepted, roots = self._caller_edges()
+            claims = [claim for claims in self._claims.values() for claim in claims]
+            claims.sort(key=lambda claim: self._precedence(claim, roots))
+            refusals: dict[EdgeClaim, InsertRefused] = {}
+            for claim in claims:
+                error = self._refusal(claim, accepted)
+                if error is not None:
+                    refusals[claim] = error
+                elif self._prevails(claim, accepted.get(claim.child)):
+                    accepted[claim.child] = _AcceptedEdge(claim.parent, claim.source.name, claim, claim.pose)
+            before = [claim for claim in claims if claim.is_accepted]
+            self._withdraw_refused(refusals)
+            for claim in claims:
+                self.version += claim.pose is None and claim.is_accepted == (claim in refusals)
+                claim.is_accepted, claim.refusal = claim not in refusals, refusals.get(claim)
+            self._refused, self._is_resolved = dict.fromkeys(refusals), True
+            self._insert_accepted(accepted.values(), published)
+            for claim in {*before, *published}.intersection(refusals):
+                if claim.pose is not None:
+                    self._report(claim.source, refusals[claim])
+
+    def _caller_edges(self) -> tuple[dict[str, _AcceptedEdge], set[str]]:
+        """The edges in the buffer that are no claims, by child; and the roots of models."""
+        layout = self.buffer.layout()
+        accepted: dict[str, _AcceptedEdge] = {}
+        for child, edge in layout.edges.items():
+            if edge is not None and (edge.robot is not None or not self._is_claimed(edge)):
+                pose = None
+                if edge.kind == "static":
+                    pose = Transform.from_pose7(edge.parent, edge.child, edge.pose)
+                by = edge.writer or "hand"
+                accepted[child] = _AcceptedEdge(edge.parent, by, None, pose, edge.robot is not None)
+        roots = {track.frame(track.model.root) for track in layout.robots.values()}
+        all_claims = (claim for claims in self._claims.values() for claim in claims)
+        of_models = [claim for claim in all_claims if self._rank(claim) == _MODEL]
+        roots |= {claim.parent for claim in of_models} - {claim.child for claim in of_models}
+        return accepted, roots
+
+    def _is_claimed(self, edge: Edge) -> bool:
+        placed = self._placed.get(edge.child)
+        if edge.kind == "static":
+            return (
+                placed is not None and placed.parent == edge.parent and edge.own_writer == placed.source.name
+            )
+        claims = self._claims.get(edge.child, ())
+        return any(claim.pose is None and claim.parent == edge.parent for claim in claims)
+
+    def _precedence(self, claim: EdgeClaim, roots: Collection[str]) -> tuple[int, bool, bool, bool, int]:
+        """The sort key of a claim; the smallest is accepted first."""
+        rank, is_root = self._rank(claim), claim.child in roots
+        return rank, is_root, self._is_departed(claim), claim.pose is not None, claim.order
+
+    def _is_departed(self, claim: EdgeClaim) -> bool:
+        return (claim.source.robot, claim.source.session) in self._departed
+
+    def _refusal(self, claim: EdgeClaim, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
+        """The refusal of an edge that conflicts with the edges accepted before it."""
+        parent, child = names = claim.names
+        by, rank = claim.source.name, self._rank(claim)
+        if rank == _OTHERS:
+            rule = foreign_objection(claim.source.robot, names, self._robots, self._placers)
+            if rule:
+                return InsertRefused(rule, reason=FOREIGN, edge=names)
+        there = accepted.get(child)
+        if there is None:
+            return _loop(names, by, accepted)
+        is_same_edge = there.parent == parent
+        if is_same_edge and (there.is_as_good_as(claim) or self._rank_of(there) == rank):
+            return None
+        if rank == _OTHERS and self._rank_of(there) < _OTHERS:
+            text = (
+                f"{child!r} is placed on {there.parent!r} by robot {robot_in(child)!r} itself "
+                f"({there.writer}), whose edge counts; that of robot {claim.source.robot!r}, on {parent!r}, "
+                "does not"
+            )
+            return InsertRefused(text, reason=FOREIGN, edge=names)
+        if is_same_edge:
+            text = f"{parent!r} -> {child!r} is written by {there.writer} already; refused: {by}"
+            return InsertRefused(f"{text}; one edge has one writer", reason="second writer", edge=names)
+        text = (
+            f"{child!r} has the parent {there.parent!r} by {there.writer} and cannot get a second one, "
+            f"{parent!r} by {by}; withdraw one of the two"
+        )
+        return InsertRefused(text, reason="second parent", edge=names)
+
+    def _prevails(self, claim: EdgeClaim, there: _AcceptedEdge | None) -> bool:
+        """Whether it is the claim that is inserted, of all claims of the same edge."""
+        if there is None:
+            return True
+        if there.claim is None or there.pose is None or claim.pose is None:
+            return False
+        if self._rank(there.claim) != self._rank(claim):
+            return False
+        if self._is_departed(claim) != self._is_departed(there.claim):
+            return self._is_departed(there.claim)
+        return claim.published > there.claim.published
+
+    def _withdraw_refused(self, refused: Collection[EdgeClaim]) -> None:
+        for claim in refused:
+            if self._is_in_buffer(claim):
+                self.buffer.withdraw(claim.child)
+            if self._placed.get(claim.child) is claim:
+                del self._placed[claim.child]
+
+    def _insert_accepted(self, accepted: Iterable[_AcceptedEdge], published: Collection[EdgeClaim]) -> None:
+        for one in accepted:
+            claim = one.claim
+            if claim is None or claim.pose is None:
+                continue
+            if claim in published or not self._is_in_buffer(claim):
+                try:
+                    self._insert(claim)
+                except InsertRefused as error:  # the caller changed the buffer in the meantime
+                    claim.is_accepted, claim.refusal = False, error
+                    self._refused[claim] = None
+                    self._report(claim.source, error)
+
+    def _report(self, source: EdgeSource, error: InsertRefused) -> None:
+        self.counters.count_refusal(error.reason, f"static edge of {source.name!r}: {error}")
+        if error.reason in (*CONTESTED, FOREIGN) and self._on_conflict is not None:
+            self._on_conflict(source.robot, source.name, error.edge[1], str(error))
+
+
+def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
+    """The refusal of an edge that would close a loop."""
+    parent, child = names
+    ring = [parent]
+    while ring[-1] != child:
+        above = accepted.get(ring[-1])
+        if above is None:
+            return None
+        ring.append(above.parent)
+    way = " -> ".join(map(repr, reversed(ring)))
+    writer = accepted[ring[-2]].writer if len(ring) > 1 else by
+    text = (
+        f"{parent!r} -> {child!r} by {by} would close the loop {way} -> {child!r}; "
+        f"{child!r} -> {ring[-2] if len(ring) > 1 else child!r} is written by {writer}"
+    )
+    return InsertRefused(text, reason="loop", edge=names)

@@ -1,0 +1,141 @@
+"""Checks of sample stamps against the clock here. Samples that fail are inserted all the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import SYSTEM, stamp_text
+from zstate.errors.times import counts_from_start, duration_text, unit_mistaken
+from zstate.ingest.counters import Counters
+from zstate.wire.messages import Sample, TransformSample
+
+LATE_NS = 1_000_000_000
+"""Samples of a smaller age are not checked: a shorter wait is no backlog."""
+
+FAR_NS = 60_000_000_000
+"""No network delays a sample by this much; a larger difference is a clock that was never set."""
+
+_LAG_GROWTH_NS = 1_000_000_000
+
+# After this long without a late sample, later ones are another backlog, for instance of another cut.
+_BACKLOG_PAUSE_NS = 2_000_000_000
+
+_HOUR_NS = 3_600_000_000_000
+_ANY_STAMP = (-(2**63), 2**63)
+
+
+class StampCheck:
+    """Counts samples stamped more than a minute from now in ``off_clock``; warns once for each program.
+
+    Samples that are late by less are passed to a ``LagDetector``. ``is_described`` means that robots publish
+    descriptions, which name their clock: a robot without one yet is not checked.
+    """
+
+    def __init__(self, buffer: TransformBuffer, counters: Counters, *, is_described: bool) -> None:
+        self._buffer = buffer
+        self._counters = counters
+        self._is_described = is_described
+        self._reported: BoundedDict[tuple[str, str], None] = BoundedDict()
+        self._lag = LagDetector(counters)
+
+    def accepted_range(self) -> tuple[int, int]:
+        """The earliest and latest stamp [ns] that need no check, as of now."""
+        clock = self._buffer.clock
+        if clock.domain != SYSTEM:
+            return _ANY_STAMP
+        now = clock.now()
+        return now - LATE_NS, now + FAR_NS
+
+    def check(self, robot: str, writer: str | None, sample: Sample) -> None:
+        """Check a sample outside the accepted range."""
+        if not self._is_on_system_clock(robot, sample):
+            return
+        now = self._buffer.clock.now()
+        if abs(sample.stamp - now) <= FAR_NS:
+            self._lag.add(robot, writer, now - sample.stamp, now)
+            return
+        self._counters.for_robot(robot).count("off_clock")
+        # By program, not by session: a writer that restarts with each sample would be logged each time.
+        key = (robot, _program(writer))
+        if key not in self._reported:
+            self._reported[key] = None
+            offset = sample.stamp - now
+            self._counters.warn_once(
+                f"off clock {' '.join(key)}",
+                f"{_samples_text(robot, writer)} are stamped {duration_text(abs(offset))} "
+                f"{'after' if offset > 0 else 'before'} this machine's time ({stamp_text(sample.stamp)}): "
+                f"{likely_cause(sample.stamp, now)}; they are used and counted in off_clock",
+            )
+
+    def _is_on_system_clock(self, robot: str, sample: Sample) -> bool:
+        domain = self._buffer.domain.of(robot)
+        if domain is None and self._is_described:
+            # The description names the clock, and may not have arrived yet.
+            return isinstance(sample, TransformSample) and sample.edges is not None
+        return domain in (None, "", SYSTEM)
+
+
+@dataclass(slots=True)
+class _Backlog:
+    least_ns: int
+    last_ns: int
+    is_reported: bool = False
+
+
+class LagDetector:
+    """Warns once for each program when the age of its samples at arrival has grown by more than a second.
+
+    Only growth counts, because the clocks of both sides may disagree. The burst after a network cut begins
+    with its oldest sample, so its age only falls.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._backlogs: BoundedDict[tuple[str, str], _Backlog] = BoundedDict()
+
+    def add(self, robot: str, writer: str | None, age_ns: int, now_ns: int) -> None:
+        """Add a late sample of ``writer``, which arrived ``age_ns`` after its stamp."""
+        key = (robot, _program(writer))
+        backlog = self._backlogs.get(key)
+        if backlog is None:
+            self._backlogs[key] = _Backlog(age_ns, now_ns)
+            return
+        is_same_backlog = now_ns - backlog.last_ns <= _BACKLOG_PAUSE_NS
+        backlog.last_ns = now_ns
+        backlog.least_ns = min(backlog.least_ns, age_ns) if is_same_backlog else age_ns
+        if age_ns > backlog.least_ns + _LAG_GROWTH_NS and not backlog.is_reported:
+            backlog.is_reported = True
+            age, before = duration_text(age_ns), duration_text(backlog.least_ns)
+            self._counters.warn_once(
+                f"lag {' '.join(key)}",
+                f"{_samples_text(robot, writer)} come {age} after their stamps, {before} shortly before: "
+                "more is sent than the network carries, or than this program handles; `zstate monitor` shows "
+                "where samples wait, and a lower rate helps either way",
+            )
+
+
+def likely_cause(stamp: int, now: int) -> str:
+    """The likely reason why a writer stamps a sample ``stamp`` at the time ``now`` [ns]."""
+    if unit := unit_mistaken(stamp, now):
+        return f"the writer gives {unit} where nanoseconds are meant"
+    if counts_from_start(stamp):
+        return (
+            "1970 and after: the writer stamps with the time since it was switched on, its machine has no "
+            "clock that was set, or this is simulated time (then both sides need `--clock sim`)"
+        )
+    hours, rest = divmod(stamp - now + FAR_NS, _HOUR_NS // 2)
+    if rest < 2 * FAR_NS and abs(hours) <= 28:
+        return "whole hours: the writer takes its local time for UTC, or the other way round"
+    return "the clock of one of the two machines was never set (NTP); or this is a recording played back"
+
+
+def _program(writer: str | None) -> str:
+    """The writer's program and host without its pid; empty if the writer is not announced."""
+    name, has_pid, _ = (writer or "").rpartition(" pid ")
+    return name if has_pid else writer or ""
+
+
+def _samples_text(robot: str, writer: str | None) -> str:
+    return f"samples of {robot!r}{f', which {writer} writes,' if writer else ''}"

@@ -1,0 +1,148 @@
+"""Ingest of transforms that publishers computed, into a buffer."""
+
+from __future__ import annotations
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate.clock import SET_BACK_NS
+from zstate.errors import InsertRefused, InvalidInput
+from zstate.ingest.base import ClockSetBack, StreamIngest
+from zstate.ingest.edge_claims import CONTESTED, Admitted, EdgeSource
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.wire.keys import full_name
+from zstate.wire.messages import (
+    Edges,
+    RobotDescription,
+    Sample,
+    TransformSample,
+    order_digest,
+    poses_from_block,
+)
+
+
+class TransformIngest(StreamIngest):
+    """Inserts transform samples as poses of edges; needs no model."""
+
+    def __init__(
+        self, robot: str, ownership: FrameOwnership, on_set_back: ClockSetBack | None = None
+    ) -> None:
+        super().__init__(robot, ownership, on_set_back)
+        # The newest stamp [ns], in a list that is updated, by the digest of a sample's edges. ``_newest`` is
+        # not used here.
+        self._newest_by_order: BoundedDict[bytes, list[int]] = BoundedDict()
+        self._edges: Edges = ()
+        self._order = b""
+        self._described = EdgeSource(robot, "", is_model=True)
+        self._undescribed = EdgeSource(robot, "")
+        # By the edges that samples name: their full names, and which of those are admitted.
+        self._full_names: BoundedDict[Edges, Edges] = BoundedDict()
+        self._admitted: BoundedDict[Edges, Admitted] = BoundedDict()
+        self._last: tuple[Edges, Admitted] = (), Admitted()
+        self._version = -1
+
+    def describe(self, description: RobotDescription) -> None:
+        self.has_data = True
+        self._set_domain(description)
+        with self._lock:
+            order = order_digest(description.moving_edges)
+            if order == self._order:
+                return
+            try:
+                edges = self._named(description.moving_edges)
+            except InvalidInput as error:
+                self._counters.count_refusal("robot description", str(error))
+                return
+            self._release(self._described)
+            self._edges, self._order = edges, order
+            self._buffer.domain.place(self.robot, (child for _, child in edges))
+            self._insert_early()
+
+    def _named(self, edges: Edges) -> Edges:
+        return tuple((full_name(self.robot, parent), full_name(self.robot, child)) for parent, child in edges)
+
+    def _insert(self, sample: Sample) -> bool | None:
+        assert isinstance(sample, TransformSample)
+        edges, source = self._edges, self._described
+        if sample.edges is not None:
+            edges, source = self._named_edges(sample.edges), self._undescribed
+        elif sample.order != self._order:
+            return None
+        if not edges:
+            return True  # a robot without moving parts
+        admitted = self._admit(source, edges)
+        try:
+            return self._insert_admitted(sample, edges, admitted)
+        except InsertRefused as error:
+            if error is admitted.refusal or error.reason not in CONTESTED:
+                raise
+        # The buffer holds a conflicting edge that was not compared yet.
+        self._ownership.resolve()
+        return self._insert_admitted(sample, edges, self._admit(source, edges))
+
+    def _named_edges(self, names: Edges) -> Edges:
+        edges = self._full_names.get(names)
+        if edges is None:
+            edges = self._full_names[names] = self._named(names)
+            new = {child for _, child in edges} - {child for _, child in self._undescribed.claims}
+            self._ownership.replace_departed(self._undescribed, new)
+            self._buffer.domain.place(self.robot, new)
+        return edges
+
+    def _admit(self, source: EdgeSource, edges: Edges) -> Admitted:
+        """The admitted rows of ``edges``, decided again if the decision may have changed."""
+        if self._version == self._ownership.version:
+            if edges is self._last[0]:
+                return self._last[1]
+            known = self._admitted.get(edges)
+            if known is not None:
+                self._last = edges, known
+                return known
+        source.name, source.session = self.writer or "", self._session or 0
+        admitted = self._ownership.admit(source, edges)
+        if self._version != self._ownership.version:
+            self._admitted.clear()
+            self._version = self._ownership.version
+        self._admitted[edges] = admitted
+        self._last = edges, admitted
+        return admitted
+
+    def _insert_admitted(self, sample: TransformSample, edges: Edges, admitted: Admitted) -> bool:
+        poses = poses_from_block(sample.poses)
+        if admitted.refusal is None:
+            return self._buffer.insert_many(edges, sample.stamp, poses, writer=self.writer)
+        if not admitted.rows:
+            raise admitted.refusal.with_traceback(None)  # it is raised for each sample
+        self._count_refusal(admitted.refusal)
+        chosen = [edges[row] for row in admitted.rows]
+        return self._buffer.insert_many(chosen, sample.stamp, poses[list(admitted.rows)], writer=self.writer)
+
+    def _advance(self, sample: Sample) -> bool:
+        # One writer may stamp one edge later than another, for instance one from a slow camera.
+        newest = self._newest_by_order.get(sample.order)
+        if newest is None:
+            self._newest_by_order[sample.order] = [sample.stamp]
+            return False
+        if sample.stamp >= newest[0]:
+            newest[0] = sample.stamp
+            return False
+        return sample.stamp < newest[0] - SET_BACK_NS
+
+    def _newest_of(self, sample: Sample) -> int | None:
+        newest = self._newest_by_order.get(sample.order)
+        return None if newest is None else newest[0]
+
+    def _drop_history(self) -> None:
+        self._newest_by_order.clear()
+        self._release(self._described)
+        self._release(self._undescribed)
+
+    def _release(self, source: EdgeSource) -> None:
+        self._ownership.release(source)
+        self._full_names.clear()
+        self._admitted.clear()
+        self._last = (), Admitted()
+
+    def _may_restart_epoch(self) -> bool:
+        return not any(map(self._ownership.others_move, (self._described, self._undescribed)))
+
+    def _on_writer_changed(self) -> None:
+        pass  # each sample is inserted under its writer's name

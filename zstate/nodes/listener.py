@@ -1,0 +1,386 @@
+"""TransformListener: subscribes to robots on the network and fills a transform buffer."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
+from typing import Literal, ParamSpec, TypeVar
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.tracks import Offset
+from zstate.clock import SYSTEM, Clock
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, MessageError
+from zstate.ingest.base import StreamIngest
+from zstate.ingest.counters import Counters, ListenerStats
+from zstate.ingest.events import EventLog, WriterEvent
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
+from zstate.ingest.stamp_checks import StampCheck
+from zstate.ingest.static_transforms import StaticTransformIngest
+from zstate.ingest.transforms import TransformIngest
+from zstate.net.clock_offset import OffsetMeter
+from zstate.net.history import PastReader
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.presence import announce_reader, watch
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber, capacity_for
+from zstate.net.wires import wire_named
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened
+from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
+from zstate.wire.protocol import SerializedSample
+from zstate.wire.writer import Announced, Writer
+
+Follow = Literal["joint_states", "tf"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class TransformListener(Closing):
+    """Fills ``buffer`` with the transforms of one robot, or of all robots with ``robot="*"``.
+
+    Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
+    ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
+    ``follow="tf"`` subscribes to transforms and needs no model. With ``history_on_join`` the buffer also gets
+    the samples that publishers of the native wire cached in the seconds before (``StatePublisher``'s
+    ``cache_s``). A context manager.
+
+    The clock domain of each robot is the one in its description, and robots of different domains may share
+    the buffer; a lookup across two of them raises ClockMismatch. ``clock`` is the one that ages are measured
+    with (default: the system clock); for simulated robots pass a ``SimulatedClock``. Input that cannot be
+    used is counted in ``stats``, logged once through ``logging``, and never stops the stream.
+
+    In a forked process nothing fills the buffer: it answers from the samples it has, waits end at once, and
+    errors name this as the reason.
+
+    A frame ``robot/...`` is placed by that robot's own writers; its root may also be placed by writers of
+    other robots, in their frames. ``placers`` names the robots that may; None: every robot.
+
+    ``on_event(event)`` is called on a thread of its own when a writer joins, leaves, is restarted, is cut off
+    or comes back, falls silent, or conflicts with another one: see ``WriterEvent``.
+    """
+
+    def __init__(  # noqa: PLR0917 - the order is that of the published contract
+        self,
+        session: Session,
+        robot: str = ANY,
+        buffer: TransformBuffer | None = None,
+        wire: str = "native",
+        follow: Follow = "joint_states",
+        history_s: float = 10.0,
+        *,
+        clock: Clock | None = None,
+        history_on_join: bool = True,
+        on_event: Callable[[WriterEvent], None] | None = None,
+        placers: Collection[str] | None = None,
+    ) -> None:
+        if isinstance(placers, str):
+            raise InvalidInput(f"placers is a collection of robot names, for instance {[placers]!r}")
+        if follow not in ("joint_states", "tf"):
+            raise InvalidInput(f"follow is 'joint_states' or 'tf', not {follow!r}")
+        self.robot = robot
+        self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
+        if clock is not None:
+            self.buffer.use_clock(clock)
+        self._wire = wire_named(wire)
+        self._robot_from_key: Callable[[str], str] = self._wire.robot_of if robot == ANY else lambda _: robot
+        self._follow: Follow = follow
+        self._is_shared = follow in self._wire.shared
+        self._counters = Counters()
+        self._stamp_check = StampCheck(self.buffer, self._counters, is_described=not self._wire.shared)
+        streams: tuple[Stream, ...] = ("robot_description", "tf_static", follow)
+        self._events = EventLog(streams, follow, self._wire.shared, on_event)
+        self._ownership = FrameOwnership(
+            self.buffer,
+            self._counters,
+            is_shared=bool(self._wire.shared),
+            placers=placers,
+            on_conflict=self._events.add_second_edge,
+        )
+        self._names = self._ownership.live
+        self._ingests: dict[tuple[str, int], StreamIngest] = {}
+        self._statics: dict[tuple[str, int], StaticTransformIngest] = {}
+        self._overflowed: set[StreamIngest] = set()
+        self._history: PastReader | None = None
+        self._clock_offsets: _WriterClockOffsets | None = None
+        self._observers: tuple[Callable[[], object], ...] = ()
+        with ExitStack() as opening:
+            opening.enter_context(self._events)
+            expression = self._wire.expression
+            key = expression(robot, "robot_description")
+            opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_description)))
+            key = expression(robot, "tf_static")
+            opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_statics)))
+            key = expression(robot, follow)
+            self._capacity = capacity_for(key)
+            opening.enter_context(StreamSubscriber(session, key, self._on_samples))
+            if history_on_join and self._wire.name == "native":
+                self._history = PastReader(session, self._observed(self._on_history), self._count_undecodable)
+                opening.enter_context(self._history)
+            if not self._wire.shared:
+                self._clock_offsets = _WriterClockOffsets(session, self.buffer)
+                opening.enter_context(self._clock_offsets)
+            # History is requested from each writer found: after subscribing, so that no sample falls between.
+            on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
+            opening.enter_context(watch(session, robot, on_writer, wire, on_cut_off))
+            for announcement in announce_reader(session, self._wire, robot, streams):
+                opening.enter_context(announcement)
+            self._opened = opening.pop_all()
+        self._pid = os.getpid()
+        _LISTENERS.add(self)
+
+    def __repr__(self) -> str:
+        robots, received = len(self.robots()), self.stats.received
+        return f"<TransformListener of {self.robot!r}: {robots} robots, {received} samples received>"
+
+    @property
+    def stats(self) -> ListenerStats:
+        """Counts of samples received, lost and refused so far."""
+        return self._counters.stats()
+
+    def stats_of(self, robot: str) -> ListenerStats:
+        """The part of ``stats`` that concerns one robot."""
+        return self._counters.for_robot(robot).stats()
+
+    @property
+    def refusals(self) -> dict[str, str]:
+        """The text of the first refusal of each reason in ``stats.refused``."""
+        return self._counters.refusals()
+
+    def robots(self) -> tuple[str, ...]:
+        """The robots that sent any message so far, sorted by name."""
+        return tuple(sorted({ingest.robot for ingest in list(self._ingests.values()) if ingest.has_data}))
+
+    def events(self) -> tuple[WriterEvent, ...]:
+        """The last 1024 events of writers, oldest first.
+
+        Without ``on_event`` there are no "stale" events, and a writer that froze before it disappeared has
+        "left".
+        """
+        return self._events.recent()
+
+    def add_observer(self, notify: Callable[[], object]) -> None:
+        """Call ``notify()`` after each batch of messages that was processed, on its thread: keep it short."""
+        self._observers = (*self._observers, notify)
+
+    def _observed(self, handle: Callable[P, R]) -> Callable[P, R]:
+        """``handle``, followed by the calls of the observers."""
+
+        def handle_and_notify(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return handle(*args, **kwargs)
+            finally:
+                for notify in self._observers:
+                    notify()
+
+        return handle_and_notify
+
+    def close(self) -> None:
+        """Stop listening; the buffer keeps its samples. A second call does nothing."""
+        _LISTENERS.discard(self)
+        self._opened.close()
+
+    def end_after_fork(self) -> None:
+        """End the buffer in a forked child, where nothing fills it."""
+        self.buffer.end(
+            f"its listener belongs to process {self._pid} and does not run after a fork: no more data comes; "
+            "call connect() and open a listener in the child processes alone, or start them with the 'spawn' "
+            "or 'forkserver' method"
+        )
+
+    def _ingest_for(self, robot: str, session: int) -> StreamIngest:
+        key = (robot, session if self._is_shared else 0)
+        ingest = self._ingests.get(key)
+        if ingest is None:
+            make = JointStateIngest if self._follow == "joint_states" else TransformIngest
+            ingest = self._ingests.setdefault(key, make(robot, self._ownership, self._events.add_set_back))
+            self._ownership.add_robot(robot)
+            if self._is_shared and (robot, session) in self._names:
+                ingest.name_writer(session, self._names[robot, session])
+        return ingest
+
+    def _on_samples(self, arrivals: list[SerializedSample]) -> None:
+        is_full = len(arrivals) >= self._capacity
+        if is_full:
+            # A full ring has lost samples of any of the writers, and loses more while it is drained.
+            self._overflowed = set(self._ingests.values())
+        earliest, latest = self._stamp_check.accepted_range()
+        failure: Exception | None = None
+        for arrival in arrivals:
+            try:
+                robot = self._robot_from_key(arrival.key)
+                for sample in self._decode(self._follow, arrival, robot):
+                    if isinstance(sample, Sample):
+                        ingest = self._ingest_for(robot, sample.session)
+                        ingest.insert_sample(sample, overflowed=is_full or ingest in self._overflowed)
+                        self._overflowed.discard(ingest)
+                        self._events.on_sample(robot, sample.session)
+                        if not earliest <= sample.stamp <= latest:
+                            writer = self._names.get((robot, sample.session))
+                            self._stamp_check.check(robot, writer, sample)
+            except InvalidInput as error:  # noqa: PERF203 - not a function of its own: runs for each sample
+                self._count_foreign(arrival.key, error)
+            except Exception as error:  # raised below, after the other samples
+                failure = error
+        for notify in self._observers:  # not by _observed(), whose call costs 0.2 us
+            notify()
+        if failure is not None:
+            raise failure
+
+    def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
+        robot = self._robot_from_key(arrivals[0].key)  # the key of the request
+        samples = [
+            sample
+            for arrival in arrivals
+            for sample in self._decode(self._follow, arrival, robot)
+            if isinstance(sample, Sample)
+        ]
+        if any(sample.session != writer for sample in samples):
+            text = f"{robot!r}: samples of another session than {writer}, whose history was requested"
+            self._counters.count_refusal("foreign answer", text)
+            return False
+        return bool(samples) and self._ingest_for(robot, writer).insert_history(samples)
+
+    def _on_description(self, arrival: SerializedSample) -> None:
+        try:
+            robot = self._robot_from_key(arrival.key)
+        except InvalidInput as error:
+            self._count_foreign(arrival.key, error)
+            return
+        if self._is_withdrawn(arrival):
+            return
+        for description in self._decode("robot_description", arrival, robot):
+            if isinstance(description, RobotDescription):
+                self._ingest_for(robot, description.session).describe(description)
+
+    def _on_statics(self, arrival: SerializedSample) -> None:
+        try:
+            robot, writer = self._robot_from_key(arrival.key), self._wire.statics_writer(arrival.key)
+        except InvalidInput as error:
+            self._count_foreign(arrival.key, error)
+            return
+        if writer == MODEL_WRITER and self._follow == "joint_states":
+            return  # the model has the same edges
+        if not self._is_withdrawn(arrival):
+            for message in self._decode("tf_static", arrival, robot):
+                if isinstance(message, StaticTransforms):
+                    self._insert_statics(arrival.key, robot, writer, message)
+        elif writer is not None:
+            self._static_ingest(arrival.key, robot, writer).withdraw()
+            self._statics.pop((arrival.key, 0), None)
+            self._events.set_static_children(robot, writer, frozenset())
+
+    def _is_withdrawn(self, arrival: SerializedSample) -> bool:
+        # In ROS nothing can be withdrawn: an empty payload there is a broken message.
+        return not arrival.payload and not self._wire.shared
+
+    def _insert_statics(self, key: str, robot: str, writer: str | None, message: StaticTransforms) -> None:
+        self._ingest_for(robot, message.session).has_data = True
+        if writer is not None:
+            ingest = self._static_ingest(key, robot, writer)
+            ingest.replace(message)
+            self._events.set_static_children(robot, writer, ingest.children)
+        else:
+            # A ROS node that is not announced yet is identified by its number.
+            name = self._names.get((robot, message.session), f"a ROS node {message.session:016x}")
+            self._static_ingest(key, robot, name, message.session).add(message)
+
+    def _static_ingest(self, key: str, robot: str, writer: str, session: int = 0) -> StaticTransformIngest:
+        ingest = StaticTransformIngest(robot, writer, self._ownership, is_model=writer == MODEL_WRITER)
+        return self._statics.setdefault((key, session), ingest)
+
+    def _decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
+        try:
+            return self._wire.decode(stream, arrival, robot)
+        except MessageError as error:
+            self._counters.for_robot(robot).count_refusal(error.reason, f"{arrival.key}: {error}")
+            return ()
+
+    def _count_undecodable(self, key: str, error: MessageError) -> None:
+        self._counters.count_refusal(error.reason, f"{key}: {error}")
+
+    def _count_foreign(self, key: str, error: InvalidInput) -> None:
+        self._counters.count_refusal("foreign", f"{shortened(key)}: {error}")
+
+    def _on_writer(self, announced: Announced, alive: bool) -> None:
+        self._events.on_writer(announced, alive)
+        self._set_writer(announced, alive=alive)
+
+    def _on_cut_off(self, announced: Announced) -> None:
+        self._events.on_cut_off(announced)
+        self._set_writer(announced, alive=False)
+
+    def _set_writer(self, announced: Announced, *, alive: bool) -> None:
+        robot, session, stream = announced.robot, announced.writer.session, announced.stream
+        name = str(announced.writer)
+        if alive:
+            self._names[robot, session] = name
+            self._ownership.add_robot(robot)
+        else:
+            self._names.pop((robot, session), None)
+        if stream == "tf_static" and alive:
+            self._ownership.add_writer(robot, session)
+            for (_, other), static_ingest in list(self._statics.items()):
+                if other == session:  # of a ROS node, whose edges may arrive before its name
+                    static_ingest.name_writer(name)
+        elif stream == "tf_static":
+            self._ownership.remove_writer(robot, session)
+        elif stream == "robot_description" and self._follow == "joint_states" and alive:
+            self._ingest_for(robot, session).name_writer(session, name)
+        elif stream == self._follow:
+            self._set_followed_writer(announced, alive=alive)
+
+    def _set_followed_writer(self, announced: Announced, *, alive: bool) -> None:
+        robot, session = announced.robot, announced.writer.session
+        if self._clock_offsets is not None:
+            self._clock_offsets.on_writer(announced, alive=alive)
+        if alive and self._history is not None:
+            self._history.ask(self._wire.expression(robot, self._follow), session)
+        if self._is_shared and (robot, session) not in self._ingests:
+            return  # a ROS node that has not published yet
+        ingest = self._ingest_for(robot, session)
+        if alive:
+            ingest.name_writer(session, str(announced.writer))
+            return
+        ingest.writer_left(session)
+        if self._is_shared:
+            del self._ingests[robot, session]
+
+
+class _WriterClockOffsets(Closing):
+    """Measures the clock offset of each writer of the native wire, for the error texts of ``buffer``."""
+
+    def __init__(self, session: Session, buffer: TransformBuffer) -> None:
+        self._offsets = buffer.clock_offsets
+        self._is_enabled = buffer.clock.domain == SYSTEM
+        self._meter = OffsetMeter(session, buffer.clock)
+        self._measured: dict[Writer, Callable[[], Offset | None]] = {}
+
+    def on_writer(self, announced: Announced, *, alive: bool) -> None:
+        """Start or stop measuring the clock of a writer."""
+        writer = announced.writer
+        if not alive:
+            offset = self._measured.pop(writer, None)
+            if offset is not None and self._offsets.get(str(writer)) is offset:
+                del self._offsets[str(writer)]
+        elif self._is_enabled and writer not in self._measured:
+            offset = self._measured[writer] = self._meter.follow(announced.robot, writer)
+            self._offsets[str(writer)] = offset
+
+    def close(self) -> None:
+        """Stop measuring; the last offsets stay. A second call does nothing."""
+        self._meter.close()
+
+
+_LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()
+
+
+def _end_after_fork() -> None:
+    for listener in tuple(_LISTENERS):
+        listener.end_after_fork()
+
+
+os.register_at_fork(after_in_child=_end_after_fork)

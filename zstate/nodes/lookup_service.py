@@ -1,0 +1,97 @@
+"""Lookup queryable: one lookup per Zenoh query, for devices without a buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.tracks import JointTrack
+from zstate.closing import Closing
+from zstate.errors import AmbiguousFrame, ZStateError
+from zstate.locks import new_lock
+from zstate.model.robot import RobotModel
+from zstate.net.history import Memory
+from zstate.net.service import Answer, Service
+from zstate.net.session import Session
+from zstate.transform import Transform
+from zstate.wire.json import to_json
+from zstate.wire.keys import full_name, lookup_key
+from zstate.wire.messages import from_block
+from zstate.wire.questions import LookupQuestion, error_to_json
+
+_JSON = "application/json"
+
+
+class LookupService(Closing):
+    """Answers ``zstate/<robot>/lookup?target=..;source=..;at=..`` with one transform in JSON.
+
+    Without ``at`` [ns] the newest instant is used. Ambiguous bare frame names are those of ``robot``.
+    ``buffer`` is the buffer, for instance ``listener.buffer``, or a function that returns it at each query.
+    A failed lookup is answered with an error, in JSON as well. A context manager.
+    """
+
+    def __init__(
+        self, session: Session, buffer: TransformBuffer | Callable[[], TransformBuffer], robot: str
+    ) -> None:
+        self._get_buffer = (lambda: buffer) if isinstance(buffer, TransformBuffer) else buffer
+        self._robot = robot
+        self._service = Service(session, lookup_key(robot), self._answer)
+
+    @property
+    def answered(self) -> int:
+        """The number of replies, errors included."""
+        return self._service.answered
+
+    @property
+    def overflows(self) -> int:
+        """How often the queue of queries was full, so that some may have been lost."""
+        return self._service.overflows
+
+    def _answer(self, parameters: Mapping[str, str]) -> Answer:
+        try:
+            return Answer(to_json(self._lookup(LookupQuestion.parse(parameters))), _JSON)
+        except ZStateError as error:
+            return Answer(error_to_json(error), _JSON, is_error=True)
+
+    def _lookup(self, question: LookupQuestion) -> Transform:
+        buffer = self._get_buffer()
+        try:
+            return buffer.lookup(question.target, question.source, question.at)
+        except AmbiguousFrame:
+            names = [full_name(self._robot, frame) for frame in (question.target, question.source)]
+            return buffer.lookup(names[0], names[1], question.at)
+
+    def close(self) -> None:
+        """Stop answering. A second call does nothing."""
+        self._service.close()
+
+
+class RecentBuffer:
+    """A buffer of one robot's frames, filled from its writer's sample cache at each query.
+
+    Created at the first query, so that a publisher without queries pays nothing.
+    """
+
+    def __init__(self, model: RobotModel, robot: str, memory: Memory) -> None:
+        self._model, self._robot = model, robot
+        self._memory = memory
+        self._state: tuple[TransformBuffer, JointTrack] | None = None
+        self._next_seq = 0
+        self._lock = new_lock()
+
+    def buffer(self) -> TransformBuffer:
+        """The buffer with every sample until now."""
+        with self._lock:
+            if self._state is None:
+                made = TransformBuffer(self._memory.span_s)
+                self._state = made, made.add_robot(self._model, self._robot)
+            buffer, track = self._state
+            for state in self._memory.since(self._next_seq):
+                rates = None if state.velocities is None else from_block(state.velocities)
+                sample = (track, state.stamp, from_block(state.positions), rates)
+                if not buffer.insert_joints(*sample):
+                    # The writer's clock was set back: earlier samples are another epoch.
+                    buffer.restart(track)
+                    buffer.insert_joints(*sample)
+                self._next_seq = state.seq + 1
+        return buffer

@@ -1,0 +1,1 @@
+"""Recordings: reading robots from MCAP files and bags."""
