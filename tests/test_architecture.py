@@ -16,12 +16,13 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
-    {"closing", "errors", "locks", "_kernel"},
+    {"_util", "closing", "errors", "locks", "_kernel"},
     {"checks", "extension"},
     {"clock"},
     {"se3", "rate", "facts"},
     {"transform", "twist"},
     {"model", "buffer", "wire"},
+    {"ingest"},
     {"net", "record"},
     {"sources", "following", "moving_edges", "status", "lookup_service"},
     {

@@ -13,7 +13,7 @@ from zstate.errors import duration_text
 from zstate.following.bounded import remember
 from zstate.following.placements import Placements
 from zstate.following.teller import Teller
-from zstate.following.vigil import Vigil
+from zstate.ingest.deadline import DeadlineMonitor
 from zstate.locks import new_lock
 from zstate.wire.keys import Stream
 from zstate.wire.writer import Announced, Writer
@@ -78,7 +78,7 @@ class Events(Closing):
         self._fought: dict[tuple[str, str, int, str], None] = {}
         self._placements = Placements()
         self._lock = new_lock()
-        self._vigil = Vigil()
+        self._deadlines = DeadlineMonitor()
         self._teller = None if on_event is None else Teller(on_event, self._look)
 
     def recent(self) -> tuple[Event, ...]:
@@ -114,7 +114,7 @@ class Events(Closing):
     def note_sample(self, robot: str, session: int) -> None:
         """A sample of the followed stream has come."""
         if self._teller is not None:
-            silent_s = self._vigil.hear((robot, session), time.monotonic())
+            silent_s = self._deadlines.on_sample((robot, session), time.monotonic())
             if silent_s is not None:
                 with self._lock:
                     self._tell_of_silence("resumed", robot, session, silent_s)
@@ -148,7 +148,7 @@ class Events(Closing):
         remember(self._fought, key, None)
 
     def _look(self, now_s: float) -> float:
-        stale, next_s = self._vigil.look(now_s)
+        stale, next_s = self._deadlines.expired(now_s)
         if stale:
             with self._lock:
                 for (robot, session), silent_s in stale.items():
@@ -166,7 +166,7 @@ class Events(Closing):
         if rivals and announced.stream in self._alone:
             text = f"{_who(announced)}, and so does {rivals[-1]}; readers follow whoever came last"
             self._add("conflict", announced.robot, announced.stream, writer, text)
-        self._vigil.begin((announced.robot, writer.session))
+        self._deadlines.register((announced.robot, writer.session))
 
     def _tell_of_coming(self, announced: Announced, *, is_alone: bool) -> None:
         place, writer = _place(announced), announced.writer
@@ -190,7 +190,7 @@ class Events(Closing):
         if not others:
             del self._alive[place]
             self._placements.replace((announced.robot, announced.name), frozenset())
-        was_stale = self._vigil.end((announced.robot, writer.session))
+        was_stale = self._deadlines.unregister((announced.robot, writer.session))
         who = f"{announced.robot!r}: {writer} "
         what = _what(announced)
         if kind == "cut off":

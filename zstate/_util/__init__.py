@@ -1,0 +1,1 @@
+"""Utilities that no package owns: bounded containers, callback threads, refusal counters."""

@@ -1,0 +1,1 @@
+"""Ingest: received messages into a transform buffer."""
