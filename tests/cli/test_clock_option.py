@@ -97,7 +97,7 @@ def test_tf_tells_ages_by_the_time_of_the_robot():
 
 def test_a_reader_with_one_clock_follows_robots_of_the_other_and_gives_no_ages_of_them(spawn: Spawn):
     with simulation(), standing():
-        listening = started(spawn, "listen", "--clock", "sim", "--json")
+        listening = started(spawn, "monitor", "--robots", "--clock", "sim", "--json")
 
         def is_followed() -> bool:
             said = json.loads(listening.line())
@@ -124,7 +124,7 @@ def test_listen_counts_stamps_that_are_off_the_clock(spawn: Spawn):
         thread = threading.Thread(target=publish)
         thread.start()
         try:
-            listening = started(spawn, "listen")
+            listening = started(spawn, "monitor", "--robots")
             until(lambda: "  off the clock " in listening.line())
             until(lambda: "the writer gives seconds where nanoseconds are meant" in listening.stderr)
         finally:

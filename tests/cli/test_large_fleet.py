@@ -59,7 +59,12 @@ def test_a_command_answers(fleet: None, command: tuple[str, ...]):
 @pytest.mark.processes
 @pytest.mark.parametrize(
     "command",
-    [("ls", "--watch"), ("listen", "rrbot"), ("record", "FILE", "rrbot"), ("view", "--port", "PORT")],
+    [
+        ("ls", "--watch"),
+        ("monitor", "--robots", "--robot", "rrbot"),
+        ("record", "FILE", "rrbot"),
+        ("view", "--port", "PORT"),
+    ],
     ids=lambda command: command[0],
 )
 def test_ctrl_c_ends_a_command(

@@ -59,7 +59,7 @@ def test_a_format_that_is_none_is_refused():
 
 
 def test_every_line_of_a_command_that_goes_on_is_json(spawn: Spawn):
-    command = started(spawn, "listen", "rrbot", "--log-format", "json")
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     until(lambda: "waiting: nobody announces" in command.stderr)
     with standing() as publisher:
         command.line()
@@ -82,7 +82,7 @@ def test_what_a_service_announces_on_standard_output_is_json_too(spawn: Spawn, f
 
 
 def test_a_warning_of_the_library_tells_its_event_and_reason(spawn: Spawn):
-    command = started(spawn, "listen", "rrbot", "--log-format", "json")
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
     with standing(), connect() as session, StreamPublisher(session, key, encoding) as noise:
         command.line()

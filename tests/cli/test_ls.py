@@ -10,8 +10,9 @@ from support import until
 
 from zstate import StaticPublisher, connect
 from zstate.cli.robot_list import robots_text
-from zstate.cli.sampling import Sampler
 from zstate.net.presence import RobotInfo
+from zstate.net.topic_statistics import TopicStatistics
+from zstate.net.wires import wire_named
 from zstate.wire.writer import Writer
 
 pytestmark = pytest.mark.processes
@@ -87,10 +88,10 @@ def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
 def test_a_narrow_terminal_has_less_of_when_and_of_age():
     writer = Writer("driver", "jetson", 412, 0, 7)
     robots = (RobotInfo("arm", (("joint_states", writer),)),)
-    with connect() as session, Sampler(session) as sampler:
-        wide = robots_text(robots, sampler).splitlines()[1]
-        headings, robot, narrow = robots_text(robots, sampler, width=55).splitlines()
-        narrowest = robots_text(robots, sampler, width=40).splitlines()[1]
+    with connect() as session, TopicStatistics(session, wire_named("native")) as statistics:
+        wide = robots_text(robots, statistics).splitlines()[1]
+        headings, robot, narrow = robots_text(robots, statistics, width=55).splitlines()
+        narrowest = robots_text(robots, statistics, width=40).splitlines()[1]
     assert (robot, headings.split()) == ("arm", ["robot,", "stream", "rate", "age", "writer"])
     assert headings.index("writer") == narrow.index("driver@")
     assert "since 1970-01-01" in wide

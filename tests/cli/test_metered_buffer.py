@@ -1,43 +1,39 @@
 from __future__ import annotations
 
-import time
-
 import pytest
 
-from zstate.cli.metered_buffer import Mark, Meter
+from zstate.cli.metered_buffer import MeteredBuffer
+from zstate.clock import ManualClock
+
+SECOND = 1_000_000_000
+NOW = 1_789_000_000 * SECOND
 
 
-def test_a_measure_counts_what_came_between_its_marks():
-    meter = Meter()
-    meter.note(0)
-    first = meter.mark()
-    for _ in range(3):
-        meter.note(0)
-    last = Mark(first.time_s + 0.5, meter.mark().count)
-    meter.note(0)
-    assert meter.measure(first, last).rate_hz == pytest.approx(3 / 0.5)
+def metered(*ages_s: float) -> MeteredBuffer:
+    """A buffer that gets a sample of each age, in this order."""
+    buffer = MeteredBuffer(ManualClock(NOW))
+    for age_s in ages_s:
+        stamp = NOW - round(age_s * SECOND)
+        buffer.insert_many([("r1/base", "r1/tool")], stamp, [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    return buffer
 
 
-def test_latency_is_the_median_of_the_samples_between_the_marks_alone():
-    meter = Meter()
+def test_latency_is_the_median_and_age_that_of_the_newest():
+    buffer = metered(0.3, 0.1, 0.02)
+    measure = buffer.measure("r1")
+    assert measure.latency_s == pytest.approx(0.1)
+    assert measure.age_s == pytest.approx(0.02)
+    assert measure.rate_hz > 0.0
+    assert buffer.statistics_of("r1").count == 3
+    assert buffer.has_samples.is_set()
 
-    def note(age_s: int) -> None:
-        meter.note(time.time_ns() - age_s * 1_000_000_000)
 
-    note(1000)
-    first = meter.mark()
-    for age_s in (30, 10, 20):
-        note(age_s)
-    last = meter.mark()
-    note(2000)
-    measure = meter.measure(first, last)
-    assert measure.latency_s == pytest.approx(20.0, abs=5.0)
-    assert measure.age_s == pytest.approx(2000.0, abs=5.0)
+def test_samples_of_another_robot_do_not_count():
+    assert metered(0.1).measure("r2") == MeteredBuffer().measure("r2")
 
 
 def test_nothing_measured_is_nothing_claimed():
-    meter = Meter()
-    mark = meter.mark()
-    measure = meter.measure(mark, mark)
+    buffer = metered()
+    measure = buffer.measure("r1")
     assert (measure.rate_hz, measure.latency_s, measure.age_s) == (0.0, None, None)
-    assert not meter.has_begun.is_set()
+    assert not buffer.has_samples.is_set()

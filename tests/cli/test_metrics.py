@@ -44,7 +44,7 @@ def test_a_publisher_serves_what_it_does_and_what_it_costs(spawn: Spawn):
 
 
 def test_a_listener_serves_the_counts_that_it_shows(spawn: Spawn):
-    command = started(spawn, "listen", "rrbot", "--json", "--metrics", "0")
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
     url = url_of(command)
     with standing():
         until(lambda: row("zstate_listener_received_total", robot="rrbot") in scraped(url))
@@ -116,7 +116,7 @@ def test_without_the_library_a_command_says_what_to_install(spawn: Spawn):
 def test_commands_without_it_load_no_library():
     code = (
         "import sys\n"
-        "import zstate.cli.commands.listen, zstate.cli.commands.publish, zstate.cli.metered_buffer\n"
+        "import zstate.cli.commands.monitor, zstate.cli.commands.publish, zstate.cli.metered_buffer\n"
         "print('prometheus_client' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"False\n"

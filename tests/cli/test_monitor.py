@@ -10,7 +10,7 @@ from support import until
 from zstate import StaticPublisher, Transform, connect, load_model
 from zstate.buffer.frames import FrameInfo
 from zstate.buffer.tracks import Offset
-from zstate.cli.monitor.meter import Measure, PathMeter
+from zstate.cli.monitor.meter import EdgeMeasure, EdgeStatistics
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
@@ -39,7 +39,7 @@ TREE = (
     frame("r1/hand", "r1/left"),
     frame("r1/right", "r1/torso"),
 )
-MEASURE = Measure(99.96, 0.0004, 0.0021, 0.00011, 3, 0.004)
+MEASURE = EdgeMeasure(99.96, 0.0004, 0.0021, 0.00011, 3, 0.004)
 
 
 def rows(offset: Offset | None = None) -> list[Row]:
@@ -91,7 +91,7 @@ def test_a_narrow_terminal_has_fewer_columns_and_letters_for_the_writers():
 
 
 def test_silence_is_told_instead_of_a_rate():
-    silent = Measure(100.0, 0.0004, 0.0021, 0.00011, 0, 12.0)
+    silent = EdgeMeasure(100.0, 0.0004, 0.0021, 0.00011, 0, 12.0, is_stale=True)
     text = report_text([Row("r1/left", frame("r1/left", "r1/base"), silent, None)])
     assert "silent 12.0 s" in text
 
@@ -139,7 +139,7 @@ def test_gaps_in_the_numbers_and_stamps_that_are_late_are_measured():
     with (
         connect() as writer,
         connect() as reader,
-        PathMeter(reader, "r1", "native", "joint_states", CLOCK) as meter,
+        EdgeStatistics(reader, "r1", "native", "joint_states", CLOCK) as meter,
     ):
         key, order = "zstate/r1/joint_states", order_digest(("swing",))
         with StreamPublisher(writer, key, ENCODINGS[JointState]) as stream:

@@ -134,9 +134,10 @@ def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
             assert measured["missed"] == 0
 
 
-def test_listen_follows_tf_and_the_joints_of_a_robot_that_is_named(spawn: Spawn, ros_router: str):
+def test_robots_are_monitored_by_tf_and_the_joints_of_a_robot_that_is_named(spawn: Spawn, ros_router: str):
     with standing(wire="ros2", router=ros_router):
-        everybody, one = started(spawn, "listen", "--json"), started(spawn, "listen", "rrbot", "--json")
+        monitor = ("monitor", "--robots", "--json")
+        everybody, one = started(spawn, *monitor), started(spawn, *monitor, "--robot", "rrbot")
         until(lambda: json.loads(everybody.line())["received"] > 0)
         until(lambda: json.loads(one.line())["received"] > 0)
     assert "following ROS 2 topic /tf (domain 0)" in everybody.stderr

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
+from datetime import datetime
 
 import numpy as np
+import pytest
 
 from zstate.view.graph_watch import StreamUse, WriterState
 from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.graph_panel import graph_html
-from zstate.view.panels.robots_panel import apart_html, unplaced_html
+from zstate.view.panels.robots_panel import apart_html, silence_text, unplaced_html
 from zstate.wire.messages import Level, Status
 
 SCRIPT = "<img src=x onerror=alert(1)>\"'&"
@@ -94,3 +96,13 @@ def test_streams_with_the_same_ends_stand_together_and_what_nobody_writes_stands
     assert "r1: joint_states, tf" in plain(made)
     assert re.search(r"written by\s+nobody", plain(made))
     assert made.count(html.ALARM) == 1
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "lasting"),
+    [(4.71, "4 s"), (75.0, "1 min 15 s"), (3 * 3600 + 25 * 60 + 7, "3 h 25 min")],
+)
+def test_a_silence_is_said_with_how_long_and_since_when(silent_s: float, lasting: str):
+    now = datetime(2026, 3, 4, 15, 6, 7).astimezone()
+    since = datetime.fromtimestamp(now.timestamp() - silent_s).astimezone()
+    assert silence_text(silent_s, now.timestamp()) == f"silent for {lasting}, since {since:%H:%M:%S}"

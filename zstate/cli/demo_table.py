@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Sequence
 from math import degrees
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.console import count_text, duration_or_dash, is_terminal, say, terminal_width
-from zstate.cli.metered_buffer import Measure, MeteredBuffer
+from zstate.cli.console import count_text, duration_or_dash, is_terminal, rate_text, say, terminal_width
+from zstate.cli.metered_buffer import MeteredBuffer
 from zstate.clock import wait_in_slices
 from zstate.errors import LookupFailed, duration_text
 from zstate.nodes.listener import TransformListener
@@ -21,8 +20,8 @@ if TYPE_CHECKING:
     from zstate.transform import Transform
 
 _REFRESH_S = 0.1
-# The rate shown is that of so many refreshes.
-_WINDOW = 10
+# Rate and latency shown are those of the last second.
+_RECENT_NS = 1_000_000_000
 # So many columns are enough for angles, too.
 _WITH_ANGLES = 72
 
@@ -42,12 +41,11 @@ class DemoTable:
     ) -> None:
         self._listener = listener
         self._buffer = buffer
-        self._meter = buffer.meter_of(robot)
+        self._statistics = buffer.statistics_of(robot)
         self._robot = robot
         self._root = root
         self._links = links
-        self._begun = self._meter.mark()
-        self._marks = deque([self._begun], maxlen=_WINDOW + 1)
+        self._begun = time.monotonic_ns(), self._statistics.count
 
     def show(self, ended: threading.Event, seconds: float | None) -> None:
         """Until ``ended``, or for ``seconds``."""
@@ -56,29 +54,34 @@ class DemoTable:
         until = float("inf") if seconds is None else time.monotonic() + seconds
         if not is_terminal():
             while not _is_over(ended, until, 1.0):
-                self._marks.append(self._meter.mark())
                 say(self.line())
             return
         with Live(self.table(), auto_refresh=False) as live:
             while not _is_over(ended, until, _REFRESH_S):
-                self._marks.append(self._meter.mark())
                 live.update(self.table(), refresh=True)
 
     def summary(self) -> str:
         """What was received since the beginning."""
-        stats, now = self._listener.stats, self._meter.mark()
-        measure = self._meter.measure(self._begun, now)
-        received = count_text(now.count - self._begun.count, "sample")
+        stats, (began, before) = self._listener.stats, self._begun
+        count, now = self._statistics.count - before, time.monotonic_ns()
+        seconds = (now - began) * 1e-9
         return (
             # With as many digits as agree: so many samples in so long make that rate.
-            f"{received} received in {now.time_s - self._begun.time_s:.2f} s: {measure.rate_hz:.1f} Hz, "
-            f"{stats.missed + stats.dropped} missed, median latency {_latency(measure)}"
+            f"{count_text(count, 'sample')} received in {seconds:.2f} s: {count / seconds:.1f} Hz, "
+            f"{stats.missed + stats.dropped} missed, median latency {self._latency(now - began)}"
         )
 
     @property
     def _freshness(self) -> str:
-        measure = self._meter.measure(self._marks[0], self._marks[-1])
-        return f"{measure.rate_hz:.1f} Hz, {_latency(measure)}"
+        window = self._statistics.recent(_RECENT_NS)
+        rate_hz = None if window is None else window.rate_hz
+        rate = "silent" if self._statistics.is_stale() else rate_text(rate_hz)
+        return f"{rate}, {self._latency(_RECENT_NS)}"
+
+    def _latency(self, within_ns: int) -> str:
+        latency_s = self._buffer.measure(self._robot, within_ns).latency_s
+        text = duration_or_dash(None if latency_s is None else round(latency_s * 1e9))
+        return f"{text} from stamp to lookup"
 
     def rows(self) -> list[Row]:
         """The transforms now; those that have no answer yet are left out."""
@@ -129,12 +132,6 @@ class DemoTable:
 
 def _link(row: Row) -> str:
     return row.transform.source.partition("/")[2]
-
-
-def _latency(measure: Measure) -> str:
-    """The median, in words."""
-    latency_s = measure.latency_s
-    return f"{duration_or_dash(None if latency_s is None else round(latency_s * 1e9))} from stamp to lookup"
 
 
 def _is_over(ended: threading.Event, until: float, pause_s: float) -> bool:

@@ -8,6 +8,7 @@ from zstate.cli.console import note
 from zstate.cli.words import words_of
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
+from zstate.net.topic_statistics import mean_rate_hz
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SubscribedSource
 
@@ -36,8 +37,7 @@ class HeardSource(SubscribedSource):
     @property
     def rate_hz(self) -> float:
         """The rate of the readings so far, by their stamps; 0 for fewer than two."""
-        span_ns = self._last - self._first
-        return (self.count - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
+        return mean_rate_hz(self.count, self._last - self._first) or 0.0
 
     def read(self, stamp: int) -> JointReading | None:
         reading = super().read(stamp)

@@ -4,35 +4,24 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass, replace
-from itertools import islice
-from statistics import median
+from dataclasses import dataclass
 
 from zstate._util.bounded_dict import BoundedDict
-from zstate.clock import Clock, SystemClock
+from zstate.clock import Clock
 from zstate.metrics.histogram import Histogram
 from zstate.metrics.measured_buffer import LATENCY_BOUNDS_S, MeasuredBuffer
+from zstate.net.topic_statistics import IntervalStatistics, Received
 
-# Enough for a median, bounded for a demo that runs for days.
-_KEPT = 100_000
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A moment to measure from: how many samples had come at a time of the monotonic clock [s]."""
-
-    time_s: float
-    count: int
+_WINDOW_NS = 5_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Measure:
-    """How samples came in between two marks.
+class RobotMeasure:
+    """How the samples of one robot arrived in the last five seconds.
 
-    ``rate_hz`` counts arrivals here; ``latency_s`` is the median time from a sample's stamp until it
-    could be looked up, by the clocks of both machines; ``age_s`` is that of the newest sample now. None
-    without samples, and where the clock here does not tell their time.
+    ``rate_hz`` is 0 if they have missed their deadline, or are fewer than two. ``latency_s`` is the median
+    time from a sample's stamp until it could be looked up, by the clocks of both machines; ``age_s`` is that
+    of the newest sample. None without samples, and where the clock here does not tell their time.
     """
 
     rate_hz: float
@@ -40,76 +29,53 @@ class Measure:
     age_s: float | None
 
 
-class Meter:
-    """Measures what comes in. One thread notes, another one measures. ``has_begun`` is set at the first."""
-
-    def __init__(self, clock: Clock | None = None) -> None:
-        self._clock: Clock = clock or SystemClock()
-        self.has_begun = threading.Event()
-        self._lock = threading.Lock()
-        self._delays: deque[int] = deque(maxlen=_KEPT)
-        self._count = 0
-        self._newest: int | None = None
-
-    def note(self, stamp: int) -> None:
-        """A sample of this stamp [ns] can be looked up now."""
-        with self._lock:
-            self._delays.append(self._clock.now() - stamp)
-            self._newest = stamp
-            self._count += 1
-        self.has_begun.set()
-
-    def mark(self) -> Mark:
-        """This moment."""
-        return Mark(time.monotonic(), self._count)
-
-    def measure(self, since: Mark, until: Mark) -> Measure:
-        """What came between two marks, as far as the last 100 000 samples tell."""
-        with self._lock:
-            newest, after = self._newest, self._count - until.count
-            delays = list(islice(reversed(self._delays), after, self._count - since.count))
-        passed_s = until.time_s - since.time_s
-        return Measure(
-            (until.count - since.count) / passed_s if passed_s > 0.0 else 0.0,
-            median(delays) * 1e-9 if delays else None,
-            None if newest is None else (self._clock.now() - newest) * 1e-9,
-        )
-
-
 class MeteredBuffer(MeasuredBuffer):
-    """A MeasuredBuffer that also notes, robot by robot, when each sample can be looked up."""
+    """A MeasuredBuffer that also measures, robot by robot, when each sample can be looked up.
+
+    ``has_samples`` is set at the first one.
+    """
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
-        self._meters: BoundedDict[str, Meter] = BoundedDict()
+        self.has_samples = threading.Event()
+        self._statistics: BoundedDict[str, IntervalStatistics] = BoundedDict()
         self._latencies: BoundedDict[str, Histogram] = BoundedDict()
 
-    def meter_of(self, robot: str) -> Meter:
-        """What measures the samples of one robot."""
-        meter = self._meters.get(robot)
-        if meter is None:
-            meter = Meter(self.clock)
-            self._meters[robot] = meter
-        return meter
+    def statistics_of(self, robot: str) -> IntervalStatistics:
+        """The statistics of the samples of one robot; delays are until they could be looked up."""
+        statistics = self._statistics.get(robot)
+        if statistics is None:
+            statistics = self._statistics[robot] = IntervalStatistics()
+        return statistics
 
     def latency_of(self, robot: str) -> Histogram:
         latency = self._latencies.get(robot)
         if latency is None:
-            latency = Histogram(LATENCY_BOUNDS_S)
-            self._latencies[robot] = latency
+            latency = self._latencies[robot] = Histogram(LATENCY_BOUNDS_S)
         return latency
 
     def _note_sample(self, robot: str, stamp: int) -> None:
         super()._note_sample(robot, stamp)
-        if self._is_told(robot):
-            self.latency_of(robot).note((self.clock.now() - stamp) * 1e-9)
-        self.meter_of(robot).note(stamp)
+        delay = self.clock.now() - stamp
+        if self._is_comparable(robot):
+            self.latency_of(robot).note(delay * 1e-9)
+        statistics = self.statistics_of(robot)
+        statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
+        if statistics.count == 1:
+            self.has_samples.set()
 
-    def _is_told(self, robot: str) -> bool:
+    def _is_comparable(self, robot: str) -> bool:
         """Whether the clock here tells the time that stamps the samples of ``robot``."""
         return (self.domain.of(robot) or self.clock.domain) == self.clock.domain
 
-    def measure(self, robot: str, since: Mark, until: Mark) -> Measure:
-        """How samples of ``robot`` came in between two marks of its meter."""
-        measure = self.meter_of(robot).measure(since, until)
-        return measure if self._is_told(robot) else replace(measure, latency_s=None, age_s=None)
+    def measure(self, robot: str, within_ns: int = _WINDOW_NS) -> RobotMeasure:
+        """How the samples of ``robot`` arrived."""
+        statistics, now = self.statistics_of(robot), time.monotonic_ns()
+        window, newest = statistics.recent(within_ns, now), statistics.newest
+        rate_hz = None if window is None or statistics.is_stale(now) else window.rate_hz
+        is_comparable = self._is_comparable(robot)
+        return RobotMeasure(
+            rate_hz or 0.0,
+            window.delay_s if window is not None and is_comparable else None,
+            (self.clock.now() - newest.stamp) * 1e-9 if newest is not None and is_comparable else None,
+        )

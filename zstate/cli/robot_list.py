@@ -10,38 +10,35 @@ from typing import TYPE_CHECKING, Any
 
 from zstate.cli.console import rate_text
 from zstate.cli.layout import letters_for, narrowed
-from zstate.cli.sampling import Sampler, Source
 from zstate.errors import duration_text, printable
+from zstate.net.topic_statistics import TopicStatistics, WriterKey
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.wire.keys import Stream
     from zstate.wire.writer import Writer
 
-# So long without a sample is worth a word, rather than no number.
-_SILENT_NS = 2_000_000_000
-
 _AGE, _WRITER, _SINCE = 2, 3, 4
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 
 
-def sources(robots: Sequence[RobotInfo]) -> list[Source]:
+def sources(robots: Sequence[RobotInfo]) -> list[WriterKey]:
     """What can be measured without making anybody say more: joint states."""
     return [
-        Source(robot.name, stream, writer.session)
+        WriterKey(robot.name, stream, writer.session)
         for robot in robots
         for stream, writer in robot.writers
         if stream == "joint_states"
     ]
 
 
-def robots_text(robots: Sequence[RobotInfo], sampler: Sampler, *, width: int | None = None) -> str:
+def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, width: int | None = None) -> str:
     """Each robot, and below it each stream: rate, age of the newest sample, writer, since when.
 
     Where that is wider than ``width``, the date is left out, then all of since when, then the age; at last
     writers become letters that are explained below. Headings are above where there is room for them.
     """
-    rows = [_row(robot, stream, writer, sampler) for robot in robots for stream, writer in robot.writers]
+    rows = [_row(robot, stream, writer, statistics) for robot in robots for stream, writer in robot.writers]
     lines, legend = _fitted_lines(rows, width)
     text: list[str] = []
     if width is not None:
@@ -70,13 +67,13 @@ def _fitted_lines(rows: Sequence[tuple[str, ...]], width: int | None) -> tuple[l
     return narrowed(named, width, (_SINCE, _AGE)), legend
 
 
-def _row(robot: RobotInfo, stream: Stream, writer: Writer, sampler: Sampler) -> tuple[str, ...]:
-    pulse = sampler.pulse(Source(robot.name, stream, writer.session))
-    if pulse is None:
+def _row(robot: RobotInfo, stream: Stream, writer: Writer, statistics: TopicStatistics) -> tuple[str, ...]:
+    source = statistics.get(WriterKey(robot.name, stream, writer.session))
+    if source is None:
         rate, age = "", ""
     else:
-        rate = "silent" if pulse.silent_ns > _SILENT_NS else rate_text(pulse.rate_hz)
-        age = duration_text(pulse.silent_ns)
+        rate = "silent" if source.is_stale() else rate_text(source.published_hz())
+        age = duration_text(round(source.silent_s() * 1e9))
     return f"  {_said(robot, stream, writer)}", rate, age, str(writer), _since(writer)
 
 
@@ -104,20 +101,20 @@ def _lasting(nanoseconds: int) -> str:
     return f"{minutes} min {seconds:02d} s" if minutes else duration_text(nanoseconds)
 
 
-def robots_facts(robots: Sequence[RobotInfo], sampler: Sampler) -> list[dict[str, Any]]:
+def robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> list[dict[str, Any]]:
     """The same for a program."""
     return [
-        {"robot": robot.name, "writers": [_facts(robot, *pair, sampler) for pair in robot.writers]}
+        {"robot": robot.name, "writers": [_facts(robot, *pair, statistics) for pair in robot.writers]}
         for robot in robots
     ]
 
 
-def _facts(robot: RobotInfo, stream: Stream, writer: Writer, sampler: Sampler) -> dict[str, Any]:
-    pulse = sampler.pulse(Source(robot.name, stream, writer.session))
+def _facts(robot: RobotInfo, stream: Stream, writer: Writer, statistics: TopicStatistics) -> dict[str, Any]:
+    source = statistics.get(WriterKey(robot.name, stream, writer.session))
     return {
         "stream": stream,
         **asdict(writer),
         "names": robot.names_of(writer) if stream == "tf_static" else (),
-        "rate_hz": None if pulse is None else pulse.rate_hz,
-        "silent_s": None if pulse is None else pulse.silent_ns * 1e-9,
+        "rate_hz": None if source is None else source.published_hz(),
+        "silent_s": None if source is None else source.silent_s(),
     }

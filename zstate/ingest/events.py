@@ -12,7 +12,7 @@ from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
 from zstate._util.callback_thread import CallbackThread
 from zstate.closing import Closing
 from zstate.errors import duration_text
-from zstate.following.vigil import Vigil
+from zstate.ingest.deadline import DeadlineMonitor
 from zstate.locks import new_lock
 from zstate.wire.keys import Stream
 from zstate.wire.writer import Announced, Writer
@@ -105,7 +105,7 @@ class EventLog(Closing):
         self._conflicts: BoundedDict[tuple[str, str, int, str], None] = BoundedDict()
         self._owners = StaticEdgeOwners()
         self._lock = new_lock()
-        self._vigil = Vigil()
+        self._deadlines = DeadlineMonitor()
         self._thread = None if on_event is None else CallbackThread(on_event, self._check_deadlines)
 
     def recent(self) -> tuple[WriterEvent, ...]:
@@ -141,7 +141,7 @@ class EventLog(Closing):
     def on_sample(self, robot: str, session: int) -> None:
         """Record the arrival of a sample of the followed stream."""
         if self._thread is not None:
-            silent_s = self._vigil.hear((robot, session), time.monotonic())
+            silent_s = self._deadlines.on_sample((robot, session), time.monotonic())
             if silent_s is not None:
                 with self._lock:
                     self._add_silence("resumed", robot, session, silent_s)
@@ -175,7 +175,7 @@ class EventLog(Closing):
         self._conflicts[key] = None
 
     def _check_deadlines(self, now_s: float) -> float:
-        stale, next_s = self._vigil.look(now_s)
+        stale, next_s = self._deadlines.expired(now_s)
         if stale:
             with self._lock:
                 for (robot, session), silent_s in stale.items():
@@ -202,7 +202,7 @@ class EventLog(Closing):
         if rivals and announced.stream in self._exclusive:
             text = f"{text}, and so does {rivals[-1]}; listeners use the newest writer"
             self._add("conflict", announced.robot, announced.stream, writer, text)
-        self._vigil.begin((announced.robot, writer.session))
+        self._deadlines.register((announced.robot, writer.session))
 
     def _on_left(self, announced: Announced, kind: Literal["left", "cut off"]) -> None:
         place, writer = _place(announced), announced.writer
@@ -214,7 +214,7 @@ class EventLog(Closing):
         if not others:
             del self._alive[place]
             self._owners.replace((announced.robot, announced.name), frozenset())
-        was_stale = self._vigil.end((announced.robot, writer.session))
+        was_stale = self._deadlines.unregister((announced.robot, writer.session))
         who = f"{announced.robot!r}: {writer} "
         what = _what(announced)
         if kind == "cut off":

@@ -42,7 +42,7 @@ def certs_command(
     zstate certs fleet --identity router --host 192.168.1.10
     zstate certs fleet --identity robot1 --identity viewer
     zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router
-    zstate listen --connect tls/192.168.1.10:7447 --certs fleet --identity viewer
+    zstate ls --connect tls/192.168.1.10:7447 --certs fleet --identity viewer
     zstate certs fleet --server peer1 --server peer2   # for direct links, without a router
     """
     from zstate.net.certificates import issue_identities

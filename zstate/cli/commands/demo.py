@@ -16,7 +16,7 @@ from zstate.cli.options import load_robot, rate_option, seconds_option, xacro_ar
 from zstate.errors import UnknownModel
 
 if TYPE_CHECKING:
-    from zstate.cli.metered_buffer import Meter
+    from zstate.cli.metered_buffer import MeteredBuffer
     from zstate.model.robot import RobotModel
 
 _DEFAULT = "panda"
@@ -115,7 +115,7 @@ def _look(
         TransformListener(session, robot, buffer, history_on_join=False) as listener,
     ):
         note(f"waiting for {robot!r} ...")
-        if not _has_begun(buffer.meter_of(robot), ended):
+        if not _has_begun(buffer, ended):
             return
         note(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
         table = DemoTable(listener, buffer, robot, model.root, telling_links(model))
@@ -125,10 +125,10 @@ def _look(
             say_fitted(table.summary())
 
 
-def _has_begun(meter: Meter, ended: threading.Event) -> bool:
+def _has_begun(buffer: MeteredBuffer, ended: threading.Event) -> bool:
     """Wait for the first sample; False when the publisher ended instead."""
     deadline = time.monotonic() + _START_WITHIN_S
-    while not meter.has_begun.wait(0.1):
+    while not buffer.has_samples.wait(0.1):
         if ended.is_set():
             return False
         if time.monotonic() > deadline:

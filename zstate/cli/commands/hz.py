@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from dataclasses import asdict
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -22,8 +21,7 @@ from zstate.cli.options import (
 from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
-    from zstate.cli.arrivals import Arrivals, Intervals
-    from zstate.cli.stream_reader import StreamReader
+    from zstate.cli.stream_reader import StreamReader, TimedSample
     from zstate.wire.keys import Stream
 
 _SETTLING_S = 0.1
@@ -69,71 +67,95 @@ def hz_command(
     zstate hz --wire ros2                              # /joint_states
     zstate hz --wire ros2 --stream tf --once           # /tf
     """
-    from zstate.cli.arrivals import Arrivals
     from zstate.cli.stream_reader import StreamReader
 
     refuse_topic(robot, wire)
     with ExitStack() as opened:
         session = opened.enter_context(open_session(network, (wire,)))
         tap = opened.enter_context(StreamReader(session, named_robot(session, robot, wire), stream, wire))
-        arrivals = Arrivals(window, of_all=is_ros(wire))
+        statistics = MessageStatistics(window, of_all=is_ros(wire))
+        tap.first(timeout if once else None)
+        _listen(tap, MessageStatistics(2), _SETTLING_S)  # what queued up while this process was starting
         if once:
-            _show(_measured_once(tap, arrivals, timeout), as_json=as_json)
+            _show(_measured_once(tap, statistics, timeout), as_json=as_json)
         else:
-            _follow(tap, arrivals, as_json=as_json)
+            _follow(tap, statistics, as_json=as_json)
 
 
-def _begin(tap: StreamReader, timeout_s: float | None) -> None:
-    """Wait for samples, and let those pass that queued up while this process was starting."""
-    from zstate.cli.arrivals import Arrivals
+class MessageStatistics:
+    """Rate and spread of the last ``window`` messages: of the newest writer or, if ``of_all``, of all."""
 
-    tap.first(timeout_s)
-    _listen(tap, Arrivals(2), _SETTLING_S)
+    def __init__(self, window: int, *, of_all: bool = False) -> None:
+        from zstate.net.topic_statistics import IntervalStatistics, SequenceGaps
+
+        self._statistics, self._gaps = IntervalStatistics(window), SequenceGaps()
+        self._of_all = of_all
+
+    def add(self, tapped: TimedSample) -> None:
+        """Count a sample. Several samples of one message are one."""
+        from zstate.net.topic_statistics import Received
+
+        sample, statistics = tapped.sample, self._statistics
+        if self._gaps.add(sample.session, sample.seq):
+            if sample.session != statistics.session and not self._of_all:
+                statistics.clear()
+            statistics.add(Received(tapped.came, sample.stamp, sample.seq, 0), sample.session)
+
+    def facts(self) -> dict[str, Any] | None:
+        """What is printed; None before two messages. ``missed`` counts since the start."""
+        window = self._statistics.window()
+        if window is None or window.rate_hz is None:
+            return None
+        return {
+            "rate_hz": window.rate_hz,
+            "min_s": min(window.intervals_s),
+            "max_s": max(window.intervals_s),
+            "std_dev_s": window.jitter_s,
+            "window": len(window.received),
+            "missed": self._gaps.missed(),
+        }
 
 
-def _measured_once(tap: StreamReader, arrivals: Arrivals, timeout_s: float) -> Intervals:
-    _begin(tap, timeout_s)
+def _measured_once(tap: StreamReader, statistics: MessageStatistics, timeout_s: float) -> dict[str, Any]:
     deadline = time.monotonic() + timeout_s
-    measured = None
-    while measured is None:
+    while True:
+        _listen(tap, statistics, 1.0)
+        facts = statistics.facts()
+        if facts is not None:
+            return facts
         if time.monotonic() > deadline:
             fail(f"gave up after {timeout_s:g} s: samples came, but no two to measure between")
-        _listen(tap, arrivals, 1.0)
-        measured = arrivals.intervals()
-    return measured
 
 
-def _follow(tap: StreamReader, arrivals: Arrivals, *, as_json: bool) -> NoReturn:
-    _begin(tap, None)
+def _follow(tap: StreamReader, statistics: MessageStatistics, *, as_json: bool) -> NoReturn:
     silent = False
     while True:
-        came = _listen(tap, arrivals, 1.0)
-        measured = arrivals.intervals()
-        if came and measured is not None:
-            _show(measured, as_json=as_json)
-        elif not came and not silent:
+        count, facts = _listen(tap, statistics, 1.0), statistics.facts()
+        if count and facts is not None:
+            _show(facts, as_json=as_json)
+        elif not count and not silent:
             note(tap.silence())
-        silent = not came
+        silent = not count
 
 
-def _listen(tap: StreamReader, arrivals: Arrivals, seconds: float) -> int:
-    """Note what comes within ``seconds``; how many samples that were."""
+def _listen(tap: StreamReader, statistics: MessageStatistics, seconds: float) -> int:
+    """Count what arrives within ``seconds``; how many samples that were."""
     deadline, count = time.monotonic() + seconds, 0
     while (left_s := deadline - time.monotonic()) > 0.0:
         tapped = tap.next(left_s)
         if tapped is not None:
-            arrivals.note(tapped)
+            statistics.add(tapped)
             count += 1
     return count
 
 
-def _show(measured: Intervals, *, as_json: bool) -> None:
+def _show(facts: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
-        say_json(asdict(measured))
+        say_json(facts)
         return
-    say_fitted(f"average rate: {measured.rate_hz:.3f}")
-    missed = f" missed: {measured.missed}" if measured.missed else ""
+    say_fitted(f"average rate: {facts['rate_hz']:.3f}")
+    missed = f" missed: {facts['missed']}" if facts["missed"] else ""
     say_fitted(
-        f"\tmin: {measured.min_s:.3f}s max: {measured.max_s:.3f}s "
-        f"std dev: {measured.std_dev_s:.5f}s window: {measured.window}{missed}"
+        f"\tmin: {facts['min_s']:.3f}s max: {facts['max_s']:.3f}s "
+        f"std dev: {facts['std_dev_s']:.5f}s window: {facts['window']}{missed}"
     )

@@ -14,9 +14,9 @@ from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.cli.sampling import Sampler
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.net.topic_statistics import TopicStatistics
 
 _MEASURED_WITHIN_S = 0.3
 _AGAIN_S = 0.5
@@ -80,34 +80,35 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_list import robots_facts, robots_text, sources
-    from zstate.cli.sampling import Sampler
     from zstate.net.presence import discover
+    from zstate.net.topic_statistics import FEW, TopicStatistics
+    from zstate.net.wires import wire_named
 
-    with Sampler(session) as sampler:
-        sampler.hear("joint_states")
+    with TopicStatistics(session, wire_named("native"), window=FEW) as statistics:
+        statistics.subscribe("joint_states")
         if watch:
-            _watch_robots(session, sampler, as_json=as_json)
+            _watch_robots(session, statistics, as_json=as_json)
         robots = discover(session)
-        sampler.wait(sources(robots), _MEASURED_WITHIN_S)
+        statistics.wait(sources(robots), _MEASURED_WITHIN_S)
         if as_json:
-            say_json(robots_facts(robots, sampler))
+            say_json(robots_facts(robots, statistics))
         elif robots:
-            say_fitted(robots_text(robots, sampler, width=terminal_width() if is_terminal() else None))
+            say_fitted(robots_text(robots, statistics, width=terminal_width() if is_terminal() else None))
         else:
             note(words_of("native").announced(robots))
 
 
-def _watch_robots(session: Session, sampler: Sampler, *, as_json: bool) -> NoReturn:
+def _watch_robots(session: Session, statistics: TopicStatistics, *, as_json: bool) -> NoReturn:
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.cli.robot_list import robots_facts, robots_text
 
     def text(robots: tuple[RobotInfo, ...], width: int | None) -> str:
-        return robots_text(robots, sampler, width=width) if robots else roster.words.announced(robots)
+        return robots_text(robots, statistics, width=width) if robots else roster.words.announced(robots)
 
     with RobotDirectory(session) as roster:
         time.sleep(_MEETING_S)
         if as_json:
-            _repeat_json(lambda: robots_facts(roster.robots(), sampler))
+            _repeat_json(lambda: robots_facts(roster.robots(), statistics))
         width = terminal_width if is_terminal() else lambda: None
         _show(lambda: text(roster.robots(), width()), roster.robots)
 

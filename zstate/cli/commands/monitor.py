@@ -1,17 +1,21 @@
-"""zstate monitor: how the samples behind one pose come in, edge by edge."""
+"""zstate monitor: how the samples of edges, or of robots, come in."""
 
 from __future__ import annotations
 
+import time
+from contextlib import ExitStack
 from threading import Event
 from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import is_terminal
+from zstate.cli.console import fail, is_terminal
+from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     heard_robot_option,
     json_option,
+    metrics_option,
     open_clock,
     reading_clock_option,
     session_options,
@@ -23,30 +27,38 @@ from zstate.cli.words import followed
 
 if TYPE_CHECKING:
     from zstate.cli.monitor.monitored import Monitored
+    from zstate.cli.robot_monitor import RobotMonitor
+    from zstate.metrics.address import Address
 
 _FIRST_AFTER_S = 1.0
+# Meeting everybody takes less.
+_MEETING_S = 0.3
 
 
 @click.command("monitor")
 @click.argument("target", metavar="[A]", required=False)
 @click.argument("source", metavar="B", required=False)
+@click.option("--robots", is_flag=True, help="Monitor robots rather than edges: one line for each.")
 @click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
-@timeout_option("How long --once waits for the pose.")
+@timeout_option("How long --once waits for the pose, or for a robot.")
 @heard_robot_option
 @json_option()
 @wire_option
 @reading_clock_option
+@metrics_option
 @session_options
 def monitor_command(
     *,
     network: Network,
     target: str | None,
     source: str | None,
+    robots: bool,
     once: bool,
     timeout: float,
     robot: str,
     wire: str,
     clock: str | None,
+    metrics: Address | None,
     as_json: bool,
 ) -> None:
     """Watch each edge between the frames A and B, or all that are heard, until Ctrl-C.
@@ -57,41 +69,83 @@ def monitor_command(
     time between arrivals) are those of the last five seconds; missed are gaps in the writer's numbers;
     clock is how far the writer's clock is ahead of the one here, measured over the network.
 
+    With --robots each robot has a line a second: rate, age of its newest sample, latency until a sample can
+    be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
+    history), refused, and off the clock (stamped more than a minute away from the time here). On ROS's side
+    that is /tf, all nodes together; with --robot the joint states of a robot that is described.
+
     \b
     zstate monitor
     zstate monitor panda_link0 panda_hand
     zstate monitor map r1/base_link --once --json | jq '.edges[] | {child, rate_hz}'
     zstate monitor odom base_link --wire ros2
+    zstate monitor --robots
+    zstate monitor --robots --robot panda --json --metrics 9100
     """
-    from zstate.cli.monitor.meter import PathMeter
+    from zstate.cli.monitor.meter import EdgeStatistics
     from zstate.cli.monitor.monitored import MonitoredEdges, MonitoredPose
-    from zstate.clock import SystemClock
+    from zstate.cli.robot_monitor import RobotMonitor
     from zstate.nodes.listener import TransformListener
-    from zstate.rate import Rate
 
+    if robots and target is not None:
+        raise click.UsageError("--robots takes no frames; --robot NAME selects a robot")
+    if metrics is not None and not robots:
+        raise click.UsageError("--metrics needs --robots")
     if target is not None and source is None:
         raise click.UsageError(f"{target!r} is one frame; give two of them, or none for all that are heard")
-    follow = followed(wire)
+    follow, once_s = followed(wire), timeout if once else None
     with (
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as roster,
-        open_clock(session, clock, wire, timeout_s=timeout if once else None) as kept,
-        TransformListener(
-            session, robot, wire=wire, follow=follow, clock=kept, history_on_join=False
-        ) as listener,
-        PathMeter(session, robot, wire, follow, listener.buffer.clock) as meter,
+        open_clock(session, clock, wire, timeout_s=once_s) as kept,
+        ExitStack() as opened,
     ):
-        monitored: Monitored
+        if robots:
+            monitor = opened.enter_context(RobotMonitor(session, roster, robot, wire, kept))
+            opened.enter_context(served(metrics, of_listeners(monitor.robots), of_writers(roster)))
+            _report_robots(monitor, once_s, as_json=as_json)
+            return
+        listener = opened.enter_context(
+            TransformListener(session, robot, wire=wire, follow=follow, clock=kept, history_on_join=False)
+        )
+        statistics = opened.enter_context(EdgeStatistics(session, robot, wire, follow, listener.buffer.clock))
         if target is None or source is None:
-            monitored = MonitoredEdges(listener, meter, roster)
+            _report_edges(MonitoredEdges(listener, statistics, roster), once_s, as_json=as_json)
         else:
-            monitored = MonitoredPose(listener, meter, roster, (target, source))
-        monitored.wait(timeout if once else None)
-        Event().wait(_FIRST_AFTER_S)
-        if once:
+            frames = (target, source)
+            _report_edges(MonitoredPose(listener, statistics, roster, frames), once_s, as_json=as_json)
+
+
+def _report_edges(monitored: Monitored, once_s: float | None, *, as_json: bool) -> None:
+    from zstate.clock import SystemClock
+    from zstate.rate import Rate
+
+    monitored.wait(once_s)
+    Event().wait(_FIRST_AFTER_S)
+    if once_s is not None:
+        monitored.say(as_json=as_json)
+    elif as_json or not is_terminal():
+        for _ in Rate(1.0, SystemClock(), Event()):
             monitored.say(as_json=as_json)
-        elif as_json or not is_terminal():
-            for _ in Rate(1.0, SystemClock(), Event()):
-                monitored.say(as_json=as_json)
-        else:
-            monitored.show()
+    else:
+        monitored.show()
+
+
+def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool) -> None:
+    from zstate.clock import SystemClock
+    from zstate.rate import Rate
+
+    forever = Event()
+    forever.wait(_MEETING_S)
+    if once_s is None:
+        for _ in Rate(1.0, SystemClock(), forever):
+            monitor.report(as_json=as_json)
+            monitor.update()
+        return
+    deadline = time.monotonic() + once_s
+    while reason := monitor.update():
+        if time.monotonic() > deadline:
+            fail(f"gave up after {once_s:g} s: {reason}")
+        forever.wait(_MEETING_S)
+    forever.wait(_FIRST_AFTER_S)
+    monitor.report(as_json=as_json)

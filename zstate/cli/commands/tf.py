@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from zstate.transform import Transform
     from zstate.twist import Twist
 
-# So long without a newer answer is worth a word.
-_SILENCE_S = 2.0
+# Without a second answer the period is not known: so long without one is worth a note.
+_UNKNOWN_S = 2.0
 
 # Without velocities a twist needs a second sample, which arrives sooner.
 _TWIST_WITHIN_S = 1.0
@@ -142,16 +142,18 @@ def tf_command(
 def _follow(waiter: PoseWaiter, rate_hz: float, show: Any) -> None:
     """Show each answer that is new. Never returns."""
     from zstate.clock import SystemClock
+    from zstate.ingest.deadline import Deadline
     from zstate.rate import Rate
 
     shown: Transform | None = None
-    news_at, silent = time.monotonic(), False
+    deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
     for _ in Rate(rate_hz, SystemClock(), Event()):
         transform = waiter.answer()
         if transform != shown:
             show(transform)
-            shown, news_at, silent = transform, time.monotonic(), False
-        elif not silent and transform.stamp is not None and time.monotonic() - news_at > _SILENCE_S:
+            deadline.on_sample(time.monotonic())
+            shown, silent = transform, False
+        elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
             silent = True
             note(waiter.silence())
 

@@ -11,6 +11,7 @@ from zstate.errors import NoClock, duration_text
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import ClockOffset
 from zstate.net.session import Session
+from zstate.net.topic_statistics import Window
 
 _DISTURBS_NS = 20_000_000
 _BREAKS_NS = 1_000_000_000
@@ -57,15 +58,16 @@ def domains_check(clocks: Mapping[str, str]) -> Check | None:
 
 def stamps_check(ear: Ear, session: Session) -> Check:
     """Whether samples are stamped with the time at which they were taken."""
-    if ear.samples.last_stamp is None:
+    window = ear.samples.window
+    if window is None:
         return skipped("stamps", "there is no sample")
     if ear.description is not None and ear.description.clock not in ("", SYSTEM):
         return _simulated_check(ear.description.clock, session)
-    return _far_check(ear) or _standing_check(ear) or _near_check(ear)
+    return _far_check(ear, window) or _standing_check(ear, window) or _near_check(ear, window)
 
 
-def _far_check(ear: Ear) -> Check | None:
-    least, stamp = ear.samples.delays[0], ear.samples.last_stamp or 0
+def _far_check(ear: Ear, window: Window) -> Check | None:
+    least, stamp = window.delays[0], window.received[-1].stamp
     if abs(least) <= FAR_NS:
         return None
     size = f"{duration_text(abs(least))} {'before' if least > 0 else 'after'}"
@@ -76,16 +78,17 @@ def _far_check(ear: Ear) -> Check | None:
     return broken("stamps", text, _STAMPS)
 
 
-def _standing_check(ear: Ear) -> Check | None:
-    if ear.samples.count < 3 or not ear.samples.stands_still:
+def _standing_check(ear: Ear, window: Window) -> Check | None:
+    stamps = {one.stamp for one in window.received}
+    if len(window.received) < 3 or len(stamps) > 1:
         return None
-    stamp = stamp_text(ear.samples.last_stamp or 0)
+    stamp = stamp_text(stamps.pop())
     text = f"{ear.samples_writer} gives every sample the same stamp, {stamp}: what it reads stands still"
     return broken("stamps", text, f"zstate echo {ear.info.name}")
 
 
-def _near_check(ear: Ear) -> Check:
-    least, greatest = ear.samples.delays
+def _near_check(ear: Ear, window: Window) -> Check:
+    least, greatest = window.delays
     if least < -_DISTURBS_NS:
         text, then = _cause(ear)
         text = f"{ear.samples_writer} stamps samples up to {duration_text(-least)} in the future{text}"
@@ -99,7 +102,7 @@ def _near_check(ear: Ear) -> Check:
 
 def _cause(ear: Ear) -> tuple[str, str]:
     """Whether the clock of the writer explains it, and what to do."""
-    measured = [one for one in ear.offsets if one.writer.session == ear.samples.session]
+    measured = [one for one in ear.offsets if one.writer.session == ear.samples.statistics.session]
     if not measured:
         return "", _SET_CLOCKS
     if abs(measured[0].offset_ns) > _DISTURBS_NS:

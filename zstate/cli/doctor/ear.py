@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 
-from zstate.cli.doctor.node_samples import NodeSamples
-from zstate.cli.doctor.samples import Samples
+from zstate.cli.doctor.samples import StreamSamples
 from zstate.cli.waiting import ConditionWaiter
 from zstate.closing import Closing
 from zstate.errors import MessageError
@@ -60,15 +59,15 @@ class Ear(Closing):
         with ExitStack() as opening:
             key = self._wire.expression(info.name, "robot_description")
             opening.enter_context(LatchedSubscriber(session, key, self._take_description))
-            samples = Samples(session, info.name, self.followed, self._wire, on_change)
+            samples = StreamSamples(session, info.name, self.followed, self._wire, on_change)
             self.samples = opening.enter_context(samples)
-            self.nodes: dict[Stream, NodeSamples] = {}
+            self.nodes: dict[Stream, StreamSamples] = {}
             """By stream, what each node says, on ROS's side."""
             if is_native:
                 opening.enter_context(watch_status(session, info.name, self._take_status))
             else:
                 for stream in _OF_NODES:
-                    nodes = NodeSamples(session, info.name, stream, self._wire)
+                    nodes = StreamSamples(session, info.name, stream, self._wire)
                     self.nodes[stream] = opening.enter_context(nodes)
             self.listener = opening.enter_context(
                 TransformListener(
@@ -105,19 +104,21 @@ class Ear(Closing):
     def samples_writer(self) -> str:
         """Who writes the samples that come."""
         writers = {writer.session: str(writer) for _, writer in self.info.writers}
-        return writers.get(self.samples.session or 0, "somebody who is not announced")
+        return writers.get(self.samples.statistics.session or 0, "somebody who is not announced")
 
     @property
     def lacks(self) -> bool:
         """Whether something that is announced has not come yet."""
         lacks_model = "robot_description" in self.streams and self.description is None
-        return lacks_model or (self.followed in self.streams and self.samples.count < 2)
+        return lacks_model or (self.followed in self.streams and self.samples.statistics.count < 2)
 
     @property
     def is_mute(self) -> bool:
         """Whether nothing at all has come but that somebody is there."""
         frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
-        return not (self.description or self.samples.count or self.statuses or self.offsets or frames)
+        return not (
+            self.description or self.samples.statistics.count or self.statuses or self.offsets or frames
+        )
 
     def ask(self) -> None:
         """Find out which writers are stuck, of those that have not told the time.

@@ -50,7 +50,8 @@ def robot_checks(ear: Ear, session: Session) -> Iterator[Check]:
     yield clocks_check(ear)
     yield stamps_check(ear, session)
     if model is not None:
-        yield from limits_check(ear, model, [ear.samples.ranges], f"zstate echo {ear.info.name}")
+        ranges = [writer.ranges for writer in ear.samples.writers.values()]
+        yield from limits_check(ear, model, ranges, f"zstate echo {ear.info.name}")
     yield statics_check(ear)
     yield poses_check(ear, model)
 
@@ -72,7 +73,7 @@ def _writers_check(ear: Ear) -> Check:
     for status in ear.statuses.values():
         if status.level == "error" or (status.level == "warn" and not _is_elsewhere(status)):
             text = f"{status.program}@{status.host} pid {status.pid} says: {status.text}"
-            return warning("writers", text, f"zstate listen {ear.info.name}")
+            return warning("writers", text, f"zstate monitor --robots --robot {ear.info.name}")
     streams: dict[str, list[str]] = {}
     for stream, writer in ear.info.writers:
         streams.setdefault(str(writer), []).append(stream)
@@ -151,25 +152,30 @@ def _no_model_check(ear: Ear) -> Check:
 
 
 def _samples_check(ear: Ear) -> Check:
-    stream, robot, samples = ear.followed, ear.info.name, ear.samples
+    stream, robot, statistics = ear.followed, ear.info.name, ear.samples.statistics
     writers = ear.writers(stream)
-    if not samples.count and (not writers or "joint_states" not in ear.streams):
+    if not statistics.count and (not writers or "joint_states" not in ear.streams):
         return _nobody_check(ear)
     who = str(writers[-1]) if writers else "somebody unannounced"
-    if not samples.count:
+    if not statistics.count:
         return broken(
             stream, f"{who} is there, but no sample comes: {_idle_text(ear)}", f"zstate echo {robot}"
         )
     refused = refused_check(ear)
     if refused is not None:
         return refused
-    rate_hz = samples.rate_hz
+    window = statistics.window()
+    rate_hz = None if window is None else window.rate_hz
     if rate_hz is None:
         return warning(stream, f"one sample came from {who}; too few to tell a rate", f"zstate hz {robot}")
-    if samples.silent_ns > max(500_000_000, 10e9 / rate_hz):
-        text = f"samples of {who} came, and none for {duration_text(samples.silent_ns)}"
+    if statistics.is_stale():
+        text = f"samples of {who} came, and none for {_silence_text(ear)}"
         return broken(stream, text, f"zstate hz {robot} --stream {stream}")
     return _rate_check(ear, rate_hz, who)
+
+
+def _silence_text(ear: Ear) -> str:
+    return duration_text(round(ear.samples.statistics.silent_s() * 1e9))
 
 
 def _nobody_check(ear: Ear) -> Check:
@@ -211,21 +217,21 @@ def refused_check(ear: Ear) -> Check | None:
     reason = max(reasons, key=lambda one: refused[one])
     text = f"{count_text(refused[reason], 'message')} cannot be used ({reason}): {texts[reason]}"
     if ear.listener.stats.received:
-        return warning(ear.followed, text, f"zstate listen {ear.info.name}")
+        return warning(ear.followed, text, f"zstate monitor --robots --robot {ear.info.name}")
     return broken(ear.followed, text, f"zstate echo {ear.info.name} --once")
 
 
 def _rate_check(ear: Ear, rate_hz: float, who: str) -> Check:
     stream, robot, stats = ear.followed, ear.info.name, ear.listener.stats
     text = f"{rate_hz:.1f} Hz from {who}"
-    status = ear.statuses.get(ear.samples.session or 0)
+    status = ear.statuses.get(ear.samples.statistics.session)
     if status is not None and rate_hz < _FEWER * status.rate_hz:
         text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost, or thinned by a router, on the way"
         return warning(stream, text, f"zstate hz {robot} --stream {stream}")
-    if stats.missed + stats.dropped > _FEWER * ear.samples.count:
+    if stats.missed + stats.dropped > _FEWER * ear.samples.statistics.count:
         text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
-        return warning(stream, text, f"zstate listen {robot}")
-    return ok(stream, f"{text}, newest {duration_text(ear.samples.silent_ns)} ago")
+        return warning(stream, text, f"zstate monitor --robots --robot {robot}")
+    return ok(stream, f"{text}, newest {_silence_text(ear)} ago")
 
 
 def limits_check(ear: Ear, model: RobotModel, ranges: Iterable[Ranges], echo: str) -> Iterator[Check]:
@@ -281,7 +287,7 @@ def poses_check(ear: Ear, model: RobotModel | None) -> Check:
     if len(roots) > 1:
         return _trees_check(ear, frames, roots)
     is_driven = "joint_states" in ear.streams and model is not None
-    if not (ear.samples.count or is_driven or (model is not None and not model.joint_names)):
+    if not (ear.samples.statistics.count or is_driven or (model is not None and not model.joint_names)):
         return skipped("poses", "no joint positions")
     if not frames:
         return skipped("poses", "no frame is known")
@@ -290,7 +296,7 @@ def poses_check(ear: Ear, model: RobotModel | None) -> Check:
     try:
         ear.listener.buffer.lookup(target, source)
     except LookupFailed as error:
-        if not ear.samples.count:
+        if not ear.samples.statistics.count:
             return skipped("poses", f"no joint positions: {error}")
         return broken("poses", str(error), f"zstate tf {target} {source}")
     return ok("poses", f"{count_text(len(frames), 'frame')} in one tree; {source} in {target} is known")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -11,7 +10,6 @@ from zstate.cli.console import count_text, rate_text
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import stamps_check
 from zstate.cli.doctor.ear import Ear
-from zstate.cli.doctor.node_samples import NodeHeard, NodeSamples
 from zstate.cli.doctor.robot_checks import (
     limits_check,
     model_check,
@@ -19,12 +17,12 @@ from zstate.cli.doctor.robot_checks import (
     refused_check,
     statics_check,
 )
+from zstate.cli.doctor.samples import StreamSamples, WriterSamples
 from zstate.cli.words import RosWords
 from zstate.errors import duration_text
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 
-_SILENT_NS, _SILENT_PERIODS = 500_000_000, 10
 _FEW = 6
 
 
@@ -36,7 +34,7 @@ def ros_checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iter
 
 def _checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterator[Check]:
     yield _writers_check(ear)
-    if ear.is_mute and not any(nodes.heard for nodes in ear.nodes.values()):
+    if ear.is_mute and not any(nodes.writers for nodes in ear.nodes.values()):
         yield _mute_check(ear)
         return
     model, check = _model_check(ear, words, called)
@@ -45,7 +43,7 @@ def _checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterato
     yield _transforms_check(ear, words)
     yield stamps_check(ear, session)
     if model is not None:
-        ranges = [node.ranges for node in ear.nodes["joint_states"].heard.values()]
+        ranges = [node.ranges for node in ear.nodes["joint_states"].writers.values()]
         yield from limits_check(ear, model, ranges, f"zstate echo{_named(ear, words)}")
     yield statics_check(ear)
     yield poses_check(ear, model)
@@ -74,7 +72,7 @@ def _mute_check(ear: Ear) -> Check:
 
 def _model_check(ear: Ear, words: RosWords, called: str) -> tuple[RobotModel | None, Check]:
     topic = words.topic(ear.info.name, "robot_description")
-    if not (ear.description or ear.writers("robot_description") or ear.nodes["tf"].heard):
+    if not (ear.description or ear.writers("robot_description") or ear.nodes["tf"].writers):
         return None, broken("model", f"nobody publishes {topic}", _publish(ear, words))
     model, check = model_check(ear)
     if model is None or called in ("*", ear.info.name, model.name):
@@ -94,7 +92,7 @@ def _publish(ear: Ear, words: RosWords) -> str:
 
 def _joints_check(ear: Ear, model: RobotModel | None, words: RosWords) -> Check:
     topic = words.topic(ear.info.name, "joint_states")
-    writers, heard = ear.writers("joint_states"), ear.nodes["joint_states"].heard
+    writers, heard = ear.writers("joint_states"), ear.nodes["joint_states"].writers
     if not heard and not writers:
         return _undriven_check(ear, model, topic)
     if not heard:
@@ -112,7 +110,7 @@ def _joints_check(ear: Ear, model: RobotModel | None, words: RosWords) -> Check:
 
 
 def _undriven_check(ear: Ear, model: RobotModel | None, topic: str) -> Check:
-    if ear.nodes["tf"].heard:
+    if ear.nodes["tf"].writers:
         return skipped("joint_states", f"nobody publishes {topic}; poses come ready made on tf")
     if model is not None and not model.joint_names:
         return ok("joint_states", "the model has no joint that moves")
@@ -123,7 +121,7 @@ def _undriven_check(ear: Ear, model: RobotModel | None, topic: str) -> Check:
 
 
 def _shared_check(
-    ear: Ear, model: RobotModel, heard: Mapping[int, NodeHeard], rates: str, echo: str
+    ear: Ear, model: RobotModel, heard: Mapping[int, WriterSamples], rates: str, echo: str
 ) -> Check:
     """Whether each joint of ``model`` is told by one node; joints of others may be told as well."""
     own = set(model.joint_names)
@@ -149,7 +147,7 @@ def _shared_check(
 
 
 def _transforms_check(ear: Ear, words: RosWords) -> Check:
-    heard = ear.nodes["tf"].heard
+    heard = ear.nodes["tf"].writers
     if not heard:
         return _no_transforms_check(ear, words)
     refused = refused_check(ear)
@@ -172,26 +170,25 @@ def _no_transforms_check(ear: Ear, words: RosWords) -> Check:
         text = f"nobody publishes {topic}: no node makes transforms of the joints"
         return broken("tf", text, _publish(ear, words))
     nodes = _listed(str(writer) for writer in writers)
-    if not ear.nodes["joint_states"].heard:
+    if not ear.nodes["joint_states"].writers:
         return skipped("tf", f"{nodes} announced on {topic}, and joint_states to make it of do not come")
     text = f"{nodes} announced on {topic}, but no message comes"
     return broken("tf", text, f"zstate hz{_named(ear, words)} --stream tf")
 
 
-def _silent_node(ear: Ear, heard: Mapping[int, NodeHeard]) -> str:
+def _silent_node(ear: Ear, heard: Mapping[int, WriterSamples]) -> str:
     """Which node said something and has stopped; "" for none."""
-    now = time.monotonic_ns()
     for session, node in heard.items():
-        silent_ns = now - node.last
-        if node.rate_hz and silent_ns > max(_SILENT_NS, _SILENT_PERIODS * 1e9 / node.rate_hz):
+        if node.statistics.is_stale():
+            silent_ns = round(node.statistics.silent_s() * 1e9)
             return f"{_node(ear, session)} has said nothing for {duration_text(silent_ns)}"
     return ""
 
 
-def _rates_text(ear: Ear, nodes: NodeSamples) -> str:
+def _rates_text(ear: Ear, nodes: StreamSamples) -> str:
     return ", ".join(
         f"{'one message' if node.rate_hz is None else rate_text(node.rate_hz)} from {_node(ear, session)}"
-        for session, node in nodes.heard.items()
+        for session, node in nodes.writers.items()
     )
 
 

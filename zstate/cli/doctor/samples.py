@@ -1,83 +1,23 @@
-"""Samples: how the samples of one stream of one robot come in, whatever they say."""
+"""Statistics and contents of the samples that arrive on one stream of one robot."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate.closing import Closing
-from zstate.errors import MessageError
 from zstate.model.coordinates import coordinate_names
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.net.streams import StreamSubscriber
+from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, Window
 from zstate.wire.keys import Stream
-from zstate.wire.messages import JointState, Sample, from_block, order_digest
-from zstate.wire.protocol import SerializedSample, Wire
+from zstate.wire.messages import JointState, Sample, TransformSample, from_block, order_digest
+from zstate.wire.protocol import Wire
 
-
-class Samples(Closing):
-    """Counts samples, with when they came and what they are stamped; durations in nanoseconds."""
-
-    def __init__(
-        self,
-        session: Session,
-        robot: str,
-        stream: Stream,
-        wire: Wire,
-        on_change: Callable[[], object] = lambda: None,
-    ) -> None:
-        self.count = 0
-        self.last_stamp: int | None = None
-        self.delays: tuple[int, int] = (0, 0)
-        """From the stamp to the arrival here: the least and the greatest there was."""
-        self.stands_still = True
-        """Whether all have the same stamp."""
-        self.session: int | None = None
-        """Of the writer of the newest."""
-        self.ranges = Ranges()
-        """Of the joint positions."""
-        self._came: tuple[int, int] = (0, 0)
-        self._robot, self._wire, self._on_change = robot, wire, on_change
-        self._stream: Stream = stream
-        self._subscriber = StreamSubscriber(session, wire.expression(robot, stream), self._take)
-
-    def close(self) -> None:
-        self._subscriber.close()
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Samples a second, as they come; None for fewer than two."""
-        first, last = self._came
-        return (self.count - 1) * 1e9 / (last - first) if last > first else None
-
-    @property
-    def silent_ns(self) -> int:
-        """How long there has been none."""
-        return time.monotonic_ns() - self._came[1]
-
-    def _take(self, arrivals: list[SerializedSample]) -> None:
-        for arrival in arrivals:
-            with suppress(MessageError):  # the listener beside this counts and names them
-                for sample in self._wire.decode(self._stream, arrival, self._robot):
-                    assert isinstance(sample, Sample)
-                    self._note(sample)
-        self._on_change()
-
-    def _note(self, sample: Sample) -> None:
-        came, delay = time.monotonic_ns(), time.time_ns() - sample.stamp
-        least, greatest = self.delays if self.count else (delay, delay)
-        self.delays = min(least, delay), max(greatest, delay)
-        self._came = self._came[0] if self.count else came, came
-        self.stands_still = self.stands_still and self.last_stamp in (None, sample.stamp)
-        self.last_stamp, self.session = sample.stamp, sample.session
-        self.count += 1
-        if isinstance(sample, JointState):
-            self.ranges.add(sample)
+_ALL = ""
 
 
 class Ranges:
@@ -111,3 +51,70 @@ class Ranges:
             if name in places:
                 found[:, column] = self._extremes[:, places[name]]
         return found
+
+
+@dataclass
+class WriterSamples:
+    """Statistics of one writer, its joints or child frames, and the ranges of its joint positions."""
+
+    statistics: IntervalStatistics
+    names: dict[str, None] = field(default_factory=dict[str, None])
+    ranges: Ranges = field(default_factory=Ranges)
+
+    @property
+    def rate_hz(self) -> float | None:
+        """By arrivals; None for fewer than two samples."""
+        window = self.statistics.window()
+        return None if window is None else window.rate_hz
+
+
+class StreamSamples(Closing):
+    """Subscribes to ``stream`` of ``robot``. ROS nodes share a stream; else the newest writer counts."""
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        stream: Stream,
+        wire: Wire,
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._writers: dict[int, WriterSamples] = {}
+        self._on_change = on_change
+        self.topic = TopicStatistics(session, wire, sources=_sources, on_sample=self._on_sample)
+        self.topic.subscribe(stream, robot)
+
+    def close(self) -> None:
+        self.topic.close()
+
+    def _on_sample(self, stream: Stream, sample: Sample) -> None:
+        writer = self._writers.get(sample.session)
+        if writer is None:
+            statistics = self.topic.get(sample.session)
+            assert statistics is not None
+            writer = self._writers[sample.session] = WriterSamples(statistics)
+        if isinstance(sample, JointState):
+            writer.names.update(dict.fromkeys(sample.names or ()))
+            writer.ranges.add(sample)
+        elif isinstance(sample, TransformSample):
+            writer.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
+        self._on_change()
+
+    @property
+    def statistics(self) -> IntervalStatistics:
+        """Of all writers together."""
+        return self.topic.get(_ALL) or IntervalStatistics()
+
+    @property
+    def window(self) -> Window | None:
+        """The samples of all writers together; None if none has arrived."""
+        return self.statistics.window()
+
+    @property
+    def writers(self) -> dict[int, WriterSamples]:
+        """By session, each writer whose samples have arrived."""
+        return self._writers.copy()
+
+
+def _sources(robot: str, stream: Stream, sample: Sample) -> Iterator[str | int]:
+    yield from (_ALL, sample.session)

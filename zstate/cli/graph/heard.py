@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from zstate.cli.graph.graph import Graph, StreamUse
 from zstate.cli.ros_graph import heard_graph as heard_ros_graph
-from zstate.cli.sampling import Sampler, Source
 from zstate.net.presence import discover, discover_readers
+from zstate.net.topic_statistics import FEW, TopicStatistics, WriterKey
 from zstate.net.wires import wire_named
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream
 from zstate.wire.ros2.wire import Ros2Wire
@@ -24,15 +24,15 @@ _READERS_WITHIN_S = 0.15
 
 def native_graph(session: Session) -> Graph:
     """Who announces to write and to read what, with the rates of what moves."""
-    with Sampler(session) as sampler:
-        sampler.hear("joint_states")
+    with TopicStatistics(session, wire_named("native"), window=FEW) as statistics:
+        statistics.subscribe("joint_states")
         robots = discover(session)
         readers = discover_readers(session, _READERS_WITHIN_S)
         # Transforms are said only while somebody reads them: looking must not make it so.
         for robot in _robots_whose_transforms_are_read(robots, readers):
-            sampler.hear("tf", robot)
-        sampler.wait(list(_sources(robots, readers)), _MEASURED_WITHIN_S)
-        return Graph(tuple(_uses(robots, readers, sampler)))
+            statistics.subscribe("tf", robot)
+        statistics.wait(list(_sources(robots, readers)), _MEASURED_WITHIN_S)
+        return Graph(tuple(_uses(robots, readers, statistics)))
 
 
 def ros_graph(session: Session, wire: str) -> Graph:
@@ -59,15 +59,17 @@ def _robots_whose_transforms_are_read(robots: Iterable[RobotInfo], readers: Iter
     return {robot.name for robot in robots if read & {robot.name, ANY}}
 
 
-def _sources(robots: Sequence[RobotInfo], readers: Sequence[Announced]) -> Iterator[Source]:
+def _sources(robots: Sequence[RobotInfo], readers: Sequence[Announced]) -> Iterator[WriterKey]:
     read = _robots_whose_transforms_are_read(robots, readers)
     for robot in robots:
         for stream, writer in robot.writers:
             if stream == "joint_states" or (stream == "tf" and robot.name in read):
-                yield Source(robot.name, stream, writer.session)
+                yield WriterKey(robot.name, stream, writer.session)
 
 
-def _uses(robots: Sequence[RobotInfo], readers: Sequence[Announced], sampler: Sampler) -> Iterator[StreamUse]:
+def _uses(
+    robots: Sequence[RobotInfo], readers: Sequence[Announced], statistics: TopicStatistics
+) -> Iterator[StreamUse]:
     written: set[tuple[str, Stream]] = {(one.name, stream) for one in robots for stream, _ in one.writers}
     # Whoever reads all robots does not miss what one of them lacks.
     read: set[tuple[str, Stream]] = {
@@ -80,7 +82,7 @@ def _uses(robots: Sequence[RobotInfo], readers: Sequence[Announced], sampler: Sa
         named = [pair for info in robots if info.name == robot for pair in _names(info, stream)]
         for name in dict.fromkeys(name for name, _ in named) or ("",):
             writers = [writer for of, writer in named if of == name]
-            rate_hz = _rate_hz(sampler, robot, stream, writers)
+            rate_hz = _rate_hz(statistics, robot, stream, writers)
             shown = f"{stream}/{name}" if name else stream
             yield StreamUse(robot, shown, rate_hz, _programs(writers), reading)
 
@@ -95,10 +97,12 @@ def _names(robot: RobotInfo, stream: Stream) -> list[tuple[str, Writer]]:
     return found
 
 
-def _rate_hz(sampler: Sampler, robot: str, stream: Stream, writers: Iterable[Writer]) -> float | None:
+def _rate_hz(
+    statistics: TopicStatistics, robot: str, stream: Stream, writers: Iterable[Writer]
+) -> float | None:
     """That of the first writer of whom it is known: usually there is one."""
-    pulses = (sampler.pulse(Source(robot, stream, writer.session)) for writer in writers)
-    return next((pulse.rate_hz for pulse in pulses if pulse is not None), None)
+    known = (statistics.get(WriterKey(robot, stream, writer.session)) for writer in writers)
+    return next((one.published_hz() for one in known if one is not None), None)
 
 
 def _programs(writers: Iterable[Writer]) -> tuple[str, ...]:

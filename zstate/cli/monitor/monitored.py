@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 from zstate.buffer.frames import FrameInfo
 from zstate.cli.console import fail, is_terminal, say, say_json, terminal_width
-from zstate.cli.monitor.meter import PathMeter
+from zstate.cli.monitor.meter import EdgeStatistics
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
@@ -21,7 +21,7 @@ from zstate.transform import Transform
 class Monitored(ABC):
     """Edges that are heard, and what is measured of them."""
 
-    def __init__(self, listener: TransformListener, meter: PathMeter) -> None:
+    def __init__(self, listener: TransformListener, meter: EdgeStatistics) -> None:
         self._listener = listener
         self._meter = meter
 
@@ -56,7 +56,7 @@ class Monitored(ABC):
 class MonitoredEdges(Monitored):
     """All edges."""
 
-    def __init__(self, listener: TransformListener, meter: PathMeter, roster: RobotDirectory) -> None:
+    def __init__(self, listener: TransformListener, meter: EdgeStatistics, roster: RobotDirectory) -> None:
         super().__init__(listener, meter)
         self._roster = roster
 
@@ -85,7 +85,11 @@ class MonitoredPose(Monitored):
     """One pose, and the edges on its path."""
 
     def __init__(
-        self, listener: TransformListener, meter: PathMeter, roster: RobotDirectory, frames: tuple[str, str]
+        self,
+        listener: TransformListener,
+        meter: EdgeStatistics,
+        roster: RobotDirectory,
+        frames: tuple[str, str],
     ) -> None:
         super().__init__(listener, meter)
         self._target, self._source = frames

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from zstate.cli.console import rate_text
 from zstate.cli.layout import in_columns, letters_for, narrowed
-from zstate.cli.monitor.meter import Measure, PathMeter
+from zstate.cli.monitor.meter import EdgeMeasure, EdgeStatistics
 from zstate.errors import duration_text, printable
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ _DISPENSABLE = ("max", "clock", "edge", "jitter")
 NO_NUMBERS = ("",) * (len(_HEADINGS) - 3)
 """The cells of an edge whose samples are not its own, or that has none."""
 
-_SILENT_S, _SILENT_PERIODS = 1.0, 10
 _OFFSET_NS = 1_000_000
 
 
@@ -32,7 +31,7 @@ class Row:
 
     frame: str
     edge: FrameInfo | None
-    measure: Measure | None
+    measure: EdgeMeasure | None
     offset: Offset | None
 
     def facts(self) -> dict[str, Any] | None:
@@ -45,7 +44,7 @@ class Row:
             "child": edge.name,
             "kind": edge.kind,
             "writer": edge.writer,
-            **(dict[str, Any]() if self.measure is None else asdict(self.measure)),
+            **({} if self.measure is None else self.measure.facts()),
             "clock_offset_s": None if offset is None else offset.offset_ns * 1e-9,
             "clock_uncertainty_s": None if offset is None else offset.uncertainty_ns * 1e-9,
         }
@@ -92,7 +91,7 @@ def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> Cells:
         if edge.kind == "static":
             cells.append((frame, edge.kind, *NO_NUMBERS, writer))
             continue
-        source = PathMeter.source(edge)
+        source = EdgeStatistics.source(edge)
         numbers = NO_NUMBERS if source in said else measured_cells(row.measure, row.offset)
         cells.append((frame, edge.kind, *numbers, writer if source not in said else ""))
         said.add(source)
@@ -106,7 +105,7 @@ def _names(rows: Sequence[Row]) -> list[str]:
     return [name.partition("/")[2] or name for name in full] if len(robots) == 1 else full
 
 
-def measured_cells(measure: Measure | None, offset: Offset | None) -> tuple[str, ...]:
+def measured_cells(measure: EdgeMeasure | None, offset: Offset | None) -> tuple[str, ...]:
     """What was measured, from rate to clock."""
     if measure is None:
         return ("no sample", *NO_NUMBERS[1:])
@@ -118,10 +117,8 @@ def measured_cells(measure: Measure | None, offset: Offset | None) -> tuple[str,
     )
 
 
-def _rate_text(measure: Measure) -> str:
-    pause_s = max(_SILENT_S, _SILENT_PERIODS / measure.rate_hz if measure.rate_hz else 0.0)
-    silent = measure.silent_s > pause_s
-    return f"silent {_time_text(measure.silent_s)}" if silent else rate_text(measure.rate_hz)
+def _rate_text(measure: EdgeMeasure) -> str:
+    return f"silent {_time_text(measure.silent_s)}" if measure.is_stale else rate_text(measure.rate_hz)
 
 
 def _time_text(seconds: float | None) -> str:

@@ -11,6 +11,7 @@ from zstate.cli.frame_tree import below, roots, short_name
 from zstate.cli.pictures.cards import BELOW, Card, cards
 from zstate.cli.pictures.svg import ALARM, LINE, MUTED, WRITERS, Svg, text_width
 from zstate.clock import SYSTEM
+from zstate.ingest.deadline import is_stale
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -19,9 +20,6 @@ _NAME, _NOTE = 13.0, 11.0
 _MARGIN, _HEAD = 20.0, 30.0
 _HIGH, _LOW = 38.0, 24.0
 _PAD = 12.0
-
-# Who is silent for so long is worth a colour.
-_OLD_NS = 1_000_000_000
 
 
 def svg(frames: Sequence[FrameInfo], now: int, *, in_full: bool, title: str) -> str:
@@ -91,8 +89,8 @@ class _Picture:
         if frame.kind not in ("joint", "pose"):
             return MUTED
         newest = frame.newest_in(SYSTEM)
-        is_old = frame.newest is None or (newest is not None and self._now - newest > _OLD_NS)
-        return ALARM if is_old else MUTED
+        is_old = newest is not None and is_stale((self._now - newest) * 1e-9, frame.rate_hz)
+        return ALARM if is_old or frame.newest is None else MUTED
 
     def _join(self, svg: Svg, parent: Card, card: Card, shift: tuple[float, float]) -> None:
         left, top = shift

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import Protocol
 
 import numpy as np
 import viser
 
+from zstate.ingest.deadline import is_stale
 from zstate.model.known import example_name
 from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.look import Look
-from zstate.view.staleness import is_silent, silence_text
 from zstate.view.world import World
 
 _MOST_LINES = 12
@@ -46,7 +48,7 @@ class RobotsPanel:
     def _silence(self, robot: str, look: Look) -> str | None:
         # Who is silent now was not when what is shown happened.
         silent_s = self._world.silent_s(robot) if look.is_present else None
-        if silent_s is None or not is_silent(silent_s, look.facts.rate_hz(robot)):
+        if silent_s is None or not is_stale(silent_s, look.facts.rate_hz(robot)):
             return None
         return silence_text(silent_s)
 
@@ -70,6 +72,17 @@ class RobotsPanel:
             f"{uri}\n    {where}" for robot in robots for uri, where in self._scene.missing_meshes(robot)
         ]
         return _listing("meshes are missing", "mesh is missing", lines)
+
+
+def silence_text(silent_s: float, now_s: float | None = None) -> str:
+    """ "silent for 4 s, since 14:03:22"; ``now_s`` is the present time, seconds since 1970."""
+    since = datetime.fromtimestamp((time.time() if now_s is None else now_s) - silent_s).astimezone()
+    minutes, seconds = divmod(int(silent_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    duration = f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+    if hours:
+        duration = f"{hours} h {minutes} min"
+    return f"silent for {duration}, since {since:%H:%M:%S}"
 
 
 def apart_html(tree: Tree, fixed: str) -> str:

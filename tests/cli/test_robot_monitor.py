@@ -5,14 +5,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from looking import Spawn, failure, interrupted, standing, started
+from looking import Spawn, failure, interrupted, standing, started, zstate
 from support import until
 
 pytestmark = pytest.mark.processes
 
 
 def test_each_robot_has_a_line_a_second(spawn: Spawn):
-    command = started(spawn, "listen")
+    command = started(spawn, "monitor", "--robots")
     heard: set[str] = set()
     with standing("left"), standing("right"):
         until(lambda: heard.add(command.line().split()[0]) or heard == {"left", "right"})
@@ -21,7 +21,7 @@ def test_each_robot_has_a_line_a_second(spawn: Spawn):
 
 
 def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
-    command = started(spawn, "listen", "rrbot", "--json")
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json")
     with standing():
         command.line()
         facts = json.loads(command.line())
@@ -35,14 +35,14 @@ def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
 
 
 def test_a_robot_that_writes_only_transforms_is_heard_all_the_same(spawn: Spawn):
-    command = started(spawn, "listen", "--json")
+    command = started(spawn, "monitor", "--robots", "--json")
     with standing(streams=("tf", "tf_static", "robot_description")):
         until(lambda: json.loads(command.line())["received"] > 0)
     assert "following zstate/rrbot/tf" in command.stderr
 
 
 def test_it_says_what_it_waits_for(spawn: Spawn):
-    command = started(spawn, "listen", "rrbot")
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot")
     until(lambda: "waiting: nobody announces the robot 'rrbot'" in command.stderr)
     with standing():
         assert command.line().startswith("rrbot  ")
@@ -50,7 +50,7 @@ def test_it_says_what_it_waits_for(spawn: Spawn):
 
 
 def test_a_name_that_no_robot_can_have_is_refused():
-    assert "'a/b'" in failure("listen", "a/b")
+    assert "'a/b'" in failure("monitor", "--robots", "--robot", "a/b")
 
 
 def test_many_robots_are_heard_by_one_listener(spawn: Spawn):
@@ -60,7 +60,7 @@ def test_many_robots_are_heard_by_one_listener(spawn: Spawn):
     heard: set[str] = set()
     with ExitStack() as opened:
         opened.enter_context(standing("bot0"))
-        command = started(spawn, "listen", "--json")
+        command = started(spawn, "monitor", "--robots", "--json")
         until(lambda: json.loads(command.line())["received"] > 0)
         before = threads()
         for number in range(1, 6):
@@ -69,3 +69,28 @@ def test_many_robots_are_heard_by_one_listener(spawn: Spawn):
         # Links of Zenoh's come to six processes' sessions, but no listeners.
         assert threads() < before + 4 * 5
     interrupted(command)
+
+
+def test_once_prints_one_line_for_each_robot():
+    with standing("left"), standing("right"):
+        lines = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
+    assert [line.split()[0] for line in lines] == ["left", "right"]
+    assert all(" Hz  age " in line for line in lines)
+
+
+def test_once_gives_up_with_the_reason():
+    message = failure("monitor", "--robots", "--once", "--timeout", "0.5")
+    assert "gave up after 0.5 s: no robot is announced" in message
+
+
+def test_a_robot_that_stops_is_silent(spawn: Spawn):
+    command = started(spawn, "monitor", "--robots")
+    with standing():
+        until(lambda: " Hz  " in command.line())
+    until(lambda: command.line().startswith("rrbot  silent  age "))
+    interrupted(command)
+
+
+def test_robots_and_frames_exclude_each_other():
+    assert "--robots takes no frames" in failure("monitor", "--robots", "base", "tool", code=2)
+    assert "--metrics needs --robots" in failure("monitor", "--metrics", "0", code=2)

@@ -1,0 +1,85 @@
+"""Every command, the page and the events of a listener agree on which robot is stale."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from zstate import Transform, TransformBuffer, connect
+from zstate.buffer.frames import FrameInfo
+from zstate.cli.doctor.samples import StreamSamples
+from zstate.cli.metered_buffer import MeteredBuffer
+from zstate.cli.monitor.meter import EdgeStatistics
+from zstate.cli.monitor.report import Row, report_text
+from zstate.cli.pictures.frames import svg
+from zstate.cli.pictures.svg import ALARM
+from zstate.cli.robot_list import robots_text
+from zstate.clock import SystemClock
+from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
+from zstate.net.presence import RobotInfo
+from zstate.net.topic_statistics import Received, TopicStatistics
+from zstate.net.wires import wire_named
+from zstate.wire.messages import JointState, order_digest
+from zstate.wire.writer import Writer
+
+# Times between arrivals [s], as recorded over Wi-Fi: jitter, one loss, one pause.
+INTERVALS_50_HZ = [0.020, 0.019, 0.023, 0.018, 0.041, 0.020, 0.016, 0.022, 0.021, 0.085, 0.002, 0.001] * 8
+INTERVALS_2_HZ = [0.50, 0.49, 0.53, 0.47, 0.52, 0.50, 0.48]
+SESSION = 7
+WRITER = Writer("driver", "jetson", 412, 0, SESSION)
+
+
+def answers(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
+    """Which consumers call the writer stale now, whose samples arrived then [ns, monotonic]."""
+    now_s = time.monotonic_ns() * 1e-9
+    native, order = wire_named("native"), order_digest(())
+    edge = FrameInfo("r1/tool", "r1/base", "joint", str(WRITER), None, None, None, 0)
+    found: dict[str, bool] = {}
+    with (
+        connect() as session,
+        TopicStatistics(session, native) as listed,
+        EdgeStatistics(session, "r1", "native", "joint_states", SystemClock()) as edges,
+        StreamSamples(session, "r1", "joint_states", native) as examined,
+    ):
+        events, answered, metered = DeadlineMonitor(), Deadline(unknown_s=2.0), MeteredBuffer()
+        events.register(("r1", SESSION))
+        buffer = TransformBuffer()
+        for seq, (at, stamp) in enumerate(zip(arrivals, stamps, strict=True)):
+            sample = JointState(stamp, seq, SESSION, order, b"")
+            for topic in (listed, edges.topic, examined.topic):
+                topic.add("r1", "joint_states", sample, at, stamp)
+            events.on_sample(("r1", SESSION), at * 1e-9)
+            answered.on_sample(at * 1e-9)
+            metered.statistics_of("r1").add(Received(at, stamp, seq, 0))
+            buffer.insert(Transform("r1/base", "r1/tool", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp))
+        (tool,) = [frame for frame in buffer.frames() if frame.name == "r1/tool"]
+        found["events"] = bool(events.expired(now_s)[0])
+        found["ls"] = "silent" in robots_text((RobotInfo("r1", (("joint_states", WRITER),)),), listed)
+        found["monitor"] = "silent" in report_text([Row("r1/tool", edge, edges.measure(edge), None)])
+        found["monitor --robots, demo"] = metered.measure("r1").rate_hz == 0.0
+        found["doctor"] = examined.statistics.is_stale()
+        found["doctor, ROS"] = examined.writers[SESSION].statistics.is_stale()
+        found["tf"] = answered.is_missed(now_s)
+        found["view"] = is_stale(now_s - arrivals[-1] * 1e-9, tool.rate_hz)
+        found["tree"] = ALARM in svg(buffer.frames(), time.time_ns(), in_full=True, title="")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("intervals", "silent_s", "expected"),
+    [
+        (INTERVALS_50_HZ, 0.1, False),
+        (INTERVALS_50_HZ, 0.7, True),
+        (INTERVALS_50_HZ, 30.0, True),
+        (INTERVALS_2_HZ, 0.7, False),
+        (INTERVALS_2_HZ, 3.5, False),
+        (INTERVALS_2_HZ, 6.5, True),
+    ],
+)
+def test_one_arrival_pattern_gets_one_answer(intervals: list[float], silent_s: float, expected: bool):
+    ages_s = [silent_s + sum(intervals[number:]) for number in range(len(intervals) + 1)]
+    now, system = time.monotonic_ns(), time.time_ns()
+    arrivals = [now - round(age_s * 1e9) for age_s in ages_s]
+    found = answers(arrivals, [system - round(age_s * 1e9) for age_s in ages_s])
+    assert set(found.values()) == {expected}, found

@@ -1,0 +1,93 @@
+"""Deadlines, by a clock that is given."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
+
+WRITER = ("r1", 7)
+
+
+def monitored(*times_s: float) -> DeadlineMonitor:
+    monitor = DeadlineMonitor()
+    monitor.register(WRITER)
+    for now_s in times_s:
+        assert monitor.on_sample(WRITER, now_s) is None
+    return monitor
+
+
+@pytest.mark.parametrize(("period_s", "silence_s"), [(0.01, 0.5), (0.05, 0.5), (0.2, 2.0)])
+def test_stale_is_ten_periods_and_half_a_second_at_least(period_s: float, silence_s: float):
+    monitor = monitored(*(100.0 + period_s * number for number in range(50)))
+    due_s = 100.0 + period_s * 49 + silence_s
+    stale, next_s = monitor.expired(due_s - 1e-3)
+    assert not stale
+    assert next_s == pytest.approx(due_s)
+    stale, next_s = monitor.expired(due_s + 1e-3)
+    assert stale == {WRITER: pytest.approx(silence_s + 1e-3)}
+    assert next_s == math.inf
+
+
+def test_it_is_stale_once_until_a_sample_comes():
+    monitor = monitored(1.0, 1.1)
+    assert monitor.expired(9.0)[0]
+    assert not monitor.expired(10.0)[0]
+    assert monitor.on_sample(WRITER, 11.1) == pytest.approx(10.0)
+    assert monitor.on_sample(WRITER, 11.2) is None
+    assert monitor.expired(19.0)[0]
+
+
+def test_who_has_not_said_two_things_yet_is_not_stale():
+    assert monitored().expired(1e9) == ({}, math.inf)
+    assert monitored(1.0).expired(1e9) == ({}, math.inf)
+
+
+def test_samples_of_nobody_announced_are_nobodys():
+    monitor = DeadlineMonitor()
+    for now_s in (1.0, 2.0):
+        assert monitor.on_sample(WRITER, now_s) is None
+    assert monitor.expired(1e9) == ({}, math.inf)
+
+
+def test_each_stream_that_ends_tells_whether_its_writer_was_stale():
+    monitor = monitored(1.0, 1.1)
+    monitor.register(WRITER)
+    monitor.expired(9.0)
+    assert [monitor.unregister(WRITER) for _ in range(3)] == [True, True, False]
+    assert not monitored(1.0, 1.1).unregister(WRITER)
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "rate_hz", "expected"),
+    [(0.4, 100.0, False), (0.6, 100.0, True), (1e9, None, False), (9.0, 1.0, False), (11.0, 1.0, True)],
+)
+def test_a_known_rate_gives_the_same_deadline(silent_s: float, rate_hz: float | None, expected: bool):
+    assert is_stale(silent_s, rate_hz) == expected
+
+
+def test_a_writer_that_slows_down_misses_two_deadlines_and_no_third():
+    deadline = Deadline()
+    for number in range(100):
+        deadline.on_sample(0.01 * number)
+    missed: list[bool] = []
+    for second in range(1, 6):
+        missed.append(deadline.is_missed(second + 0.99))
+        deadline.on_sample(second + 1.0)
+    assert missed == [True, True, False, False, False]
+
+
+def test_a_silence_is_no_period():
+    deadline = Deadline()
+    for now_s in (0.0, 0.1, 0.2, 60.0, 60.1):
+        deadline.on_sample(now_s)
+    assert deadline.due_s == pytest.approx(60.1 + 1.0)
+
+
+def test_a_second_sample_may_be_awaited_for_a_fixed_time():
+    deadline = Deadline(unknown_s=2.0)
+    assert not deadline.is_missed(1e9)
+    deadline.on_sample(10.0)
+    assert (deadline.is_missed(11.9), deadline.is_missed(12.1)) == (False, True)

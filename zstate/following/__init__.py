@@ -1,1 +1,0 @@
-"""What the messages of one robot become in a buffer."""

@@ -1,0 +1,264 @@
+"""Topic statistics (ROS 2's term): rates, jitter, gaps, delays and ages of what writers publish.
+
+``IntervalStatistics`` and ``SequenceGaps`` are arithmetic on samples that have arrived; ``TopicStatistics``
+subscribes to streams and keeps them for each writer. Times are nanoseconds where the name does not end in
+``_s`` [s] or ``_hz`` [Hz]; arrivals are stamped by a monotonic clock.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from functools import cached_property
+from itertools import pairwise
+from statistics import median, pstdev
+from typing import TYPE_CHECKING, NamedTuple
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate.clock import Clock, SystemClock
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, MessageError
+from zstate.ingest.deadline import Deadline
+from zstate.net.streams import StreamSubscriber
+from zstate.wire.keys import ANY, Stream
+from zstate.wire.messages import Sample
+
+if TYPE_CHECKING:
+    from zstate.net.session import Session
+    from zstate.wire.protocol import SerializedSample, Wire
+
+WINDOW = 10_000
+"""Ten seconds at 1 kHz."""
+FEW = 200
+"""Enough for a rate, and few enough for a large fleet."""
+_MEASURABLE_NS = 200_000_000
+_PUBLISHED_NS = 2_000_000_000
+
+
+def mean_rate_hz(count: int, span: int) -> float | None:
+    """The rate of ``count`` samples, the last of which is ``span`` [ns] after the first; None if unknown."""
+    return (count - 1) * 1e9 / span if count > 1 and span > 0 else None
+
+
+class Received(NamedTuple):
+    """When a sample arrived, its stamp, its sequence number, and how long it took from stamp to arrival."""
+
+    at: int
+    stamp: int
+    seq: int
+    delay: int
+
+
+class Window:
+    """Statistics of successive samples of one source, at least one; None where they are too few."""
+
+    def __init__(self, received: Sequence[Received]) -> None:
+        self.received = received
+
+    @property
+    def rate_hz(self) -> float | None:
+        """By arrivals."""
+        return mean_rate_hz(len(self.received), self.received[-1].at - self.received[0].at)
+
+    @property
+    def stamp_rate_hz(self) -> float | None:
+        """By stamps and sequence numbers: independent of losses, and of bursts on a busy machine."""
+        first, last = self.received[0], self.received[-1]
+        return mean_rate_hz(last.seq - first.seq + 1, last.stamp - first.stamp)
+
+    @cached_property
+    def intervals_s(self) -> list[float]:
+        """Between arrivals."""
+        return [(later.at - earlier.at) * 1e-9 for earlier, later in pairwise(self.received)]
+
+    @property
+    def jitter_s(self) -> float | None:
+        """The standard deviation of the intervals."""
+        return pstdev(self.intervals_s) if self.intervals_s else None
+
+    @property
+    def delay_s(self) -> float:
+        """The median."""
+        return median(one.delay for one in self.received) * 1e-9
+
+    @cached_property
+    def delays(self) -> tuple[int, int]:
+        """The least and the greatest."""
+        delays = [one.delay for one in self.received]
+        return min(delays), max(delays)
+
+
+class IntervalStatistics:
+    """The newest ``window`` samples of one source. One thread adds, any thread reads."""
+
+    def __init__(self, window: int = WINDOW) -> None:
+        self.count = 0
+        """How many samples have arrived; the window holds the newest of them."""
+        self.session = 0
+        """The writer of the newest sample."""
+        self.deadline = Deadline()
+        self._received: deque[Received] = deque(maxlen=window)
+
+    def add(self, received: Received, session: int = 0) -> None:
+        """Count a sample."""
+        self.session = session
+        self.deadline.on_sample(received.at * 1e-9)
+        self._received.append(received)
+        self.count += 1
+
+    def is_of_message(self, session: int, seq: int) -> bool:
+        """Whether the newest sample has these numbers: ROS messages hold several samples, counted as one."""
+        return bool(self._received) and self._received[-1].seq == seq and self.session == session
+
+    def clear(self) -> None:
+        """Begin a new window."""
+        self._received.clear()
+
+    @property
+    def newest(self) -> Received | None:
+        """The newest sample."""
+        received = self._received
+        return received[-1] if received else None
+
+    def window(self, since: int | None = None) -> Window | None:
+        """The samples that arrived after ``since``, or all that are kept; None if there are none."""
+        received = self._received.copy()
+        while received and since is not None and received[0].at <= since:
+            received.popleft()
+        return Window(received) if received else None
+
+    def recent(self, within_ns: int, now: int | None = None) -> Window | None:
+        """The samples that arrived within ``within_ns`` up to now."""
+        return self.window((time.monotonic_ns() if now is None else now) - within_ns)
+
+    def published_hz(self) -> float | None:
+        """The rate at which the writer publishes, from the last two seconds."""
+        window = self.recent(_PUBLISHED_NS)
+        return None if window is None else window.stamp_rate_hz
+
+    def silent_s(self, now: int | None = None) -> float:
+        """How long ago the newest sample arrived; 0 if there is none."""
+        newest = self.newest
+        return 0.0 if newest is None else ((time.monotonic_ns() if now is None else now) - newest.at) * 1e-9
+
+    def is_stale(self, now: int | None = None) -> bool:
+        """Whether the writer has missed its deadline."""
+        return self.deadline.is_missed((time.monotonic_ns() if now is None else now) * 1e-9)
+
+
+class SequenceGaps:
+    """How many samples of each session are missing, by their sequence numbers."""
+
+    def __init__(self) -> None:
+        self._sessions: BoundedDict[int, list[int]] = BoundedDict()  # the largest number, and what is missing
+
+    def add(self, session: int, seq: int) -> bool:
+        """Count a sample. Returns whether it is the first of its message: ROS puts several into one."""
+        known = self._sessions.get(session)
+        if known is None:
+            self._sessions[session] = [seq, 0]
+        elif seq == known[0]:
+            return False
+        else:
+            known[1] += max(0, seq - known[0] - 1)
+            known[0] = max(known[0], seq)
+        return True
+
+    def missed(self, session: int | None = None) -> int:
+        """How many samples of a session, or of all of them, are missing."""
+        sessions = self._sessions if session is None else self._sessions.keys() & {session}
+        return sum(self._sessions[one][1] for one in tuple(sessions))
+
+
+class WriterKey(NamedTuple):
+    """One writer of one stream."""
+
+    robot: str
+    stream: Stream
+    session: int
+
+
+Sources = Callable[[str, Stream, Sample], Iterator[Hashable]]
+"""The keys under which a sample of a robot's stream is counted."""
+
+
+def by_writer(robot: str, stream: Stream, sample: Sample) -> Iterator[WriterKey]:
+    """Each writer of a stream is a source."""
+    yield WriterKey(robot, stream, sample.session)
+
+
+class TopicStatistics(Closing):
+    """Statistics of subscribed streams, by source. Messages that cannot be decoded are skipped.
+
+    ``clock`` is the one of the stamps. ``on_sample`` is called with each sample, in the subscriber's thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        wire: Wire,
+        *,
+        sources: Sources = by_writer,
+        clock: Clock | None = None,
+        window: int = WINDOW,
+        on_sample: Callable[[Stream, Sample], None] | None = None,
+    ) -> None:
+        self.gaps = SequenceGaps()
+        self._session, self._wire, self._sources = session, wire, sources
+        self._clock = clock or SystemClock()
+        self._on_sample, self._window = on_sample, window
+        self._statistics: BoundedDict[Hashable, IntervalStatistics] = BoundedDict()
+        self._arrived = threading.Condition()
+        self._subscriptions = ExitStack()
+
+    def subscribe(self, stream: Stream, robot: str = ANY) -> None:
+        """Count ``stream`` of ``robot``, or of all robots, from now on."""
+
+        def receive(arrivals: list[SerializedSample]) -> None:
+            at, now = time.monotonic_ns(), self._clock.now()
+            with self._arrived:
+                for arrival in arrivals:
+                    with suppress(InvalidInput, MessageError):
+                        named = self._wire.robot_of(arrival.key) if robot == ANY else robot
+                        for sample in self._wire.decode(stream, arrival, named):
+                            if isinstance(sample, Sample):
+                                self.add(named, stream, sample, at, now)
+                self._arrived.notify_all()
+
+        key = self._wire.expression(robot, stream)
+        self._subscriptions.enter_context(StreamSubscriber(self._session, key, receive))
+
+    def add(self, robot: str, stream: Stream, sample: Sample, at: int, now: int) -> None:
+        """Count a sample that arrived ``at``, when it was ``now`` by the clock of the stamps."""
+        self.gaps.add(sample.session, sample.seq)
+        received = Received(at, sample.stamp, sample.seq, now - sample.stamp)
+        for source in self._sources(robot, stream, sample):
+            statistics = self._statistics.get(source)
+            if statistics is None:
+                statistics = self._statistics[source] = IntervalStatistics(self._window)
+            elif statistics.is_of_message(sample.session, sample.seq):
+                continue
+            statistics.add(received, sample.session)
+        if self._on_sample is not None:
+            self._on_sample(stream, sample)
+
+    def get(self, source: Hashable) -> IntervalStatistics | None:
+        """The statistics of one source; None if no sample has arrived."""
+        return self._statistics.get(source)
+
+    def wait(self, sources: Collection[Hashable], timeout_s: float) -> None:
+        """Until a rate of each source can be measured, 0.2 s of samples, or for ``timeout_s``."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: all(map(self._is_measurable, sources)), timeout_s)
+
+    def _is_measurable(self, source: Hashable) -> bool:
+        statistics = self.get(source)
+        window = None if statistics is None else statistics.window()
+        return window is not None and window.received[-1].at - window.received[0].at >= _MEASURABLE_NS
+
+    def close(self) -> None:
+        """Unsubscribe. A second call does nothing."""
+        self._subscriptions.close()
