@@ -31,9 +31,9 @@ def say_fitted(text: str) -> None:
     if logs.is_json():
         click.echo(logs.as_json(text, event="result"))
         return
-    from zstate.cli.layout import fitted
+    from zstate.cli.output.text_layout import wrap
 
-    say(fitted(text, terminal_width()) if is_terminal() else text)
+    say(wrap(text, terminal_width()) if is_terminal() else text)
 
 
 def say_json(value: Any) -> None:
@@ -70,6 +70,11 @@ def is_terminal() -> bool:
 def terminal_width() -> int:
     """How many letters fit on a line of the terminal; COLUMNS says otherwise."""
     return shutil.get_terminal_size().columns
+
+
+def output_width() -> int | None:
+    """The width of the terminal; None if standard output is not a terminal."""
+    return terminal_width() if is_terminal() else None
 
 
 def duration_or_dash(nanoseconds: int | None) -> str:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, is_terminal, say_fitted, say_json, terminal_width
-from zstate.cli.layout import Guides, chain_lines, in_columns, narrowed, tree_lines
+from zstate.cli.console import count_text, output_width, say_fitted, say_json
 from zstate.cli.options import json_option, xacro_arguments
+from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, in_columns, tree_lines
 from zstate.errors import Found, ModelError
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _STDIN = "standard input"
 _WITHOUT_AXIS = ("fixed", "floating")
+_LINK_HEADINGS = ("link", "joint", "type", "range")
 _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "velocity", "effort", "axis")
 
 
@@ -99,20 +100,16 @@ def _finding_row(finding: Found) -> tuple[str, str, str]:
 
 
 def _joint_lines(model: RobotModel) -> list[str]:
-    dispensable = ("axis", "effort", "velocity", "parent", "type")
-    return narrowed(_joint_rows(model), _width(), [_JOINT_HEADINGS.index(column) for column in dispensable])
+    optional = ("axis", "effort", "velocity", "parent", "type")
+    return Table(_JOINT_HEADINGS, _joint_rows(model), optional).lines(output_width())
 
 
 def _link_lines(model: RobotModel) -> list[str]:
-    lines, width = in_columns(_link_rows(model, tree_lines)), _width()
-    if width is None or max(map(len, lines)) <= width:
-        return lines
-    of_joint, of_type = 1, 2
-    return narrowed(_link_rows(model, chain_lines), width, (of_type, of_joint))
-
-
-def _width() -> int | None:
-    return terminal_width() if is_terminal() else None
+    tables = (
+        Table(_LINK_HEADINGS, _link_rows(model, tree_lines), headed=False),
+        Table(_LINK_HEADINGS, _link_rows(model, chain_lines), ("type", "joint"), headed=False),
+    )
+    return first_fitting(tables, output_width())
 
 
 def _link_rows(model: RobotModel, guides: Guides) -> list[tuple[str, str, str, str]]:
@@ -126,7 +123,7 @@ def _link_rows(model: RobotModel, guides: Guides) -> list[tuple[str, str, str, s
 def _joint_rows(model: RobotModel) -> list[tuple[str, ...]]:
     """Each joint with its place among the positions; those that do not move of their own have none."""
     places = _places(model)
-    rows = [
+    return [
         (
             *(joint.name, joint.type, joint.parent, joint.child, places.get(joint.name, "-")),
             _mimic_text(joint) or _limits_text(joint) or "-",
@@ -135,7 +132,6 @@ def _joint_rows(model: RobotModel) -> list[tuple[str, ...]]:
         )
         for joint in model.joints
     ]
-    return [_JOINT_HEADINGS, *rows]
 
 
 def _places(model: RobotModel) -> dict[str, str]:

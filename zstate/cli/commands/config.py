@@ -7,8 +7,8 @@ from dataclasses import asdict
 import click
 
 from zstate.cli.console import note, say, say_fitted, say_json
-from zstate.cli.layout import in_columns
 from zstate.cli.options import json_option, plain_session_options, reading_clock_option, wire_option
+from zstate.cli.output.text_layout import in_columns
 
 
 @click.command("config")

@@ -14,7 +14,13 @@ from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.cli.graph.graph import Graph
+    from zstate.net.graph import Graph
+    from zstate.net.session import Session
+    from zstate.wire.keys import Stream
+    from zstate.wire.writer import Writer
+
+_MEASURED_WITHIN_S = 0.4
+_READERS_WITHIN_S = 0.15
 
 
 @click.command("graph")
@@ -35,19 +41,62 @@ def graph_command(network: Network, robot: str, form: str | None, wire: str) -> 
     zstate graph --json | jq '.streams[] | select(.writers == [])'
     zstate graph --wire ros2
     """
-    from zstate.cli.graph.heard import native_graph, ros_graph
+    from zstate.cli.output.graph_text import graph_facts
 
     with open_session(network, (wire,)) as session:
-        graph = ros_graph(session, wire) if is_ros(wire) else native_graph(session)
+        graph = _ros_graph(session, wire) if is_ros(wire) else _measured_graph(session)
     if robot != "*" and not is_ros(wire):
         graph = _of_robot(graph, robot)
     if form == "json":
-        say_json(graph.facts())
+        say_json(graph_facts(graph))
     elif graph.streams:
         title = "Who writes and reads what" if robot == "*" else f"Who writes and reads what of {robot}"
-        say_fitted(_drawn(graph, form, title)) if form is None else say(_drawn(graph, form, title))
+        _print(graph, form, title)
     else:
         note(words_of(wire).announced(()))
+
+
+def _measured_graph(session: Session) -> Graph:
+    """The graph of the native wire, with the rates of the streams that move."""
+    from zstate.cli.sampling import Sampler, Source
+    from zstate.net.graph import graph_of
+    from zstate.net.presence import discover, discover_readers
+    from zstate.wire.keys import ANY
+
+    with Sampler(session) as sampler:
+        sampler.hear("joint_states")
+        robots = discover(session)
+        readers = discover_readers(session, _READERS_WITHIN_S)
+        # Transforms are published only while they are read: measuring must not make a publisher start.
+        read = {one.robot for one in readers if one.stream == "tf"}
+        moving: set[tuple[str, Stream]] = {(robot.name, "joint_states") for robot in robots}
+        for robot in robots:
+            if read & {robot.name, ANY}:
+                sampler.hear("tf", robot.name)
+                moving.add((robot.name, "tf"))
+        expected = [
+            Source(robot.name, stream, writer.session)
+            for robot in robots
+            for stream, writer in robot.writers
+            if (robot.name, stream) in moving
+        ]
+        sampler.wait(expected, _MEASURED_WITHIN_S)
+
+        def rate_of(robot: str, stream: Stream, writer: Writer) -> float | None:
+            pulse = sampler.pulse(Source(robot, stream, writer.session))
+            return None if pulse is None else pulse.rate_hz
+
+        return graph_of(robots, readers, rate_of)
+
+
+def _ros_graph(session: Session, wire: str) -> Graph:
+    from zstate.net.graph import discover_ros_graph
+    from zstate.net.wires import wire_named
+    from zstate.wire.ros2.wire import Ros2Wire
+
+    wire_format = wire_named(wire)
+    assert isinstance(wire_format, Ros2Wire)
+    return discover_ros_graph(session, wire_format).streams
 
 
 def _of_robot(graph: Graph, robot: str) -> Graph:
@@ -59,12 +108,12 @@ def _of_robot(graph: Graph, robot: str) -> Graph:
     return replace(graph, streams=streams)
 
 
-def _drawn(graph: Graph, form: str | None, title: str) -> str:
-    from zstate.cli.graph.graph import graph_text
-    from zstate.cli.graph.picture import dot, mermaid, svg
+def _print(graph: Graph, form: str | None, title: str) -> None:
+    from zstate.cli.output.graph_text import graph_drawing, graph_text
 
-    if form == "svg":
-        return svg(graph, title=title)
-    if form is not None:
-        return dot(graph) if form == "dot" else mermaid(graph)
-    return graph_text(graph)
+    if form is None:
+        say_fitted(graph_text(graph))
+        return
+    from zstate.cli.output.drawing import draw
+
+    say(draw(graph_drawing(graph), form, title))

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, is_terminal, rate_text, say_fitted, say_json, terminal_width
-from zstate.cli.layout import in_columns, narrowed
+from zstate.cli.console import count_text, output_width, rate_text, say_fitted, say_json
 from zstate.cli.options import json_option
+from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
     from zstate.cli.recording_facts import RecordedRobot
     from zstate.record.channel import Channel
     from zstate.record.info import RecordingInfo
 
+_HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
 
 
@@ -80,8 +81,8 @@ def _robot_lines(robot: RecordedRobot) -> list[str]:
         ("  " + said.stream, said.topic, said.type, str(said.count), rate_text(said.rate_hz), said.writer)
         for said in robot.streams
     ]
-    width, of_topic, of_type = terminal_width() if is_terminal() else None, 1, 2
-    return [f"{robot.name}: {_model_text(robot)}", *narrowed(rows, width, (of_type, of_topic))]
+    table = Table(_HEADINGS, rows, optional=("type", "topic"), headed=False)
+    return [f"{robot.name}: {_model_text(robot)}", *table.lines(output_width())]
 
 
 def _model_text(robot: RecordedRobot) -> str:

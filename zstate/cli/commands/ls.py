@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.console import is_terminal, note, say, say_fitted, say_json, terminal_width
+from zstate.cli.console import is_terminal, note, output_width, say, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
@@ -51,8 +51,13 @@ def ls_command(network: Network, *, watch: bool, as_json: bool, wire: str) -> No
 
 
 def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.ros_graph import RosGraph, heard_graph
-    from zstate.cli.ros_graph_text import graph_facts, graph_text, namespaces_hint, nobody_text
+    from zstate.cli.output.graph_text import (
+        empty_ros_graph_text,
+        namespaces_hint,
+        ros_graph_facts,
+        ros_graph_text,
+    )
+    from zstate.net.graph import RosGraph, discover_ros_graph
     from zstate.net.wires import wire_named
     from zstate.wire.ros2.wire import Ros2Wire
 
@@ -60,15 +65,15 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
     assert isinstance(spoken, Ros2Wire)
 
     def text(graph: RosGraph) -> str:
-        return graph_text(graph, spoken) if graph.nodes or graph.topics else nobody_text(spoken)
+        return ros_graph_text(graph, spoken) if graph.nodes or graph.topics else empty_ros_graph_text(spoken)
 
     if watch and as_json:
-        _repeat_json(lambda: graph_facts(heard_graph(session, spoken), spoken))
+        _repeat_json(lambda: ros_graph_facts(discover_ros_graph(session, spoken), spoken))
     if watch:
-        _show(lambda: text(heard_graph(session, spoken)), lambda: heard_graph(session, spoken))
-    graph = heard_graph(session, spoken)
+        _show(lambda: text(discover_ros_graph(session, spoken)), lambda: discover_ros_graph(session, spoken))
+    graph = discover_ros_graph(session, spoken)
     if as_json:
-        say_json(graph_facts(graph, spoken))
+        say_json(ros_graph_facts(graph, spoken))
     elif graph.nodes or graph.topics:
         say_fitted(text(graph))
         hint = namespaces_hint(graph, spoken)
@@ -79,7 +84,7 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.robot_list import robots_facts, robots_text, sources
+    from zstate.cli.output.robot_table import robots_facts, robots_text, sources
     from zstate.cli.sampling import Sampler
     from zstate.net.presence import discover
 
@@ -92,13 +97,13 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
         if as_json:
             say_json(robots_facts(robots, sampler))
         elif robots:
-            say_fitted(robots_text(robots, sampler, width=terminal_width() if is_terminal() else None))
+            say_fitted(robots_text(robots, sampler, width=output_width()))
         else:
             note(words_of("native").announced(robots))
 
 
 def _watch_robots(session: Session, sampler: Sampler, *, as_json: bool) -> NoReturn:
-    from zstate.cli.robot_list import robots_facts, robots_text
+    from zstate.cli.output.robot_table import robots_facts, robots_text
     from zstate.cli.roster import Roster
 
     def text(robots: tuple[RobotInfo, ...], width: int | None) -> str:
@@ -108,8 +113,7 @@ def _watch_robots(session: Session, sampler: Sampler, *, as_json: bool) -> NoRet
         time.sleep(_MEETING_S)
         if as_json:
             _repeat_json(lambda: robots_facts(roster.robots(), sampler))
-        width = terminal_width if is_terminal() else lambda: None
-        _show(lambda: text(roster.robots(), width()), roster.robots)
+        _show(lambda: text(roster.robots(), output_width()), roster.robots)
 
 
 def _repeat_json(facts: Callable[[], Any]) -> NoReturn:

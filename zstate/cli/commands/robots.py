@@ -23,7 +23,7 @@ def robots_command(name: str, *, as_json: bool) -> None:
     zstate robots ur
     zstate robots --json
     """
-    from zstate.cli.layout import in_columns
+    from zstate.cli.output.text_layout import in_columns
     from zstate.model.catalog import catalog
 
     everything = catalog()

@@ -93,7 +93,7 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
 
 
 def _plan_text(starts: Sequence[Start]) -> str:
-    from zstate.cli.layout import in_columns
+    from zstate.cli.output.text_layout import in_columns
 
     rows = [
         (start.name, shlex.join(start.arguments if start.is_program else ("zstate", *start.arguments)))

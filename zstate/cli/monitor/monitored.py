@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from zstate.buffer.frames import FrameInfo
 from zstate.cli.awaited_pose import AwaitedPose
-from zstate.cli.console import fail, is_terminal, note, say, say_json, terminal_width
+from zstate.cli.console import fail, note, output_width, say, say_json, terminal_width
 from zstate.cli.monitor.meter import PathMeter
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
@@ -45,7 +45,7 @@ class Monitored(ABC):
         if as_json:
             say_json(self._facts())
         else:
-            say(f"{self._text(terminal_width() if is_terminal() else None)}\n")
+            say(f"{self._text(output_width())}\n")
 
     def show(self) -> NoReturn:
         """A report that keeps up to date."""

@@ -45,6 +45,11 @@ class NodeToken:
     name: str
 
     @property
+    def full_name(self) -> str:
+        """The name of the node with its namespace."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+    @property
     def key(self) -> str:
         """The liveliness key."""
         names = (_mangled(part) for part in (self.enclave, self.namespace, self.name))
@@ -71,6 +76,11 @@ class EndpointToken:
     dds_type: str
     hash: str
     qos: Qos
+
+    @property
+    def full_name(self) -> str:
+        """The name of the node with its namespace."""
+        return f"{self.namespace.rstrip('/')}/{self.node}"
 
     @property
     def key(self) -> str:
