@@ -12,7 +12,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from zstate.closing import Closing
@@ -26,8 +26,9 @@ from zstate.wire.writer import Announced, Writer
 
 if TYPE_CHECKING:
     from zstate.wire.ros2.graph import DdsToken, EndpointToken, NodeToken
-    from zstate.wire.ros2.qos import Qos
     from zstate.wire.ros2.wire import Ros2Wire
+
+    RosEndpoint = EndpointToken | DdsToken
 
 ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description", "clock")
 
@@ -207,24 +208,14 @@ class GraphMonitor(Closing):
         self._thread.join(_JOIN_TIMEOUT_S)
 
 
-@dataclass(frozen=True, order=True, slots=True)
-class Endpoint:
-    """A publisher or subscriber of a topic: ``node`` with its namespace, or the bridge that announces it."""
-
-    node: str
-    zid: str
-    type_hash: str
-    qos: Qos = field(compare=False)
-
-
 @dataclass(frozen=True, slots=True)
 class Topic:
     """A topic, with its leading slash, that carries ``stream``."""
 
     name: str
     stream: Stream
-    publishers: tuple[Endpoint, ...]
-    subscribers: tuple[Endpoint, ...]
+    publishers: tuple[RosEndpoint, ...]
+    subscribers: tuple[RosEndpoint, ...]
 
     @property
     def namespace(self) -> str:
@@ -240,62 +231,37 @@ class RosGraph:
     topics: tuple[Topic, ...]
 
     @property
-    def streams(self) -> Graph:
-        """The topics with the names of the nodes that publish and subscribe."""
-        return Graph(
-            tuple(
-                StreamUse(
-                    "",
-                    topic.name,
-                    tuple(sorted({end.node for end in topic.publishers})),
-                    tuple(sorted({end.node for end in topic.subscribers})),
-                )
-                for topic in self.topics
-            )
-        )
+    def graph(self) -> Graph:
+        """The topics, with the names of the nodes at their ends."""
+
+        def names(ends: Iterable[RosEndpoint]) -> tuple[str, ...]:
+            return tuple(sorted({end.full_name for end in ends}))
+
+        uses = (StreamUse("", one.name, names(one.publishers), names(one.subscribers)) for one in self.topics)
+        return Graph(tuple(uses))
 
 
 def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
-    """The ROS graph of all namespaces of the domain. Takes up to a second if nothing is announced."""
+    """The ROS graph of all namespaces of the domain. Takes up to a second if nothing is announced.
+
+    A topic belongs to the stream that has its last name and its type; other topics are left out.
+    """
     from zstate.wire.ros2.graph import NodeToken, parse_dds_token, parse_token  # noqa: PLC0415 - ROS only
-
-    tokens = living_tokens(session, wire.writers_expression("*"))
-    parse = parse_dds_token if wire.name == "ros2dds" else parse_token
-    parsed = [token for token in map(parse, sorted(tokens)) if token is not None]
-    nodes = [token for token in parsed if isinstance(token, NodeToken)]
-    by_topic: dict[tuple[str, Stream], list[EndpointToken | DdsToken]] = {}
-    for token in parsed:
-        stream = None if isinstance(token, NodeToken) else _stream_of(token)
-        if stream is not None and not isinstance(token, NodeToken):
-            by_topic.setdefault((f"/{token.topic.strip('/')}", stream), []).append(token)
-    topics = [
-        Topic(
-            name,
-            stream,
-            tuple(sorted(_endpoint(end) for end in ends if end.kind == "MP")),
-            tuple(sorted(_endpoint(end) for end in ends if end.kind == "MS")),
-        )
-        for (name, stream), ends in sorted(by_topic.items())
-    ]
-    return RosGraph(tuple(sorted(nodes, key=lambda node: node.full_name)), tuple(topics))
-
-
-def _stream_of(token: EndpointToken | DdsToken) -> Stream | None:
-    """The stream that a topic carries, by its last name and its type."""
-    from zstate.wire.ros2.graph import DdsToken  # noqa: PLC0415 - ROS only
     from zstate.wire.ros2.topics import type_of  # noqa: PLC0415 - ROS only
 
-    last = token.topic.rpartition("/")[2]
-    for stream in ROS_STREAMS:
-        kind = type_of(stream)
-        is_typed = kind.name == token.type_name if isinstance(token, DdsToken) else kind.dds == token.dds_type
-        if stream == last and is_typed:
-            return stream
-    return None
-
-
-def _endpoint(token: EndpointToken | DdsToken) -> Endpoint:
-    from zstate.wire.ros2.graph import EndpointToken  # noqa: PLC0415 - ROS only
-
-    name = token.full_name if isinstance(token, EndpointToken) else f"bridge {token.zid[:8]}"
-    return Endpoint(name, token.zid, token.hash, token.qos)
+    parse = parse_dds_token if wire.name == "ros2dds" else parse_token
+    nodes: list[NodeToken] = []
+    ends: dict[tuple[str, Stream], list[RosEndpoint]] = {}
+    for token in map(parse, living_tokens(session, wire.writers_expression("*"))):
+        if isinstance(token, NodeToken):
+            nodes.append(token)
+        elif token is not None:
+            for stream in ROS_STREAMS:
+                if token.topic.rpartition("/")[2] == stream and token.dds_type == type_of(stream).dds:
+                    ends.setdefault((f"/{token.topic.strip('/')}", stream), []).append(token)
+    topics: list[Topic] = []
+    for (name, stream), tokens in sorted(ends.items()):
+        tokens.sort(key=lambda token: (token.full_name, token.zid, token.hash, token.key))
+        publishers = tuple(token for token in tokens if token.kind == "MP")
+        topics.append(Topic(name, stream, publishers, tuple(token for token in tokens if token.kind == "MS")))
+    return RosGraph(tuple(sorted(nodes, key=lambda node: (node.full_name, node.key))), tuple(topics))

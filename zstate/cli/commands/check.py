@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _STDIN = "standard input"
 _WITHOUT_AXIS = ("fixed", "floating")
-_LINK_HEADINGS = ("link", "joint", "type", "range")
 _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "velocity", "effort", "axis")
 
 
@@ -67,95 +66,77 @@ def check_command(
 def _report(
     name: str, model: RobotModel | None, findings: Sequence[Found], *, fix_hints: bool, joint_table: bool
 ) -> str:
-    lines = [_headline(name, model, findings)]
-    rows = in_columns([_finding_row(finding) for finding in findings])
+    if model is None:
+        errors = sum(finding.severity == "error" for finding in findings)
+        lines = [f"{name} cannot be used ({count_text(errors, 'error')})"]
+    else:
+        lines = [
+            f"{name}: robot {model.name!r}, {count_text(len(model.links), 'link')}, "
+            f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
+        ]
+    places = ("file" if finding.line is None else f"line {finding.line}" for finding in findings)
+    rows = in_columns(
+        [(place, one.severity, one.message) for place, one in zip(places, findings, strict=True)]
+    )
     for row, finding in zip(rows, findings, strict=True):
         lines += [f"  {row}"]
         if fix_hints and finding.fix:
             lines += [f"      fix: {finding.fix}"]
     if model is not None:
         lines += _joint_lines(model) if joint_table else _link_lines(model)
-    elif not fix_hints and any(finding.fix for finding in findings):
-        lines += (
-            [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
-            if name != _STDIN
-            else []
-        )
+    elif not fix_hints and name != _STDIN and any(finding.fix for finding in findings):
+        lines += [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
     return "\n".join(lines)
 
 
-def _headline(name: str, model: RobotModel | None, findings: Sequence[Found]) -> str:
-    if model is None:
-        errors = sum(finding.severity == "error" for finding in findings)
-        return f"{name} cannot be used ({count_text(errors, 'error')})"
-    return (
-        f"{name}: robot {model.name!r}, {count_text(len(model.links), 'link')}, "
-        f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
-    )
-
-
-def _finding_row(finding: Found) -> tuple[str, str, str]:
-    where = "file" if finding.line is None else f"line {finding.line}"
-    return where, finding.severity, finding.message
-
-
-def _joint_lines(model: RobotModel) -> list[str]:
-    optional = ("axis", "effort", "velocity", "parent", "type")
-    return Table(_JOINT_HEADINGS, _joint_rows(model), optional).lines(output_width())
-
-
 def _link_lines(model: RobotModel) -> list[str]:
-    tables = (
-        Table(_LINK_HEADINGS, _link_rows(model, tree_lines), headed=False),
-        Table(_LINK_HEADINGS, _link_rows(model, chain_lines), ("type", "joint"), headed=False),
-    )
-    return first_fitting(tables, output_width())
-
-
-def _link_rows(model: RobotModel, guides: Guides) -> list[tuple[str, str, str, str]]:
+    """The tree of links, each with the joint that leads to it."""
     joints = {joint.child: joint for joint in model.joints}
     children: dict[str, list[str]] = {}
     for joint in model.joints:
         children.setdefault(joint.parent, []).append(joint.child)
-    return [(guide + link, *_joint_cells(joints.get(link))) for guide, link in guides(model.root, children)]
+
+    def rows(guides: Guides) -> list[tuple[str, ...]]:
+        (_, root), *links = guides(model.root, children)
+        found: list[tuple[str, ...]] = [(root, "", "", "")]
+        for guide, link in links:
+            joint = joints[link]
+            found.append((guide + link, joint.name, joint.type, _mimic_text(joint) or _limits_text(joint)))
+        return found
+
+    headings = ("link", "joint", "type", "range")
+    tables = (
+        Table(headings, rows(tree_lines), headed=False),
+        Table(headings, rows(chain_lines), optional=("type", "joint"), headed=False),
+    )
+    return first_fitting(tables, output_width())
 
 
-def _joint_rows(model: RobotModel) -> list[tuple[str, ...]]:
-    """Each joint with its place among the positions; those that do not move of their own have none."""
-    places = _places(model)
-    return [
+def _joint_lines(model: RobotModel) -> list[str]:
+    """Each joint with its indices in the positions, "3" or "0..6"; "-" if it is not driven."""
+    from zstate.model.robot import POSITION_COUNTS
+
+    by_name = {joint.name: joint for joint in model.joints}
+    indices: dict[str, str] = {}
+    first = 0
+    for name in model.joint_names:
+        last = first + POSITION_COUNTS[by_name[name].type] - 1
+        indices[name] = f"{first}" if first == last else f"{first}..{last}"
+        first = last + 1
+    rows = [
         (
-            *(joint.name, joint.type, joint.parent, joint.child, places.get(joint.name, "-")),
+            *(joint.name, joint.type, joint.parent, joint.child, indices.get(joint.name, "-")),
             _mimic_text(joint) or _limits_text(joint) or "-",
-            *(f"{limit:g}" if math.isfinite(limit) else "-" for limit in _greatest(joint)),
+            *(
+                f"{limit:g}" if joint.type != "fixed" and math.isfinite(limit) else "-"
+                for limit in (joint.limits.velocity, joint.limits.effort)
+            ),
             " ".join(f"{part:g}" for part in joint.axis) if joint.type not in _WITHOUT_AXIS else "-",
         )
         for joint in model.joints
     ]
-
-
-def _places(model: RobotModel) -> dict[str, str]:
-    """Which of the positions are a joint's own: "3", or "0..6"."""
-    from zstate.model.robot import POSITION_COUNTS
-
-    counts = {joint.name: POSITION_COUNTS[joint.type] for joint in model.joints}
-    places: dict[str, str] = {}
-    first = 0
-    for name in model.joint_names:
-        last = first + counts[name] - 1
-        places[name] = f"{first}" if first == last else f"{first}..{last}"
-        first = last + 1
-    return places
-
-
-def _greatest(joint: Joint) -> tuple[float, float]:
-    return (joint.limits.velocity, joint.limits.effort) if joint.type != "fixed" else (math.inf, math.inf)
-
-
-def _joint_cells(joint: Joint | None) -> tuple[str, str, str]:
-    if joint is None:
-        return "", "", ""
-    return joint.name, joint.type, _mimic_text(joint) or _limits_text(joint)
+    optional = ("axis", "effort", "velocity", "parent", "type")
+    return Table(_JOINT_HEADINGS, rows, optional).lines(output_width())
 
 
 def _mimic_text(joint: Joint) -> str:
@@ -177,13 +158,8 @@ def _facts(name: str, model: RobotModel | None, findings: Sequence[Found]) -> di
         "source": name,
         "usable": model is not None,
         "findings": [
-            {
-                "line": finding.line,
-                "severity": finding.severity,
-                "message": finding.message,
-                "fix": finding.fix,
-            }
-            for finding in findings
+            {"line": one.line, "severity": one.severity, "message": one.message, "fix": one.fix}
+            for one in findings
         ],
     }
     if model is not None:
@@ -193,22 +169,17 @@ def _facts(name: str, model: RobotModel | None, findings: Sequence[Found]) -> di
 
 
 def _joint_facts(joint: Joint) -> dict[str, Any]:
-    limits = joint.limits
     facts: dict[str, Any] = {
         "name": joint.name,
         "type": joint.type,
         "parent": joint.parent,
         "child": joint.child,
         "line": joint.line,
-        "lower": _finite(limits.lower),
-        "upper": _finite(limits.upper),
+        # JSON has no infinity; a missing limit is null.
+        "lower": joint.limits.lower if math.isfinite(joint.limits.lower) else None,
+        "upper": joint.limits.upper if math.isfinite(joint.limits.upper) else None,
     }
     if joint.mimic is not None:
         mimic = joint.mimic
         facts["mimic"] = {"joint": mimic.joint, "multiplier": mimic.multiplier, "offset": mimic.offset}
     return facts
-
-
-def _finite(limit: float) -> float | None:
-    """JSON has no infinity; a limit that is not stated is null."""
-    return limit if math.isfinite(limit) else None

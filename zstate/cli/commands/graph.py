@@ -96,7 +96,7 @@ def _ros_graph(session: Session, wire: str) -> Graph:
 
     wire_format = wire_named(wire)
     assert isinstance(wire_format, Ros2Wire)
-    return discover_ros_graph(session, wire_format).streams
+    return discover_ros_graph(session, wire_format).graph
 
 
 def _of_robot(graph: Graph, robot: str) -> Graph:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
@@ -14,12 +14,13 @@ from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.cli.sampling import Sampler
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
 
+T = TypeVar("T")
+
 _MEASURED_WITHIN_S = 0.3
-_AGAIN_S = 0.5
+_AGAIN_S, _JSON_PERIOD_S = 0.5, 1.0
 # Meeting everybody takes less.
 _MEETING_S = 0.5
 
@@ -61,22 +62,24 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
     from zstate.net.wires import wire_named
     from zstate.wire.ros2.wire import Ros2Wire
 
-    spoken = wire_named(wire)
-    assert isinstance(spoken, Ros2Wire)
+    wire_format = wire_named(wire)
+    assert isinstance(wire_format, Ros2Wire)
+
+    def discover() -> RosGraph:
+        return discover_ros_graph(session, wire_format)
 
     def text(graph: RosGraph) -> str:
-        return ros_graph_text(graph, spoken) if graph.nodes or graph.topics else empty_ros_graph_text(spoken)
+        is_empty = not graph.nodes and not graph.topics
+        return empty_ros_graph_text(wire_format) if is_empty else ros_graph_text(graph, wire_format)
 
-    if watch and as_json:
-        _repeat_json(lambda: ros_graph_facts(discover_ros_graph(session, spoken), spoken))
     if watch:
-        _show(lambda: text(discover_ros_graph(session, spoken)), lambda: discover_ros_graph(session, spoken))
-    graph = discover_ros_graph(session, spoken)
+        _watch(discover, text, lambda graph: ros_graph_facts(graph, wire_format), as_json=as_json)
+    graph = discover()
     if as_json:
-        say_json(ros_graph_facts(graph, spoken))
+        say_json(ros_graph_facts(graph, wire_format))
     elif graph.nodes or graph.topics:
         say_fitted(text(graph))
-        hint = namespaces_hint(graph, spoken)
+        hint = namespaces_hint(graph, wire_format)
         if hint:
             note(hint)
     else:
@@ -85,53 +88,45 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.output.robot_table import robots_facts, robots_text, sources
+    from zstate.cli.roster import Roster
     from zstate.cli.sampling import Sampler
     from zstate.net.presence import discover
+
+    def text(robots: tuple[RobotInfo, ...]) -> str:
+        if not robots:
+            return words_of("native").announced(robots)
+        return robots_text(robots, sampler, width=output_width())
 
     with Sampler(session) as sampler:
         sampler.hear("joint_states")
         if watch:
-            _watch_robots(session, sampler, as_json=as_json)
+            with Roster(session) as roster:
+                time.sleep(_MEETING_S)
+                _watch(roster.robots, text, lambda robots: robots_facts(robots, sampler), as_json=as_json)
         robots = discover(session)
         sampler.wait(sources(robots), _MEASURED_WITHIN_S)
         if as_json:
             say_json(robots_facts(robots, sampler))
         elif robots:
-            say_fitted(robots_text(robots, sampler, width=output_width()))
+            say_fitted(text(robots))
         else:
-            note(words_of("native").announced(robots))
+            note(text(robots))
 
 
-def _watch_robots(session: Session, sampler: Sampler, *, as_json: bool) -> NoReturn:
-    from zstate.cli.output.robot_table import robots_facts, robots_text
-    from zstate.cli.roster import Roster
-
-    def text(robots: tuple[RobotInfo, ...], width: int | None) -> str:
-        return robots_text(robots, sampler, width=width) if robots else roster.words.announced(robots)
-
-    with Roster(session) as roster:
-        time.sleep(_MEETING_S)
-        if as_json:
-            _repeat_json(lambda: robots_facts(roster.robots(), sampler))
-        _show(lambda: text(roster.robots(), output_width()), roster.robots)
-
-
-def _repeat_json(facts: Callable[[], Any]) -> NoReturn:
-    while True:
-        say_json(facts())
-        time.sleep(1.0)
-
-
-def _show(text: Callable[[], str], state: Callable[[], object]) -> NoReturn:
-    """Keep ``text`` on the screen up to date; in a pipe say it whenever ``state`` is another one."""
-    if is_terminal():
+def _watch(
+    state: Callable[[], T], text: Callable[[T], str], facts: Callable[[T], Any], *, as_json: bool
+) -> NoReturn:
+    """Show ``state`` until Ctrl-C: refresh a terminal, print changes to a pipe, JSON every second."""
+    if is_terminal() and not as_json:
         from zstate.cli.live_text import keep_showing
 
-        keep_showing(text)
-    said: object = None
+        keep_showing(lambda: text(state()))
+    shown: T | None = None
     while True:
         now = state()
-        if now != said:
-            say(f"{text()}\n")
-        said = now
-        time.sleep(_AGAIN_S)
+        if as_json:
+            say_json(facts(now))
+        elif now != shown:
+            say(f"{text(now)}\n")
+        shown = now
+        time.sleep(_JSON_PERIOD_S if as_json else _AGAIN_S)

@@ -10,7 +10,7 @@ from zstate.cli.output.text_layout import in_columns
 
 if TYPE_CHECKING:
     from zstate.cli.output.drawing import Drawing
-    from zstate.net.graph import Endpoint, Graph, RosGraph, Topic
+    from zstate.net.graph import Graph, RosEndpoint, RosGraph, Topic
     from zstate.wire.ros2.wire import Ros2Wire
 
 _PROGRAM_FILL = "#eef2ff"
@@ -84,24 +84,24 @@ def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
     for topic in graph.topics:
         ends = [("  publisher", end) for end in topic.publishers]
         ends += [("  subscriber", end) for end in topic.subscribers]
-        rows = [(role, end.node, _qos_text(end), _hash_text(end, topic)) for role, end in ends]
+        rows = [(role, end.full_name, _qos_text(end), _hash_text(end, topic)) for role, end in ends]
         lines += [f"{topic.name}  {type_of(topic.stream).name}", *in_columns(rows)]
     return "\n".join(lines)
 
 
-def _qos_text(end: Endpoint) -> str:
+def _qos_text(end: RosEndpoint) -> str:
     qos = end.qos
     depth = f"keep last {qos.depth}" if qos.history == "keep_last" else "keep all"
     return f"{qos.reliability}, {qos.durability}, {depth}".replace("_", " ")
 
 
-def _hash_text(end: Endpoint, topic: Topic) -> str:
+def _hash_text(end: RosEndpoint, topic: Topic) -> str:
     """A type hash other than the usual one."""
     from zstate.wire.ros2.topics import HUMBLE_HASH, type_of
 
-    if end.type_hash == HUMBLE_HASH:
+    if end.hash == HUMBLE_HASH:
         return "humble"
-    return "" if end.type_hash in ("", type_of(topic.stream).hash) else "another version of the type"
+    return "" if end.hash in ("", type_of(topic.stream).hash) else "another version of the type"
 
 
 def namespaces_hint(graph: RosGraph, wire: Ros2Wire) -> str:
@@ -146,12 +146,12 @@ def ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
     }
 
 
-def _ends_facts(ends: Sequence[Endpoint]) -> list[dict[str, Any]]:
+def _ends_facts(ends: Sequence[RosEndpoint]) -> list[dict[str, Any]]:
     return [
         {
-            "node": end.node,
+            "node": end.full_name,
             "zid": end.zid,
-            "type_hash": end.type_hash,
+            "type_hash": end.hash,
             "reliability": end.qos.reliability,
             "durability": end.qos.durability,
             "history": end.qos.history,

@@ -107,6 +107,17 @@ class DdsToken:
     hash: str = ""
 
     @property
+    def full_name(self) -> str:
+        """The name of the bridge; the node is unknown."""
+        return f"bridge {self.zid[:8]}"
+
+    @property
+    def dds_type(self) -> str:
+        """The type as ``EndpointToken`` has it; of no message type if ``type_name`` has not three parts."""
+        package, _, name = self.type_name.split("/") if self.type_name.count("/") == 2 else ("", "", "")
+        return f"{package}::msg::dds_::{name}_"
+
+    @property
     def key(self) -> str:
         """The liveliness key."""
         names = (part.replace("/", _DDS_SLASH) for part in (self.topic, self.type_name))
