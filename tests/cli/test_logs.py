@@ -126,7 +126,7 @@ LIVE = """
     import logging
     from rich.live import Live
     from rich.text import Text
-    from zstate.cli.console import note
+    from zstate.cli.output.console import note
     from zstate.cli.logs import warn_on_standard_error
     warn_on_standard_error()
     with Live(Text("live"), auto_refresh=False) as live:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, NoReturn
 
-from zstate.cli.console import fail, note
+from zstate.cli.output.console import fail, print_status
 from zstate.cli.roster import Roster
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, UnknownFrame, WaitTimeout, duration_text
 
@@ -84,7 +84,7 @@ class AwaitedPose:
         key = (type(reason), reason.edge, getattr(reason, "name", ""), hint)
         if key != self._said:
             self._said = key
-            note(f"waiting: {self._explained(reason, hint)}")
+            print_status(f"waiting: {self._explained(reason, hint)}")
 
     def _refuse_past(self, reason: InPast) -> NoReturn:
         if reason.is_of_another_time:
@@ -129,4 +129,4 @@ class AwaitedPose:
         self._said = None
         frames = self._listener.buffer.frames()
         for robot in self._listener.robots():
-            note(self._words.heard(robot, frames))
+            print_status(self._words.heard(robot, frames))

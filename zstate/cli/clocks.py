@@ -6,7 +6,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import note
+from zstate.cli.output.console import print_status
 from zstate.clock import SYSTEM, Clock, SystemClock, stamp_text
 from zstate.errors import NoClock
 
@@ -41,6 +41,6 @@ def _await(clock: SimulatedClock, timeout_s: float | None) -> None:
     try:
         clock.wait(grace_s)
     except NoClock:
-        note(f"waiting for the simulated time on {clock.key} ...")
+        print_status(f"waiting for the simulated time on {clock.key} ...")
         clock.wait(timeout_s)
-        note(f"heard {clock.key}: it is {stamp_text(clock.now())}")
+        print_status(f"heard {clock.key}: it is {stamp_text(clock.now())}")

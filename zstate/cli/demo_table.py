@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from math import degrees
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.console import count_text, duration_or_dash, is_terminal, say, terminal_width
 from zstate.cli.metered_buffer import Measure, MeteredBuffer
+from zstate.cli.output.console import count_text, duration_or_dash, is_terminal, print_result, terminal_width
 from zstate.clock import wait_in_slices
 from zstate.errors import LookupFailed, duration_text
 from zstate.listener import TransformListener
@@ -57,7 +57,7 @@ class DemoTable:
         if not is_terminal():
             while not _is_over(ended, until, 1.0):
                 self._marks.append(self._meter.mark())
-                say(self.line())
+                print_result(self.line())
             return
         with Live(self.table(), auto_refresh=False) as live:
             while not _is_over(ended, until, _REFRESH_S):

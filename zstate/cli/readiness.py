@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import note
+from zstate.cli.output.console import print_status
 from zstate.cli.roster import Roster
 from zstate.cli.words import is_ros
 from zstate.closing import Closing
@@ -61,7 +61,7 @@ class Readiness(Closing):
                 return reason
             if lasting_s > _GRACE_S and reason != said:
                 said = reason
-                note(f"waiting: {reason}", event="waiting")
+                print_status(f"waiting: {reason}", event="waiting")
             time.sleep(_LOOK_EVERY_S)
         return ""
 

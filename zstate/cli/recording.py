@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import count_text
+from zstate.cli.output.console import count_text
 from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:

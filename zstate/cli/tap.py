@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.console import fail, note
+from zstate.cli.output.console import fail, print_status
 from zstate.cli.roster import Roster
 from zstate.clock import LONGEST_WAIT_S
 from zstate.closing import Closing
@@ -72,7 +72,7 @@ class Tap(Closing):
     def _refuse(self, key: str, error: MessageError) -> None:
         if error.reason not in self._refused:
             self._refused.add(error.reason)
-            note(f"{key}: {error}; further ones are passed over in silence")
+            print_status(f"{key}: {error}; further ones are passed over in silence")
 
     def next(self, timeout_s: float) -> Tapped | None:
         """The next sample, or None when none comes within ``timeout_s``, or half a second if that is less."""
@@ -94,11 +94,11 @@ class Tap(Closing):
             tapped = self.next(min(left_s, _GRACE_S))
             if tapped is not None:
                 if said:
-                    note(f"heard {self._roster.words.place(self.robot, (self._stream,))}")
+                    print_status(f"heard {self._roster.words.place(self.robot, (self._stream,))}")
                 return tapped
             reason = self._roster.silence(self.robot, self._stream)
             if deadline is not None and left_s <= _GRACE_S:
                 fail(f"gave up after {timeout_s:g} s: {reason}")
             if reason != said:
                 said = reason
-                note(f"waiting: {reason}")
+                print_status(f"waiting: {reason}")

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from zstate.cli.console import count_text
+from zstate.cli.output.console import count_text
 from zstate.cli.probe import silent_rendezvous
 
 if TYPE_CHECKING:

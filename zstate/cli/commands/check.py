@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, output_width, say_fitted, say_json
 from zstate.cli.options import json_option, xacro_arguments
+from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped
 from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, in_columns, tree_lines
 from zstate.errors import Found, ModelError
 
@@ -57,9 +57,9 @@ def check_command(
             raise
         findings = error.findings
     if as_json:
-        say_json(_facts(name, model, findings))
+        print_json(_facts(name, model, findings))
     else:
-        say_fitted(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
+        print_wrapped(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
     raise SystemExit(0 if model else 1)
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, note, say, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli.output.console import fail, print_json, print_result, print_status, print_wrapped
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -48,12 +48,12 @@ def graph_command(network: Network, robot: str, form: str | None, wire: str) -> 
     if robot != "*" and not is_ros(wire):
         graph = _of_robot(graph, robot)
     if form == "json":
-        say_json(graph_facts(graph))
+        print_json(graph_facts(graph))
     elif graph.streams:
         title = "Who writes and reads what" if robot == "*" else f"Who writes and reads what of {robot}"
         _print(graph, form, title)
     else:
-        note(words_of(wire).announced(()))
+        print_status(words_of(wire).announced(()))
 
 
 def _measured_graph(session: Session) -> Graph:
@@ -112,8 +112,8 @@ def _print(graph: Graph, form: str | None, title: str) -> None:
     from zstate.cli.output.graph_text import graph_drawing, graph_text
 
     if form is None:
-        say_fitted(graph_text(graph))
+        print_wrapped(graph_text(graph))
         return
     from zstate.cli.output.drawing import draw
 
-    say(draw(graph_drawing(graph), form, title))
+    print_result(draw(graph_drawing(graph), form, title))

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from zstate.cli.console import fail, note, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     json_option,
@@ -19,6 +18,7 @@ from zstate.cli.options import (
     timeout_option,
     wire_option,
 )
+from zstate.cli.output.console import fail, print_json, print_status, print_wrapped
 from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _follow(tap: Tap, arrivals: Arrivals, *, as_json: bool) -> NoReturn:
         if came and measured is not None:
             _show(measured, as_json=as_json)
         elif not came and not silent:
-            note(tap.silence())
+            print_status(tap.silence())
         silent = not came
 
 
@@ -129,11 +129,11 @@ def _listen(tap: Tap, arrivals: Arrivals, seconds: float) -> int:
 
 def _show(measured: Intervals, *, as_json: bool) -> None:
     if as_json:
-        say_json(asdict(measured))
+        print_json(asdict(measured))
         return
-    say_fitted(f"average rate: {measured.rate_hz:.3f}")
+    print_wrapped(f"average rate: {measured.rate_hz:.3f}")
     missed = f" missed: {measured.missed}" if measured.missed else ""
-    say_fitted(
+    print_wrapped(
         f"\tmin: {measured.min_s:.3f}s max: {measured.max_s:.3f}s "
         f"std dev: {measured.std_dev_s:.5f}s window: {measured.window}{missed}"
     )

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, output_width, rate_text, say_fitted, say_json
 from zstate.cli.options import json_option
+from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped, rate_text
 from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ def info_command(file: str, as_json: bool) -> None:
     info = describe(file)
     robots = recorded_robots(info)
     if as_json:
-        say_json(_facts(info, robots))
+        print_json(_facts(info, robots))
         return
     lines = [*_head(info), *(line for robot in robots for line in ("", *_robot_lines(robot)))]
-    say_fitted("\n".join([*lines, *_other_lines(info)]))
+    print_wrapped("\n".join([*lines, *_other_lines(info)]))
 
 
 def _head(info: RecordingInfo) -> Iterator[str]:

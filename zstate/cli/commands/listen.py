@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import note, say_fitted, say_json
 from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, metrics_option, reading_clock_option, session_options, wire_option
+from zstate.cli.output.console import print_json, print_status, print_wrapped
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
@@ -132,7 +132,7 @@ class Ears(Closing):
                 self._open(info.name, self._roster.streams(info.name))
         reason = "" if self._ears else self._reason()
         if reason and reason != self._said:
-            note(f"waiting: {reason}", event="waiting", robot=self._robot)
+            print_status(f"waiting: {reason}", event="waiting", robot=self._robot)
         self._said = reason
 
     def _open(self, robot: str, streams: frozenset[Stream]) -> None:
@@ -140,7 +140,9 @@ class Ears(Closing):
         if follow in streams:
             listener, buffer = self._listeners.get(follow) or self._listen(follow)
             remember(self._ears, robot, Ear(robot, listener, buffer, buffer.meter_of(robot).mark()))
-            note(f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot)
+            print_status(
+                f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot
+            )
 
     def _listen(self, follow: Follow) -> tuple[TransformListener, MeteredBuffer]:
         from zstate.cli.metered_buffer import MeteredBuffer
@@ -174,9 +176,9 @@ class Ears(Closing):
 
 def _show(robot: str, measure: Measure, stats: Stats, *, as_json: bool) -> None:
     if as_json:
-        say_json({"robot": robot, **asdict(measure), **asdict(stats)})
+        print_json({"robot": robot, **asdict(measure), **asdict(stats)})
         return
-    say_fitted(
+    print_wrapped(
         f"{robot}  {measure.rate_hz:.1f} Hz  age {_time_text(measure.age_s)}  "
         f"latency {_time_text(measure.latency_s)}  received {stats.received}  dropped {stats.dropped}  "
         f"missed {stats.missed}  late {stats.late}  refused {_refused_text(stats.refused)}"

@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
-from zstate.cli.console import is_terminal, note, output_width, say, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, wire_option
+from zstate.cli.output.console import (
+    is_terminal,
+    keep_showing,
+    output_width,
+    print_json,
+    print_result,
+    print_status,
+    print_wrapped,
+)
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -76,14 +84,14 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
         _watch(discover, text, lambda graph: ros_graph_facts(graph, wire_format), as_json=as_json)
     graph = discover()
     if as_json:
-        say_json(ros_graph_facts(graph, wire_format))
+        print_json(ros_graph_facts(graph, wire_format))
     elif graph.nodes or graph.topics:
-        say_fitted(text(graph))
+        print_wrapped(text(graph))
         hint = namespaces_hint(graph, wire_format)
         if hint:
-            note(hint)
+            print_status(hint)
     else:
-        note(text(graph))
+        print_status(text(graph))
 
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
@@ -106,11 +114,11 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
         robots = discover(session)
         sampler.wait(sources(robots), _MEASURED_WITHIN_S)
         if as_json:
-            say_json(robots_facts(robots, sampler))
+            print_json(robots_facts(robots, sampler))
         elif robots:
-            say_fitted(text(robots))
+            print_wrapped(text(robots))
         else:
-            note(text(robots))
+            print_status(text(robots))
 
 
 def _watch(
@@ -118,15 +126,13 @@ def _watch(
 ) -> NoReturn:
     """Show ``state`` until Ctrl-C: refresh a terminal, print changes to a pipe, JSON every second."""
     if is_terminal() and not as_json:
-        from zstate.cli.live_text import keep_showing
-
         keep_showing(lambda: text(state()))
     shown: T | None = None
     while True:
         now = state()
         if as_json:
-            say_json(facts(now))
+            print_json(facts(now))
         elif now != shown:
-            say(f"{text(now)}\n")
+            print_result(f"{text(now)}\n")
         shown = now
         time.sleep(_JSON_PERIOD_S if as_json else _AGAIN_S)

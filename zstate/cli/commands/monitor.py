@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import is_terminal
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     heard_robot_option,
@@ -17,6 +16,7 @@ from zstate.cli.options import (
     timeout_option,
     wire_option,
 )
+from zstate.cli.output.console import is_terminal
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed
 

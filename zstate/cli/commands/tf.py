@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
@@ -20,6 +19,7 @@ from zstate.cli.options import (
     timeout_option,
     wire_option,
 )
+from zstate.cli.output.console import print_json, print_result, print_status
 from zstate.cli.roster import Roster
 from zstate.cli.words import followed
 from zstate.errors import LookupFailed
@@ -128,12 +128,12 @@ def tf_command(
             if as_json:
                 _show_json(transform, awaited.age_s(transform), speed)
             else:
-                say(transform_text(transform, precision))
+                print_result(transform_text(transform, precision))
                 if twist:
-                    say(twist_text(speed, precision))
+                    print_result(twist_text(speed, precision))
 
         if not as_json:
-            say(f"pose of {source} in {target}")
+            print_result(f"pose of {source} in {target}")
         if ends:
             show(awaited.answer(at, timeout_s=timeout))
         else:
@@ -154,7 +154,7 @@ def _follow(awaited: AwaitedPose, rate_hz: float, show: Any) -> None:
             shown, news_at, silent = transform, time.monotonic(), False
         elif not silent and transform.stamp is not None and time.monotonic() - news_at > _SILENCE_S:
             silent = True
-            note(awaited.silence())
+            print_status(awaited.silence())
 
 
 def _speed(listener: TransformListener, transform: Transform) -> Twist | None:
@@ -178,7 +178,7 @@ def _show_json(transform: Transform, age_s: float | None, speed: Twist | None) -
     facts = {**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s}
     if speed is not None:
         facts |= {"linear": speed.linear.tolist(), "angular": speed.angular.tolist()}
-    say_json(facts)
+    print_json(facts)
 
 
 def transform_text(transform: Transform, precision: int = 3) -> str:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import output_width, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli.output.console import output_width, print_json, print_result
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -44,11 +44,11 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
         frames = collect_frames(session, robot) if is_native else collect_ros_frames(session, robot, wire)
         now = time.time_ns()
     if form == "json":
-        say_json([_facts(frame, now) for frame in frames])
+        print_json([_facts(frame, now) for frame in frames])
     elif frames:
         title = "Frames" if robot == "*" else f"Frames of {robot}"
         named = [_named(frame, words_of(wire)) for frame in frames]
-        say(_drawn(named, now, form, in_full=not is_native, title=title))
+        print_result(_drawn(named, now, form, in_full=not is_native, title=title))
 
 
 def _named(frame: FrameInfo, words: Words) -> FrameInfo:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, timeout_option, wire_option
+from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 from zstate.errors import Unreachable, ZStateError
 
 _GRACE_S = 0.5
@@ -52,7 +52,7 @@ def wait_command(
     if as_json:
         _tell(what, names, began, None)
     else:
-        say(told)
+        print_result(told)
 
 
 def _check_count(what: str, names: tuple[str, ...]) -> None:
@@ -64,7 +64,9 @@ def _check_count(what: str, names: tuple[str, ...]) -> None:
 
 def _tell(what: str, names: tuple[str, ...], began: float, reason: str | None) -> None:
     waited_s = round(time.monotonic() - began, 3)
-    say_json({"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason})
+    print_json(
+        {"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason}
+    )
 
 
 def _await_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
@@ -121,6 +123,6 @@ def _await_router(network: Network, names: tuple[str, ...], wire: str, timeout_s
     except Unreachable:
         raise
     except TimeoutError:
-        note(f"waiting: nobody answers at {where} yet", event="waiting")
+        print_status(f"waiting: nobody answers at {where} yet", event="waiting")
         worker.result()
     return f"ready: the router at {where}"

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from zstate.buffer.frames import FrameInfo
-from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
 from zstate.cli.doctor.ear import Ear
 from zstate.cli.doctor.samples import Ranges
+from zstate.cli.output.console import count_text
 from zstate.cli.target_frames import near_frames, without_advice
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing

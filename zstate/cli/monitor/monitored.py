@@ -8,11 +8,19 @@ from typing import Any, NoReturn
 
 from zstate.buffer.frames import FrameInfo
 from zstate.cli.awaited_pose import AwaitedPose
-from zstate.cli.console import fail, note, output_width, say, say_json, terminal_width
 from zstate.cli.monitor.meter import PathMeter
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
+from zstate.cli.output.console import (
+    fail,
+    keep_showing,
+    output_width,
+    print_json,
+    print_result,
+    print_status,
+    terminal_width,
+)
 from zstate.cli.roster import Roster
 from zstate.errors import duration_text
 from zstate.listener import TransformListener
@@ -43,14 +51,12 @@ class Monitored(ABC):
     def say(self, *, as_json: bool) -> None:
         """One report."""
         if as_json:
-            say_json(self._facts())
+            print_json(self._facts())
         else:
-            say(f"{self._text(output_width())}\n")
+            print_result(f"{self._text(output_width())}\n")
 
     def show(self) -> NoReturn:
         """A report that keeps up to date."""
-        from zstate.cli.live_text import keep_showing  # with rich, which few need
-
         keep_showing(lambda: self._text(terminal_width()))
 
     def _row(self, frame: str, edge: FrameInfo) -> Row:
@@ -73,7 +79,7 @@ class MonitoredEdges(Monitored):
                 fail(f"gave up after {timeout_s:g} s: {reason}")
             if passed_s > _GRACE_S and reason != said:
                 said = reason
-                note(f"waiting: {reason}")
+                print_status(f"waiting: {reason}")
             time.sleep(_LOOK_EVERY_S)
 
     def _reason(self) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import groupby
 
-from zstate.cli.console import count_text
 from zstate.cli.monitor.report import NO_NUMBERS, Cells, Row, measured_cells, table_text
+from zstate.cli.output.console import count_text
 
 
 def overview_text(rows: Sequence[Row], *, width: int | None = None) -> str:

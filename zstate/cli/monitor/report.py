@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from zstate.cli.console import rate_text
 from zstate.cli.monitor.meter import Measure, PathMeter
+from zstate.cli.output.console import rate_text
 from zstate.cli.output.text_layout import Table
 from zstate.errors import duration_text
 

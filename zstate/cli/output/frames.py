@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import count_text, fail, note, rate_text, sample_age_text
+from zstate.cli.output.console import count_text, fail, print_status, rate_text, sample_age_text
 from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, tree_lines
 from zstate.cli.roster import Roster, announced_robots
 from zstate.cli.words import words_of
@@ -58,7 +58,7 @@ def collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
     with TransformListener(session, robot) as listener:
         robots = discovery.result()
         if not robots:
-            note(words_of("native").announced(()))
+            print_status(words_of("native").announced(()))
             return ()
         _wait(
             listener,
@@ -68,14 +68,14 @@ def collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
             ),
         )
         for text in _missing(listener, robots):
-            note(text)
+            print_status(text)
         moving = {robot.name for robot in robots if "joint_states" in _streams(robot)}
         _wait(
             listener, _SAMPLES_WITHIN_S, lambda frames, _: all(_has_rate(frame, moving) for frame in frames)
         )
         frames = listener.buffer.frames()
     if not frames:
-        note(_NO_FRAMES)
+        print_status(_NO_FRAMES)
     return frames
 
 
@@ -157,7 +157,7 @@ def collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameIn
         frames = listener.buffer.frames()
         for node in sorted(without_samples(frames, 1)):
             topic = roster.words.place(robot, ("tf",))
-            note(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
+            print_status(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
         return frames
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from zstate.cli.console import count_text
+from zstate.cli.output.console import count_text
 from zstate.cli.output.text_layout import in_columns
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from zstate.cli.console import rate_text
+from zstate.cli.output.console import rate_text
 from zstate.cli.output.text_layout import Table, first_fitting
 from zstate.cli.sampling import Sampler, Source
 from zstate.errors import duration_text
