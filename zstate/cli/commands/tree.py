@@ -52,7 +52,7 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
 
 
 def _named(frame: FrameInfo, words: Words) -> FrameInfo:
-    """The same with the names by which its wire calls frames."""
+    """The frame with the names that its wire format uses."""
     parent = None if frame.parent is None else words.explained(frame.parent)
     return replace(frame, name=words.explained(frame.name), parent=parent)
 

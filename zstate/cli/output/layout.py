@@ -8,8 +8,9 @@ begins at (0, 0).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from itertools import combinations, pairwise
 from math import sqrt
 from statistics import fmean as mean
@@ -46,11 +47,11 @@ def layered_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
     Edges that close a cycle are reversed, each node is placed right of its predecessors, the order within
     layers is changed to reduce crossings, and nodes then move up and down towards their neighbours.
     """
-    forward = _break_cycles(list(sizes), edges)
-    ranks = _ranks(list(sizes), list(forward.values()))
+    order, forward = _break_cycles(sizes, edges)
+    ranks = _ranks(order, forward.values())
     layers: list[list[str]] = [[] for _ in range(max(ranks.values(), default=-1) + 1)]
-    for node, rank in ranks.items():
-        layers[rank].append(node)
+    for node in sizes:
+        layers[ranks[node]].append(node)
     # A long edge has a placeholder without size in each layer that it passes.
     chains: list[list[str]] = []
     for number, (begin, end) in enumerate(forward.values()):
@@ -86,34 +87,26 @@ def layered_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
     return Layout(places, routes)
 
 
-def _break_cycles(nodes: Sequence[str], edges: Sequence[Pair]) -> dict[Pair, Pair]:
-    """Each edge, reversed if it closes a cycle."""
-    after = _successors(edges)
-    done: set[str] = set()
-    open_now: set[str] = set()
-    reversed_edges: set[Pair] = set()
-    entered = {end for _, end in edges}
-    for root in sorted(nodes, key=lambda node: node in entered):
-        stack = [(root, iter(after.get(root, ())))] if root not in done else []
-        open_now |= {root} - done
-        while stack:
-            node, rest = stack[-1]
-            for other in rest:
-                if other in open_now:
-                    reversed_edges.add((node, other))
-                elif other not in done:
-                    open_now.add(other)
-                    stack.append((other, iter(after.get(other, ()))))
-                    break
-            else:
-                stack.pop()
-                open_now.discard(node)
-                done.add(node)
-    return {edge: _reversed(edge) if edge in reversed_edges else edge for edge in edges}
+def _break_cycles(nodes: Iterable[str], edges: Sequence[Pair]) -> tuple[list[str], dict[Pair, Pair]]:
+    """The nodes in the order of the data, and the direction of each edge in it.
 
-
-def _reversed(edge: Pair) -> Pair:
-    return edge[1], edge[0]
+    Of each cycle the edge that is last in ``edges`` is reversed.
+    """
+    kept = list(edges)
+    while True:
+        predecessors: dict[str, list[str]] = {node: [] for node in nodes}
+        for begin, end in kept:
+            predecessors[end].append(begin)
+        try:
+            order = list(TopologicalSorter(predecessors).static_order())
+        except CycleError as error:
+            cycle: list[str] = error.args[1]
+            kept.remove(max(pairwise(cycle), key=kept.index))
+        else:
+            position = {node: number for number, node in enumerate(order)}
+            return order, {
+                one: one if position[one[0]] < position[one[1]] else _reversed(one) for one in edges
+            }
 
 
 def _successors(edges: Iterable[Pair]) -> dict[str, list[str]]:
@@ -123,21 +116,18 @@ def _successors(edges: Iterable[Pair]) -> dict[str, list[str]]:
     return after
 
 
-def _ranks(nodes: Sequence[str], edges: Sequence[Pair]) -> dict[str, int]:
+def _reversed(edge: Pair) -> Pair:
+    return edge[1], edge[0]
+
+
+def _ranks(order: Iterable[str], edges: Collection[Pair]) -> dict[str, int]:
     """The layer of each node: right of all its predecessors, and close to its successors."""
-    ranks = dict.fromkeys(nodes, 0)
-    for _ in nodes:
-        changed = False
-        for begin, end in edges:
-            if ranks[end] <= ranks[begin]:
-                ranks[end] = ranks[begin] + 1
-                changed = True
-        if not changed:
-            break
-    entered = {end for _, end in edges}
-    for node, after in _successors(edges).items():
-        if node not in entered:
-            ranks[node] = min(ranks[end] for end in after) - 1
+    before, after = _successors(map(_reversed, edges)), _successors(edges)
+    ranks: dict[str, int] = {}
+    for node in order:
+        ranks[node] = max((ranks[other] + 1 for other in before.get(node, ())), default=0)
+    for node in after.keys() - before.keys():
+        ranks[node] = min(ranks[end] for end in after[node]) - 1
     return ranks
 
 
