@@ -23,7 +23,6 @@ FLOORS = (
     {"transform", "twist"},
     {"model", "buffer", "wire"},
     {"ingest"},
-    {"ingest"},
     {"net", "record"},
     {"sources"},
     {"nodes", "recorder", "recording"},

@@ -10,17 +10,18 @@ from looking import RRBOT, Spawn, failure, standing, started, zstate
 from support import until
 
 from zstate import StaticPublisher, TransformListener, connect, discover
-from zstate.cli.graph.graph import Graph, StreamUse, graph_text
-from zstate.cli.graph.picture import dot, mermaid, svg
+from zstate.cli.output.drawing import dot, mermaid, svg
+from zstate.cli.output.graph_text import graph_drawing, graph_text
+from zstate.net.graph import Graph, StreamUse
 
 DRIVER, PUBLISH, VIEWER = "driver@jetson pid 4", "zstate-publish@nuc pid 5", "viewer@desk pid 6"
 
 GRAPH = Graph(
     (
-        StreamUse("arm", "joint_states", 500.0, (DRIVER,), (PUBLISH,)),
-        StreamUse("arm", "robot_description", None, (PUBLISH,), (VIEWER,)),
-        StreamUse("arm", "tf_static", None, (PUBLISH,), (VIEWER,)),
-        StreamUse("base", "joint_states", None, (), (VIEWER,)),
+        StreamUse("arm", "joint_states", (DRIVER,), (PUBLISH,), 500.0),
+        StreamUse("arm", "robot_description", (PUBLISH,), (VIEWER,)),
+        StreamUse("arm", "tf_static", (PUBLISH,), (VIEWER,)),
+        StreamUse("base", "joint_states", (), (VIEWER,)),
     )
 )
 
@@ -40,14 +41,14 @@ def test_streams_with_the_same_ends_stand_together():
 
 
 def test_pictures_have_a_node_for_each_program_and_bundle_and_an_edge_for_each_use():
-    root = ElementTree.fromstring(svg(GRAPH, title="A & B"))
+    root = ElementTree.fromstring(svg(graph_drawing(GRAPH), "A & B"))
     name = "{http://www.w3.org/2000/svg}"
     texts = [element.text for element in root.iter(f"{name}text")]
     assert {"A & B", "driver", "jetson pid 4", "joint_states (500.0 Hz)", "tf_static"} <= set(texts)
     assert len(list(root.iter(f"{name}rect"))) == 1 + 3 + 3  # paper, bundles, programs
     assert len(list(root.iter(f"{name}path"))) == 2 * 5  # each with its arrow's head
-    assert sum(" -> " in line for line in dot(GRAPH).splitlines()) == 5
-    assert sum(" --> " in line for line in mermaid(GRAPH).splitlines()) == 5
+    assert sum(" -> " in line for line in dot(graph_drawing(GRAPH)).splitlines()) == 5
+    assert sum(" --> " in line for line in mermaid(graph_drawing(GRAPH)).splitlines()) == 5
 
 
 @pytest.mark.processes

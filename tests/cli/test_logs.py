@@ -126,12 +126,12 @@ LIVE = """
     import logging
     from rich.live import Live
     from rich.text import Text
-    from zstate.cli.console import note
+    from zstate.cli.output.console import print_status
     from zstate.cli.logs import warn_on_standard_error
     warn_on_standard_error()
     with Live(Text("live"), auto_refresh=False) as live:
         live.update(Text("12 messages"), refresh=True)
-        note("recording panda")
+        print_status("recording panda")
         logging.getLogger("zstate").warning("a gap")
         live.update(Text("13 messages"), refresh=True)
 """

@@ -9,7 +9,7 @@ from looking import EVERYTHING, Spawn, failure, interrupted, standing, started, 
 from support import until
 
 from zstate import StaticPublisher, connect
-from zstate.cli.robot_list import robots_text
+from zstate.cli.output.robot_table import robots_text
 from zstate.net.presence import RobotInfo
 from zstate.net.topic_statistics import TopicStatistics
 from zstate.net.wires import wire_named

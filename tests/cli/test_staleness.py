@@ -12,9 +12,8 @@ from zstate.cli.doctor.samples import StreamSamples
 from zstate.cli.metered_buffer import MeteredBuffer
 from zstate.cli.monitor.meter import EdgeStatistics
 from zstate.cli.monitor.report import Row, report_text
-from zstate.cli.pictures.frames import svg
-from zstate.cli.pictures.svg import ALARM
-from zstate.cli.robot_list import robots_text
+from zstate.cli.output.drawing import ALARM, svg
+from zstate.cli.output.robot_table import robots_text
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
 from zstate.net.presence import RobotInfo

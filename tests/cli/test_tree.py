@@ -68,7 +68,7 @@ def test_dot_and_mermaid_have_an_edge_for_each_frame_but_the_root():
     assert '  "rrbot/world" -> "rrbot/base" [label="static"];' in dot
     assert sum("->" in line for line in dot) == 6
     assert mermaid[0] == "graph TD"
-    assert '  f0["rrbot/world"]' in mermaid
+    assert '  n0["rrbot/world"]' in mermaid
     assert sum("-->" in line for line in mermaid) == 6
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from zstate.buffer.frames import FrameInfo
-from zstate.cli.tree_text import tree_text
+from zstate.cli.output.frames import tree_text
 
 NOW = 5_000_000_000
 WRITER = "driver@jetson pid 412"

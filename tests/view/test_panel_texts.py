@@ -8,7 +8,7 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from zstate.view.graph_watch import StreamUse, WriterState
+from zstate.net.graph import Graph, StreamUse, WriterState
 from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.graph_panel import graph_html
@@ -75,24 +75,24 @@ def status(level: Level, text: str = "") -> Status:
 
 
 def test_a_publisher_is_told_of_with_its_rate_and_its_own_words():
-    text = plain(graph_html([WriterState("r1", status("warn", "3 ticks late"), 0.5)], ()))
+    text = plain(graph_html([WriterState("r1", status("warn", "3 ticks late"), 0.5)], Graph()))
     assert "r1 at 99.9 Hz" in text
     assert "driver pid 42: 3 ticks late" in text
 
 
 def test_what_a_publisher_said_long_ago_does_not_hold_any_more():
-    made = graph_html([WriterState("r1", status("ok"), 12.0)], ())
+    made = graph_html([WriterState("r1", status("ok"), 12.0)], Graph())
     assert "has said nothing for 12.0 s" in plain(made)
     assert html.ALARM in made
 
 
 def test_streams_with_the_same_ends_stand_together_and_what_nobody_writes_stands_out():
-    uses = [
+    uses = (
         StreamUse("r1", "joint_states", ("a",), ("b", "c")),
         StreamUse("r1", "tf", ("a",), ("b", "c")),
         StreamUse("r2", "tf", (), ("b",)),
-    ]
-    made = graph_html((), uses)
+    )
+    made = graph_html((), Graph(uses))
     assert "r1: joint_states, tf" in plain(made)
     assert re.search(r"written by\s+nobody", plain(made))
     assert made.count(html.ALARM) == 1

@@ -8,8 +8,15 @@ from collections.abc import Sequence
 from math import degrees
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.console import count_text, duration_or_dash, is_terminal, rate_text, say, terminal_width
 from zstate.cli.metered_buffer import MeteredBuffer
+from zstate.cli.output.console import (
+    count_text,
+    duration_or_dash,
+    is_terminal,
+    print_result,
+    rate_text,
+    terminal_width,
+)
 from zstate.clock import wait_in_slices
 from zstate.errors import LookupFailed, duration_text
 from zstate.nodes.listener import TransformListener
@@ -54,7 +61,7 @@ class DemoTable:
         until = float("inf") if seconds is None else time.monotonic() + seconds
         if not is_terminal():
             while not _is_over(ended, until, 1.0):
-                say(self.line())
+                print_result(self.line())
             return
         with Live(self.table(), auto_refresh=False) as live:
             while not _is_over(ended, until, _REFRESH_S):

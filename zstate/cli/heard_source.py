@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zstate.cli.console import note
+from zstate.cli.output.console import print_status
 from zstate.cli.words import words_of
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
@@ -54,7 +54,7 @@ class HeardSource(SubscribedSource):
         assert reading.stamp is not None
         if not self.count:
             self._first = reading.stamp
-            note(f"heard {self._place}: {len(reading.positions)} positions")
+            print_status(f"heard {self._place}: {len(reading.positions)} positions")
         self._last = reading.stamp
         self.count += 1
         self._further.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)

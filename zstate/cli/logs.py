@@ -101,9 +101,9 @@ def as_json(text: str, *, level: str = "info", event: str = "note", **facts: obj
 def _as_wide_as_seen(text: str) -> str:
     if not _standard_error().isatty():
         return text
-    from zstate.cli.layout import fitted
+    from zstate.cli.output.text_layout import wrap
 
-    return fitted(text, shutil.get_terminal_size().columns)
+    return wrap(text, shutil.get_terminal_size().columns)
 
 
 def _write_line(line: str) -> None:

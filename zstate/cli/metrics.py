@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import note
+from zstate.cli.output.console import print_status
 
 if TYPE_CHECKING:
     from zstate.bridge import Bridge
@@ -28,7 +28,7 @@ def served(address: Address | None, *collectors: Callable[[], Collector]) -> Gen
     from zstate.metrics.endpoint import MetricsEndpoint
 
     with MetricsEndpoint([make() for make in collectors], *address) as endpoint:
-        note(f"metrics at {endpoint.url}", event="metrics")
+        print_status(f"metrics at {endpoint.url}", event="metrics")
         yield
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from threading import Event
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import note
 from zstate.cli.documents import Document, DocumentWriter
+from zstate.cli.output.console import print_status
 from zstate.clock import wait_in_slices
 from zstate.closing import Closing
 from zstate.errors import MessageError
@@ -50,7 +50,7 @@ class Named(Closing):
         try:
             (description,) = self._wire.decode("robot_description", arrival, self._robot)
         except MessageError as error:
-            note(f"{arrival.key}: {error}")
+            print_status(f"{arrival.key}: {error}")
             return
         assert isinstance(description, RobotDescription)
         self._writer.describe(description)
@@ -64,7 +64,7 @@ class Named(Closing):
         if not self._writer.knows(tapped.sample) and not self._warned:
             self._warned = True
             why = "is of another model" if self._described.is_set() else "is missing"
-            note(
+            print_status(
                 f"the description of {self._robot!r} {why}, so its joints have no names here; "
                 f"`zstate publish {self._robot}` publishes it"
             )

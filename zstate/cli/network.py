@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail
 from zstate.cli.logs import warn_on_standard_error
+from zstate.cli.output.console import fail
 from zstate.cli.words import is_ros
 from zstate.errors import Unreachable
 

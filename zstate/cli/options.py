@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from zstate.cli.console import GRACE_S, note
 from zstate.cli.network import Network
+from zstate.cli.output.console import GRACE_S, print_status
 from zstate.errors import InvalidInput, NoClock
 
 if TYPE_CHECKING:
@@ -442,7 +442,7 @@ def open_clock(
         try:
             clock.wait(GRACE_S if timeout_s is None else min(timeout_s, GRACE_S))
         except NoClock:
-            note(f"waiting for the simulated time on {clock.key} ...")
+            print_status(f"waiting for the simulated time on {clock.key} ...")
             clock.wait(timeout_s)
-            note(f"heard {clock.key}: it is {stamp_text(clock.now())}")
+            print_status(f"heard {clock.key}: it is {stamp_text(clock.now())}")
         yield clock

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zstate.cli.console import report_text, say_fitted
+from zstate.cli.output.console import print_wrapped, report_text
 from zstate.cli.processes import BackgroundCall
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources.source import JointSource
@@ -18,6 +18,6 @@ def run(publisher: StatePublisher, source: JointSource, rate_hz: float, seconds:
         report = worker.result()
     except SystemExit:
         publisher.close()
-        say_fitted(report_text(worker.result(1.0)))
+        print_wrapped(report_text(worker.result(1.0)))
         raise
-    say_fitted(report_text(report))
+    print_wrapped(report_text(report))

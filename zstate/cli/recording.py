@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import count_text
+from zstate.cli.output.console import count_text
 from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import count_text
+from zstate.cli.output.console import count_text
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:

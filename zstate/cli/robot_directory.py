@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import fail
+from zstate.cli.output.console import fail
 from zstate.cli.words import is_ros, words_of
 from zstate.closing import Closing
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from zstate._util.bounded_dict import BoundedDict
-from zstate.cli.console import duration_or_dash, note, rate_text, say_fitted, say_json
 from zstate.cli.metered_buffer import MeteredBuffer
+from zstate.cli.output.console import duration_or_dash, print_json, print_status, print_wrapped, rate_text
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed, is_ros
 from zstate.closing import Closing
@@ -68,7 +68,7 @@ class RobotMonitor(Closing):
                 self._follow(info.name, self._roster.streams(info.name))
         reason = "" if self._robots else self._reason()
         if reason and reason != self._reported:
-            note(f"waiting: {reason}", event="waiting", robot=self._robot)
+            print_status(f"waiting: {reason}", event="waiting", robot=self._robot)
         self._reported = reason
         return reason
 
@@ -77,7 +77,9 @@ class RobotMonitor(Closing):
         if follow in streams:
             listener, buffer = self._listeners.get(follow) or self._listen(follow)
             self._robots[robot] = MonitoredRobot(robot, listener, buffer)
-            note(f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot)
+            print_status(
+                f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot
+            )
 
     def _listen(self, follow: Follow) -> tuple[TransformListener, MeteredBuffer]:
         from zstate.cli.metered_buffer import MeteredBuffer
@@ -110,10 +112,10 @@ class RobotMonitor(Closing):
         for one in self.robots():
             measure, stats = one.buffer.measure(one.robot), one.stats
             if as_json:
-                say_json({"robot": one.robot, **asdict(measure), **asdict(stats)})
+                print_json({"robot": one.robot, **asdict(measure), **asdict(stats)})
                 continue
             is_stale = one.buffer.statistics_of(one.robot).is_stale()
-            say_fitted(
+            print_wrapped(
                 f"{one.robot}  {'silent' if is_stale else rate_text(measure.rate_hz)}  "
                 f"age {_time_text(measure.age_s)}  latency {_time_text(measure.latency_s)}  "
                 f"received {stats.received}  dropped {stats.dropped}  missed {stats.missed}  "

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.console import fail, note
+from zstate.cli.output.console import fail, print_status
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.waiting import ConditionWaiter
 from zstate.clock import LONGEST_WAIT_S
@@ -71,7 +71,7 @@ class StreamReader(Closing):
         except MessageError as error:
             if error.reason not in self._refused:
                 self._refused.add(error.reason)
-                note(f"{arrival.key}: {error}; further ones are passed over in silence")
+                print_status(f"{arrival.key}: {error}; further ones are passed over in silence")
             return ()
 
     def next(self, timeout_s: float) -> TimedSample | None:
@@ -87,7 +87,7 @@ class StreamReader(Closing):
         if not waiter.wait_for(self._samples.qsize, timeout_s, self._reason):
             fail(f"gave up after {timeout_s:g} s: {self._reason()}")
         if waiter.noted:
-            note(f"heard {self._directory.words.place(self.robot, (self._stream,))}")
+            print_status(f"heard {self._directory.words.place(self.robot, (self._stream,))}")
         return self._samples.get_nowait()
 
     def silence(self) -> str:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.options import load_robot
+from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.processes import BackgroundCall
 from zstate.cli.waiting import ConditionWaiter
 from zstate.model.catalog import is_path
@@ -91,7 +91,7 @@ def chosen_sliders(session: Session, named: Sequence[Named], wire: str) -> Itera
             chosen, model = _local(one.robot)
         sliders = Sliders(session, model, chosen.robot, wires=(wire,))
         if sliders.refusal:
-            note(f"{chosen.robot!r} is not moved: {sliders.refusal}", robot=chosen.robot)
+            print_status(f"{chosen.robot!r} is not moved: {sliders.refusal}", robot=chosen.robot)
         yield chosen, sliders
 
 
@@ -117,11 +117,11 @@ def running(view: View) -> Generator[BackgroundCall[None]]:
 
 def show_address(page: Page) -> None:
     """Say what to open, and how that is reached from elsewhere."""
-    say(f"the view is at {page.url}")
+    print_result(f"the view is at {page.url}")
     if not is_loopback(page.host):
-        note("whoever has this address may look, and move what has sliders; it travels in the clear")
+        print_status("whoever has this address may look, and move what has sliders; it travels in the clear")
     elif os.environ.get("SSH_CONNECTION"):
-        note(f"from your own machine: ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}")
+        print_status(f"from your own machine: ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}")
 
 
 def take_snapshot(
@@ -150,7 +150,7 @@ def take_snapshot(
     take_picture(page, path, width=width, height=height, hold=view.hold)
     sights = view.sights()
     seen = ", ".join(one.robot for one in sights if one.is_seen) or "no robot"
-    say(f"wrote {path}: {seen}, {width} x {height} pixels")
+    print_result(f"wrote {path}: {seen}, {width} x {height} pixels")
     _note_what_is_missing(view, sights)
 
 
@@ -159,11 +159,11 @@ def _note_what_is_missing(view: View, sights: Sequence[Sight]) -> None:
     for one in sights:
         if one.reason:
             part = "in the picture in part" if one.is_seen else "not in the picture"
-            note(f"{one.robot!r} is {part}: {one.reason}", robot=one.robot)
+            print_status(f"{one.robot!r} is {part}: {one.reason}", robot=one.robot)
     roots = sorted({one.root for one in sights if one.is_seen})
     if len(roots) > 1:
         joined = f"zstate static {roots[0]} {roots[1]} --xyz 1 0 0"
-        note(
+        print_status(
             f"the frames are in {len(roots)} trees ({_first_few(roots)}), drawn beside each other: their "
             f"relative place is not known; join them, for instance with: {joined}"
         )
@@ -171,8 +171,8 @@ def _note_what_is_missing(view: View, sights: Sequence[Sight]) -> None:
     if missing:
         count = count_text(len(missing), "file")
         named = _first_few([f"{uri} ({why})" for uri, why in missing.items()])
-        note(f"{count} of the robots cannot be drawn: {named}")
-        note(
+        print_status(f"{count} of the robots cannot be drawn: {named}")
+        print_status(
             "packages are found below ROS_PACKAGE_PATH and in share/ of AMENT_PREFIX_PATH; a URDF file that "
             "is named, as in `zstate view arm.urdf`, is drawn with the files around it"
         )

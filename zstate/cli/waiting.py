@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, NoReturn
 
-from zstate.cli.console import GRACE_S, fail, note
+from zstate.cli.output.console import GRACE_S, fail, print_status
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import is_ros
 from zstate.clock import wait_in_slices
@@ -94,7 +94,7 @@ class ConditionWaiter:
                 note_at = now + GRACE_S
                 if (text := reason()) != self.noted:
                     self.noted = text
-                    note(f"waiting: {text}", event="waiting")
+                    print_status(f"waiting: {text}", event="waiting")
             wake_at = min((one for one in (deadline, note_at) if one is not None), default=None)
             self.wait(None if wake_at is None else wake_at - now)
         return True
@@ -276,7 +276,7 @@ class PoseWaiter:
         key = (type(reason), reason.edge, getattr(reason, "name", ""), hint)
         if key != self._noted:
             self._noted = key
-            note(f"waiting: {self._reason_text(reason, hint)}")
+            print_status(f"waiting: {self._reason_text(reason, hint)}")
 
     def _note_end(self) -> None:
         """Note that the robots are received, if a wait for them was noted."""
@@ -285,7 +285,7 @@ class PoseWaiter:
         self._noted = None
         frames = self._listener.buffer.frames()
         for robot in self._listener.robots():
-            note(self._words.heard(robot, frames))
+            print_status(self._words.heard(robot, frames))
 
     def _fail_in_past(self, reason: InPast) -> NoReturn:
         advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED

@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.console import count_text
+from zstate.cli.output.console import count_text
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo

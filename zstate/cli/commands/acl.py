@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import click
 
-from zstate.cli.console import say
 from zstate.cli.options import Command
+from zstate.cli.output.console import print_result
 
 
 def _named(option: str, what: str) -> Callable[[Command], Command]:
@@ -69,4 +69,4 @@ def acl_command(
             "name somebody: --robot NAME, --viewer NAME, --operator NAME, --timekeeper NAME or --placer NAME"
         )
     fleet = Fleet(robot, viewer, operator, timekeeper, namespace, wires, placer)
-    say(access_text(fleet).rstrip("\n"))
+    print_result(access_text(fleet).rstrip("\n"))

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, note, say_fitted
 from zstate.cli.metrics import of_bridge, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import metrics_option, session_options
+from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.errors import Unreachable
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ def bridge_command(
             served(metrics, of_bridge(bridge)),
         ):
             named = " and ".join(map(repr, robots)) if robots else "every robot"
-            say_fitted(f"bridging {named} between native and {wire} at {ros}")
-            note("a robot is carried as soon as its robot_description is heard")
+            print_wrapped(f"bridging {named} between native and {wire} at {ros}")
+            print_status("a robot is carried as soon as its robot_description is heard")
             wait_in_slices(threading.Event())
 
 
@@ -101,4 +101,4 @@ def _ros_session(endpoint: str) -> Session:
 
 
 def _tell(robot: str, way: Way | None) -> None:
-    say_fitted(f"{robot!r} is carried no more" if way is None else f"carrying {robot!r}: {way}")
+    print_wrapped(f"{robot!r} is carried no more" if way is None else f"carrying {robot!r}: {way}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from zstate.cli.console import note, say_fitted
+from zstate.cli.output.console import print_status, print_wrapped
 
 _ROUTER = "router"
 
@@ -57,8 +57,8 @@ def certs_command(
         raise click.UsageError(f"--host is for those that listen: --server NAME, or --identity {_ROUTER}")
     issued = issue_identities(folder, names, hosts=hosts, servers=may_listen, days=days)
     for name, files in issued.items():
-        say_fitted(f"{name}: {files.certificate} and {files.key}, for {days} days")
-    note(
+        print_wrapped(f"{name}: {files.certificate} and {files.key}, for {days} days")
+    print_status(
         f"These are for tests: whoever has {authority.key} can be anybody. In production keep it off every "
         "robot and router, or better, let your own authority sign (common name = identity, for TLS servers "
         f"and clients). A machine needs {authority.certificate}, its own .pem and its own .key, and new ones "

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, is_terminal, say_fitted, say_json, terminal_width
-from zstate.cli.layout import Guides, chain_lines, in_columns, narrowed, tree_lines
 from zstate.cli.options import json_option, xacro_arguments
+from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped
+from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, in_columns, tree_lines
 from zstate.errors import Found, ModelError
 
 if TYPE_CHECKING:
@@ -57,109 +57,86 @@ def check_command(
             raise
         findings = error.findings
     if as_json:
-        say_json(_facts(name, model, findings))
+        print_json(_facts(name, model, findings))
     else:
-        say_fitted(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
+        print_wrapped(_report(name, model, findings, fix_hints=fix_hints, joint_table=joint_table))
     raise SystemExit(0 if model else 1)
 
 
 def _report(
     name: str, model: RobotModel | None, findings: Sequence[Found], *, fix_hints: bool, joint_table: bool
 ) -> str:
-    lines = [_headline(name, model, findings)]
-    rows = in_columns([_finding_row(finding) for finding in findings])
+    if model is None:
+        errors = sum(finding.severity == "error" for finding in findings)
+        lines = [f"{name} cannot be used ({count_text(errors, 'error')})"]
+    else:
+        lines = [
+            f"{name}: robot {model.name!r}, {count_text(len(model.links), 'link')}, "
+            f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
+        ]
+    places = ("file" if finding.line is None else f"line {finding.line}" for finding in findings)
+    rows = in_columns(
+        [(place, one.severity, one.message) for place, one in zip(places, findings, strict=True)]
+    )
     for row, finding in zip(rows, findings, strict=True):
         lines += [f"  {row}"]
         if fix_hints and finding.fix:
             lines += [f"      fix: {finding.fix}"]
     if model is not None:
         lines += _joint_lines(model) if joint_table else _link_lines(model)
-    elif not fix_hints and any(finding.fix for finding in findings):
-        lines += (
-            [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
-            if name != _STDIN
-            else []
-        )
+    elif not fix_hints and name != _STDIN and any(finding.fix for finding in findings):
+        lines += [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
     return "\n".join(lines)
 
 
-def _headline(name: str, model: RobotModel | None, findings: Sequence[Found]) -> str:
-    if model is None:
-        errors = sum(finding.severity == "error" for finding in findings)
-        return f"{name} cannot be used ({count_text(errors, 'error')})"
-    return (
-        f"{name}: robot {model.name!r}, {count_text(len(model.links), 'link')}, "
-        f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
-    )
-
-
-def _finding_row(finding: Found) -> tuple[str, str, str]:
-    where = "file" if finding.line is None else f"line {finding.line}"
-    return where, finding.severity, finding.message
-
-
-def _joint_lines(model: RobotModel) -> list[str]:
-    dispensable = ("axis", "effort", "velocity", "parent", "type")
-    return narrowed(_joint_rows(model), _width(), [_JOINT_HEADINGS.index(column) for column in dispensable])
-
-
 def _link_lines(model: RobotModel) -> list[str]:
-    lines, width = in_columns(_link_rows(model, tree_lines)), _width()
-    if width is None or max(map(len, lines)) <= width:
-        return lines
-    of_joint, of_type = 1, 2
-    return narrowed(_link_rows(model, chain_lines), width, (of_type, of_joint))
-
-
-def _width() -> int | None:
-    return terminal_width() if is_terminal() else None
-
-
-def _link_rows(model: RobotModel, guides: Guides) -> list[tuple[str, str, str, str]]:
+    """The tree of links, each with the joint that leads to it."""
     joints = {joint.child: joint for joint in model.joints}
     children: dict[str, list[str]] = {}
     for joint in model.joints:
         children.setdefault(joint.parent, []).append(joint.child)
-    return [(guide + link, *_joint_cells(joints.get(link))) for guide, link in guides(model.root, children)]
+
+    def rows(guides: Guides) -> list[tuple[str, ...]]:
+        (_, root), *links = guides(model.root, children)
+        found: list[tuple[str, ...]] = [(root, "", "", "")]
+        for guide, link in links:
+            joint = joints[link]
+            found.append((guide + link, joint.name, joint.type, _mimic_text(joint) or _limits_text(joint)))
+        return found
+
+    headings = ("link", "joint", "type", "range")
+    tables = (
+        Table(headings, rows(tree_lines), headed=False),
+        Table(headings, rows(chain_lines), optional=("type", "joint"), headed=False),
+    )
+    return first_fitting(tables, output_width())
 
 
-def _joint_rows(model: RobotModel) -> list[tuple[str, ...]]:
-    """Each joint with its place among the positions; those that do not move of their own have none."""
-    places = _places(model)
+def _joint_lines(model: RobotModel) -> list[str]:
+    """Each joint with its indices in the positions, "3" or "0..6"; "-" if it is not driven."""
+    from zstate.model.robot import POSITION_COUNTS
+
+    by_name = {joint.name: joint for joint in model.joints}
+    indices: dict[str, str] = {}
+    first = 0
+    for name in model.joint_names:
+        last = first + POSITION_COUNTS[by_name[name].type] - 1
+        indices[name] = f"{first}" if first == last else f"{first}..{last}"
+        first = last + 1
     rows = [
         (
-            *(joint.name, joint.type, joint.parent, joint.child, places.get(joint.name, "-")),
+            *(joint.name, joint.type, joint.parent, joint.child, indices.get(joint.name, "-")),
             _mimic_text(joint) or _limits_text(joint) or "-",
-            *(f"{limit:g}" if math.isfinite(limit) else "-" for limit in _greatest(joint)),
+            *(
+                f"{limit:g}" if joint.type != "fixed" and math.isfinite(limit) else "-"
+                for limit in (joint.limits.velocity, joint.limits.effort)
+            ),
             " ".join(f"{part:g}" for part in joint.axis) if joint.type not in _WITHOUT_AXIS else "-",
         )
         for joint in model.joints
     ]
-    return [_JOINT_HEADINGS, *rows]
-
-
-def _places(model: RobotModel) -> dict[str, str]:
-    """Which of the positions are a joint's own: "3", or "0..6"."""
-    from zstate.model.robot import POSITION_COUNTS
-
-    counts = {joint.name: POSITION_COUNTS[joint.type] for joint in model.joints}
-    places: dict[str, str] = {}
-    first = 0
-    for name in model.joint_names:
-        last = first + counts[name] - 1
-        places[name] = f"{first}" if first == last else f"{first}..{last}"
-        first = last + 1
-    return places
-
-
-def _greatest(joint: Joint) -> tuple[float, float]:
-    return (joint.limits.velocity, joint.limits.effort) if joint.type != "fixed" else (math.inf, math.inf)
-
-
-def _joint_cells(joint: Joint | None) -> tuple[str, str, str]:
-    if joint is None:
-        return "", "", ""
-    return joint.name, joint.type, _mimic_text(joint) or _limits_text(joint)
+    optional = ("axis", "effort", "velocity", "parent", "type")
+    return Table(_JOINT_HEADINGS, rows, optional).lines(output_width())
 
 
 def _mimic_text(joint: Joint) -> str:
@@ -181,13 +158,8 @@ def _facts(name: str, model: RobotModel | None, findings: Sequence[Found]) -> di
         "source": name,
         "usable": model is not None,
         "findings": [
-            {
-                "line": finding.line,
-                "severity": finding.severity,
-                "message": finding.message,
-                "fix": finding.fix,
-            }
-            for finding in findings
+            {"line": one.line, "severity": one.severity, "message": one.message, "fix": one.fix}
+            for one in findings
         ],
     }
     if model is not None:
@@ -197,22 +169,17 @@ def _facts(name: str, model: RobotModel | None, findings: Sequence[Found]) -> di
 
 
 def _joint_facts(joint: Joint) -> dict[str, Any]:
-    limits = joint.limits
     facts: dict[str, Any] = {
         "name": joint.name,
         "type": joint.type,
         "parent": joint.parent,
         "child": joint.child,
         "line": joint.line,
-        "lower": _finite(limits.lower),
-        "upper": _finite(limits.upper),
+        # JSON has no infinity; a missing limit is null.
+        "lower": joint.limits.lower if math.isfinite(joint.limits.lower) else None,
+        "upper": joint.limits.upper if math.isfinite(joint.limits.upper) else None,
     }
     if joint.mimic is not None:
         mimic = joint.mimic
         facts["mimic"] = {"joint": mimic.joint, "multiplier": mimic.multiplier, "offset": mimic.offset}
     return facts
-
-
-def _finite(limit: float) -> float | None:
-    """JSON has no infinity; a limit that is not stated is null."""
-    return limit if math.isfinite(limit) else None

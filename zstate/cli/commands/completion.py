@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from zstate.cli.console import say
+from zstate.cli.output.console import print_result
 
 # What click's functions lack. In zsh, who has not asked for completion yet has no compdef; in fish, all of
 # a help after its first comma would be lost.
@@ -34,4 +34,4 @@ def completion_command(shell: str) -> None:
     kind = get_completion_class(shell)
     assert kind is not None
     source = kind(group, {}, "zstate", COMPLETION_VARIABLE).source().strip("\n")
-    say(source.replace(*_MENDED[shell]) if shell in _MENDED else source)
+    print_result(source.replace(*_MENDED[shell]) if shell in _MENDED else source)

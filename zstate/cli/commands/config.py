@@ -6,9 +6,9 @@ from dataclasses import asdict
 
 import click
 
-from zstate.cli.console import note, say, say_fitted, say_json
-from zstate.cli.layout import in_columns
 from zstate.cli.options import json_option, plain_session_options, reading_clock_option, wire_option
+from zstate.cli.output.console import print_json, print_result, print_status, print_wrapped
+from zstate.cli.output.text_layout import in_columns
 
 
 @click.command("config")
@@ -38,12 +38,14 @@ def config_command(context: click.Context, /, *, as_zenoh: bool, as_json: bool, 
     wrong = problems(context)
     if as_zenoh:
         told = zenoh_settings(context)
-        say_json(told) if as_json else say("\n".join(in_columns([(k, str(v)) for k, v in told.items()])))
+        print_json(told) if as_json else print_result(
+            "\n".join(in_columns([(k, str(v)) for k, v in told.items()]))
+        )
     elif as_json:
-        say_json({"settings": [asdict(one) for one in settings(context)], "problems": wrong})
+        print_json({"settings": [asdict(one) for one in settings(context)], "problems": wrong})
     else:
         rows = [(one.name, one.text, one.origin) for one in settings(context)]
-        say_fitted("\n".join(in_columns([("setting", "value", "from"), *rows])))
+        print_wrapped("\n".join(in_columns([("setting", "value", "from"), *rows])))
     for text in wrong:
-        note(f"zstate: {text}", event="problem")
+        print_status(f"zstate: {text}", event="problem")
     raise SystemExit(1 if wrong else 0)

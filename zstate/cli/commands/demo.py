@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import load_robot, rate_option, seconds_option, xacro_arguments
+from zstate.cli.output.console import count_text, fail, print_status, print_wrapped
 from zstate.errors import UnknownModel
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def demo_command(
         "publisher", [*arguments, "--connect", endpoint], on_end=lambda _: ended.set()
     ) as publisher:
         size = f"{count_text(len(model.joint_names), 'joint')}, {count_text(len(model.links), 'link')}"
-        say_fitted(
+        print_wrapped(
             f"{called} ({size}): process {publisher.pid} publishes it at {rate:g} Hz, this one looks it up"
         )
         _look(endpoint, model, called, ended, seconds)
@@ -79,7 +79,7 @@ def _default_robot() -> str:
 
     robot = example_name()
     if robot != _DEFAULT:
-        note(f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {robot!r}")
+        print_status(f"{_DEFAULT!r} is not installed (pip install 'zstate[robots]'), so this shows {robot!r}")
     return robot
 
 
@@ -114,15 +114,15 @@ def _look(
         open_session(Network(listen=(endpoint,))) as session,
         TransformListener(session, robot, buffer, history_on_join=False) as listener,
     ):
-        note(f"waiting for {robot!r} ...")
+        print_status(f"waiting for {robot!r} ...")
         if not _has_begun(buffer, ended):
             return
-        note(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
+        print_status(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
         table = DemoTable(listener, buffer, robot, model.root, telling_links(model))
         try:
             table.show(ended, seconds)
         finally:
-            say_fitted(table.summary())
+            print_wrapped(table.summary())
 
 
 def _has_begun(buffer: MeteredBuffer, ended: threading.Event) -> bool:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import say, say_json
 from zstate.cli.network import Network
 from zstate.cli.options import json_option, session_options, timeout_option, wire_option
+from zstate.cli.output.console import print_json, print_result
 
 if TYPE_CHECKING:
     from zstate.cli.doctor.check import Check
@@ -54,10 +54,10 @@ def doctor_command(
     found = diagnosis(network, robot, wire, timeout)
     if as_json:
         checks += found
-        say_json(facts(checks))
+        print_json(facts(checks))
     else:
         checks += _said(found, in_full=in_full or robot != ANY)
-        say(verdict_text(checks))
+        print_result(verdict_text(checks))
     raise SystemExit(1 if first_broken(checks) else 0)
 
 
@@ -69,12 +69,12 @@ def _said(found: Iterable[Check], *, in_full: bool) -> list[Check]:
     for robot, checks in groupby(found, key=lambda check: check.robot):
         if robot is None:
             for check in checks:
-                say(check_text(check))
+                print_result(check_text(check))
                 said.append(check)
         else:
             of_robot = list(checks)
             for line in robot_lines(robot, of_robot, in_full=in_full):
-                say(line)
+                print_result(line)
             said += of_robot
     return said
 

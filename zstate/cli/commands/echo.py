@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from zstate.cli.console import say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import named_robot, refuse_topic, session_options, timeout_option, wire_option
+from zstate.cli.output.console import print_json, print_result
 
 if TYPE_CHECKING:
     from zstate.cli.document_text import Changes
@@ -104,12 +104,12 @@ def _printer(form: str | None, field: str | None, changes: Changes | None) -> Ca
         if changes is not None and not changes.note(value):
             return
         if form == "json":
-            say_json(_with_nulls(value))
+            print_json(_with_nulls(value))
         elif form == "csv":
-            say("\n".join(table.lines(value, field or "")))
+            print_result("\n".join(table.lines(value, field or "")))
         elif field is not None and not isinstance(value, dict):
-            say(yaml_text(value))
+            print_result(yaml_text(value))
         else:
-            say(f"{yaml_text(value)}\n---")
+            print_result(f"{yaml_text(value)}\n---")
 
     return show

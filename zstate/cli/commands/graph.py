@@ -8,13 +8,19 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.console import fail, note, say, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli.output.console import fail, print_json, print_result, print_status, print_wrapped
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.cli.graph.graph import Graph
+    from zstate.net.graph import Graph
+    from zstate.net.session import Session
+    from zstate.wire.keys import Stream
+    from zstate.wire.writer import Writer
+
+_MEASURED_WITHIN_S = 0.4
+_READERS_WITHIN_S = 0.15
 
 
 @click.command("graph")
@@ -35,19 +41,63 @@ def graph_command(network: Network, robot: str, form: str | None, wire: str) -> 
     zstate graph --json | jq '.streams[] | select(.writers == [])'
     zstate graph --wire ros2
     """
-    from zstate.cli.graph.heard import native_graph, ros_graph
+    from zstate.cli.output.graph_text import graph_facts
 
     with open_session(network, (wire,)) as session:
-        graph = ros_graph(session, wire) if is_ros(wire) else native_graph(session)
+        graph = _ros_graph(session, wire) if is_ros(wire) else _measured_graph(session)
     if robot != "*" and not is_ros(wire):
         graph = _of_robot(graph, robot)
     if form == "json":
-        say_json(graph.facts())
+        print_json(graph_facts(graph))
     elif graph.streams:
         title = "Who writes and reads what" if robot == "*" else f"Who writes and reads what of {robot}"
-        say_fitted(_drawn(graph, form, title)) if form is None else say(_drawn(graph, form, title))
+        _print(graph, form, title)
     else:
-        note(words_of(wire).announced(()))
+        print_status(words_of(wire).announced(()))
+
+
+def _measured_graph(session: Session) -> Graph:
+    """The graph of the native wire, with the rates of the streams that move."""
+    from zstate.net.graph import graph_of
+    from zstate.net.presence import discover, discover_readers
+    from zstate.net.topic_statistics import FEW, TopicStatistics, WriterKey
+    from zstate.net.wires import wire_named
+    from zstate.wire.keys import ANY
+
+    with TopicStatistics(session, wire_named("native"), window=FEW) as statistics:
+        statistics.subscribe("joint_states")
+        robots = discover(session)
+        readers = discover_readers(session, _READERS_WITHIN_S)
+        # Transforms are published only while they are read: measuring must not make a publisher start.
+        read = {one.robot for one in readers if one.stream == "tf"}
+        moving: set[tuple[str, Stream]] = {(robot.name, "joint_states") for robot in robots}
+        for robot in robots:
+            if read & {robot.name, ANY}:
+                statistics.subscribe("tf", robot.name)
+                moving.add((robot.name, "tf"))
+        expected = [
+            WriterKey(robot.name, stream, writer.session)
+            for robot in robots
+            for stream, writer in robot.writers
+            if (robot.name, stream) in moving
+        ]
+        statistics.wait(expected, _MEASURED_WITHIN_S)
+
+        def rate_of(robot: str, stream: Stream, writer: Writer) -> float | None:
+            source = statistics.get(WriterKey(robot, stream, writer.session))
+            return None if source is None else source.published_hz()
+
+        return graph_of(robots, readers, rate_of)
+
+
+def _ros_graph(session: Session, wire: str) -> Graph:
+    from zstate.net.graph import discover_ros_graph
+    from zstate.net.wires import wire_named
+    from zstate.wire.ros2.wire import Ros2Wire
+
+    wire_format = wire_named(wire)
+    assert isinstance(wire_format, Ros2Wire)
+    return discover_ros_graph(session, wire_format).graph
 
 
 def _of_robot(graph: Graph, robot: str) -> Graph:
@@ -58,12 +108,12 @@ def _of_robot(graph: Graph, robot: str) -> Graph:
     return replace(graph, streams=streams)
 
 
-def _drawn(graph: Graph, form: str | None, title: str) -> str:
-    from zstate.cli.graph.graph import graph_text
-    from zstate.cli.graph.picture import dot, mermaid, svg
+def _print(graph: Graph, form: str | None, title: str) -> None:
+    from zstate.cli.output.graph_text import graph_drawing, graph_text
 
-    if form == "svg":
-        return svg(graph, title=title)
-    if form is not None:
-        return dot(graph) if form == "dot" else mermaid(graph)
-    return graph_text(graph)
+    if form is None:
+        print_wrapped(graph_text(graph))
+        return
+    from zstate.cli.output.drawing import draw
+
+    print_result(draw(graph_drawing(graph), form, title))

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.console import fail, note, say_fitted, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     json_option,
@@ -18,6 +17,7 @@ from zstate.cli.options import (
     timeout_option,
     wire_option,
 )
+from zstate.cli.output.console import fail, print_json, print_status, print_wrapped
 from zstate.cli.words import is_ros
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _follow(tap: StreamReader, statistics: MessageStatistics, *, as_json: bool) 
         if count and facts is not None:
             _show(facts, as_json=as_json)
         elif not count and not silent:
-            note(tap.silence())
+            print_status(tap.silence())
         silent = not count
 
 
@@ -151,11 +151,11 @@ def _listen(tap: StreamReader, statistics: MessageStatistics, seconds: float) ->
 
 def _show(facts: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
-        say_json(facts)
+        print_json(facts)
         return
-    say_fitted(f"average rate: {facts['rate_hz']:.3f}")
+    print_wrapped(f"average rate: {facts['rate_hz']:.3f}")
     missed = f" missed: {facts['missed']}" if facts["missed"] else ""
-    say_fitted(
+    print_wrapped(
         f"\tmin: {facts['min_s']:.3f}s max: {facts['max_s']:.3f}s "
         f"std dev: {facts['std_dev_s']:.5f}s window: {facts['window']}{missed}"
     )

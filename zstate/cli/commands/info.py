@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import count_text, is_terminal, rate_text, say_fitted, say_json, terminal_width
-from zstate.cli.layout import in_columns, narrowed
 from zstate.cli.options import json_option
+from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped, rate_text
+from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
     from zstate.cli.recording_facts import RecordedRobot
-    from zstate.record.channel import Channel
     from zstate.record.info import RecordingInfo
 
+_HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
 
 
@@ -36,10 +36,10 @@ def info_command(file: str, as_json: bool) -> None:
     info = describe(file)
     robots = recorded_robots(info)
     if as_json:
-        say_json(_facts(info, robots))
+        print_json(_facts(info, robots))
         return
     lines = [*_head(info), *(line for robot in robots for line in ("", *_robot_lines(robot)))]
-    say_fitted("\n".join([*lines, *_other_lines(info)]))
+    print_wrapped("\n".join([*lines, *_other_lines(info)]))
 
 
 def _head(info: RecordingInfo) -> Iterator[str]:
@@ -62,7 +62,7 @@ def _head(info: RecordingInfo) -> Iterator[str]:
 
 
 def _recoverable(info: RecordingInfo) -> list[str]:
-    """The files that ``zstate recover`` mends."""
+    """The files that ``zstate recover`` can make complete."""
     from zstate.record.reader import RecordReader
 
     with RecordReader(info.path) as reader:
@@ -76,29 +76,24 @@ def _time_text(stamp: int) -> str:
 
 
 def _robot_lines(robot: RecordedRobot) -> list[str]:
+    model, described = robot.model, robot.fault or "no model"
+    if model is not None:
+        size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joints), 'joint')}"
+        described = f"model {model.name!r}, {size} ({len(model.joint_names)} driven)"
     rows = [
-        ("  " + said.stream, said.topic, said.type, str(said.count), rate_text(said.rate_hz), said.writer)
-        for said in robot.streams
+        ("  " + one.stream, one.topic, one.type, str(one.count), rate_text(one.rate_hz), one.writer)
+        for one in robot.streams
     ]
-    width, of_topic, of_type = terminal_width() if is_terminal() else None, 1, 2
-    return [f"{robot.name}: {_model_text(robot)}", *narrowed(rows, width, (of_type, of_topic))]
-
-
-def _model_text(robot: RecordedRobot) -> str:
-    model = robot.model
-    if model is None:
-        return robot.fault or "no model"
-    size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joints), 'joint')}"
-    return f"model {model.name!r}, {size} ({len(model.joint_names)} driven)"
+    table = Table(_HEADINGS, rows, optional=("type", "topic"), headed=False)
+    return [f"{robot.name}: {described}", *table.lines(output_width())]
 
 
 def _other_lines(info: RecordingInfo) -> list[str]:
     from zstate.cli.recording_facts import mean_rate, other_channels
 
     rows = [
-        ("  " + channel.topic, channel.type_name, str(channel.count), rate)
-        for channel in other_channels(info)
-        for rate in [rate_text(mean_rate(channel, info.duration_s))]
+        ("  " + one.topic, one.type_name, str(one.count), rate_text(mean_rate(one, info.duration_s)))
+        for one in other_channels(info)
     ]
     rows += [
         ("  " + one.topic, f"{one.encoding}: not read here", str(one.count), "-") for one in info.skipped
@@ -124,14 +119,8 @@ def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, An
         "duration_s": info.duration_s,
         "messages": info.message_count,
         "robots": [robot.facts() for robot in robots],
-        "others": [_channel_facts(channel) for channel in (*other_channels(info), *info.skipped)],
-    }
-
-
-def _channel_facts(channel: Channel) -> dict[str, Any]:
-    return {
-        "topic": channel.topic,
-        "type": channel.type_name,
-        "encoding": channel.encoding,
-        "count": channel.count,
+        "others": [
+            {"topic": one.topic, "type": one.type_name, "encoding": one.encoding, "count": one.count}
+            for one in (*other_channels(info), *info.skipped)
+        ],
     }

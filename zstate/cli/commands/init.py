@@ -8,8 +8,8 @@ from pathlib import Path
 
 import click
 
-from zstate.cli.console import fail, note, say
 from zstate.cli.options import load_robot, name_option, xacro_arguments
+from zstate.cli.output.console import fail, print_result, print_status
 
 
 @click.command("init")
@@ -40,7 +40,7 @@ def init_command(
     source = os.path.relpath(robot, file.parent) if is_path(robot) else robot
     text = example_text(shlex.quote(file.name), source, called, model, xacro_args)
     if output == "-":
-        say(text.rstrip("\n"))
+        print_result(text.rstrip("\n"))
         return
     try:
         with file.open("w" if force else "x", encoding="utf-8") as written:
@@ -49,4 +49,4 @@ def init_command(
         fail(f"{str(file)!r} exists; --force replaces it, -o FILE writes another")
     except OSError as error:
         fail(f"{str(file)!r} cannot be written: {error.strerror}")
-    note(f"wrote {file}; start it with `zstate up {shlex.quote(str(file))}`")
+    print_status(f"wrote {file}; start it with `zstate up {shlex.quote(str(file))}`")

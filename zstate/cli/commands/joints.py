@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, say_fitted
 from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
@@ -22,6 +21,7 @@ from zstate.cli.options import (
     wire_option,
     xacro_arguments,
 )
+from zstate.cli.output.console import count_text, print_wrapped
 from zstate.cli.words import words_of
 
 if TYPE_CHECKING:
@@ -77,5 +77,5 @@ def joints_command(
     ):
         joints = count_text(len(model.joint_names), "joint")
         place = words_of(wire).place(called, ("joint_states",))
-        say_fitted(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
+        print_wrapped(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
         run(publisher, SineSource(model), rate, seconds)

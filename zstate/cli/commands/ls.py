@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
-from zstate.cli.console import is_terminal, note, say, say_fitted, say_json, terminal_width
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, wire_option
+from zstate.cli.output.console import (
+    is_terminal,
+    keep_showing,
+    output_width,
+    print_json,
+    print_result,
+    print_status,
+    print_wrapped,
+)
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
-    from zstate.net.topic_statistics import TopicStatistics
+
+T = TypeVar("T")
 
 _MEASURED_WITHIN_S = 0.3
-_AGAIN_S = 0.5
+_AGAIN_S, _JSON_PERIOD_S = 0.5, 1.0
 # Meeting everybody takes less.
 _MEETING_S = 0.5
 
@@ -51,84 +60,80 @@ def ls_command(network: Network, *, watch: bool, as_json: bool, wire: str) -> No
 
 
 def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.ros_graph import RosGraph, heard_graph
-    from zstate.cli.ros_graph_text import graph_facts, graph_text, namespaces_hint, nobody_text
+    from zstate.cli.output.graph_text import (
+        empty_ros_graph_text,
+        namespaces_hint,
+        ros_graph_facts,
+        ros_graph_text,
+    )
+    from zstate.net.graph import RosGraph, discover_ros_graph
     from zstate.net.wires import wire_named
     from zstate.wire.ros2.wire import Ros2Wire
 
-    spoken = wire_named(wire)
-    assert isinstance(spoken, Ros2Wire)
+    wire_format = wire_named(wire)
+    assert isinstance(wire_format, Ros2Wire)
+
+    def discover() -> RosGraph:
+        return discover_ros_graph(session, wire_format)
 
     def text(graph: RosGraph) -> str:
-        return graph_text(graph, spoken) if graph.nodes or graph.topics else nobody_text(spoken)
+        is_empty = not graph.nodes and not graph.topics
+        return empty_ros_graph_text(wire_format) if is_empty else ros_graph_text(graph, wire_format)
 
-    if watch and as_json:
-        _repeat_json(lambda: graph_facts(heard_graph(session, spoken), spoken))
     if watch:
-        _show(lambda: text(heard_graph(session, spoken)), lambda: heard_graph(session, spoken))
-    graph = heard_graph(session, spoken)
+        _watch(discover, text, lambda graph: ros_graph_facts(graph, wire_format), as_json=as_json)
+    graph = discover()
     if as_json:
-        say_json(graph_facts(graph, spoken))
+        print_json(ros_graph_facts(graph, wire_format))
     elif graph.nodes or graph.topics:
-        say_fitted(text(graph))
-        hint = namespaces_hint(graph, spoken)
+        print_wrapped(text(graph))
+        hint = namespaces_hint(graph, wire_format)
         if hint:
-            note(hint)
+            print_status(hint)
     else:
-        note(text(graph))
+        print_status(text(graph))
 
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.robot_list import robots_facts, robots_text, sources
+    from zstate.cli.output.robot_table import robots_facts, robots_text, sources
+    from zstate.cli.robot_directory import RobotDirectory
     from zstate.net.presence import discover
     from zstate.net.topic_statistics import FEW, TopicStatistics
     from zstate.net.wires import wire_named
 
+    def text(robots: tuple[RobotInfo, ...]) -> str:
+        if not robots:
+            return words_of("native").announced(robots)
+        return robots_text(robots, statistics, width=output_width())
+
     with TopicStatistics(session, wire_named("native"), window=FEW) as statistics:
         statistics.subscribe("joint_states")
         if watch:
-            _watch_robots(session, statistics, as_json=as_json)
+            with RobotDirectory(session) as roster:
+                time.sleep(_MEETING_S)
+                _watch(roster.robots, text, lambda robots: robots_facts(robots, statistics), as_json=as_json)
         robots = discover(session)
         statistics.wait(sources(robots), _MEASURED_WITHIN_S)
         if as_json:
-            say_json(robots_facts(robots, statistics))
+            print_json(robots_facts(robots, statistics))
         elif robots:
-            say_fitted(robots_text(robots, statistics, width=terminal_width() if is_terminal() else None))
+            print_wrapped(text(robots))
         else:
-            note(words_of("native").announced(robots))
+            print_status(text(robots))
 
 
-def _watch_robots(session: Session, statistics: TopicStatistics, *, as_json: bool) -> NoReturn:
-    from zstate.cli.robot_directory import RobotDirectory
-    from zstate.cli.robot_list import robots_facts, robots_text
-
-    def text(robots: tuple[RobotInfo, ...], width: int | None) -> str:
-        return robots_text(robots, statistics, width=width) if robots else roster.words.announced(robots)
-
-    with RobotDirectory(session) as roster:
-        time.sleep(_MEETING_S)
-        if as_json:
-            _repeat_json(lambda: robots_facts(roster.robots(), statistics))
-        width = terminal_width if is_terminal() else lambda: None
-        _show(lambda: text(roster.robots(), width()), roster.robots)
-
-
-def _repeat_json(facts: Callable[[], Any]) -> NoReturn:
-    while True:
-        say_json(facts())
-        time.sleep(1.0)
-
-
-def _show(text: Callable[[], str], state: Callable[[], object]) -> NoReturn:
-    """Keep ``text`` on the screen up to date; in a pipe say it whenever ``state`` is another one."""
-    if is_terminal():
-        from zstate.cli.live_text import keep_showing
-
-        keep_showing(text)
-    said: object = None
+def _watch(
+    state: Callable[[], T], text: Callable[[T], str], facts: Callable[[T], Any], *, as_json: bool
+) -> NoReturn:
+    """Show ``state`` until Ctrl-C: refresh a terminal, print changes to a pipe, JSON every second."""
+    if is_terminal() and not as_json:
+        keep_showing(lambda: text(state()))
+    shown: T | None = None
     while True:
         now = state()
-        if now != said:
-            say(f"{text()}\n")
-        said = now
-        time.sleep(_AGAIN_S)
+        if as_json:
+            print_json(facts(now))
+        elif now != shown:
+            print_result(f"{text(now)}\n")
+        shown = now
+        time.sleep(_JSON_PERIOD_S if as_json else _AGAIN_S)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, is_terminal
 from zstate.cli.metrics import of_listeners, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
@@ -22,6 +21,7 @@ from zstate.cli.options import (
     timeout_option,
     wire_option,
 )
+from zstate.cli.output.console import fail, is_terminal
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, wire_option
+from zstate.cli.output.console import count_text, fail, print_wrapped
 from zstate.cli.robot_directory import only_robot
 from zstate.cli.words import words_of
 
@@ -123,4 +123,4 @@ def _draw(curves: Curves, name: str, frames: tuple[str, str] | None, output: Pat
         draw_joints(curves, f"{name}: joint positions", path)
     what = "the path" if frames else count_text(len(curves.names), "curve")
     lasted = curves.seconds[-1]
-    say_fitted(f"wrote {path}: {what}, {count_text(len(curves.stamps), 'sample')} in {lasted:.1f} s")
+    print_wrapped(f"wrote {path}: {what}, {count_text(len(curves.stamps), 'sample')} in {lasted:.1f} s")

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say_fitted
 from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
@@ -24,6 +23,7 @@ from zstate.cli.options import (
     wires_option,
     xacro_arguments,
 )
+from zstate.cli.output.console import count_text, fail, print_status, print_wrapped
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -139,18 +139,20 @@ def publish_command(
 def _introduce(publisher: StatePublisher, places: list[str]) -> None:
     model = publisher.model
     size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
-    say_fitted(f"publishing {publisher.robot!r} ({size}) on {' and on '.join(places)}")
+    print_wrapped(f"publishing {publisher.robot!r} ({size}) on {' and on '.join(places)}")
     _mention_warnings(model)
 
 
 def _mention_router(network: Network, wires: tuple[str, ...]) -> None:
     if not network.is_given and len(set(map(is_ros, wires))) == 2:
-        note("ROS 2 nodes are met at their router: say --connect, for instance tcp/127.0.0.1:7447")
+        print_status("ROS 2 nodes are met at their router: say --connect, for instance tcp/127.0.0.1:7447")
 
 
 def _mention_warnings(model: RobotModel) -> None:
     if model.findings:
-        note(f"{count_text(len(model.findings), 'warning')} about the model; `zstate check` shows them")
+        print_status(
+            f"{count_text(len(model.findings), 'warning')} about the model; `zstate check` shows them"
+        )
 
 
 def _follow(  # noqa: PLR0917 - one use, in the order of what happens
@@ -166,7 +168,7 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
 
     words, robot = words_of(wire), derived.robot
     place = words.place(robot, ("joint_states",))
-    note(f"waiting for {place} ...")
+    print_status(f"waiting for {place} ...")
     with HeardSource(session, derived.model, robot, wire, further=whole) as source:
         if rate_hz is not None:
             run(derived, source, rate_hz, seconds)
@@ -196,4 +198,4 @@ def _publish_every_sample(publisher: StatePublisher, source: HeardSource, second
             publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
     finally:
         if source.count:
-            say_fitted(f"{count_text(source.count, 'sample')} published, {source.rate_hz:.2f} Hz")
+            print_wrapped(f"{count_text(source.count, 'sample')} published, {source.rate_hz:.2f} Hz")

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, is_terminal, note, say_fitted
 from zstate.cli.metrics import of_recorder, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
+from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def record_command(
 
     if not file.endswith(".mcap"):
         file = f"{file}.mcap"
-        note(f"recording into {file!r}")
+        print_status(f"recording into {file!r}")
     with open_session(network, (wire,)) as session:
         try:
             recorder = Recorder(
@@ -111,7 +111,7 @@ def _run(recorder: Recorder, roster: RobotDirectory, robots: tuple[str, ...], du
     finally:
         recorder.close()
         recorder.wait(_INDEX_WITHIN_S)  # on a busy machine, the index of a large file takes its time
-        say_fitted(progress.summary())
+        print_wrapped(progress.summary())
     if recorder.failure is not None:
         raise recorder.failure
     if not recorder.stats.messages:
@@ -124,8 +124,8 @@ def _show(recorder: Recorder, progress: Progress, duration: float | None) -> Non
     if not is_terminal():
         while not _is_over(recorder, until, _LINE_S):
             for news in progress.news():
-                note(news)
-            say_fitted(progress.line())
+                print_status(news)
+            print_wrapped(progress.line())
         return
     from rich.live import Live
     from rich.text import Text

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, say_fitted
+from zstate.cli.output.console import count_text, fail, print_wrapped
 
 if TYPE_CHECKING:
     from zstate.record.recover import RecoverReport
@@ -32,7 +32,7 @@ def recover_command(file: str, target: str | None, overwrite: bool) -> None:
         report = recover(source, named, overwrite=overwrite)
     except RecordingError as error:
         fail(str(error).replace("overwrite=True", "--overwrite"))
-    say_fitted("\n".join(_lines(report)))
+    print_wrapped("\n".join(_lines(report)))
 
 
 def _lines(report: RecoverReport) -> list[str]:

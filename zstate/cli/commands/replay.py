@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, is_terminal, note, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
+from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def replay_command(
         live = live_writers(session, replayer.robots, wires)
         if live and not takeover:
             fail(f"there is {'; '.join(live)} on the network already; end that first, or use --takeover")
-        say_fitted(introduction(replayer, file))
+        print_wrapped(introduction(replayer, file))
         _run(replayer)
 
 
@@ -110,9 +110,9 @@ def _run(replayer: Replayer) -> None:
         report = _show(replayer, worker)
     except SystemExit:
         replayer.close()
-        say_fitted(report_text(replayer.report()))
+        print_wrapped(report_text(replayer.report()))
         raise
-    say_fitted(report_text(report))
+    print_wrapped(report_text(report))
     if not report.samples:
         fail("no sample was published; `zstate info` shows what the file holds")
 
@@ -123,7 +123,7 @@ def _show(replayer: Replayer, worker: BackgroundCall[ReplayReport]) -> ReplayRep
 
     if not is_terminal():
         while (report := _result(worker, _LINE_S)) is None:
-            note(progress_line(replayer))
+            print_status(progress_line(replayer))
         return report
     from rich.live import Live
     from rich.text import Text

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say, say_json
 from zstate.cli.options import json_option
+from zstate.cli.output.console import count_text, fail, print_json, print_result, print_status
 
 
 @click.command("robots")
@@ -23,7 +23,7 @@ def robots_command(name: str, *, as_json: bool) -> None:
     zstate robots ur
     zstate robots --json
     """
-    from zstate.cli.layout import in_columns
+    from zstate.cli.output.text_layout import in_columns
     from zstate.model.catalog import catalog
 
     everything = catalog()
@@ -31,10 +31,10 @@ def robots_command(name: str, *, as_json: bool) -> None:
     if not entries and not as_json:
         fail(f"no robot known by name contains {name!r}; `zstate robots` lists all {len(everything)}")
     if as_json:
-        say_json([{"name": one.name, "path": str(one.path), "origin": one.origin} for one in entries])
+        print_json([{"name": one.name, "path": str(one.path), "origin": one.origin} for one in entries])
         return
     for line in in_columns([(entry.name, entry.origin) for entry in entries]):
-        say(line)
-    note(f"{count_text(len(entries), 'robot')}; a path to a URDF or xacro file works as well")
+        print_result(line)
+    print_status(f"{count_text(len(entries), 'robot')}; a path to a URDF or xacro file works as well")
     if not any(entry.origin == "example-robot-data" for entry in everything):
-        note("for many more: pip install 'zstate[robots]'")
+        print_status("for many more: pip install 'zstate[robots]'")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, note, say
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import session_options
+from zstate.cli.output.console import count_text, print_result, print_status
 
 if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
@@ -84,7 +84,7 @@ def ros1_command(
             _look_after(bridge)
         finally:
             gone, come = bridge.carried
-            say(f"{count_text(gone, 'sample')} to ROS, {come} from there{_refused_text(bridge)}")
+            print_result(f"{count_text(gone, 'sample')} to ROS, {come} from there{_refused_text(bridge)}")
 
 
 def _model(source: str | None, *, from_ros: bool) -> RobotModel | None:
@@ -98,7 +98,7 @@ def _model(source: str | None, *, from_ros: bool) -> RobotModel | None:
 def _introduce(node: Node, robot: str, *, to_ros: bool, from_ros: bool) -> None:
     arrow = f"{'<' * from_ros}-{'>' * to_ros}"
     topics = f"{{{node.resolved('joint_states')},/tf,/tf_static}}"
-    say(f"bridging {robot!r}: zstate {arrow} ROS 1 {topics} at {node.master.uri} as {node.name}")
+    print_result(f"bridging {robot!r}: zstate {arrow} ROS 1 {topics} at {node.master.uri} as {node.name}")
 
 
 def _look_after(bridge: Ros1Bridge) -> None:
@@ -111,7 +111,7 @@ def _look_after(bridge: Ros1Bridge) -> None:
         bridge.check()
         reason = bridge.waits_for()
         if reason != said:
-            note(f"waiting for {reason} ..." if reason else f"heard joint_states of {bridge.robot!r}")
+            print_status(f"waiting for {reason} ..." if reason else f"heard joint_states of {bridge.robot!r}")
             said = reason
 
 

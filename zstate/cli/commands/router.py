@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, note, say, say_fitted
 from zstate.cli.metrics import of_connections, of_writers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import config_option, metrics_option, router_identity_options
+from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def router_command(
     thinning = _thinning(downsample, robot, wan, namespace)
     router = _router(listen, connect, credentials, acl, thinning, ros2=ros2)
     if only_print:
-        say(router.text(masked=True).rstrip("\n"))
+        print_result(router.text(masked=True).rstrip("\n"))
     if output is not None:
         _write_private(output, router.text())
     if not only_print and output is None:
@@ -173,8 +173,8 @@ def _run(network: Network, listen: tuple[str, ...], metrics: Address | None, fil
         RobotDirectory(session) as roster,
         served(metrics, of_connections(session), of_writers(roster)),
     ):
-        say_fitted(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
+        print_wrapped(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
         if listen == (default := listening("router", (), network.credentials)):
             opened = default[0].replace("127.0.0.1", "0.0.0.0")
-            note(f"it serves this host alone; --listen {opened} opens it to the network")
+            print_status(f"it serves this host alone; --listen {opened} opens it to the network")
         wait_in_slices(threading.Event())

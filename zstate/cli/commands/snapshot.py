@@ -10,7 +10,6 @@ import click
 from click.core import ParameterSource
 
 from zstate.cli import logs
-from zstate.cli.console import count_text, fail, note, say
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
@@ -21,6 +20,7 @@ from zstate.cli.options import (
     wire_option,
     wires_option,
 )
+from zstate.cli.output.console import count_text, fail, print_result, print_status
 
 if TYPE_CHECKING:
     from zstate.cli.snapshot.snapshot import Configuration
@@ -68,14 +68,14 @@ def save_command(
         snapshot = taken(session, network, robots, wire, timeout)
     text = json_text(snapshot) if path.suffix == ".json" else toml_text(snapshot)
     if file == "-":
-        say(text.rstrip("\n"))
+        print_result(text.rstrip("\n"))
         return
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         fail(f"{file!r} cannot be written: {error.strerror}")
     size = f"{count_text(len(snapshot.robot), 'robot')}, {count_text(len(snapshot.static), 'static edge')}"
-    note(f"wrote {file} ({size}); `zstate snapshot load {shlex.quote(file)}` says it again")
+    print_status(f"wrote {file} ({size}); `zstate snapshot load {shlex.quote(file)}` says it again")
 
 
 @snapshot_command.command("load")
@@ -142,10 +142,10 @@ def _joining(
     is_wire_said = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
     if as_saved:
         if not saved.is_plain:
-            note(f"as saved on {saved.host!r}: {saved.options()}")
+            print_status(f"as saved on {saved.host!r}: {saved.options()}")
         return saved.network(network), wires if is_wire_said else (saved.wire,)
     if not (saved.is_plain or network.is_given or is_wire_said):
-        note(f"it was saved on {saved.host!r} with {saved.options()}; --as-saved does the same here")
+        print_status(f"it was saved on {saved.host!r} with {saved.options()}; --as-saved does the same here")
     return network, wires
 
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import fail, note, say_fitted
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import session_options, takeover_option, wire_option
+from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -112,12 +112,12 @@ def static_command(
             )
             for edge in owned:
                 publisher.set(edge)
-                say_fitted(_sentence(edge, publisher, wires))
+                print_wrapped(_sentence(edge, publisher, wires))
             if "native" in wires and not new:
                 published.append((publisher, owned))
         for publisher, owned in published:
             for text in unknown_target_warnings(session, publisher, owned):
-                note(f"warning: {text}", event="warning", robot=publisher.robot)
+                print_status(f"warning: {text}", event="warning", robot=publisher.robot)
         wait_in_slices(threading.Event())
 
 
@@ -175,7 +175,7 @@ def _robot_of_wire(wire: str) -> str:
 def _only_robot(session: Session) -> str:
     from zstate.net.presence import discover
 
-    note("looking for the robot this belongs to ...")
+    print_status("looking for the robot this belongs to ...")
     robots = discover(session)
     if len(robots) != 1:
         fail(f"whose edge is this? Say --robot NAME ({words_of('native').announced(robots)})")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
@@ -21,6 +20,7 @@ from zstate.cli.options import (
     timeout_option,
     wire_option,
 )
+from zstate.cli.output.console import print_json, print_result, print_status
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.words import followed
 from zstate.errors import LookupFailed
@@ -127,12 +127,12 @@ def tf_command(
             if as_json:
                 _show_json(transform, waiter.age_s(transform), velocity)
             else:
-                say(transform_text(transform, precision))
+                print_result(transform_text(transform, precision))
                 if twist:
-                    say(twist_text(velocity, precision))
+                    print_result(twist_text(velocity, precision))
 
         if not as_json:
-            say(f"pose of {source} in {target}")
+            print_result(f"pose of {source} in {target}")
         if ends:
             show(waiter.answer(at, timeout_s=timeout))
         else:
@@ -155,7 +155,7 @@ def _follow(waiter: PoseWaiter, rate_hz: float, show: Any) -> None:
             shown, silent = transform, False
         elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
             silent = True
-            note(waiter.silence())
+            print_status(waiter.silence())
 
 
 def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:
@@ -179,7 +179,7 @@ def _show_json(transform: Transform, age_s: float | None, speed: Twist | None) -
     facts = {**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s}
     if speed is not None:
         facts |= {"linear": speed.linear.tolist(), "angular": speed.angular.tolist()}
-    say_json(facts)
+    print_json(facts)
 
 
 def transform_text(transform: Transform, precision: int = 3) -> str:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.console import is_terminal, say, say_json, terminal_width
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli.output.console import output_width, print_json, print_result
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
@@ -37,38 +37,34 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
     zstate tree --json | jq '.[] | select(.age_s > 1)'
     zstate tree --wire ros2                            # hears /tf and /tf_static
     """
-    from zstate.cli.frames import gathered_frames
-    from zstate.cli.ros_frames import gathered_ros_frames
+    from zstate.cli.output.frames import collect_frames, collect_ros_frames
 
     with open_session(network, (wire,)) as session:
-        if is_ros(wire):
-            frames = gathered_ros_frames(session, robot, wire)
-        else:
-            frames = gathered_frames(session, robot)
+        is_native = not is_ros(wire)
+        frames = collect_frames(session, robot) if is_native else collect_ros_frames(session, robot, wire)
         now = time.time_ns()
     if form == "json":
-        say_json([_facts(frame, now) for frame in frames])
+        print_json([_facts(frame, now) for frame in frames])
     elif frames:
         title = "Frames" if robot == "*" else f"Frames of {robot}"
         named = [_named(frame, words_of(wire)) for frame in frames]
-        say(_drawn(named, now, form, in_full=is_ros(wire), title=title))
+        print_result(_drawn(named, now, form, in_full=not is_native, title=title))
 
 
 def _named(frame: FrameInfo, words: Words) -> FrameInfo:
-    """The same with the names by which its wire calls frames."""
+    """The frame with the names that its wire format uses."""
     parent = None if frame.parent is None else words.explained(frame.parent)
     return replace(frame, name=words.explained(frame.name), parent=parent)
 
 
 def _drawn(frames: Sequence[FrameInfo], now: int, form: str | None, *, in_full: bool, title: str) -> str:
-    from zstate.cli.pictures.frames import dot, mermaid, svg
-    from zstate.cli.tree_text import tree_text
+    from zstate.cli.output.frames import tree_drawing, tree_text
 
-    if form == "svg":
-        return svg(frames, now, in_full=in_full, title=title)
-    if form is not None:
-        return dot(frames) if form == "dot" else mermaid(frames)
-    return tree_text(frames, now, in_full=in_full, width=terminal_width() if is_terminal() else None)
+    if form is None:
+        return tree_text(frames, now, in_full=in_full, width=output_width())
+    from zstate.cli.output.drawing import draw
+
+    return draw(tree_drawing(frames, now, in_full=in_full), form, title)
 
 
 def _facts(frame: FrameInfo, now: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli import logs
-from zstate.cli.console import fail, say
+from zstate.cli.output.console import fail, print_result
 
 if TYPE_CHECKING:
     from zstate.cli.up.starts import Start
@@ -87,13 +87,13 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     settings = parsed_settings(parameters)
     starts = planned(read_cell(file, settings), Path(file), settings)
     if only_check:
-        say(_plan_text(starts))
+        print_result(_plan_text(starts))
     else:
         _run(starts)
 
 
 def _plan_text(starts: Sequence[Start]) -> str:
-    from zstate.cli.layout import in_columns
+    from zstate.cli.output.text_layout import in_columns
 
     rows = [
         (start.name, shlex.join(start.arguments if start.is_program else ("zstate", *start.arguments)))
@@ -121,6 +121,6 @@ def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:
         if logs.is_json():
             logs.pass_on(line, is_error=is_error, part=name)
         else:
-            say(prefixes[name] + line)
+            print_result(prefixes[name] + line)
 
     return show

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import click
 
-from zstate.cli.console import GRACE_S, count_text, fail, note, say, say_json
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, timeout_option, wire_option
+from zstate.cli.output.console import GRACE_S, count_text, fail, print_json, print_result, print_status
 from zstate.errors import Unreachable, ZStateError
 
 
@@ -50,7 +50,7 @@ def wait_command(
     if as_json:
         _print_outcome(what, names, began, None)
     else:
-        say(text)
+        print_result(text)
 
 
 def _check_count(what: str, names: tuple[str, ...]) -> None:
@@ -62,7 +62,9 @@ def _check_count(what: str, names: tuple[str, ...]) -> None:
 
 def _print_outcome(what: str, names: tuple[str, ...], began: float, reason: str | None) -> None:
     waited_s = round(time.monotonic() - began, 3)
-    say_json({"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason})
+    print_json(
+        {"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason}
+    )
 
 
 def _wait_for_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
@@ -120,6 +122,6 @@ def _wait_for_router(network: Network, names: tuple[str, ...], wire: str, timeou
     except Unreachable:
         raise
     except TimeoutError:
-        note(f"waiting: nobody answers at {where} yet", event="waiting")
+        print_status(f"waiting: nobody answers at {where} yet", event="waiting")
         call.result()
     return f"ready: the router at {where}"

@@ -8,9 +8,9 @@ from contextlib import ExitStack
 from importlib import metadata
 
 from zstate import __version__
-from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, warning
 from zstate.cli.network import Network
+from zstate.cli.output.console import count_text
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from zstate.cli.console import colored, count_text, is_terminal
 from zstate.cli.doctor.check import Check, first_broken
+from zstate.cli.output.console import colored, count_text, is_terminal
 
 _COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
 _STATE, _NAME = 7, 12

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from zstate.buffer.frames import FrameInfo
-from zstate.cli.console import count_text
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
 from zstate.cli.doctor.ear import Ear
 from zstate.cli.doctor.samples import Ranges
 from zstate.cli.frame_checks import similar_frames, without_program_advice
+from zstate.cli.output.console import count_text
 from zstate.cli.telling_links import telling_links
 from zstate.cli.words import writing
 from zstate.errors import LookupFailed, ModelError, duration_text

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
-from zstate.cli.console import count_text, rate_text
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import stamps_check
 from zstate.cli.doctor.ear import Ear
@@ -18,6 +17,7 @@ from zstate.cli.doctor.robot_checks import (
     statics_check,
 )
 from zstate.cli.doctor.samples import StreamSamples, WriterSamples
+from zstate.cli.output.console import count_text, rate_text
 from zstate.cli.words import RosWords
 from zstate.errors import duration_text
 from zstate.model.robot import RobotModel

@@ -6,11 +6,18 @@ from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
 from zstate.buffer.frames import FrameInfo
-from zstate.cli.console import fail, is_terminal, say, say_json, terminal_width
 from zstate.cli.monitor.meter import EdgeStatistics
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
+from zstate.cli.output.console import (
+    fail,
+    keep_showing,
+    output_width,
+    print_json,
+    print_result,
+    terminal_width,
+)
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.waiting import ConditionWaiter, PoseWaiter
 from zstate.errors import duration_text
@@ -38,14 +45,12 @@ class Monitored(ABC):
     def say(self, *, as_json: bool) -> None:
         """One report."""
         if as_json:
-            say_json(self._facts())
+            print_json(self._facts())
         else:
-            say(f"{self._text(terminal_width() if is_terminal() else None)}\n")
+            print_result(f"{self._text(output_width())}\n")
 
     def show(self) -> NoReturn:
         """A report that keeps up to date."""
-        from zstate.cli.live_text import keep_showing  # with rich, which few need
-
         keep_showing(lambda: self._text(terminal_width()))
 
     def _row(self, frame: str, edge: FrameInfo) -> Row:

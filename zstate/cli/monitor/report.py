@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from zstate.cli.console import rate_text
-from zstate.cli.layout import in_columns, letters_for, narrowed
 from zstate.cli.monitor.meter import EdgeMeasure, EdgeStatistics
-from zstate.errors import duration_text, printable
+from zstate.cli.output.console import rate_text
+from zstate.cli.output.text_layout import Table
+from zstate.errors import duration_text
 
 if TYPE_CHECKING:
     from zstate.buffer.frames import FrameInfo
@@ -55,30 +55,18 @@ Cells = list[tuple[str, ...]]
 
 def report_text(rows: Sequence[Row], *, width: int | None = None) -> str:
     """The table of a path, from its first frame to its last."""
-    return table_text(rows, lambda letters: _cells(rows, letters), width=width)
+    return table_text(rows, _cells(rows), _DISPENSABLE, width=width)
 
 
 def table_text(
-    rows: Sequence[Row],
-    cells: Callable[[Mapping[str, str]], Cells],
-    *,
-    width: int | None = None,
-    dispensable: Sequence[str] = _DISPENSABLE,
+    rows: Sequence[Row], cells: Cells, optional: Sequence[str], *, width: int | None = None
 ) -> str:
-    """The table of ``cells`` and what is to be said of clocks; ``cells`` is given other names for writers.
-
-    Where it is wider than ``width``, writers are letters and ``dispensable`` columns are left out.
-    """
-    lines = in_columns([_HEADINGS, *cells({})])
-    if width is not None and max(map(len, lines)) > width:
-        letters = letters_for(row.edge.writer for row in rows if row.edge is not None and row.edge.writer)
-        columns = [_HEADINGS.index(heading) for heading in dispensable]
-        lines = narrowed([_HEADINGS, *cells(letters)], width, columns)
-        lines += [f"{letter}: {printable(writer)}" for writer, letter in letters.items()]
+    """The table of ``cells`` and notes on clocks; ``optional`` columns may be left out to fit ``width``."""
+    lines = Table(_HEADINGS, cells, optional, abbreviate="writer").lines(width)
     return "\n".join([*lines, *_clock_notes(rows)])
 
 
-def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> Cells:
+def _cells(rows: Sequence[Row]) -> Cells:
     """Edges whose samples are those of the edge above have only their kind: one robot's joints, mostly."""
     cells: Cells = []
     said: set[str] = set()
@@ -87,7 +75,7 @@ def _cells(rows: Sequence[Row], letters: Mapping[str, str]) -> Cells:
         if edge is None:
             cells.append((frame, *[""] * (len(_HEADINGS) - 1)))
             continue
-        writer = letters.get(edge.writer or "", edge.writer or "")
+        writer = edge.writer or ""
         if edge.kind == "static":
             cells.append((frame, edge.kind, *NO_NUMBERS, writer))
             continue

@@ -7,9 +7,9 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from zstate.cli.console import fail, note
 from zstate.cli.documents import Document, DocumentWriter
 from zstate.cli.named_joints import Named
+from zstate.cli.output.console import fail, print_status
 from zstate.cli.plot.curves import Curves, joint_curves, path_curves
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.stream_reader import StreamReader
@@ -34,7 +34,7 @@ def live_joints(session: Session, robot: str, wire: str, seconds: float) -> Curv
     """The joints of ``robot`` for ``seconds`` from now on. Fails when no sample comes."""
     with Named(session, robot, wire) as named, StreamReader(session, robot, "joint_states", wire) as tap:
         documents = [named.document(tap.first(_WAIT_S))]
-        note(f"listening to {robot} for {seconds:g} s ...")
+        print_status(f"listening to {robot} for {seconds:g} s ...")
         deadline = time.monotonic() + seconds
         while (left_s := deadline - time.monotonic()) > 0.0:
             tapped = tap.next(left_s)
@@ -57,7 +57,7 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
         ) as listener,
     ):
         PoseWaiter(listener, roster, *frames).answer(timeout_s=_WAIT_S)
-        note(f"listening for {seconds:g} s ...")
+        print_status(f"listening for {seconds:g} s ...")
         time.sleep(seconds)
         return path_curves(listener.buffer, *frames)
 

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 
-from zstate.cli.console import count_text, fail, note, say
+from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.processes import BackgroundCall
 from zstate.cli.snapshot.snapshot import RobotShot, Snapshot, StaticShot
 from zstate.clock import SystemClock
@@ -61,7 +61,7 @@ class Standing(Closing):
                 opening.enter_context(placing)
                 for shot in edges:
                     placing.set(shot.transform())
-                say(f"{robot}: {count_text(len(edges), 'static edge')} of {writer}")
+                print_result(f"{robot}: {count_text(len(edges), 'static edge')} of {writer}")
             self._opened = opening.pop_all()
 
     def close(self) -> None:
@@ -87,6 +87,8 @@ class Standing(Closing):
 def _tell(shot: RobotShot) -> None:
     joints = count_text(len(shot.positions), "joint")
     state = f"{joints} standing still" if shot.positions else "no joint states"
-    say(f"{shot.name}: its model, {state}; until Ctrl-C")
+    print_result(f"{shot.name}: its model, {state}; until Ctrl-C")
     if not shot.positions:
-        note(f"{shot.name}: nothing was known of its joints when the snapshot was taken", robot=shot.name)
+        print_status(
+            f"{shot.name}: nothing was known of its joints when the snapshot was taken", robot=shot.name
+        )

@@ -9,8 +9,8 @@ from datetime import datetime, timezone
 from typing import Any
 
 from zstate import __version__
-from zstate.cli.console import fail, note
 from zstate.cli.network import Network
+from zstate.cli.output.console import fail, print_status
 from zstate.cli.snapshot.snapshot import FORMAT, Configuration, RobotShot, Snapshot, StaticShot
 from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import words_of
@@ -44,7 +44,7 @@ def taken(session: Session, network: Network, robots: Sequence[str], wire: str, 
         waiter.wait_for(lambda: not any(sitting.lacking() for sitting in sittings), timeout_s)
         for sitting in sittings:
             for text in sitting.lacking():
-                note(f"{sitting.info.name}: {text} within {timeout_s:g} s", robot=sitting.info.name)
+                print_status(f"{sitting.info.name}: {text} within {timeout_s:g} s", robot=sitting.info.name)
         return Snapshot(
             FORMAT,
             datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
@@ -102,7 +102,7 @@ class _Sitting(Closing):
         try:
             writer = self._wire.statics_writer(arrival.key) or arrival.key
         except InvalidInput as error:
-            note(f"{arrival.key}: {error}")
+            print_status(f"{arrival.key}: {error}")
             return
         if not arrival.payload or writer == MODEL_WRITER:
             self._statics.pop(writer, None)  # the model says the same
@@ -114,7 +114,7 @@ class _Sitting(Closing):
                         message
                     )
         except MessageError as error:
-            note(f"{arrival.key}: {error}")
+            print_status(f"{arrival.key}: {error}")
 
     def lacking(self) -> list[str]:
         """What is announced and has not come."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 
-from zstate.cli.layout import in_columns
+from zstate.cli.output.text_layout import in_columns
 from zstate.model.coordinates import coordinate_names
 from zstate.model.robot import RobotModel
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from zstate.cli.console import note
+from zstate.cli.output.console import print_status
 from zstate.cli.processes import END_WITHIN_S, ChildProcess
 from zstate.cli.up.starts import Start
 from zstate.clock import LONGEST_WAIT_S
@@ -121,7 +121,7 @@ class Supervisor:
         is_well = child.exit_code == 0
         if restart == "always" or (restart == "on-failure" and not is_well):
             text = f"{_end_text(child)}; it starts again in {part.pause():g} s"
-            note(text, event="restart", level="warning")
+            print_status(text, event="restart", level="warning")
         elif is_well:
             part.is_over = part.is_ready = True
         else:
@@ -132,7 +132,7 @@ class Supervisor:
         for part in self._parts.values():
             awaited = self._awaited(part)
             if part.child is None and awaited:
-                note(f"{part.start.name!r} waits for {', '.join(map(repr, awaited))}, not ready yet")
+                print_status(f"{part.start.name!r} waits for {', '.join(map(repr, awaited))}, not ready yet")
 
     def _end_all(self) -> None:
         """Whoever started after another ends before it; those that may end together do."""
@@ -149,7 +149,7 @@ class Supervisor:
                 assert part.child is not None
                 part.child.wait(deadline)
                 if part.start.is_program and part.child.exit_code not in _ENDED_AS_ASKED:
-                    note(_end_text(part.child))
+                    print_status(_end_text(part.child))
             living = [part for part in living if part not in ending]
 
 

@@ -9,9 +9,9 @@ from typing import Protocol
 import viser
 
 from zstate.closing import Closing
+from zstate.net.graph import GraphMonitor
 from zstate.view.fixed_frame import FixedFrame
 from zstate.view.frame_facts import FrameFacts
-from zstate.view.graph_watch import GraphWatch
 from zstate.view.moment import Moment
 from zstate.view.panels import html
 from zstate.view.panels.between_panel import BetweenPanel
@@ -71,8 +71,8 @@ class Board(Closing):
             self._panels.append(ReplayPanel(gui, self.clock))
         if world.session is not None:
             with tabs.add_tab("Graph"):
-                watch = self._opened.enter_context(GraphWatch(world.session))
-                self._panels.append(GraphPanel(gui, watch))
+                monitor = self._opened.enter_context(GraphMonitor(world.session))
+                self._panels.append(GraphPanel(gui, monitor))
 
     def _add_joints(self, gui: viser.GuiApi, sliders: Sequence[Sliders]) -> None:
         for one in sliders:

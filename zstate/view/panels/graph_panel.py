@@ -1,36 +1,36 @@
-"""Who writes and reads what, how fast, and how the writers say they do."""
+"""Panel of the graph: status of each publisher, and the writers and readers of each stream."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import viser
 
 from zstate.errors import duration_text
-from zstate.view.graph_watch import GraphWatch, StreamUse, WriterState
+from zstate.net.graph import Graph, GraphMonitor, StreamGroup, WriterState
 from zstate.view.panels import html
 from zstate.view.panels.look import Look
 
 _LATE_S = 3.0
-"""A publisher says once a second how it does; what it said so long ago does not hold any more."""
+"""Publishers send a status once a second; an older one is not valid any more."""
 
 
 class GraphPanel:
-    """How every publisher does, by its own word; then the streams, those together that have the same ends."""
+    """The status of every publisher, then the streams, grouped by writers and readers."""
 
-    def __init__(self, gui: viser.GuiApi, watch: GraphWatch) -> None:
-        self._watch = watch
+    def __init__(self, gui: viser.GuiApi, monitor: GraphMonitor) -> None:
+        self._monitor = monitor
         self._text = gui.add_html("")
 
     def update(self, look: Look) -> None:
-        self._text.content = graph_html(self._watch.states(), self._watch.uses())
+        self._text.content = graph_html(self._monitor.states(), self._monitor.graph())
 
 
-def graph_html(states: Sequence[WriterState], uses: Sequence[StreamUse]) -> str:
-    """The graph and the rates as the page shows them."""
-    if not states and not uses:
+def graph_html(states: Sequence[WriterState], graph: Graph) -> str:
+    """Publishers and streams as HTML."""
+    if not states and not graph.streams:
         return html.paragraph("Nobody writes or reads anything of a robot.", muted=True)
-    return "".join([*map(_state_html, states), *_bundles_html(uses)])
+    return "".join([*map(_state_html, states), *map(_group_html, graph.groups)])
 
 
 def _state_html(state: WriterState) -> str:
@@ -43,13 +43,12 @@ def _state_html(state: WriterState) -> str:
     return html.heading(head, color=color) + html.paragraph(f"{status.program} pid {status.pid}: {text}")
 
 
-def _bundles_html(uses: Sequence[StreamUse]) -> Iterator[str]:
-    bundles: dict[tuple[str, tuple[str, ...], tuple[str, ...]], list[str]] = {}
-    for use in uses:
-        bundles.setdefault((use.robot, use.writers, use.readers), []).append(use.stream)
-    for (robot, writers, readers), streams in bundles.items():
-        yield html.heading(f"{robot}: {', '.join(streams)}", color="" if writers else html.ALARM)
-        yield html.pairs([("written by", _lines(writers)), ("read by", _lines(readers))])
+def _group_html(group: StreamGroup) -> str:
+    names = ", ".join(stream.name for stream in group.streams)
+    ends = [("written by", _lines(group.writers)), ("read by", _lines(group.readers))]
+    return html.heading(f"{group.robot}: {names}", color="" if group.writers else html.ALARM) + html.pairs(
+        ends
+    )
 
 
 def _lines(programs: Sequence[str]) -> str:

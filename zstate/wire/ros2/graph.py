@@ -45,6 +45,11 @@ class NodeToken:
     name: str
 
     @property
+    def full_name(self) -> str:
+        """The name of the node with its namespace."""
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+    @property
     def key(self) -> str:
         """The liveliness key."""
         names = (_mangled(part) for part in (self.enclave, self.namespace, self.name))
@@ -73,6 +78,11 @@ class EndpointToken:
     qos: Qos
 
     @property
+    def full_name(self) -> str:
+        """The name of the node with its namespace."""
+        return f"{self.namespace.rstrip('/')}/{self.node}"
+
+    @property
     def key(self) -> str:
         """The liveliness key, of which ``gid`` is made."""
         names = (_mangled(part) for part in (self.enclave, self.namespace, self.node, self.topic))
@@ -95,6 +105,17 @@ class DdsToken:
     type_name: str
     qos: Qos
     hash: str = ""
+
+    @property
+    def full_name(self) -> str:
+        """The name of the bridge; the node is unknown."""
+        return f"bridge {self.zid[:8]}"
+
+    @property
+    def dds_type(self) -> str:
+        """The type as ``EndpointToken`` has it; of no message type if ``type_name`` has not three parts."""
+        package, _, name = self.type_name.split("/") if self.type_name.count("/") == 2 else ("", "", "")
+        return f"{package}::msg::dds_::{name}_"
 
     @property
     def key(self) -> str:

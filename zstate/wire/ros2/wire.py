@@ -150,8 +150,7 @@ class Ros2Wire:
         parsed = parse_token(token)
         if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
             return None
-        node = f"{parsed.namespace.rstrip('/')}/{parsed.node}"
-        writer = Writer(node, host="", pid=0, since=0, session=session_of(gid(token)))
+        writer = Writer(parsed.full_name, host="", pid=0, since=0, session=session_of(gid(token)))
         return self._announced(parsed.topic, parsed.dds_type, robot, writer)
 
     def _announced(self, topic: str, dds_type: str, robot: str, writer: Writer) -> Announced | None:
@@ -208,6 +207,5 @@ class Ros2DdsWire(Ros2Wire):
         parsed = parse_dds_token(token)
         if parsed is None or parsed.kind != "MP":
             return None
-        package, _, name = parsed.type_name.split("/") if parsed.type_name.count("/") == 2 else ("", "", "")
         writer = Writer(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
-        return self._announced(f"/{parsed.topic}", f"{package}::msg::dds_::{name}_", robot, writer)
+        return self._announced(f"/{parsed.topic}", parsed.dds_type, robot, writer)

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from zstate.cli.output.text_layout import Table, first_fitting, short_labels, wrap
+
+
+def test_what_fits_stays_as_it_is():
+    assert wrap("a line\n  and  another", 14) == "a line\n  and  another"
+
+
+def test_a_long_cell_goes_on_below_itself():
+    line = "mode  client  option --connect, which alone means a router"
+    assert wrap(line, 44).splitlines() == [
+        "mode  client  option --connect, which alone",
+        "              means a router",
+    ]
+
+
+def test_where_the_last_column_is_too_narrow_a_line_goes_on_with_an_indent():
+    line = "  frame  " + "x" * 30 + "  and what is to be said of it"
+    assert wrap(line, 45).splitlines() == [f"  frame  {'x' * 30}  and", "    what is to be said of it"]
+
+
+def test_prose_is_folded_between_words_which_stay_whole():
+    said = wrap("zstate: nothing answers at 'tcp/a-host-with-a-long-name:7447' (refused)", 30)
+    assert said.splitlines() == [
+        "zstate: nothing answers at",
+        "  'tcp/a-host-with-a-long-name:7447'",
+        "  (refused)",
+    ]
+
+
+def test_letters_stand_for_names_in_their_order():
+    assert short_labels(["left", "right", "left"]) == {"left": "a", "right": "b"}
+    assert list(short_labels(map(str, range(28))).values())[25:] == ["z", "27", "28"]
+
+
+ROWS = (
+    ("base", "root", ""),
+    ("arm", "joint", "driver@jetson pid 4"),
+    ("hand", "joint", "driver@jetson pid 4"),
+)
+TABLE = Table(("frame", "kind", "writer"), ROWS, optional=("kind",), abbreviate="writer")
+
+
+def test_a_table_with_enough_width_is_complete():
+    assert (
+        TABLE.lines(None)
+        == TABLE.lines(33)
+        == [
+            "frame  kind   writer",
+            "base   root",
+            "arm    joint  driver@jetson pid 4",
+            "hand   joint  driver@jetson pid 4",
+        ]
+    )
+
+
+def test_a_narrow_table_first_abbreviates_names_then_omits_optional_columns():
+    legend = "a: driver@jetson pid 4"
+    assert TABLE.lines(32) == [
+        "frame  kind   writer",
+        "base   root",
+        "arm    joint  a",
+        "hand   joint  a",
+        legend,
+    ]
+    narrowest = ["frame  writer", "base", "arm    a", "hand   a", legend]
+    assert TABLE.lines(15) == TABLE.lines(1) == narrowest
+
+
+def test_of_several_tables_the_first_that_fits_is_printed():
+    other = Table(("frame", "kind"), [row[:2] for row in ROWS], headed=False)
+    assert first_fitting((TABLE, other), 32)[0] == "frame  kind   writer"
+    assert first_fitting((TABLE, other), 11) == ["base  root", "arm   joint", "hand  joint"]

@@ -1,1 +1,0 @@
-"""zstate graph: who writes and reads what."""

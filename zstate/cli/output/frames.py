@@ -1,0 +1,236 @@
+"""The frames of the announced robots: collected from the network, as text and as a drawing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from zstate.cli.output.console import count_text, fail, print_status, rate_text, sample_age_text
+from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, tree_lines
+from zstate.cli.processes import BackgroundCall
+from zstate.cli.robot_directory import RobotDirectory, announced_robots
+from zstate.cli.waiting import ConditionWaiter
+from zstate.cli.words import words_of
+from zstate.ingest.deadline import is_stale
+
+if TYPE_CHECKING:
+    from zstate.buffer.frames import FrameInfo
+    from zstate.cli.output.drawing import Drawing
+    from zstate.net.presence import RobotInfo
+    from zstate.net.session import Session
+    from zstate.nodes.listener import TransformListener
+
+_NO_FRAMES = "announced, but without any frame: who publishes the model? `zstate publish ROBOT` does"
+_MODELS_WITHIN_S = 3.0
+_SAMPLES_WITHIN_S = 1.0
+# The rate of two samples may be far off.
+_RATE_OVER_NS = 100_000_000
+
+# ROS nodes publish transforms at 1 Hz at least; nodes without a message in this time are named.
+_MESSAGES_WITHIN_S = 2.0
+_NODES_WITHIN_S = 1.0
+
+_QUIET_S = 0.15
+
+_HEADINGS = ("frame", "edge", "rate", "age", "writer")
+_NARROW_HEADINGS = ("frame", "rate and age", "writer")
+
+
+def collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
+    """Every frame of ``robot``, or of all robots for "*", with rates and stamps of received samples.
+
+    Prints on standard error which announced models and static edges did not arrive, or that no robot is
+    announced. Fails if ``robot`` is not announced.
+    """
+    from zstate.net.presence import discover
+    from zstate.wire.keys import ANY
+
+    # Models and static edges arrive during discovery, which is mostly waiting.
+    discovery = BackgroundCall(
+        "zstate announced",
+        lambda: discover(session) if robot == ANY else announced_robots(session, robot),
+    )
+    from zstate.nodes.listener import TransformListener
+
+    waiter = ConditionWaiter()
+    with TransformListener(session, robot) as listener:
+        listener.add_observer(waiter.notify)
+        robots = discovery.result()
+        if not robots:
+            print_status(words_of("native").announced(()))
+            return ()
+
+        def has_models(stable: bool) -> bool:
+            has_statics = stable or _has_statics(listener.buffer.frames(), robots)
+            return has_statics and not _missing(listener, robots)
+
+        waiter.wait_until_stable(
+            lambda: len(listener.buffer.frames()), has_models, quiet_s=_QUIET_S, timeout_s=_MODELS_WITHIN_S
+        )
+        for text in _missing(listener, robots):
+            print_status(text)
+        moving = {robot.name for robot in robots if "joint_states" in _streams(robot)}
+        waiter.wait_for(
+            lambda: all(_has_rate(frame, moving) for frame in listener.buffer.frames()), _SAMPLES_WITHIN_S
+        )
+        frames = listener.buffer.frames()
+    if not frames:
+        print_status(_NO_FRAMES)
+    return frames
+
+
+def _has_statics(frames: tuple[FrameInfo, ...], robots: tuple[RobotInfo, ...]) -> bool:
+    """Whether a frame of every writer of static edges has arrived."""
+    from zstate.wire.keys import MODEL_WRITER
+
+    names = [name for robot in robots for name, _ in robot.static_names if name != MODEL_WRITER]
+    arrived = {frame.writer for frame in frames if frame.kind == "static"}
+    return len(names) == len(arrived.intersection(names))  # not if two robots have one of the same name
+
+
+def _missing(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> list[str]:
+    owners = {frame.name.partition("/")[0] for frame in listener.buffer.frames()}
+    known = {*owners, *listener.robots()}
+    missing: list[str] = []
+    for robot in robots:
+        streams = _streams(robot)
+        if "robot_description" in streams and robot.name not in owners:
+            missing.append(f"{robot.name}: its model has not arrived within {_MODELS_WITHIN_S:g} s")
+        elif "tf_static" in streams and robot.name not in known:
+            missing.append(f"{robot.name}: its static edges have not arrived within {_MODELS_WITHIN_S:g} s")
+    return missing
+
+
+def _streams(robot: RobotInfo) -> set[str]:
+    return {stream for stream, _ in robot.writers}
+
+
+def _has_rate(frame: FrameInfo, moving: set[str]) -> bool:
+    """Whether there are samples enough for a rate, or none are to be expected."""
+    if frame.kind != "joint" or frame.name.partition("/")[0] not in moving:
+        return True
+    return frame.count > 1 and (frame.newest or 0) - (frame.oldest or 0) >= _RATE_OVER_NS
+
+
+def collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameInfo, ...]:
+    """Every frame on /tf and /tf_static, with rates and stamps.
+
+    Prints on standard error which nodes publish transforms, but have sent none. Fails if there is no node.
+    """
+    from zstate.nodes.listener import TransformListener
+
+    waiter = ConditionWaiter()
+    with (
+        RobotDirectory(session, robot, wire, waiter.notify) as roster,
+        TransformListener(session, robot, wire=wire, follow="tf") as listener,
+    ):
+        listener.add_observer(waiter.notify)
+
+        def nodes() -> set[str]:
+            writers = (pair for info in roster.robots() for pair in info.writers)
+            return {str(writer) for stream, writer in writers if stream == "tf"}
+
+        def without_samples(frames: tuple[FrameInfo, ...], least: int) -> set[str]:
+            return nodes() - {one.writer for one in frames if one.kind == "pose" and one.count >= least}
+
+        if not waiter.wait_for(lambda: listener.buffer.frames() or nodes(), _NODES_WITHIN_S):
+            fail(roster.words.silence(robot, "tf", roster.robots(), ended=False))
+        waiter.wait_until_stable(
+            lambda: len(listener.buffer.frames()),
+            lambda stable: stable and not without_samples(listener.buffer.frames(), 2),
+            quiet_s=_QUIET_S,
+            timeout_s=_MESSAGES_WITHIN_S,
+        )
+        frames = listener.buffer.frames()
+        for node in sorted(without_samples(frames, 1)):
+            topic = roster.words.place(robot, ("tf",))
+            print_status(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
+        return frames
+
+
+def tree_text(frames: Sequence[FrameInfo], now: int, *, in_full: bool, width: int | None = None) -> str:
+    """The tree with a line for each frame: kind, rate, age and writer of its edge; ``now`` [ns] is for ages.
+
+    If that is wider than ``width``, writers become letters that are explained below, then a frame that is its
+    parent's only child is not indented, and at last moving edges have no kind.
+    """
+
+    def rows(guides: Guides, *, with_kind: bool = True) -> list[tuple[str, ...]]:
+        found: list[tuple[str, ...]] = []
+        for guide, frame in _walk(frames, guides):
+            rate, age = _rate_and_age(frame, now)
+            cells = (frame.kind, rate, age) if with_kind else (f"{rate} {age}" if rate else frame.kind,)
+            found.append((guide + _shown_name(frame, in_full), *cells, frame.writer or ""))
+        return found
+
+    tables = (
+        Table(_HEADINGS, rows(tree_lines), abbreviate="writer"),
+        Table(_HEADINGS, rows(chain_lines), abbreviate="writer"),
+        Table(_NARROW_HEADINGS, rows(chain_lines, with_kind=False), abbreviate="writer", headed=False),
+    )
+    return "\n".join(first_fitting(tables, width))
+
+
+def _walk(frames: Sequence[FrameInfo], guides: Guides = tree_lines) -> list[tuple[str, FrameInfo]]:
+    """(guide, frame) of all frames, parents first; roots and siblings in alphabetical order."""
+    by_name = {frame.name: frame for frame in sorted(frames, key=lambda frame: frame.name)}
+    children: dict[str, list[str]] = {}
+    for frame in by_name.values():
+        if frame.parent is not None:
+            children.setdefault(frame.parent, []).append(frame.name)
+    roots = [frame.name for frame in by_name.values() if frame.parent is None]
+    return [(guide, by_name[name]) for root in roots for guide, name in guides(root, children)]
+
+
+def _shown_name(frame: FrameInfo, in_full: bool) -> str:
+    """The name, without the robot's if the parent belongs to the same robot and not ``in_full``."""
+    robot, slash, bare = frame.name.partition("/")
+    is_short = not in_full and slash and (frame.parent or "").startswith(f"{robot}/")
+    return bare if is_short else frame.name
+
+
+def _rate_and_age(frame: FrameInfo, now: int) -> tuple[str, str]:
+    if frame.kind not in ("joint", "pose"):
+        return "", ""
+    return rate_text(frame.rate_hz), sample_age_text(frame, now)
+
+
+def tree_drawing(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> Drawing:
+    """The tree; each edge has its kind, rate, age, and the colour of its writer. ``now`` [ns] is for ages."""
+    from zstate.cli.output.drawing import ALARM, LINE, MUTED, PALETTE, Drawing, Edge, Node
+    from zstate.clock import SYSTEM
+
+    writers = [frame.writer for frame in frames if frame.writer]
+    colors = {writer: PALETTE[n % len(PALETTE)] for n, writer in enumerate(dict.fromkeys(writers))}
+    nodes: list[Node] = []
+    edges: list[Edge] = []
+    for _, frame in _walk(frames):
+        is_static, newest = frame.kind == "static", frame.newest_in(SYSTEM)
+        lines, text_color = [_shown_name(frame, in_full)], MUTED
+        if frame.kind in ("joint", "pose"):
+            rate, age = _rate_and_age(frame, now)
+            lines.append(
+                f"{frame.kind}, no sample" if frame.newest is None else f"{frame.kind} · {rate} · {age}"
+            )
+            is_old = newest is not None and is_stale((now - newest) * 1e-9, frame.rate_hz)
+            text_color = ALARM if is_old or frame.newest is None else MUTED
+        elif not is_static:
+            lines.append(frame.kind)
+        nodes.append(
+            Node(
+                frame.name,
+                lines,
+                label=frame.name,
+                stroke=colors.get(frame.writer or "", LINE),
+                dashed=is_static,
+                bar=not is_static,
+                text_color=text_color,
+            )
+        )
+        if frame.parent is not None:
+            label = frame.kind if frame.rate_hz is None else f"{frame.kind} {rate_text(frame.rate_hz)}"
+            edges.append(Edge(frame.parent, frame.name, label, dashed=is_static))
+    legend = [
+        (color, f"{writer}: {count_text(writers.count(writer), 'edge')}") for writer, color in colors.items()
+    ]
+    return Drawing("frames", "tree", nodes, edges, legend)

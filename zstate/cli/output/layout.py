@@ -1,0 +1,369 @@
+"""Where the nodes of a graph are placed, and along which points its edges run.
+
+``layered_layout`` draws any graph from left to right. ``tree_layout`` draws trees from the top down and folds
+them to the shape of a page: in layers, the 60 frames of a humanoid would be 4000 pixels wide and 370 high.
+Both take the size of each node as (width, height), and edges between different nodes, each once. The drawing
+begins at (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from itertools import combinations, pairwise
+from math import sqrt
+from statistics import fmean as mean
+
+Point = tuple[float, float]
+Size = tuple[float, float]
+Pair = tuple[str, str]
+
+_LAYER_GAP, _NODE_GAP = 90.0, 18.0
+_SWEEPS = 12
+
+_ACROSS, _BELOW, _INDENT, _STACKED = 14.0, 22.0, 22.0, 7.0
+"""Between neighbours, below a parent, right of it along a rail, and between nodes on a rail."""
+
+_RAIL = 9.0
+"""Distance of a rail from the left edge of its parent."""
+
+_TREE_GAP = 40.0
+_PAGE_SHAPE = 1.6
+_MAX_ARRANGEMENTS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The upper left corner of each node, and the points of each edge."""
+
+    places: dict[str, Point]
+    routes: dict[Pair, list[Point]]
+
+
+def layered_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
+    """Layered layout from left to right (Sugiyama, Tagawa and Toda, 1981).
+
+    Edges that close a cycle are reversed, each node is placed right of its predecessors, the order within
+    layers is changed to reduce crossings, and nodes then move up and down towards their neighbours.
+    """
+    order, forward = _break_cycles(sizes, edges)
+    ranks = _ranks(order, forward.values())
+    layers: list[list[str]] = [[] for _ in range(max(ranks.values(), default=-1) + 1)]
+    for node in sizes:
+        layers[ranks[node]].append(node)
+    # A long edge has a placeholder without size in each layer that it passes.
+    chains: list[list[str]] = []
+    for number, (begin, end) in enumerate(forward.values()):
+        passed = {rank: f"\0{number} {rank}" for rank in range(ranks[begin] + 1, ranks[end])}
+        for rank, placeholder in passed.items():
+            layers[rank].append(placeholder)
+        chains.append([begin, *passed.values(), end])
+    links = [link for chain in chains for link in pairwise(chain)]
+    layers = _reduce_crossings(layers, links)
+    heights = {node: sizes.get(node, (0.0, 0.0))[1] for layer in layers for node in layer}
+    middles = _middles(layers, heights, links)
+
+    lefts, rights = list[float](), list[float]()
+    for layer in layers:
+        lefts.append(rights[-1] + _LAYER_GAP if rights else 0.0)
+        rights.append(lefts[-1] + max(sizes.get(node, (0.0, 0.0))[0] for node in layer))
+    places = {
+        node: ((lefts[rank] + rights[rank] - sizes[node][0]) / 2, middles[node] - heights[node] / 2)
+        for node, rank in ranks.items()
+    }
+    leaving = [(chain[0], middles[chain[1]]) for chain in chains]
+    entering = [(chain[-1], middles[chain[-2]]) for chain in chains]
+    begins, ends = _ports(leaving, places, sizes, side=1), _ports(entering, places, sizes, side=0)
+    routes = dict[Pair, list[Point]]()
+    for number, (chain, (edge, along)) in enumerate(zip(chains, forward.items(), strict=True)):
+        between = [
+            (x, middles[node])
+            for rank, node in enumerate(chain[1:-1], ranks[chain[0]] + 1)
+            for x in (lefts[rank], rights[rank])
+        ]
+        route = [begins[number], *between, ends[number]]
+        routes[edge] = route if along == edge else route[::-1]
+    return Layout(places, routes)
+
+
+def _break_cycles(nodes: Iterable[str], edges: Sequence[Pair]) -> tuple[list[str], dict[Pair, Pair]]:
+    """The nodes in the order of the data, and the direction of each edge in it.
+
+    Of each cycle the edge that is last in ``edges`` is reversed.
+    """
+    kept = list(edges)
+    while True:
+        predecessors: dict[str, list[str]] = {node: [] for node in nodes}
+        for begin, end in kept:
+            predecessors[end].append(begin)
+        try:
+            order = list(TopologicalSorter(predecessors).static_order())
+        except CycleError as error:
+            cycle: list[str] = error.args[1]
+            kept.remove(max(pairwise(cycle), key=kept.index))
+        else:
+            position = {node: number for number, node in enumerate(order)}
+            return order, {
+                one: one if position[one[0]] < position[one[1]] else _reversed(one) for one in edges
+            }
+
+
+def _successors(edges: Iterable[Pair]) -> dict[str, list[str]]:
+    after: dict[str, list[str]] = {}
+    for begin, end in edges:
+        after.setdefault(begin, []).append(end)
+    return after
+
+
+def _reversed(edge: Pair) -> Pair:
+    return edge[1], edge[0]
+
+
+def _ranks(order: Iterable[str], edges: Collection[Pair]) -> dict[str, int]:
+    """The layer of each node: right of all its predecessors, and close to its successors."""
+    before, after = _successors(map(_reversed, edges)), _successors(edges)
+    ranks: dict[str, int] = {}
+    for node in order:
+        ranks[node] = max((ranks[other] + 1 for other in before.get(node, ())), default=0)
+    for node in after.keys() - before.keys():
+        ranks[node] = min(ranks[end] for end in after[node]) - 1
+    return ranks
+
+
+def _reduce_crossings(layers: list[list[str]], links: Sequence[Pair]) -> list[list[str]]:
+    """The layers with few crossings: each node is placed near the mean position of its neighbours."""
+    left, right = _successors(map(_reversed, links)), _successors(links)
+    best, fewest = [list(layer) for layer in layers], _crossings(layers, links)
+    for sweep in range(_SWEEPS):
+        neighbours = left if sweep % 2 == 0 else right
+        for layer in layers if sweep % 2 == 0 else layers[::-1]:
+            order = {node: position for some in layers for position, node in enumerate(some)}
+            layer.sort(key=lambda node: mean([order[other] for other in neighbours.get(node, [node])]))
+        crossings = _crossings(layers, links)
+        if crossings < fewest:
+            best, fewest = [list(layer) for layer in layers], crossings
+    return best
+
+
+def _crossings(layers: Sequence[Sequence[str]], links: Sequence[Pair]) -> int:
+    place = {node: (rank, at) for rank, layer in enumerate(layers) for at, node in enumerate(layer)}
+    spans = sorted((place[begin], place[end][1]) for begin, end in links)
+    return sum(
+        one[0][0] == other[0][0] and one[0][1] < other[0][1] and one[1] > other[1]
+        for one, other in combinations(spans, 2)
+    )
+
+
+def _middles(
+    layers: Sequence[Sequence[str]], heights: Mapping[str, float], links: Sequence[Pair]
+) -> dict[str, float]:
+    """The y of the middle of each node; the highest node begins at 0."""
+    neighbours = _successors([*map(_reversed, links), *links])
+    middles: dict[str, float] = {}
+    for layer in layers:
+        y = 0.0
+        for node in layer:
+            middles[node] = y + heights[node] / 2
+            y += heights[node] + _NODE_GAP
+    for _ in range(_SWEEPS):
+        for layer in (*layers, *layers[::-1]):
+            desired = [mean([middles[other] for other in neighbours.get(node, [node])]) for node in layer]
+            middles.update(zip(layer, _spread_out(desired, [heights[node] for node in layer]), strict=True))
+    top = min((middles[node] - height / 2 for node, height in heights.items()), default=0.0)
+    return {node: middle - top for node, middle in middles.items()}
+
+
+def _spread_out(desired: Sequence[float], heights: Sequence[float]) -> list[float]:
+    """Middles nearest to the desired ones, in the same order and without overlap."""
+    offsets = [0.0]
+    for above, below in pairwise(heights):
+        offsets.append(offsets[-1] + (above + below) / 2 + _NODE_GAP)
+    # Without the required distances the middles only have to ascend; neighbours that do not move as one.
+    blocks: list[list[float]] = []
+    for middle, offset in zip(desired, offsets, strict=True):
+        blocks.append([middle - offset])
+        while len(blocks) > 1 and mean(blocks[-2]) > mean(blocks[-1]):
+            last = blocks.pop()
+            blocks[-1] += last
+    flat = [mean(block) for block in blocks for _ in block]
+    return [y + offset for y, offset in zip(flat, offsets, strict=True)]
+
+
+def _ports(
+    attached: Sequence[tuple[str, float]],
+    places: Mapping[str, Point],
+    sizes: Mapping[str, Size],
+    *,
+    side: int,
+) -> dict[int, Point]:
+    """Where each edge touches its node, given as (node, y of the edge's next point).
+
+    Edges are spread over the left (``side`` 0) or right (1) edge of a node in the order of their next points.
+    """
+    by_node: dict[str, list[tuple[float, int]]] = {}
+    for number, (node, y) in enumerate(attached):
+        by_node.setdefault(node, []).append((y, number))
+    ports: dict[int, Point] = {}
+    for node, ends in by_node.items():
+        (x, y), (width, height) = places[node], sizes[node]
+        for position, (_, number) in enumerate(sorted(ends), 1):
+            ports[number] = (x + side * width, y + height * position / (len(ends) + 1))
+    return ports
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrangement:
+    """One way to draw a subtree: its size, and the (x, width, height) of its root in it.
+
+    A ``name`` of None is no node: its ``parts`` are children of one node that share a rail.
+    """
+
+    name: str | None
+    width: float
+    height: float
+    box: tuple[float, float, float]
+    has_rail: bool
+    parts: tuple[_Arrangement, ...]
+
+    @property
+    def middle(self) -> float:
+        """The x at which the line from the parent arrives."""
+        x, width, _ = self.box
+        return x + width / 2
+
+
+def tree_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
+    """Layout of trees from the top down, on a page that is not too wide.
+
+    A node is drawn with its children side by side below it, or under each other along a rail, or with its
+    leaves along a rail beside the other children. Of all combinations, from the leaves up, those are kept
+    that no other one beats in both width and height; the one that fits the smallest page is drawn.
+    """
+    children = _successors(edges)
+    entered = {end for _, end in edges}
+    roots = [name for name in sizes if name not in entered]
+    trees = [min(_arrangements(root, children, sizes), key=_page_size) for root in roots]
+    area = sum((tree.width + _TREE_GAP) * (tree.height + _TREE_GAP) for tree in trees)
+    page_width = max([sqrt(area * _PAGE_SHAPE), *(tree.width for tree in trees)])
+    layout = Layout({}, {})
+    x = y = row_height = 0.0
+    for tree in trees:
+        if x and x + tree.width > page_width:
+            x, y, row_height = 0.0, y + row_height + _TREE_GAP, 0.0
+        _place(tree, (x, y), sizes, layout)
+        x, row_height = x + tree.width + _TREE_GAP, max(row_height, tree.height)
+    return layout
+
+
+def _page_size(way: _Arrangement) -> tuple[float, float]:
+    """The height of the page that an arrangement fits on, then its own width."""
+    return max(way.width / _PAGE_SHAPE, way.height), way.width
+
+
+def _arrangements(
+    root: str, children: Mapping[str, Sequence[str]], sizes: Mapping[str, Size]
+) -> list[_Arrangement]:
+    """The ways to draw a tree that no other one beats; not recursive, so that depth has no limit."""
+    found: dict[str, list[_Arrangement]] = {}
+    order = [root]
+    for name in order:
+        order += children.get(name, ())
+    for name in reversed(order):
+        below = [found.pop(child) for child in children.get(name, ())]
+        best: list[_Arrangement] = []
+        for way in sorted(_arrange(name, sizes[name], below), key=lambda way: (way.width, way.height)):
+            if not best or way.height < best[-1].height:
+                best.append(way)
+        # Not too many, and as evenly chosen as possible.
+        step = max(1.0, (len(best) - 1) / (_MAX_ARRANGEMENTS - 1))
+        found[name] = [best[round(number * step)] for number in range(min(len(best), _MAX_ARRANGEMENTS))]
+    return found[root]
+
+
+def _arrange(name: str, size: Size, below: Sequence[list[_Arrangement]]) -> Iterator[_Arrangement]:
+    if not below:
+        yield _Arrangement(name, *size, (0.0, *size), False, ())
+        return
+    leaves = [ways for ways in below if not ways[0].parts]
+    others = [ways for ways in below if ways[0].parts]
+    yield from _side_by_side(name, size, below)
+    if len(below) > 1 or leaves:
+        for width in sorted({way.width for ways in below for way in ways}):
+            # For each width of the column, its lowest arrangement.
+            fitting = [[way for way in ways if way.width <= width] for ways in below]
+            if all(fitting):
+                yield _along_rail(name, size, [min(ways, key=lambda way: way.height) for ways in fitting])
+    if len(leaves) > 1 and others:
+        rail = [_along_rail(None, (0.0, 0.0), [way for way, *_ in leaves])]
+        yield from _side_by_side(name, size, [rail, *others])
+
+
+def _side_by_side(name: str, size: Size, below: Sequence[list[_Arrangement]]) -> Iterator[_Arrangement]:
+    """For each height that the row of children can have, its narrowest arrangement."""
+    for height in sorted({way.height for ways in below for way in ways}):
+        fitting = [[way for way in ways if way.height <= height] for ways in below]
+        if all(fitting):
+            row = tuple(min(ways, key=lambda way: way.width) for ways in fitting)
+            width, middle = _row_span(row)
+            x = middle - size[0] / 2
+            shift = max(0.0, -x)
+            whole = (
+                max(width + shift, x + shift + size[0]),
+                size[1] + _BELOW + max(way.height for way in row),
+            )
+            yield _Arrangement(name, *whole, (x + shift, *size), False, row)
+
+
+def _row_span(row: Sequence[_Arrangement]) -> tuple[float, float]:
+    """The width of a row, and the middle of the lines that arrive at it."""
+    width = sum(way.width for way in row) + _ACROSS * (len(row) - 1)
+    return width, (row[0].middle + width - row[-1].width + row[-1].middle) / 2
+
+
+def _along_rail(name: str | None, size: Size, column: Sequence[_Arrangement]) -> _Arrangement:
+    width = max(size[0], _INDENT + max(way.width for way in column))
+    height = size[1] + sum(_STACKED + way.height for way in column)
+    box = (0.0, *size) if name is not None else (0.0, 2 * _RAIL, 0.0)
+    return _Arrangement(name, width, height, box, True, tuple(column))
+
+
+def _place(tree: _Arrangement, corner: Point, sizes: Mapping[str, Size], layout: Layout) -> None:
+    """Add the nodes and edges of ``tree`` to ``layout``; ``corner`` is the upper left one."""
+    places = layout.places
+    stack: list[tuple[_Arrangement, float, float, str | None, float | None]] = [(tree, *corner, None, None)]
+    while stack:
+        way, left, top, parent, rail = stack.pop()
+        box_x, width, height = way.box
+        if way.name is not None:
+            places[way.name] = (left + box_x, top)
+            if parent is not None:
+                ends = (places[parent], sizes[parent]), (places[way.name], sizes[way.name])
+                layout.routes[parent, way.name] = _connect(*ends, rail)
+            parent = way.name
+        if way.has_rail:
+            part_x, part_y, rail = left + _INDENT, top + height + _STACKED, left + _RAIL
+        else:
+            arrival = _row_span(way.parts)[1] if way.parts else 0.0
+            part_x, part_y, rail = left + box_x + width / 2 - arrival, top + height + _BELOW, None
+        parts: list[tuple[_Arrangement, float, float, str | None, float | None]] = []
+        for part in way.parts:
+            parts.append((part, part_x, part_y, parent, rail))
+            if way.has_rail:
+                part_y += part.height + _STACKED
+            else:
+                part_x += part.width + _ACROSS
+        stack += parts[::-1]
+
+
+def _connect(parent: tuple[Point, Size], child: tuple[Point, Size], rail: float | None) -> list[Point]:
+    """From the lower edge of the parent to the upper edge of the child, or along a rail to its left edge."""
+    ((left, top), (width, height)), ((x, y), (child_width, child_height)) = parent, child
+    begin, bottom = left + width / 2, top + height
+    bus = bottom + _BELOW / 2
+    if rail is None:
+        middle = x + child_width / 2
+        return [(begin, bottom), (begin, bus), (middle, bus), (middle, y)]
+    is_below_parent = left < rail < left + width
+    start = [(rail, bottom)] if is_below_parent else [(begin, bottom), (begin, bus), (rail, bus)]
+    return [*start, (rail, y + child_height / 2), (x, y + child_height / 2)]

@@ -1,1 +1,0 @@
-"""Pictures of frames and programs, as SVG and as text for other tools, without any of them."""

@@ -1,0 +1,267 @@
+"""The graph: which programs write and read the streams of robots, and which ROS nodes use their topics.
+
+It is discovered from the liveliness tokens of writers and readers. Programs that subscribe to keys without
+zstate have no token.
+"""
+
+# pyright: reportUnknownMemberType=false
+# zenoh's stubs leave the return types of some methods out
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from zstate.closing import Closing
+from zstate.errors import NetworkError
+from zstate.net.presence import RobotInfo, discover, discover_readers, living_tokens
+from zstate.net.session import Session
+from zstate.net.status import watch_status
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream
+from zstate.wire.messages import Status
+from zstate.wire.writer import Announced, Writer
+
+if TYPE_CHECKING:
+    from zstate.wire.ros2.graph import DdsToken, EndpointToken, NodeToken
+    from zstate.wire.ros2.wire import Ros2Wire
+
+    RosEndpoint = EndpointToken | DdsToken
+
+ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description", "clock")
+
+_PERIOD_S = 2.0
+_FIRST_PERIOD_S = 0.5
+_DISCOVERY_TIMEOUT_S = 0.3
+_IDLE_AFTER_S = 3.0
+_JOIN_TIMEOUT_S = 1.0
+_MAX_STATUSES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class StreamUse:
+    """One stream of ``robot`` with the programs that write and read it, each once, sorted.
+
+    A ROS topic belongs to no robot: ``robot`` is empty, ``name`` is the topic with its namespace.
+    ``rate_hz`` is None for latched streams and if it was not measured.
+    """
+
+    robot: str
+    name: str
+    writers: tuple[str, ...]
+    readers: tuple[str, ...]
+    rate_hz: float | None = None
+
+    @property
+    def label(self) -> str:
+        """The name, and the rate if it is known."""
+        return self.name if self.rate_hz is None else f"{self.name} ({self.rate_hz:.1f} Hz)"
+
+
+@dataclass(frozen=True, slots=True)
+class StreamGroup:
+    """Streams of one robot that have the same writers and readers."""
+
+    robot: str
+    writers: tuple[str, ...]
+    readers: tuple[str, ...]
+    streams: tuple[StreamUse, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """All streams, sorted."""
+
+    streams: tuple[StreamUse, ...] = ()
+
+    @property
+    def programs(self) -> list[str]:
+        """All writers and readers, sorted."""
+        return sorted({one for stream in self.streams for one in (*stream.writers, *stream.readers)})
+
+    @property
+    def groups(self) -> list[StreamGroup]:
+        """The streams, grouped by robot, writers and readers."""
+        groups: dict[tuple[str, tuple[str, ...], tuple[str, ...]], list[StreamUse]] = {}
+        for stream in self.streams:
+            groups.setdefault((stream.robot, stream.writers, stream.readers), []).append(stream)
+        return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
+
+
+RateOf = Callable[[str, Stream, Writer], float | None]
+"""The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
+
+
+def graph_of(
+    robots: Sequence[RobotInfo], readers: Sequence[Announced], rate_of: RateOf | None = None
+) -> Graph:
+    """The graph of discovered writers and readers.
+
+    Static edges have a stream for each name under which they are written. The rate is that of the first
+    writer whose rate is known: usually there is only one.
+    """
+    return Graph(tuple(_stream_uses(robots, readers, rate_of)))
+
+
+def _stream_uses(
+    robots: Sequence[RobotInfo], readers: Sequence[Announced], rate_of: RateOf | None
+) -> Iterator[StreamUse]:
+    written: set[tuple[str, Stream]] = {
+        (robot.name, stream) for robot in robots for stream, _ in robot.writers
+    }
+    # A reader of all robots does not miss a stream that one of them lacks.
+    read: set[tuple[str, Stream]] = {
+        (one.robot, one.stream) for one in readers if one.robot != ANY or not written
+    }
+    for robot, stream in sorted(written | read):
+        reading = [one.writer for one in readers if one.stream == stream and one.robot in (robot, ANY)]
+        named = [pair for info in robots if info.name == robot for pair in _named_writers(info, stream)]
+        for name in dict.fromkeys(name for name, _ in named) or ("",):
+            writers = [writer for writer_name, writer in named if writer_name == name]
+            rates = (rate_of(robot, stream, writer) for writer in writers) if rate_of else ()
+            rate_hz = next((rate for rate in rates if rate is not None), None)
+            shown = f"{stream}/{name}" if name else stream
+            yield StreamUse(robot, shown, _programs(writers), _programs(reading), rate_hz)
+
+
+def _named_writers(robot: RobotInfo, stream: Stream) -> Iterator[tuple[str, Writer]]:
+    """The writers of a stream, with the names under which they write static edges."""
+    for written, writer in robot.writers:
+        if written == stream:
+            names = [name for name in robot.names_of(writer) if name != MODEL_WRITER]
+            yield from ((name, writer) for name in (names if stream == "tf_static" and names else [""]))
+
+
+def _programs(writers: Iterable[Writer]) -> tuple[str, ...]:
+    return tuple(sorted({str(writer) for writer in writers}))
+
+
+@dataclass(frozen=True, slots=True)
+class WriterState:
+    """The newest status of a publisher of ``robot``, received ``age_s`` ago."""
+
+    robot: str
+    status: Status
+    age_s: float
+
+
+class GraphMonitor(Closing):
+    """Keeps the graph and the status of all publishers up to date, from a thread of its own.
+
+    Discovery runs every 2 s, and only if ``graph`` was called in the last 3 s.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._graph = Graph()
+        self._statuses: dict[tuple[str, int], tuple[Status, float]] = {}
+        self._used_at = -_IDLE_AFTER_S
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._status = watch_status(session, ANY, self._on_status)
+        self._thread = threading.Thread(target=self._run, name="zstate graph", daemon=True)
+        self._thread.start()
+
+    def graph(self) -> Graph:
+        """Every stream that is written, or read by its robot's name; from the latest discovery."""
+        self._used_at = time.monotonic()
+        return self._graph
+
+    def states(self) -> tuple[WriterState, ...]:
+        """The newest status of every announced publisher, sorted by robot and program."""
+        with self._lock:
+            statuses = list(self._statuses.items())
+        now = time.monotonic()
+        states = (WriterState(robot, status, now - at) for (robot, _), (status, at) in statuses)
+        return tuple(sorted(states, key=lambda state: (state.robot, state.status.program)))
+
+    def _on_status(self, robot: str, status: Status) -> None:
+        key = (robot, status.session)
+        with self._lock:
+            if key in self._statuses or len(self._statuses) < _MAX_STATUSES:
+                self._statuses[key] = (status, time.monotonic())
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S if self._graph.streams else _FIRST_PERIOD_S):
+            if time.monotonic() - self._used_at < _IDLE_AFTER_S:
+                try:
+                    self._update()
+                except NetworkError:
+                    return
+
+    def _update(self) -> None:
+        robots = discover(self._session, _DISCOVERY_TIMEOUT_S)
+        graph = graph_of(robots, discover_readers(self._session, _DISCOVERY_TIMEOUT_S))
+        # The process of this monitor may itself read all robots, which is no stream of a robot.
+        self._graph = Graph(tuple(stream for stream in graph.streams if stream.robot != ANY))
+        alive = {(robot.name, writer.session) for robot in robots for _, writer in robot.writers}
+        with self._lock:
+            for key in self._statuses.keys() - alive:
+                del self._statuses[key]
+
+    def close(self) -> None:
+        """Stop the thread. A second call does nothing."""
+        self._stop.set()
+        self._status.close()
+        self._thread.join(_JOIN_TIMEOUT_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic, with its leading slash, that carries ``stream``."""
+
+    name: str
+    stream: Stream
+    publishers: tuple[RosEndpoint, ...]
+    subscribers: tuple[RosEndpoint, ...]
+
+    @property
+    def namespace(self) -> str:
+        """Without outer slashes; empty for the root."""
+        return self.name.rpartition("/")[0].strip("/")
+
+
+@dataclass(frozen=True, slots=True)
+class RosGraph:
+    """Announced nodes and topics, sorted by name. Bridges of ros2dds announce no nodes."""
+
+    nodes: tuple[NodeToken, ...]
+    topics: tuple[Topic, ...]
+
+    @property
+    def graph(self) -> Graph:
+        """The topics, with the names of the nodes at their ends."""
+
+        def names(ends: Iterable[RosEndpoint]) -> tuple[str, ...]:
+            return tuple(sorted({end.full_name for end in ends}))
+
+        uses = (StreamUse("", one.name, names(one.publishers), names(one.subscribers)) for one in self.topics)
+        return Graph(tuple(uses))
+
+
+def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
+    """The ROS graph of all namespaces of the domain. Takes up to a second if nothing is announced.
+
+    A topic belongs to the stream that has its last name and its type; other topics are left out.
+    """
+    from zstate.wire.ros2.graph import NodeToken, parse_dds_token, parse_token  # noqa: PLC0415 - ROS only
+    from zstate.wire.ros2.topics import type_of  # noqa: PLC0415 - ROS only
+
+    parse = parse_dds_token if wire.name == "ros2dds" else parse_token
+    nodes: list[NodeToken] = []
+    ends: dict[tuple[str, Stream], list[RosEndpoint]] = {}
+    for token in map(parse, living_tokens(session, wire.writers_expression("*"))):
+        if isinstance(token, NodeToken):
+            nodes.append(token)
+        elif token is not None:
+            for stream in ROS_STREAMS:
+                if token.topic.rpartition("/")[2] == stream and token.dds_type == type_of(stream).dds:
+                    ends.setdefault((f"/{token.topic.strip('/')}", stream), []).append(token)
+    topics: list[Topic] = []
+    for (name, stream), tokens in sorted(ends.items()):
+        tokens.sort(key=lambda token: (token.full_name, token.zid, token.hash, token.key))
+        publishers = tuple(token for token in tokens if token.kind == "MP")
+        topics.append(Topic(name, stream, publishers, tuple(token for token in tokens if token.kind == "MS")))
+    return RosGraph(tuple(sorted(nodes, key=lambda node: (node.full_name, node.key))), tuple(topics))
