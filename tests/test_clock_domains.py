@@ -23,7 +23,7 @@ from zstate.following.tally import Tally
 from zstate.listener import TransformListener
 from zstate.net.streams import StreamPublisher
 from zstate.publisher import StatePublisher
-from zstate.replayer import Replayer
+from zstate.recording.player import Player
 from zstate.simulated_clock import SimulatedClock
 from zstate.statics import StaticPublisher
 from zstate.transform import Transform
@@ -465,7 +465,7 @@ def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
     with (
         StatePublisher(writer, RRBOT, "r1"),
         TransformListener(reader, "*", clock=SystemClock()) as listener,
-        Replayer(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
+        Player(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
     ):
         until(lambda: listener.buffer.domain.of("r1") == "system")
         replayer.run()

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from zstate.net.presence import discover
     from zstate.net.session import connect
     from zstate.publisher import StatePublisher
-    from zstate.recording import Recording
+    from zstate.recording.recording import Recording
     from zstate.simulated_clock import SimulatedClock
     from zstate.sources import JointReading, SineSource
     from zstate.statics import StaticPublisher
@@ -91,7 +91,7 @@ __all__ = [
 _HOMES = {
     "JointReading": "sources",
     "Kinematics": "model.kinematics",
-    "Recording": "recording",
+    "Recording": "recording.recording",
     "RobotModel": "model.robot",
     "SimulatedClock": "simulated_clock",
     "SineSource": "sources",

@@ -54,10 +54,10 @@ class TransformBuffer(Questions):
         each reason. Raises RecordingError, and InvalidInput when there is nothing of ``robot`` in it.
         """
         from zstate.following.recorded import HISTORY_S, fill  # noqa: PLC0415 - looked for here, made there
-        from zstate.record.reader import RecordReader  # noqa: PLC0415 - as above
+        from zstate.recording.reader import RecordingReader  # noqa: PLC0415 - as above
 
         buffer = cls(HISTORY_S, clock)
-        with RecordReader(path) as reader:
+        with RecordingReader(path) as reader:
             fill(buffer, reader, robot)
         return buffer
 

@@ -31,9 +31,14 @@ from zstate.following.statics import StaticFollower
 from zstate.following.tally import Stats, Tally
 from zstate.following.unmodelled import Unmodelled
 from zstate.model.robot import RobotModel
-from zstate.record.models import first_descriptions, model_of
-from zstate.record.reader import RecordReader
-from zstate.record.transcript import Said, Speaker, Transcript
+from zstate.recording.decode import (
+    DecodedMessage,
+    DecodedRecording,
+    RecordedWriter,
+    first_descriptions,
+    recorded_model,
+)
+from zstate.recording.reader import RecordingReader
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
     JointState,
@@ -53,7 +58,7 @@ _UNNAMED = "a ROS node"
 
 def fill(
     buffer: TransformBuffer,
-    reader: RecordReader,
+    reader: RecordingReader,
     robot: str | None = None,
     *,
     around: NDArray[np.int64] | None = None,
@@ -64,24 +69,24 @@ def fill(
     """
     tally = Tally()
     buffer.home.is_recording = True
-    transcript = Transcript(reader, tally.refuse)
+    transcript = DecodedRecording(reader, tally.refuse)
     robots = None if robot is None else (check_recorded(transcript, robot),)
-    shares_frames = any(speaker.foreign or _is_of_ros(speaker) for speaker in transcript.speakers)
+    shares_frames = any(speaker.foreign or _is_of_ros(speaker) for speaker in transcript.writers)
     followed = RecordedRobots(buffer, tally, () if shares_frames else transcript.robots)
     for description in first_descriptions(transcript, robots).values():
-        model = model_of(transcript, description, tally.refuse)
+        model = recorded_model(transcript, description, tally.refuse)
         if model is not None:
             followed.follow(description, model)
     stamps = None if around is None else np.unique(around)
     batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
-    for count, said in enumerate(transcript.said(robots), 1):
+    for count, said in enumerate(transcript.messages(robots), 1):
         followed.take(said)
         if stamps is not None and not count % batch:
             buffer.keep_around(stamps)
     return tally.stats()
 
 
-def check_recorded(transcript: Transcript, robot: str) -> str:
+def check_recorded(transcript: DecodedRecording, robot: str) -> str:
     """``robot``, if the recording tells of it. Raises InvalidInput, with those it tells of."""
     if robot not in transcript.robots:
         there = ", ".join(map(repr, transcript.robots)) or "none"
@@ -89,7 +94,7 @@ def check_recorded(transcript: Transcript, robot: str) -> str:
     return robot
 
 
-def _is_of_ros(speaker: Speaker) -> bool:
+def _is_of_ros(speaker: RecordedWriter) -> bool:
     return speaker.stream == "tf_static" and speaker.static_writer is None
 
 
@@ -109,18 +114,18 @@ class RecordedRobots:
         self._statics: dict[tuple[str, str | int], StaticFollower] = {}
         self._said: dict[tuple[str, str | int], StaticTransforms] = {}
         self._withdrawn: set[str] = set()
-        self._named: set[Speaker] = set()
+        self._named: set[RecordedWriter] = set()
         self._unmodelled = Unmodelled()
         self._times = EdgeTimes()
 
-    def follow(self, description: Said, model: RobotModel) -> None:
+    def follow(self, description: DecodedMessage, model: RobotModel) -> None:
         """Follow the joint states of a robot, whose ``model`` that is. Before anything is taken."""
-        robot = description.speaker.robot
+        robot = description.writer.robot
         self._unmodelled.learn(robot, model)
         self._joints[robot] = RecordedJoints(robot, self._ownership, self._unmodelled)
         self.take(description)
 
-    def take(self, said: Said) -> None:
+    def take(self, said: DecodedMessage) -> None:
         """The next message."""
         speaker, message, _ = said
         if isinstance(message, JointState):
@@ -133,7 +138,7 @@ class RecordedRobots:
             self._name(self._joints[speaker.robot], speaker)
             self._joints[speaker.robot].describe(message)
 
-    def _take_joints(self, speaker: Speaker, state: JointState) -> None:
+    def _take_joints(self, speaker: RecordedWriter, state: JointState) -> None:
         follower = self._joints.get(speaker.robot)
         if follower is None:
             text = f"{speaker.robot!r}: no robot_description fits its joint states"
@@ -142,7 +147,7 @@ class RecordedRobots:
             self._name(follower, speaker)
             follower.take(state, overflowed=False)
 
-    def _take_edges(self, speaker: Speaker, sample: TransformSample) -> None:
+    def _take_edges(self, speaker: RecordedWriter, sample: TransformSample) -> None:
         rest = self._unmodelled.sample(speaker.robot, sample)
         if rest is None or rest.edges is None:
             return
@@ -153,7 +158,7 @@ class RecordedRobots:
         self._name(self._edges[key], speaker)
         self._edges[key].take(rest, overflowed=False)
 
-    def _take_statics(self, speaker: Speaker, statics: StaticTransforms) -> None:
+    def _take_statics(self, speaker: RecordedWriter, statics: StaticTransforms) -> None:
         robot, writer = speaker.robot, speaker.static_writer
         if writer == MODEL_WRITER and robot in self._joints:
             return  # the model itself says the same
@@ -170,7 +175,7 @@ class RecordedRobots:
         make = StaticFollower(robot, name, self._ownership)
         self._statics.setdefault(key, make).add(rest)
 
-    def _name(self, follower: Follower, speaker: Speaker) -> None:
+    def _name(self, follower: Follower, speaker: RecordedWriter) -> None:
         if speaker not in self._named and speaker.program is not None:
             follower.name_writer(speaker.session, speaker.program)
             self._named.add(speaker)
