@@ -386,7 +386,7 @@ RATCHETS = (
     Ratchet("modules in largest folder", modules_in_largest_folder, 44, 18),
     Ratchet("modules in cycles", modules_in_cycles, 11, 0),
     Ratchet("modules", lambda: len(modules()), 404, 270),
-    Ratchet("lines", lines, 45_838, 36_000),
+    Ratchet("lines", lines, 45_819, 36_000),
     Ratchet("median body", median_body, 4, 6),
 )
 

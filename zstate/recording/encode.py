@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
@@ -84,7 +84,7 @@ class RecordingEncoder:
         self._namespaces = RosNamespaces(alone)
         self._programs = programs
         self._lock = new_lock()
-        self._channels: dict[str, OpenChannels] = {}
+        self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
         self._latched: dict[str, dict[str, ChannelWriter]] = {}
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
         self._orders: dict[str, OrderRegistry] = {}
@@ -185,24 +185,19 @@ class RecordingEncoder:
             self._counts[robot, stream] += 1
 
     def _orders_of(self, robot: str) -> OrderRegistry:
+        # Atomic: descriptions are added from another thread, without the lock.
         return self._orders.setdefault(robot, OrderRegistry())
 
     def _channel(
         self, robot: str, stream: Stream, session: int, log_time: int, static_writer: str = ""
     ) -> ChannelWriter:
         key = (stream, session, static_writer)
-        opened = self._channels.get(robot)
-        if opened is None:
-            opened = self._channels[robot] = OpenChannels()
+        opened = self._channels[robot]
         channel = opened.find(key)
-        if channel is None:
-            if not opened.allow(log_time):
-                raise _TooManyWriters("its writers start too often, each with channels of its own")
-            channel = self._new_channel(robot, *key)
-            opened.add(key, channel, self._latched.get(robot, {}).values())
-        return channel
-
-    def _new_channel(self, robot: str, stream: Stream, session: int, static_writer: str) -> ChannelWriter:
+        if channel is not None:
+            return channel
+        if not opened.allow(log_time):
+            raise _TooManyWriters("its writers start too often, each with channels of its own")
         options = self._namespaces.options(robot)
         metadata = {"zstate.session": str(session)}
         if stream != "clock":
@@ -212,8 +207,10 @@ class RecordingEncoder:
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
         topic = RmwKeys(options).topic(robot, stream)
-        channel = self._writer.channel(topic, type_of(stream), STREAM_QOS[stream], metadata)
-        return ChannelWriter(self._writer, channel, stream, FrameNames(options, robot))
+        number = self._writer.channel(topic, type_of(stream), STREAM_QOS[stream], metadata)
+        channel = ChannelWriter(self._writer, number, stream, FrameNames(options, robot))
+        opened.add(key, channel, self._latched.get(robot, {}).values())
+        return channel
 
 
 class ChannelWriter:
@@ -231,14 +228,10 @@ class ChannelWriter:
 
     def write(self, message: Sample | Clock, sample_names: SampleNames, log_time: int) -> None:
         """Write one sample; ``sample_names`` names its numbers."""
-        payload = self._encode(message, sample_names)
+        payload = self.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
         publish_time = max(message.stamp, 0)
         self._writer.write(self._channel, payload, log_time, publish_time, sequence=message.seq)
-
-    def encode(self, message: Message) -> bytes:
-        """The payload of a latched message; slow for a large one."""
-        return self._encode(message, _NAMED)
 
     def latch(self, key: str, payload: bytes, log_time: int) -> None:
         """Write a payload that is latched until the next of this ``key``."""
@@ -252,7 +245,8 @@ class ChannelWriter:
         """Leave the channel out of the files that follow."""
         self._writer.release(self._channel)
 
-    def _encode(self, message: Message, sample_names: SampleNames) -> bytes:
+    def encode(self, message: Message, sample_names: SampleNames = _NAMED) -> bytes:
+        """The payload of ``message``; slow for a large latched one."""
         if sample_names is not self._sample_names:
             self._sample_names = sample_names
             self._outlet = RosOutlet(self._stream, _NO_ADDRESS, self._names, sample_names)

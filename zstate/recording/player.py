@@ -235,17 +235,14 @@ class Player(Closing):
             if not self._is_open or self._target is not None:
                 return False
             if self._is_paused:
-                self._wait_paused(ticks)
+                self._player_clock.pause()
+                while not self._wake.wait(1.0 / CLOCK_HZ):
+                    if ticks is not None:
+                        ticks.repeat(self._position)
+                self._player_clock.start(self._position)
             elif self._player_clock.wait(log_time, self._wake):
                 self._position = log_time
                 return True
-
-    def _wait_paused(self, ticks: _ClockTicks | None) -> None:
-        self._player_clock.pause()
-        while not self._wake.wait(1.0 / CLOCK_HZ):
-            if ticks is not None:
-                ticks.repeat(self._position)
-        self._player_clock.start(self._position)
 
     def _publish(
         self, decoded: DecodedMessage, publishers: PlaybackPublishers, clock: ClockPublisher

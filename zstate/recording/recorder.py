@@ -183,7 +183,7 @@ class Recorder(Closing):
         self._closing = new_lock()
         self._stop = outlive_fork(threading.Event())
         self._ended = outlive_fork(threading.Event())
-        self._large = _LargeValues(self._write_large, self._tally)
+        self._large = _LargeValues(self._write_arrival, self._tally)
         with ExitStack() as opening:
             self._queue = opening.enter_context(MessageQueue(session))
             robot = self._selected[0] if len(self._selected) == 1 else ANY
@@ -285,7 +285,7 @@ class Recorder(Closing):
         if self._encoder is None:
             return
         for batch in self._pending:
-            self._write(self._encoder, batch)
+            self._write(batch)
         self._pending = []
 
     def _new_encoder(self) -> RecordingEncoder | None:
@@ -306,7 +306,7 @@ class Recorder(Closing):
         alone = others.pop() if len(others) == 1 else None
         return RecordingEncoder(self._writer, self._tally.refuse, alone=alone, programs=self._programs)
 
-    def _write(self, encoder: RecordingEncoder, batch: Batch) -> None:
+    def _write(self, batch: Batch) -> None:
         self._gaps.begin(overflowed=batch.overflowed)
         for arrival in batch.arrivals:
             if time.monotonic() > self._ends_at:
@@ -318,14 +318,11 @@ class Recorder(Closing):
             if batch.stream in _LATCHED and self._large.accepts(robot, len(arrival.payload)):
                 self._large.put(robot, batch, arrival)
             else:
-                self._write_arrival(encoder, batch, robot, arrival)
+                self._write_arrival(robot, batch, arrival)
 
-    def _write_large(self, robot: str, batch: Batch, arrival: Arrival) -> None:
-        assert self._encoder is not None
-        self._write_arrival(self._encoder, batch, robot, arrival)
-
-    def _write_arrival(self, encoder: RecordingEncoder, batch: Batch, robot: str, arrival: Arrival) -> None:
-        stream, stamp = batch.stream, batch.stamp
+    def _write_arrival(self, robot: str, batch: Batch, arrival: Arrival) -> None:
+        encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
+        assert encoder is not None
         static_writer = self._wire.statics_writer(arrival.key) if stream == "tf_static" else None
         if not arrival.payload and stream in _LATCHED:
             if static_writer is not None:

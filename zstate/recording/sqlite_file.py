@@ -41,7 +41,8 @@ class SqliteFile:
             with self._errors():
                 self._check_tables()
                 self._channels = dict(self._read_channels())
-                self.span = self._read_span()
+                ((first, last),) = self._rows("SELECT min(timestamp), max(timestamp) FROM messages")
+                self.span = None if first is None else (int(first), int(last))
         except RecordingError:
             self.close()
             raise
@@ -96,10 +97,6 @@ class SqliteFile:
             topic, type_name, encoding, *rest = texts
             metadata = {_OPTIONAL[key]: text for key, text in zip(extra, rest, strict=True) if text}
             yield number, Channel(topic, type_name, encoding, metadata, int(counts.get(number, 0)))
-
-    def _read_span(self) -> tuple[int, int] | None:
-        ((first, last),) = self._rows("SELECT min(timestamp), max(timestamp) FROM messages")
-        return None if first is None else (int(first), int(last))
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[Any]:
         self._steps = 0

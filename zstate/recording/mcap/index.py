@@ -134,26 +134,22 @@ class Summary:
 
     def index(self, header: Header) -> Index:
         """The index. Raises CorruptData if the summary leaves something out."""
-        counts, span = self._read_statistics()
+        found = self.statistics
+        if found is None or len(self.chunks) != found.chunk_count:
+            raise CorruptData("its summary leaves out chunks")
+        counts, span = found.channel_message_counts, None
+        if sum(counts.values()) != found.message_count:
+            raise CorruptData("its summary counts its messages in two ways, which differ")
+        if found.message_count:
+            if not self.chunks:
+                raise CorruptData("its messages stand outside of chunks")
+            span = (found.message_start_time, found.message_end_time)
         if not set(counts) <= set(self.channels):
             raise CorruptData("its summary leaves out channels")
         if not {c.schema_id for c in self.channels.values()} <= {0, *self.schemas}:
             raise CorruptData("its summary leaves out schemas")
         ranges = tuple(self._ranges())
         return Index(header, self.schemas, self.channels, counts, span, ranges, complete=True)
-
-    def _read_statistics(self) -> tuple[dict[int, int], tuple[int, int] | None]:
-        found = self.statistics
-        if found is None or len(self.chunks) != found.chunk_count:
-            raise CorruptData("its summary leaves out chunks")
-        counts = found.channel_message_counts
-        if sum(counts.values()) != found.message_count:
-            raise CorruptData("its summary counts its messages in two ways, which differ")
-        if found.message_count == 0:
-            return counts, None
-        if not self.chunks:
-            raise CorruptData("its messages stand outside of chunks")
-        return counts, (found.message_start_time, found.message_end_time)
 
     def _ranges(self) -> Iterator[DataRange]:
         for chunk in self.chunks:

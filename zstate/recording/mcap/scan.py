@@ -109,7 +109,7 @@ class Scan:
         except CorruptData as damage:
             self._add_bare_range(at)
             return self._resume(at, opcode, end, str(damage))
-        return end
+        return stated
 
     def _add_record(self, opcode: int, at: int, end: int | None) -> None:
         if end is None:
