@@ -1,4 +1,4 @@
-"""Recordings that tests tell by hand: what robots say, written by a Scribe, and bags as ROS leaves them."""
+"""Recordings built by hand: robot messages through a RecordingEncoder, and bags as ROS leaves them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from zstate.model.robot import RobotModel
-from zstate.record.scribe import Scribe
-from zstate.record.writer import RecordWriter
+from zstate.recording.encode import RecordingEncoder
+from zstate.recording.mcap.writer import RecordingWriter
 from zstate.transform import Transform
 from zstate.wire.messages import (
     JointState,
@@ -37,9 +37,9 @@ class Tale:
     """A recording in the making; everything is heard a little after its stamp."""
 
     def __init__(self, path: Path, alone: str | None = None, programs: dict[int, str] | None = None) -> None:
-        self.writer = RecordWriter(path)
+        self.writer = RecordingWriter(path)
         self.refused: list[str] = []
-        self.scribe = Scribe(
+        self.scribe = RecordingEncoder(
             self.writer, lambda reason, _: self.refused.append(reason), alone=alone, programs=programs or {}
         )
         self._seqs: dict[tuple[str, int], int] = {}
@@ -58,7 +58,7 @@ class Tale:
 
     def describe(self, robot: str, model: RobotModel = RRBOT, session: int = 1, at: int = START) -> None:
         said = RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
-        self.scribe.take(robot, said, at)
+        self.scribe.write_message(robot, said, at)
 
     def joints(
         self,
@@ -79,7 +79,7 @@ class Tale:
             to_block(positions),
             None if velocities is None else to_block(velocities),
         )
-        self.scribe.take(robot, state, stamp + LATENCY if heard is None else heard)
+        self.scribe.write_message(robot, state, stamp + LATENCY if heard is None else heard)
         return state
 
     def edges(
@@ -94,7 +94,7 @@ class Tale:
         names = tuple(poses)
         block = to_block(list(poses.values()))
         sample = TransformSample(stamp, self._seq(robot, session), session, order_digest(names), block, names)
-        self.scribe.take(robot, sample, stamp + LATENCY if heard is None else heard)
+        self.scribe.write_message(robot, sample, stamp + LATENCY if heard is None else heard)
         return sample
 
     def statics(
@@ -107,7 +107,7 @@ class Tale:
         writer: str | None = "camera",
     ) -> None:
         said = StaticTransforms(session, tuple(poses), to_block(list(poses.values())))
-        self.scribe.take(robot, said, at, writer)
+        self.scribe.write_message(robot, said, at, writer)
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> list[float]:

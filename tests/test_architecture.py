@@ -1,13 +1,21 @@
 """The floors of zstate: imports look down, each library has one home, the pure rooms stay pure.
 
 Read from the import statements, so that nothing needs to run; laziness is seen in a fresh interpreter.
+Below them the ratchets: figures of the source that may only improve;
+`python tests/test_architecture.py` prints them.
 """
 
 import ast
+import io
+import re
+import statistics
 import subprocess
 import sys
-from collections.abc import Iterator
+import tokenize
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,11 +31,10 @@ FLOORS = (
     {"transform", "twist"},
     {"model", "buffer", "wire"},
     {"ingest"},
-    {"net", "record"},
+    {"net"},
     {"sources"},
-    {"nodes", "recorder", "recording"},
-    {"ros1", "bridge", "replaying"},
-    {"replayer"},
+    {"nodes"},
+    {"ros1", "bridge", "recording"},
     {"zstate"},
     {"metrics"},
     {"view", "cli"},
@@ -41,7 +48,6 @@ NEIGHBOURS = {
 # Constructors that users look for on the class, and that are made elsewhere, loaded when they are called.
 CONSTRUCTORS = {
     ("buffer/buffer.py", "recording"),  # TransformBuffer.from_recording
-    ("buffer/buffer.py", "record"),
 }
 
 HOMES = {
@@ -52,9 +58,9 @@ HOMES = {
     "zenoh": "net",
     "cryptography": "net",
     "xxhash": "wire",
-    "mcap": "record",
-    "lz4": "record",
-    "zstandard": "record",
+    "mcap": "recording",
+    "lz4": "recording",
+    "zstandard": "recording",
     "rospy": "ros1",
     "geometry_msgs": "ros1",
     "rosgraph_msgs": "ros1",
@@ -105,6 +111,11 @@ PURE_PARTS = {
 }
 
 
+@cache
+def nodes_of(text: str) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(ast.parse(text)))
+
+
 @dataclass(frozen=True)
 class Source:
     """A file of zstate, by its path in the package."""
@@ -118,7 +129,7 @@ class Source:
         return "zstate" if top == "__init__" else top
 
     def nodes(self) -> Iterator[ast.AST]:
-        return ast.walk(ast.parse(self.text))
+        return iter(nodes_of(self.text))
 
     def imports(self) -> Iterator[tuple[str, ...]]:
         """Each import's dotted name, taken apart; ``from a.b import c`` counts as a.b.c."""
@@ -231,3 +242,157 @@ def test_a_buffer_loads_no_library():
 def test_following_transforms_loads_no_kinematics():
     code = "from zstate import TransformListener, connect\nTransformListener, connect"
     assert loaded_by(code) == {"msgspec", "zenoh"}
+
+
+# Ratchets
+
+DIALECT = re.compile(
+    r"\b(say|said|says|tell|tells|told|hear|hears|heard|whoever|somebody|nobody|whom|beside|anew|meanwhile)\b",
+    re.IGNORECASE,
+)
+BANNED_METHODS = frozenset(
+    ["take", "note", "tell", "say", "said", "hear", "look", "of", "begin", "end", "learn", "hang", "wear"]
+)
+
+
+@cache
+def modules() -> dict[str, Source]:
+    """Every module of the package by its dotted name; a package's name stands for its ``__init__``."""
+    found: dict[str, Source] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found[name] = Source(path.relative_to(PACKAGE).as_posix(), path.read_text())
+    return found
+
+
+@cache
+def importers() -> dict[str, set[str]]:
+    """Which modules import each module: at the top, in a function, for types only, or lazily by its name.
+
+    ``from a.b import c`` is an import of a.b.c if that is a module, else of a.b. A string constant that is
+    a module's whole dotted name is an import: the front door and click load by such names.
+    """
+    found: dict[str, set[str]] = {name: set() for name in modules()}
+    for name, source in modules().items():
+        # The extension is a module of its own, which ``zstate/__init__.py`` does not load.
+        imported = (".".join(parts) for parts in source.imports() if "_kernel" not in parts)
+        names = {one if one in found else one.rpartition(".")[0] for one in imported}
+        names.update(text for text in strings(source) if text.startswith("zstate."))
+        for target in (names & set(found)) - {name}:
+            found[target].add(name)
+    return found
+
+
+def is_counted(name: str) -> bool:
+    """Whether folders and importers of a module count: not packages, ``__main__`` or the commands."""
+    path = modules()[name].path
+    return not path.endswith(("__init__.py", "__main__.py")) and not path.startswith("cli/commands/")
+
+
+def strings(source: Source) -> Iterator[str]:
+    """String literals, docstrings included; of an f-string only its text."""
+    for node in source.nodes():
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def prose(source: Source) -> Iterator[str]:
+    """Comments and string literals; the tokens of f-strings differ between versions of Python."""
+    for token in tokenize.generate_tokens(io.StringIO(source.text).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.string
+    yield from strings(source)
+
+
+def dialect_words() -> int:
+    return sum(len(DIALECT.findall(text)) for source in modules().values() for text in prose(source))
+
+
+def banned_methods() -> int:
+    classes = (
+        node for source in modules().values() for node in source.nodes() if isinstance(node, ast.ClassDef)
+    )
+    methods = (node for one in classes for node in one.body)
+    functions = (node for node in methods if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+    return sum(node.name in BANNED_METHODS for node in functions)
+
+
+def single_importers() -> int:
+    """Modules that exactly one module of the package imports, be it a package's ``__init__`` or a command."""
+    return sum(len(those) == 1 for name, those in importers().items() if is_counted(name))
+
+
+def modules_in_largest_folder() -> int:
+    folders = Counter(modules()[name].path.rpartition("/")[0] for name in modules() if is_counted(name))
+    return max(folders.values())
+
+
+def modules_in_cycles() -> int:
+    """Modules that import themselves through others. That a module loads its packages is not counted."""
+    above = importers()
+
+    def reached(name: str) -> set[str]:
+        found: set[str] = set()
+        ahead = list(above[name])
+        while ahead:
+            if (one := ahead.pop()) not in found:
+                found.add(one)
+                ahead.extend(above[one])
+        return found
+
+    return sum(name in reached(name) for name in above)
+
+
+def lines() -> int:
+    return sum(source.text.count("\n") for source in modules().values())
+
+
+def median_body() -> int:
+    """Lines from the first to the last statement of a function, its docstring left out."""
+    bodies: list[int] = []
+    for source in modules().values():
+        for node in source.nodes():
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                body = node.body[1:] if ast.get_docstring(node) is not None else node.body
+                bodies.append((body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0)
+    return int(statistics.median(bodies))
+
+
+@dataclass(frozen=True)
+class Ratchet:
+    """A figure of the source: what it may be at worst ``today``, and what it is to become."""
+
+    name: str
+    figure: Callable[[], int]
+    today: int
+    goal: int
+
+    def is_worse(self, value: int) -> bool:
+        return value < self.today if self.goal > self.today else value > self.today
+
+
+RATCHETS = (
+    Ratchet("dialect words", dialect_words, 1040, 150),
+    Ratchet("banned methods", banned_methods, 53, 0),
+    Ratchet("single importers", single_importers, 119, 25),
+    Ratchet("modules in largest folder", modules_in_largest_folder, 44, 18),
+    Ratchet("modules in cycles", modules_in_cycles, 11, 0),
+    Ratchet("modules", lambda: len(modules()), 404, 270),
+    Ratchet("lines", lines, 45_819, 36_000),
+    Ratchet("median body", median_body, 4, 6),
+)
+
+
+@pytest.mark.parametrize("ratchet", RATCHETS, ids=lambda ratchet: ratchet.name)
+def test_no_figure_gets_worse(ratchet: Ratchet):
+    value = ratchet.figure()
+    assert not ratchet.is_worse(value), f"{ratchet.name} was {ratchet.today}, and is {value} now"
+    assert abs(value - ratchet.today) <= 0.05 * ratchet.today, f"write {value} for {ratchet.name} in RATCHETS"
+
+
+if __name__ == "__main__":
+    for ratchet in RATCHETS:
+        print(
+            f"{ratchet.name:28}{ratchet.figure():>8}   at worst {ratchet.today:>6}   goal {ratchet.goal:>6}"
+        )

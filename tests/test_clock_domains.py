@@ -24,7 +24,7 @@ from zstate.nodes.clock import ClockPublisher, SimulatedClock
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
-from zstate.replayer import Replayer
+from zstate.recording.player import Player
 from zstate.transform import Transform
 from zstate.wire.messages import JointState, RobotDescription, TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
@@ -466,7 +466,7 @@ def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
     with (
         StatePublisher(writer, RRBOT, "r1"),
         TransformListener(reader, "*", clock=SystemClock()) as listener,
-        Replayer(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
+        Player(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
     ):
         until(lambda: listener.buffer.domain.of("r1") == "system")
         replayer.run()

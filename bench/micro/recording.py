@@ -23,9 +23,9 @@ from bench.micro.others import meet_nobody_else, running
 from zstate import connect
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.record.reader import RecordReader
-from zstate.recorder import Recorder
-from zstate.replayer import Replayer
+from zstate.recording.player import Player
+from zstate.recording.reader import RecordingReader
+from zstate.recording.recorder import Recorder
 
 RATE_HZ = 100.0
 SETTLE_S = 1.0
@@ -51,7 +51,7 @@ def measure(robot: str, seconds: float) -> None:
             recorder_ms, size = recorder_cost(session, robot, path, seconds)
         print(f"{robot}, {RATE_HZ:g} Hz: recorder {recorder_ms:.3f} ms CPU a tick, {size:.0f} bytes a tick")
         print(f"  two bare subscriptions: {bare_ms:.3f} ms CPU a tick")
-        with Replayer(session, path) as replayer:
+        with Player(session, path) as replayer:
             report = replayer.run()
         print(late("replay", np.array([report.lateness_p50, report.lateness_p99, report.lateness_max])))
         print(late("a sleep loop", np.quantile(asleep(path), (0.5, 0.99, 1.0))), flush=True)
@@ -91,7 +91,7 @@ def cpu_of(ticks: Callable[[], int], seconds: float) -> float:
 
 def asleep(path: Path) -> np.ndarray:
     """How late [ns] each joint state is for who sleeps until it is due."""
-    with RecordReader(path) as reader:
+    with RecordingReader(path) as reader:
         due = np.array([record.log_time for record in reader.records(["/joint_states"])])
     lateness = np.empty(len(due), dtype=np.int64)
     behind = time.time_ns() - int(due[0])

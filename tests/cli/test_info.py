@@ -14,7 +14,7 @@ from support import until
 
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
-from zstate.recorder import Recorder
+from zstate.recording.recorder import Recorder
 
 pytestmark = pytest.mark.processes
 

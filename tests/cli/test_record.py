@@ -7,8 +7,8 @@ import pytest
 from looking import Spawn, failure, interrupted, standing, started, zstate
 
 from zstate import StatePublisher, connect, load_model
-from zstate.record.info import describe
-from zstate.record.reader import RecordReader
+from zstate.recording.info import read_info
+from zstate.recording.reader import RecordingReader
 
 pytestmark = pytest.mark.processes
 
@@ -26,7 +26,7 @@ def test_ctrl_c_ends_a_recording_with_a_complete_file_and_a_summary(spawn: Spawn
     assert f"into {path} (" in summary
     assert "; nothing lost" in summary
     assert "recording left: joint_states, robot_description, tf, tf_static" in command.stderr
-    info = describe(path)
+    info = read_info(path)
     assert (info.complete, set(info.robots)) == (True, {"left", "right"})
     assert info.message_count == int(summary.split()[1])
 
@@ -36,8 +36,8 @@ def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path
     with standing("left"), standing("right"):
         ended = zstate("record", str(path), "left", "--duration", "1")
     assert ended.returncode == 0, ended.stderr
-    assert describe(path).robots == ("left",)
-    with RecordReader(path) as reader:
+    assert read_info(path).robots == ("left",)
+    with RecordingReader(path) as reader:
         assert {channel.topic for channel in reader.channels()} == {
             *("/robot_description", "/tf_static", "/joint_states", "/tf"),
         }
@@ -83,7 +83,7 @@ def test_a_recording_is_split_by_time_and_all_files_are_named(tmp_path: Path):
     with standing():
         ended = zstate("record", str(path), "--duration", "2.5", "--split-seconds", "1")
     assert f"into 3 files, {path} to run_2.mcap (" in ended.stdout.decode()
-    assert len(describe(path).files) == 3
+    assert len(read_info(path).files) == 3
 
 
 def test_losses_are_told(tmp_path: Path):
@@ -97,7 +97,7 @@ def test_what_ros_says_is_recorded_over_its_wire(tmp_path: Path):
     with connect() as session, StatePublisher(session, load_model("rrbot"), "r1", wires=("ros2",)):
         ended = zstate("record", str(path), "--wire", "ros2", "--mode", "peer", "--duration", "1.5")
     assert ended.returncode == 0, ended.stderr
-    assert {channel.topic for channel in describe(path).channels} == {"/robot_description", "/tf_static"}
+    assert {channel.topic for channel in read_info(path).channels} == {"/robot_description", "/tf_static"}
     assert "no wire 'nonsense'" in failure("record", "x", "--wire", "nonsense", code=2)
 
 

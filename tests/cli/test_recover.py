@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 from looking import failure, zstate
-from record.recordings import joint_states, write_run
+from recording.recordings import joint_states, write_run
 
-from zstate.record.info import describe
+from zstate.recording.info import read_info
 
 pytestmark = pytest.mark.processes
 
@@ -17,7 +17,7 @@ def cut(tmp_path: Path) -> Path:
     path = tmp_path / "run.mcap"
     write_run(path, joint_states(100), flush_every=60)
     path.write_bytes(path.read_bytes()[:-3000])
-    assert not describe(path).complete
+    assert not read_info(path).complete
     return path
 
 
@@ -25,11 +25,11 @@ def test_what_was_saved_and_lost_is_told_and_stands_beside_the_original(cut: Pat
     before = cut.read_bytes()
     said = zstate("recover", str(cut)).stdout.decode()
     saved = cut.with_name("run_recovered.mcap")
-    count = describe(saved).message_count
+    count = read_info(saved).message_count
     assert said.startswith(f"saved {count} messages in ")
     assert f"into {saved} (/robot_description 1, /joint_states {count - 1})" in said
     assert "\nlost " in said
-    assert describe(saved).complete
+    assert read_info(saved).complete
     assert cut.read_bytes() == before
 
 

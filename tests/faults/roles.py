@@ -26,7 +26,7 @@ from zstate import (
     load_model,
 )
 from zstate.clock import SystemClock
-from zstate.recorder import Recorder
+from zstate.recording.recorder import Recorder
 from zstate.sources.source import JointReading
 from zstate.transform import Transform
 

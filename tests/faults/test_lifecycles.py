@@ -17,7 +17,7 @@ FORKING = """
     import json, multiprocessing, os, select, sys, threading, time
     from zstate import SineSource, StatePublisher, TransformListener, connect, discover, load_model
     from zstate.errors import Closed, LookupFailed
-    from zstate.recorder import Recorder
+    from zstate.recording.recorder import Recorder
 
     with (
         connect(**json.loads(sys.argv[1])) as session,

@@ -15,7 +15,7 @@ import pytest
 from parties import SLACK, Start, client
 from support import until
 
-from zstate.record.reader import RecordReader
+from zstate.recording.reader import RecordingReader
 
 pytestmark = pytest.mark.processes
 
@@ -141,6 +141,6 @@ def test_a_recorder_whose_disk_is_full_says_so_and_nobody_else_notices(
     assert "No space left" in reason
     assert (stats["missed"], stats["dropped"], stats["refused"]) == (0, 0, {})
     assert recorder.ask("census")
-    with RecordReader(small_disk / "run.mcap") as recording:
+    with RecordingReader(small_disk / "run.mcap") as recording:
         assert not recording.complete
         assert 0 < sum(1 for _ in recording.records()) <= written

@@ -151,7 +151,7 @@ def test_a_child_of_multiprocessing_ends_with_its_own_exit_code(tmp_path: Path, 
 @pytest.mark.usefixtures("rrbot")
 def test_a_recording_that_nobody_closes_is_finished_at_the_end(spawn, tmp_path: Path):
     body = """
-        from zstate.recorder import Recorder
+        from zstate.recording.recorder import Recorder
         recorder = Recorder(zstate.connect(), sys.argv[1], "rrbot")
         while not recorder.stats.messages: time.sleep(0.001)
     """

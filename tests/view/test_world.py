@@ -11,7 +11,7 @@ from support import until
 from wire.ros2.raw_nodes import JOINT_STATES, key_of
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
-from zstate.recorder import Recorder
+from zstate.recording.recorder import Recorder
 from zstate.view.world import World
 
 MODEL = load_model("rrbot")

@@ -53,11 +53,11 @@ class TransformBuffer(Questions):
         tells what becomes of restarts. Messages that cannot be used are left out, and logged once for
         each reason. Raises RecordingError, and InvalidInput when there is nothing of ``robot`` in it.
         """
-        from zstate.record.reader import RecordReader  # noqa: PLC0415 - as above
         from zstate.recording.load import HISTORY_S, load_into  # noqa: PLC0415 - looked for here, made there
+        from zstate.recording.reader import RecordingReader  # noqa: PLC0415 - as above
 
         buffer = cls(HISTORY_S, clock)
-        with RecordReader(path) as reader:
+        with RecordingReader(path) as reader:
             load_into(buffer, reader, robot)
         return buffer
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from zstate.metrics.listening import Listened
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
-    from zstate.recorder import Recorder
+    from zstate.recording.recorder import Recorder
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from zstate.cli.output.console import count_text
 from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
-    from zstate.recorder import Recorder, RecorderStats
+    from zstate.recording.recorder import Recorder, RecorderStats
 
 # Meeting everybody takes less.
 _MEETING_S = 0.5

@@ -9,10 +9,10 @@ from typing import Any
 from zstate.errors import MessageError, ModelError
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.record.channel import Channel
-from zstate.record.info import RecordingInfo
-from zstate.record.reader import RecordReader
-from zstate.record.transcript import LATCHED, Speaker
+from zstate.recording.decode import LATCHED, RecordedWriter
+from zstate.recording.info import RecordingInfo
+from zstate.recording.reader import RecordingReader
+from zstate.recording.storage import Channel
 from zstate.wire.keys import Stream
 from zstate.wire.ros2.plain import decode_string
 
@@ -52,18 +52,18 @@ class RecordedRobot:
 
 def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
     """The robots by name. RecordingError when a description's chunk turns out to be damaged."""
-    by_name: dict[str, list[tuple[Speaker, Channel]]] = {}
+    by_name: dict[str, list[tuple[RecordedWriter, Channel]]] = {}
     for channel in info.channels:
-        speaker = Speaker.of(channel)
+        speaker = RecordedWriter.from_channel(channel)
         if speaker is not None and speaker.robot:
             by_name.setdefault(speaker.robot, []).append((speaker, channel))
-    with RecordReader(info.path) as reader:
+    with RecordingReader(info.path) as reader:
         return [_robot(name, reader, said, info.duration_s) for name, said in sorted(by_name.items())]
 
 
 def other_channels(info: RecordingInfo) -> list[Channel]:
     """The clock, and what says nothing of a robot's state."""
-    speakers = ((Speaker.of(channel), channel) for channel in info.channels)
+    speakers = ((RecordedWriter.from_channel(channel), channel) for channel in info.channels)
     return [channel for speaker, channel in speakers if speaker is None or not speaker.robot]
 
 
@@ -73,7 +73,7 @@ def mean_rate(channel: Channel, duration_s: float) -> float | None:
 
 
 def _robot(
-    name: str, reader: RecordReader, said: Sequence[tuple[Speaker, Channel]], duration_s: float
+    name: str, reader: RecordingReader, said: Sequence[tuple[RecordedWriter, Channel]], duration_s: float
 ) -> RecordedRobot:
     described = {channel.topic for speaker, channel in said if speaker.stream == "robot_description"}
     model, fault = _model(reader, described, name)
@@ -81,7 +81,7 @@ def _robot(
     return RecordedRobot(name, model, fault, tuple(streams))
 
 
-def _model(reader: RecordReader, topics: set[str], name: str) -> tuple[RobotModel | None, str]:
+def _model(reader: RecordingReader, topics: set[str], name: str) -> tuple[RobotModel | None, str]:
     """The first model that was recorded."""
     record = next(reader.records(topics), None) if topics else None
     if record is None:
@@ -92,7 +92,7 @@ def _model(reader: RecordReader, topics: set[str], name: str) -> tuple[RobotMode
         return None, str(error)
 
 
-def _stream(speaker: Speaker, channel: Channel, duration_s: float) -> RecordedStream:
+def _stream(speaker: RecordedWriter, channel: Channel, duration_s: float) -> RecordedStream:
     rate = None if speaker.stream in LATCHED else mean_rate(channel, duration_s)
     writer = ", ".join(filter(None, (speaker.static_writer, speaker.program)))
     return RecordedStream(speaker.stream, channel.topic, channel.type_name, channel.count, rate, writer)

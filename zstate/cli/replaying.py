@@ -10,7 +10,7 @@ from zstate.errors import duration_text
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
-    from zstate.replayer import Replayer, ReplayReport
+    from zstate.recording.player import Player, PlayerReport
 
 
 def live_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
@@ -31,7 +31,7 @@ def live_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) 
     return found
 
 
-def introduction(replayer: Replayer, file: str) -> str:
+def introduction(replayer: Player, file: str) -> str:
     """Which robots, when, and how fast."""
     from zstate.clock import stamp_text
 
@@ -42,7 +42,7 @@ def introduction(replayer: Replayer, file: str) -> str:
     return f"replaying {robots} from {file}: {took}, {stamp_text(first)} to {stamp_text(last)}, {pace}"
 
 
-def progress_line(replayer: Replayer) -> str:
+def progress_line(replayer: Player) -> str:
     """Where it is."""
     from zstate.clock import stamp_text
 
@@ -53,7 +53,7 @@ def progress_line(replayer: Replayer) -> str:
     return f"{where}  {stamp_text(now)}  {report.samples} samples  {report.rate:.2f}x  late {late}"
 
 
-def report_text(report: ReplayReport) -> str:
+def report_text(report: PlayerReport) -> str:
     """What became of it."""
     late = (
         f"late by {duration_text(report.lateness_p50)} (median), {duration_text(report.lateness_p99)} "

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from zstate.bridge import Bridge
 from zstate.metrics.families import MOST_ROBOTS, Families
 from zstate.metrics.library import Collector, Metric
-from zstate.recorder import Recorder
+from zstate.recording.recorder import Recorder
 
 _MOST_STREAMS = 5 * MOST_ROBOTS
 

@@ -1,1 +1,1 @@
-"""Recordings: reading robots from MCAP files and bags."""
+"""Recordings: MCAP files and ROS 2 bags, recorded, read and played back."""

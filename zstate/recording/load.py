@@ -32,9 +32,14 @@ from zstate.ingest.model_filter import ModelEdgeFilter
 from zstate.ingest.static_transforms import StaticTransformIngest
 from zstate.ingest.transforms import TransformIngest
 from zstate.model.robot import RobotModel
-from zstate.record.models import first_descriptions, model_of
-from zstate.record.reader import RecordReader
-from zstate.record.transcript import Said, Speaker, Transcript
+from zstate.recording.decode import (
+    DecodedMessage,
+    DecodedRecording,
+    RecordedWriter,
+    first_descriptions,
+    recorded_model,
+)
+from zstate.recording.reader import RecordingReader
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import (
     Edges,
@@ -60,7 +65,7 @@ _UNNAMED = "a ROS node"
 
 def load_into(
     buffer: TransformBuffer,
-    reader: RecordReader,
+    reader: RecordingReader,
     robot: str | None = None,
     *,
     around: NDArray[np.int64] | None = None,
@@ -71,27 +76,27 @@ def load_into(
     """
     counters = Counters()
     buffer.home.is_recording = True
-    transcript = Transcript(reader, counters.count_refusal)
+    transcript = DecodedRecording(reader, counters.count_refusal)
     robots = None if robot is None else (check_has_robot(transcript, robot),)
     shares_frames = any(
         writer.foreign or (writer.stream == "tf_static" and writer.static_writer is None)  # of ROS
-        for writer in transcript.speakers
+        for writer in transcript.writers
     )
     loader = RecordingLoader(buffer, counters, () if shares_frames else transcript.robots)
     for description in first_descriptions(transcript, robots).values():
-        model = model_of(transcript, description, counters.count_refusal)
+        model = recorded_model(transcript, description, counters.count_refusal)
         if model is not None:
             loader.add_model(description, model)
     stamps = None if around is None else np.unique(around)
     batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
-    for count, decoded in enumerate(transcript.said(robots), 1):
+    for count, decoded in enumerate(transcript.messages(robots), 1):
         loader.insert(decoded)
         if stamps is not None and not count % batch:
             buffer.keep_around(stamps)
     return counters.stats()
 
 
-def check_has_robot(transcript: Transcript, robot: str) -> str:
+def check_has_robot(transcript: DecodedRecording, robot: str) -> str:
     """``robot``, if the recording has it. Raises InvalidInput, which names the robots it has."""
     if robot not in transcript.robots:
         there = ", ".join(map(repr, transcript.robots)) or "none"
@@ -116,18 +121,18 @@ class RecordingLoader:
         self._statics: dict[tuple[str, str | int], StaticTransformIngest] = {}
         self._static_messages: dict[tuple[str, str | int], StaticTransforms] = {}
         self._withdrawn: set[str] = set()
-        self._named: set[Speaker] = set()
+        self._named: set[RecordedWriter] = set()
         self._filter = ModelEdgeFilter()
         self._epochs = EdgeEpochs()
 
-    def add_model(self, description: Said, model: RobotModel) -> None:
+    def add_model(self, description: DecodedMessage, model: RobotModel) -> None:
         """Insert the joint states of a robot with this ``model``. Call it before the first ``insert``."""
-        robot = description.speaker.robot
+        robot = description.writer.robot
         self._filter.set_model(robot, model)
         self._joints[robot] = RecordedJointStateIngest(robot, self._ownership, self._filter)
         self.insert(description)
 
-    def insert(self, decoded: Said) -> None:
+    def insert(self, decoded: DecodedMessage) -> None:
         """Insert the next message."""
         writer, message, _ = decoded
         if isinstance(message, JointState):
@@ -146,7 +151,7 @@ class RecordingLoader:
             self._set_name(self._joints[writer.robot], writer)
             self._joints[writer.robot].describe(message)
 
-    def _insert_transforms(self, writer: Speaker, sample: TransformSample) -> None:
+    def _insert_transforms(self, writer: RecordedWriter, sample: TransformSample) -> None:
         rest = self._filter.filter_sample(writer.robot, sample)
         if rest is None or rest.edges is None:
             return
@@ -159,7 +164,7 @@ class RecordingLoader:
         self._set_name(ingest, writer)
         ingest.insert_sample(rest, overflowed=False)
 
-    def _insert_statics(self, writer: Speaker, statics: StaticTransforms) -> None:
+    def _insert_statics(self, writer: RecordedWriter, statics: StaticTransforms) -> None:
         robot, static_writer = writer.robot, writer.static_writer
         if static_writer == MODEL_WRITER and robot in self._joints:
             return  # the model has the same edges
@@ -176,7 +181,7 @@ class RecordingLoader:
         ingest = StaticTransformIngest(robot, name, self._ownership)
         self._statics.setdefault(key, ingest).add(rest)
 
-    def _set_name(self, ingest: StreamIngest, writer: Speaker) -> None:
+    def _set_name(self, ingest: StreamIngest, writer: RecordedWriter) -> None:
         if writer not in self._named and writer.program is not None:
             ingest.name_writer(writer.session, writer.program)
             self._named.add(writer)

@@ -11,10 +11,10 @@ from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import check_stamps
 from zstate.closing import Closing
-from zstate.record.info import RecordingInfo, describe
-from zstate.record.reader import RecordReader
-from zstate.record.transcript import Transcript
+from zstate.recording.decode import DecodedRecording
+from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.load import HISTORY_S, check_has_robot, load_into
+from zstate.recording.reader import RecordingReader
 
 
 class Recording(Closing):
@@ -25,10 +25,10 @@ class Recording(Closing):
     """
 
     def __init__(self, path: str | Path, robot: str | None = None) -> None:
-        self.info: RecordingInfo = describe(path)
+        self.info: RecordingInfo = read_info(path)
         self.robot = robot
-        self._reader = RecordReader(path)
-        transcript = Transcript(self._reader, Refusals().count)
+        self._reader = RecordingReader(path)
+        transcript = DecodedRecording(self._reader, Refusals().count)
         self.robots = transcript.robots
         try:
             if robot is not None:

@@ -14,7 +14,7 @@ from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
     from zstate.cli.recording_facts import RecordedRobot
-    from zstate.record.info import RecordingInfo
+    from zstate.recording.info import RecordingInfo
 
 _HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
@@ -31,9 +31,9 @@ def info_command(file: str, as_json: bool) -> None:
     again every 10 s, which is counted.
     """
     from zstate.cli.recording_facts import recorded_robots
-    from zstate.record.info import describe
+    from zstate.recording.info import read_info
 
-    info = describe(file)
+    info = read_info(file)
     robots = recorded_robots(info)
     if as_json:
         print_json(_facts(info, robots))
@@ -62,10 +62,10 @@ def _head(info: RecordingInfo) -> Iterator[str]:
 
 
 def _recoverable(info: RecordingInfo) -> list[str]:
-    """The files that ``zstate recover`` can make complete."""
-    from zstate.record.reader import RecordReader
+    """The files that ``zstate recover`` mends."""
+    from zstate.recording.reader import RecordingReader
 
-    with RecordReader(info.path) as reader:
+    with RecordingReader(info.path) as reader:
         return [str(file.path) for file in reader.storages if not file.complete and file.format == "mcap"]
 
 

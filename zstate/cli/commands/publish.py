@@ -181,7 +181,7 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
 
 def _publish_recording(publisher: StatePublisher, path: str, rate_hz: float, seconds: float | None) -> None:
     from zstate.cli.publishing import run
-    from zstate.sources.recorded import RecordedSource
+    from zstate.recording.source import RecordedSource
 
     with RecordedSource(path, None, publisher.model) as source:
         # One tick more than the recording is long, for its last sample.

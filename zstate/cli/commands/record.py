@@ -17,7 +17,7 @@ from zstate.cli.robot_directory import RobotDirectory
 if TYPE_CHECKING:
     from zstate.cli.recording import Progress
     from zstate.metrics.address import Address
-    from zstate.recorder import Recorder
+    from zstate.recording.recorder import Recorder
 
 _LINE_S = 1.0
 _REFRESH_S = 0.25
@@ -76,7 +76,7 @@ def record_command(
     zstate record run.mcap --wire ros2:domain=5 --split-size 500
     """
     from zstate.errors import RecordingError
-    from zstate.recorder import Recorder
+    from zstate.recording.recorder import Recorder
 
     if not file.endswith(".mcap"):
         file = f"{file}.mcap"

@@ -10,7 +10,7 @@ import click
 from zstate.cli.output.console import count_text, fail, print_wrapped
 
 if TYPE_CHECKING:
-    from zstate.record.recover import RecoverReport
+    from zstate.recording.mcap.recover import RecoverReport
 
 
 @click.command("recover")
@@ -24,7 +24,7 @@ def recover_command(file: str, target: str | None, overwrite: bool) -> None:
     FILE_recovered.mcap unless given. Of a recording in several files each is recovered by itself.
     """
     from zstate.errors import RecordingError
-    from zstate.record.recover import recover
+    from zstate.recording.mcap.recover import recover
 
     source = Path(file)
     named = Path(target) if target else source.with_name(f"{source.stem}_recovered.mcap")

@@ -14,14 +14,14 @@ from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
-    from zstate.replayer import Replayer, ReplayReport
+    from zstate.recording.player import Player, PlayerReport
 
 _LINE_S = 1.0
 _REFRESH_S = 0.1
 
 
 def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
-    from zstate.replaying.pace import check_speed
+    from zstate.recording.player_clock import check_speed
 
     try:
         return check_speed(rate)
@@ -78,11 +78,11 @@ def replay_command(
     zstate replay bag_folder --wire ros2:domain=5
     """
     from zstate.cli.replaying import introduction, live_writers
-    from zstate.replayer import Replayer
+    from zstate.recording.player import Player
 
     with (
         open_session(network, wires) as session,
-        Replayer(
+        Player(
             session,
             file,
             robots,
@@ -101,8 +101,7 @@ def replay_command(
         _run(replayer)
 
 
-def _run(replayer: Replayer) -> None:
-    from zstate.cli.processes import BackgroundCall
+def _run(replayer: Player) -> None:
     from zstate.cli.replaying import report_text
 
     worker = BackgroundCall("zstate replay", replayer.run)
@@ -117,7 +116,7 @@ def _run(replayer: Replayer) -> None:
         fail("no sample was published; `zstate info` shows what the file holds")
 
 
-def _show(replayer: Replayer, worker: BackgroundCall[ReplayReport]) -> ReplayReport:
+def _show(replayer: Player, worker: BackgroundCall[PlayerReport]) -> PlayerReport:
     """Until it has ended."""
     from zstate.cli.replaying import progress_line
 
@@ -134,7 +133,7 @@ def _show(replayer: Replayer, worker: BackgroundCall[ReplayReport]) -> ReplayRep
     return report
 
 
-def _result(worker: BackgroundCall[ReplayReport], timeout_s: float) -> ReplayReport | None:
+def _result(worker: BackgroundCall[PlayerReport], timeout_s: float) -> PlayerReport | None:
     with suppress(TimeoutError):
         return worker.result(timeout_s)
     return None

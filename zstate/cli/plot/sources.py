@@ -16,10 +16,9 @@ from zstate.cli.stream_reader import StreamReader
 from zstate.cli.waiting import PoseWaiter
 from zstate.cli.words import followed
 from zstate.nodes.listener import TransformListener
-from zstate.record.models import first_descriptions
-from zstate.record.reader import RecordReader
-from zstate.record.transcript import Transcript
+from zstate.recording.decode import DecodedRecording, first_descriptions
 from zstate.recording.load import check_has_robot
+from zstate.recording.reader import RecordingReader
 from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, RobotDescription
 
@@ -64,8 +63,8 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
 
 def recorded_joints(path: str, robot: str | None, start_s: float, seconds: float | None) -> Curves:
     """The joints of ``robot``, or of the only one, in a recording. Raises RecordingError and InvalidInput."""
-    with RecordReader(path) as reader:
-        transcript = Transcript(reader, _refuse)
+    with RecordingReader(path) as reader:
+        transcript = DecodedRecording(reader, _refuse)
         name = _only(transcript.robots) if robot is None else check_has_robot(transcript, robot)
         writer = DocumentWriter()
         for described in first_descriptions(transcript, (name,)).values():
@@ -81,9 +80,9 @@ def recorded_joints(path: str, robot: str | None, start_s: float, seconds: float
 
 
 def _documents(
-    transcript: Transcript, robot: str, writer: DocumentWriter, begin: int, end: int | None
+    transcript: DecodedRecording, robot: str, writer: DocumentWriter, begin: int, end: int | None
 ) -> Iterator[Document]:
-    for said in transcript.said((robot,), ("joint_states",), begin, end):
+    for said in transcript.messages((robot,), ("joint_states",), begin, end):
         if isinstance(said.message, JointState):
             yield writer.document(said.message)
 

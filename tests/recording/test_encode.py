@@ -1,0 +1,377 @@
+"""What robots say stands in a recording as a ROS 2 node would have said it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import STORE, S
+
+from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
+from zstate.recording.encode import (
+    CHANNEL_BURST,
+    MAX_LATCHED,
+    MAX_PENDING,
+    MAX_PENDING_BYTES,
+    PendingSamples,
+    RecordingEncoder,
+)
+from zstate.recording.mcap.writer import RecordingWriter
+from zstate.recording.reader import RecordingReader
+from zstate.recording.storage import Record
+from zstate.wire.keys import MODEL_WRITER
+from zstate.wire.messages import (
+    Clock,
+    JointState,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+    to_block,
+)
+
+NOW = 1_790_000_000 * S
+URDF = """<robot name="cart">
+  <link name="world"/><link name="base"/><link name="arm"/>
+  <joint name="free" type="floating"><parent link="world"/><child link="base"/></joint>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>"""
+CART: RobotModel = parse_urdf(URDF, "cart")
+MOVING = (("world", "base"), ("base", "arm"))
+POSITIONS = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 0.5]
+VELOCITIES = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
+POSES = [[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 0.0, 0.0, 0.6, 0.8]]
+
+
+def description(session: int = 1, urdf: str = URDF, names: tuple[str, ...] = CART.joint_names):
+    return RobotDescription(session, urdf, "", names, MOVING)
+
+
+def joints(stamp: int = NOW, seq: int = 0, session: int = 1) -> JointState:
+    order = order_digest(CART.joint_names)
+    return JointState(stamp, seq, session, order, to_block(POSITIONS), to_block(VELOCITIES))
+
+
+def transforms(stamp: int = NOW, seq: int = 0, session: int = 1) -> TransformSample:
+    return TransformSample(stamp, seq, session, order_digest(MOVING), to_block(POSES))
+
+
+def statics(*edges: tuple[str, str], session: int = 1) -> StaticTransforms:
+    return StaticTransforms(session, edges, to_block([POSES[1]] * len(edges)))
+
+
+class Desk:
+    """A recording at hand, and who writes it."""
+
+    def __init__(self, path: Path, **options: Any) -> None:
+        self.path = path
+        self.refused: Counter[str] = Counter()
+        self.writer = RecordingWriter(path, max_seconds=100.0)
+        self.encoder = RecordingEncoder(
+            self.writer, lambda reason, _: self.refused.update([reason]), **options
+        )
+
+    def records(self) -> list[Record]:
+        """All of it, once it is finished."""
+        self.writer.close()
+        with RecordingReader(self.path) as reader:
+            return list(reader.records())
+
+    def read(self, topic: str) -> list[Any]:
+        """The messages of one topic, as rosbags reads them."""
+        return [
+            STORE.deserialize_cdr(record.payload, record.type_name)
+            for record in self.records()
+            if record.topic == topic
+        ]
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path / "run.mcap", alone="cart", programs={1: "driver@host pid 7"})
+
+
+def test_each_number_of_a_joint_state_has_the_name_of_its_coordinate(desk: Desk):
+    desk.encoder.write_message("cart", description(), NOW)
+    desk.encoder.write_message("cart", joints(NOW - 5), NOW)
+    (message,) = desk.read("/joint_states")
+    free = [f"free.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    assert message.name == [*free, "turn"]
+    assert message.position.tolist() == POSITIONS
+    # A floating joint has six velocities: none under its seventh coordinate.
+    assert np.array_equal(message.velocity, [*VELOCITIES[:6], math.nan, VELOCITIES[6]], equal_nan=True)
+    assert message.header.stamp.sec * S + message.header.stamp.nanosec == NOW - 5
+    assert message.effort.size == 0
+
+
+def test_moving_and_fixed_edges_stand_under_their_names(desk: Desk):
+    desk.encoder.write_message("cart", description(), NOW)
+    desk.encoder.write_message("cart", transforms(), NOW)
+    desk.encoder.write_message("cart", statics(("arm", "tool"), ("fleet/map", "world")), NOW, MODEL_WRITER)
+    (moving,), (fixed,) = desk.read("/tf"), desk.read("/tf_static")
+    assert [(t.header.frame_id, t.child_frame_id) for t in moving.transforms] == list(MOVING)
+    first = moving.transforms[0].transform
+    assert [first.translation.x, first.translation.y, first.translation.z] == POSES[0][:3]
+    assert [first.rotation.x, first.rotation.y, first.rotation.z, first.rotation.w] == POSES[0][3:]
+    assert [(t.header.frame_id, t.child_frame_id) for t in fixed.transforms] == [
+        ("arm", "tool"),
+        ("fleet/map", "world"),
+    ]
+
+
+def test_a_channel_tells_the_robot_its_writer_and_the_program(desk: Desk):
+    desk.encoder.write_message("cart", description(), NOW)
+    desk.encoder.write_message("cart", joints(seq=2**32 + 7), NOW)
+    desk.encoder.write_message("cart", statics(("arm", "tool"), session=2), NOW, "mount")
+    records = {record.topic: record for record in desk.records()}
+    facts = records["/joint_states"].metadata
+    assert facts["zstate.robot"] == "cart"
+    assert facts["zstate.frame_prefix"] == ""
+    assert facts["zstate.session"] == "1"
+    assert facts["zstate.program"] == "driver@host pid 7"
+    assert "zstate.writer" not in facts
+    assert "reliability: 1" in facts["offered_qos_profiles"]
+    assert records["/joint_states"].sequence == 7
+    assert records["/tf_static"].metadata["zstate.writer"] == "mount"
+    assert "zstate.program" not in records["/tf_static"].metadata
+    assert records["/robot_description"].publish_time == records["/robot_description"].log_time == NOW
+
+
+def test_samples_that_come_before_the_description_are_written_when_it_comes(desk: Desk):
+    for number in range(3):
+        desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
+        desk.encoder.write_message("cart", transforms(NOW + number, number), NOW + number)
+    assert (desk.encoder.messages, desk.encoder.unwritten) == ({}, 6)
+    desk.encoder.write_message("cart", description(), NOW + 10)
+    assert desk.encoder.unwritten == 0
+    assert desk.encoder.messages["cart", "joint_states"] == desk.encoder.messages["cart", "tf"] == 3
+    log_times = [record.log_time for record in desk.records() if record.topic == "/joint_states"]
+    assert log_times == [NOW, NOW + 1, NOW + 2]
+
+
+def test_of_samples_without_a_description_only_the_newest_are_kept_and_all_are_counted(desk: Desk):
+    for number in range(MAX_PENDING + 5):
+        desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
+    assert desk.encoder.unwritten == MAX_PENDING + 5
+    desk.encoder.write_message("cart", description(), NOW + S)
+    assert desk.encoder.unwritten == 5
+    assert min(r.log_time for r in desk.records() if r.topic == "/joint_states") == NOW + 5
+
+
+def test_samples_of_another_model_wait_for_its_description(desk: Desk):
+    desk.encoder.write_message(
+        "cart", description(urdf=URDF.replace("turn", "spin"), names=("free", "spin")), NOW
+    )
+    desk.encoder.write_message("cart", joints(session=2), NOW)
+    assert desk.encoder.unwritten == 1
+    desk.encoder.write_message("cart", description(session=2), NOW)
+    (message,) = desk.read("/joint_states")
+    assert message.name[-1] == "turn"
+
+
+def test_a_writer_that_names_its_numbers_needs_no_description(desk: Desk):
+    names = ("b", "a")
+    state = JointState(NOW, 0, 1, order_digest(names), to_block([1.0, 2.0]), None, None, names)
+    edges = (("map", "odom"),)
+    sample = TransformSample(NOW, 0, 1, order_digest(edges), to_block(POSES[:1]), edges)
+    desk.encoder.write_message("cart", state, NOW)
+    desk.encoder.write_message("cart", sample, NOW)
+    assert desk.read("/joint_states")[0].name == ["b", "a"]
+    assert desk.read("/tf")[0].transforms[0].child_frame_id == "odom"
+
+
+def test_a_model_that_cannot_be_used_is_recorded_and_told_and_the_transforms_are_written(desk: Desk):
+    desk.encoder.write_message("cart", description(urdf="<robot name='cart'/>"), NOW)
+    desk.encoder.write_message("cart", joints(), NOW)
+    desk.encoder.write_message("cart", transforms(), NOW)
+    assert desk.refused == {"unusable model": 1}
+    assert desk.encoder.unwritten == 1
+    assert desk.read("/robot_description")[0].data == "<robot name='cart'/>"
+    assert len(desk.read("/tf")) == 1
+
+
+def test_what_cdr_cannot_say_is_counted_by_reason_and_the_rest_written(desk: Desk):
+    desk.encoder.write_message("cart", description(), NOW)
+    for stamp in (0, 2**31 * S, -(2**31) * S - 1, 2**31 * S - 1, -(2**31) * S):
+        desk.encoder.write_message("cart", joints(stamp), NOW)
+        desk.encoder.write_message("cart", transforms(stamp), NOW)
+    short = JointState(NOW, 0, 1, order_digest(CART.joint_names), to_block([1.0]))
+    desk.encoder.write_message("cart", short, NOW)
+    desk.encoder.write_message("cart", statics(("arm", "to\0ol")), NOW, "mount")
+    desk.encoder.write_message("a b", statics(("arm", "tool")), NOW, "mount")
+    assert desk.refused == {"no stamp": 2, "stamp outside 1901 to 2038": 4, "not sayable": 3}
+    assert [message.header.stamp.sec for message in desk.read("/joint_states")] == [2**31 - 1, -(2**31)]
+    published = [record.publish_time for record in desk.records() if record.topic == "/tf"]
+    assert published == [2**31 * S - 1, 0]
+
+
+def test_robots_beside_the_one_in_the_root_have_a_namespace_and_a_prefix_that_ros_allows(tmp_path: Path):
+    desk = Desk(tmp_path / "run.mcap", alone="cart")
+    for robot in ("cart", "arm-1", "arm.1", "2nd"):
+        desk.encoder.write_message(robot, description(), NOW)
+        desk.encoder.write_message(robot, joints(), NOW)
+        desk.encoder.write_message(robot, transforms(), NOW)
+    topics = {
+        record.metadata["zstate.robot"]: record.topic for record in desk.records() if "joint" in record.topic
+    }
+    assert topics == {
+        "cart": "/joint_states",
+        "arm-1": "/arm_1/joint_states",
+        "arm.1": "/arm_1_/joint_states",
+        "2nd": "/_2nd/joint_states",
+    }
+    frames = [message.transforms[0].child_frame_id for message in desk.read("/tf")]
+    assert frames == ["base", "arm-1/base", "arm.1/base", "2nd/base"]
+    assert {record.metadata["zstate.frame_prefix"] for record in desk.records()} == {
+        "", "arm-1/", "arm.1/", "2nd/",
+    }  # fmt: skip
+
+
+def test_a_writer_that_starts_again_has_a_channel_of_its_own(desk: Desk):
+    for session in (1, 2):
+        desk.encoder.write_message("cart", description(session), NOW + session)
+        desk.encoder.write_message("cart", joints(session=session), NOW + session)
+    sessions = [r.metadata["zstate.session"] for r in desk.records() if r.topic == "/joint_states"]
+    assert sessions == ["1", "2"]
+    with RecordingReader(desk.path) as reader:
+        assert sum(channel.topic == "/joint_states" for channel in reader.channels()) == 2
+
+
+def repeated(desk: Desk) -> list[tuple[str, str, list[str]]]:
+    """What holds at the beginning of a next file: topic, session, and the children of its edges."""
+    desk.encoder.write_message("cart", Clock(1, 0, 9), NOW + 200 * S)
+    desk.writer.close()
+    with RecordingReader(desk.path.with_name("run_1.mcap")) as reader:
+        return [
+            (
+                record.topic,
+                record.metadata["zstate.session"],
+                [
+                    edge.child_frame_id
+                    for edge in getattr(
+                        STORE.deserialize_cdr(record.payload, record.type_name), "transforms", ()
+                    )
+                ],
+            )
+            for record in reader.records()
+            if record.topic != "/clock"
+        ]
+
+
+def test_what_holds_is_said_again_in_the_next_file_and_what_was_replaced_is_not(desk: Desk):
+    desk.encoder.write_message("cart", description(1), NOW)
+    desk.encoder.write_message("cart", description(2), NOW)
+    desk.encoder.write_message("cart", statics(("arm", "old"), session=1), NOW, "mount")
+    desk.encoder.write_message("cart", statics(("arm", "new"), session=2), NOW, "mount")
+    desk.encoder.write_message("cart", statics(("arm", "other"), session=3), NOW, "another")
+    assert repeated(desk) == [
+        ("/robot_description", "2", []),
+        ("/tf_static", "2", ["new"]),
+        ("/tf_static", "3", ["other"]),
+    ]
+
+
+def test_statics_that_are_withdrawn_end_with_an_empty_message(desk: Desk):
+    desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
+    desk.encoder.withdraw("cart", "mount", NOW + 1)
+    desk.encoder.withdraw("cart", "mount", NOW + 2)
+    desk.encoder.withdraw("cart", "nobody", NOW + 2)
+    assert repeated(desk) == []
+    assert [len(message.transforms) for message in desk.read("/tf_static")] == [1, 0]
+
+
+def test_a_static_writer_that_comes_back_holds_again(desk: Desk):
+    desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
+    desk.encoder.withdraw("cart", "mount", NOW + 1)
+    desk.encoder.write_message("cart", statics(("arm", "tool")), NOW + 2, "mount")
+    assert repeated(desk) == [("/tf_static", "1", ["tool"])]
+
+
+def test_statics_without_a_writers_name_add_up_as_in_ros(desk: Desk):
+    desk.encoder.write_message("cart", statics(("arm", "a")), NOW)
+    desk.encoder.write_message("cart", statics(("arm", "b"), ("arm", "c")), NOW)
+    desk.encoder.write_message("cart", statics(("base", "a")), NOW)
+    desk.encoder.write_message("cart", statics(("arm", "d"), session=2), NOW)
+    said = [
+        [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
+        for message in desk.read("/tf_static")
+    ]
+    assert said == [
+        [("arm", "a")],
+        [("arm", "a"), ("arm", "b"), ("arm", "c")],
+        [("base", "a"), ("arm", "b"), ("arm", "c")],
+        [("arm", "d")],
+    ]
+    writers = {record.metadata["zstate.writer"] for record in desk.records()}
+    assert writers == {"ros-1", "ros-2"}
+
+
+def test_simulated_time_is_recorded_from_zero_on(desk: Desk):
+    for number in range(3):
+        desk.encoder.write_message("ros", Clock(number * S, number, 5), NOW + number)
+    assert [message.clock.sec for message in desk.read("/clock")] == [0, 1, 2]
+    assert {record.publish_time for record in desk.records()} == {0, S, 2 * S}
+    assert "zstate.robot" not in desk.records()[0].metadata
+
+
+def test_a_robot_whose_writer_starts_without_end_takes_no_channels_from_another(desk: Desk):
+    desk.encoder.write_message("cart", description(), NOW)
+    desk.encoder.write_message("flapping", description(), NOW)
+    for number in range(3 * CHANNEL_BURST):
+        assert desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
+        is_known = desk.encoder.write_message(
+            "flapping", joints(NOW + number, 0, session=number + 9), NOW + number
+        )
+        assert is_known == (number < CHANNEL_BURST - 1)
+    assert desk.refused == {"too many writers": 2 * CHANNEL_BURST + 1}
+    later = NOW + S
+    assert (
+        sum(
+            desk.encoder.write_message("flapping", joints(later, 0, session=n), later)
+            for n in range(10**6, 10**6 + 100)
+        )
+        == 10
+    )
+    assert desk.encoder.messages["cart", "joint_states"] == 3 * CHANNEL_BURST
+    counts = Counter(record.metadata["zstate.robot"] for record in desk.records())
+    assert counts == {"cart": 3 * CHANNEL_BURST + 1, "flapping": CHANNEL_BURST + 10}
+
+
+def test_channels_of_writers_that_are_gone_are_released_and_those_that_hold_something_are_not(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("zstate.recording.encode.MAX_OPEN_CHANNELS", 10)
+    desk.encoder.write_message("cart", description(), NOW)
+    for session in range(2, 40):
+        desk.encoder.write_message("cart", joints(session=session), NOW)
+    desk.encoder.write_message("cart", joints(session=2, seq=1), NOW)
+    assert repeated(desk) == [("/robot_description", "1", [])]
+    with RecordingReader(desk.path.with_name("run_1.mcap")) as reader:
+        assert len(reader.channels()) <= 11
+    sessions = [r.metadata["zstate.session"] for r in desk.records() if r.topic == "/joint_states"]
+    assert sessions == [*map(str, range(2, 40)), "2"]
+
+
+def test_static_writers_without_end_are_refused_and_counted(desk: Desk):
+    for number in range(MAX_LATCHED + 3):
+        desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, f"writer_{number}")
+    assert desk.refused == {"too many writers": 3}
+    assert desk.encoder.write_message("cart", statics(("arm", "other")), NOW, "writer_0")
+    desk.encoder.withdraw("cart", "writer_0", NOW)
+    assert desk.encoder.write_message("cart", statics(("arm", "other")), NOW, "another")
+
+
+def test_of_large_samples_without_a_description_fewer_are_kept():
+    early = PendingSamples()
+    large = JointState(NOW, 0, 1, order_digest(CART.joint_names), bytes(MAX_PENDING_BYTES // 24 * 8))
+    for number in range(5):
+        early.append("cart", large, NOW + number)
+    assert (early.waiting, early.dropped) == (3, 2)
+    assert [log_time for _, log_time in early.pop("cart")] == [NOW + 2, NOW + 3, NOW + 4]
+    assert early.waiting == 0

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import time
+from contextlib import closing
+
+from live import Tap, await_reader
+from support import SOON_S, until
+
+from zstate.net.latched import LatchedPublisher
+from zstate.net.streams import CAPACITY, StreamPublisher
+from zstate.recording.recorder import QUEUE_LENGTH, Batch, MessageQueue
+
+
+def payloads(heard: list[Batch]) -> list[bytes]:
+    return [arrival.payload for one in heard for arrival in one.arrivals]
+
+
+def test_what_several_subscriptions_hear_comes_in_one_queue_with_its_time(sessions):
+    writer, reader = sessions
+    heard: list[Batch] = []
+    with (
+        MessageQueue(reader) as inbox,
+        StreamPublisher(writer, "a/samples", "") as samples,
+        LatchedPublisher(writer, "a/value", "") as value,
+    ):
+        value.set(b"holds")
+        inbox.subscribe("joint_states", "a/samples", "r1")
+        inbox.subscribe_latched("robot_description", "a/*", None)
+        until(lambda: samples.has_readers)
+        await_reader(writer, "a/value")
+        before = time.time_ns()
+        for number in range(5):
+            samples.put(b"%d" % number)
+        until(lambda: heard.extend(inbox.pop_all()) or len(payloads(heard)) >= 11)
+        assert inbox.pop_all() == []
+    ours = [one for one in heard if one.robot == "r1"]
+    assert payloads(ours) == [b"0", b"1", b"2", b"3", b"4"]
+    assert all(before <= one.stamp <= time.time_ns() and not one.overflowed for one in ours)
+    assert {one.stream for one in ours} == {"joint_states"}
+    assert b"holds" in payloads([one for one in heard if one.stream == "robot_description"])
+
+
+def test_who_takes_nothing_keeps_a_bounded_number_and_is_told_of_the_loss(sessions):
+    writer, reader = sessions
+    sent = QUEUE_LENGTH + 3 * CAPACITY
+    with (
+        MessageQueue(reader) as inbox,
+        StreamPublisher(writer, "a/samples", "") as samples,
+        closing(Tap(reader, "a/samples")) as tap,
+    ):
+        inbox.subscribe("joint_states", "a/samples", "r1")
+        until(lambda: samples.has_readers)
+        for number in range(sent):
+            samples.put(b"%d" % number)
+            if number % 50 == 49:  # what comes too fast is lost on the way
+                tap.payloads(number + 1)
+        heard: list[Batch] = []
+        until(lambda: heard.extend(inbox.pop_all()) or any(one.overflowed for one in heard))
+        samples.put(b"last")
+        until(lambda: heard.extend(inbox.pop_all()) or payloads(heard)[-1] == b"last")
+    assert QUEUE_LENGTH <= len(payloads(heard)) <= QUEUE_LENGTH + 3 * CAPACITY
+    assert len(payloads(heard)) < sent
+
+
+def test_closing_is_quick_while_nobody_takes_and_what_waits_may_still_be_taken(sessions):
+    writer, reader = sessions
+    inbox = MessageQueue(reader)
+    with StreamPublisher(writer, "a/samples", "") as samples:
+        inbox.subscribe("joint_states", "a/samples", "r1")
+        until(lambda: samples.has_readers)
+        for number in range(QUEUE_LENGTH + 2 * CAPACITY):
+            samples.put(b"%d" % number)
+    began = time.monotonic()
+    inbox.close()
+    inbox.close()
+    assert time.monotonic() - began < SOON_S
+    # How many its ring lost before them is the machine's business.
+    waiting = [int(payload) for payload in payloads(inbox.pop_all())]
+    assert waiting
+    assert waiting == sorted(waiting)

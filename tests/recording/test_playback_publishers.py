@@ -1,0 +1,96 @@
+"""Who replays what somebody writes now is told, whether or not its model is known."""
+
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+
+import pytest
+from live import RRBOT
+from support import until
+from tales import MS, START, Tale, pose
+
+from zstate.errors import SecondWriter
+from zstate.net.presence import tokens_now
+from zstate.net.session import connect
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.recording.player import Player
+from zstate.transform import Transform
+
+COUNT = 20
+CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
+
+
+@pytest.fixture
+def cart(tmp_path: Path) -> Path:
+    """A cart without a model, on which two writers have put the same camera."""
+    path = tmp_path / "cart.mcap"
+    with Tale(path, "cart") as tale:
+        for writer in ("mount", "gripper"):
+            tale.statics("cart", START, {("cart/base", "cart/camera"): pose(z=0.1)}, writer=writer)
+        for n in range(COUNT):
+            tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n)})
+    return path
+
+
+def replay(session, path: Path, **options: object) -> int:
+    with Player(session, path, rate=math.inf, **options) as replayer:
+        return replayer.run().samples
+
+
+def test_samples_that_somebody_writes_are_not_replayed_but_with_takeover(sessions, cart: Path):
+    with StatePublisher(sessions[0], RRBOT, "cart", streams=["tf"], program="driver"):
+        until(lambda: tokens_now(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
+        with pytest.raises(SecondWriter) as raised:
+            replay(sessions[1], cart)
+        assert (raised.value.stream, raised.value.first.program) == ("tf", "driver")
+        assert replay(sessions[1], cart, takeover=True) == COUNT
+    assert replay(sessions[1], cart) == COUNT
+
+
+@pytest.mark.parametrize(("name", "edge"), [("mount", None), ("room", ("cart/base", "cart/camera"))])
+def test_static_edges_that_somebody_places_are_not_replayed_but_with_takeover(
+    sessions, cart: Path, name: str, edge: tuple[str, str] | None
+):
+    with StaticPublisher(sessions[0], "cart", name, program="calibration") as live:
+        live.set(CAMERA)
+        with pytest.raises(SecondWriter) as raised:
+            replay(sessions[1], cart)
+        assert (raised.value.edge, raised.value.first.program) == (edge, "calibration")
+        assert replay(sessions[1], cart, takeover=True) == COUNT
+
+
+def test_a_replay_keeps_others_from_writing_the_same(sessions, cart: Path):
+    with Player(sessions[0], cart, rate=0.01) as replayer:
+        thread = threading.Thread(target=replayer.run)
+        thread.start()
+        until(lambda: tokens_now(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
+        with pytest.raises(SecondWriter):
+            StatePublisher(sessions[1], RRBOT, "cart", streams=["tf"])
+        replayer.close()
+        thread.join()
+
+
+def test_passes_of_a_loop_are_not_in_each_others_way(sessions, cart: Path):
+    with Player(sessions[0], cart, rate=math.inf, loop=True) as replayer:
+        thread = threading.Thread(target=replayer.run)
+        thread.start()
+        until(lambda: replayer.report().passes >= 5)
+        replayer.close()
+        thread.join()
+    assert not replayer.report().refused
+
+
+def test_behind_a_router_it_is_the_same(cart: Path, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    with (
+        connect(mode="router", listen=endpoint),
+        connect(mode="client", endpoints=endpoint) as ours,
+        connect(mode="client", endpoints=endpoint) as theirs,
+        StatePublisher(theirs, RRBOT, "cart", streams=["tf"]),
+    ):
+        until(lambda: tokens_now(ours, "zstate/cart/@writer/tf/*", 1.0))
+        with pytest.raises(SecondWriter):
+            replay(ours, cart)

@@ -1,0 +1,520 @@
+"""Recording robots over real sessions on loopback."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from live import RRBOT, STAMP, UPRIGHT, Tap, settle
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from support import SOON_S, until
+
+from zstate.errors import InvalidInput, RecordingError
+from zstate.model.catalog import load_model
+from zstate.model.kinematics import Kinematics
+from zstate.model.robot import RobotModel
+from zstate.net.session import Session, connect
+from zstate.net.streams import StreamPublisher
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.recording.reader import RecordingReader
+from zstate.recording.recorder import Recorder
+from zstate.sources import SineSource
+from zstate.transform import Transform
+from zstate.wire.messages import Clock, JointState, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+PERIOD = 1_000_000
+GRIPPER = load_model("gripper")
+
+
+def by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
+    """Topic and message of each record, as rosbags reads the file."""
+    with AnyReader([path]) as reader:
+        for connection, _, data in reader.messages():
+            yield connection.topic, reader.deserialize(data, connection.msgtype)
+
+
+def by_mcap_ros2(path: Path) -> Iterator[tuple[str, Any]]:
+    """The same, as mcap-ros2-support reads it."""
+    with path.open("rb") as stream:
+        for _, channel, _, message in make_reader(
+            stream, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            yield channel.topic, message
+
+
+OTHERS = [by_rosbags, by_mcap_ros2]
+
+
+def stamp_of(header: Any) -> int:
+    return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+
+
+def read(path: Path, topic: str) -> list[Any]:
+    return [message for name, message in by_rosbags(path) if name == topic]
+
+
+def count(recorder: Recorder, robot: str, stream: str = "joint_states") -> int:
+    return recorder.stats.messages.get((robot, stream), 0)
+
+
+def publish_paced(
+    publisher: StatePublisher, recorder: Recorder, reader: Session, number: int
+) -> list[np.ndarray]:
+    """So many samples of a sine, as fast as ``reader`` hears those of "r1"; their positions."""
+    sine = SineSource(publisher.model)
+    sent = [sine.read(STAMP + k * PERIOD * 10).positions for k in range(number)]
+    with closing(Tap(reader, "zstate/r1/tf")) as tap:
+        for k, positions in enumerate(sent):
+            publisher.publish(positions, stamp=STAMP + k * PERIOD)
+            if k % 10 == 9:  # a network whose reader is behind drops samples
+                tap.payloads(k + 1)
+    until(lambda: count(recorder, "r1") == count(recorder, "r1", "tf") == number)
+    return sent
+
+
+@pytest.fixture(scope="module")
+def panda() -> RobotModel:
+    return load_model("panda")
+
+
+@pytest.fixture
+def ten_thousand(sessions, tmp_path: Path, panda: RobotModel) -> tuple[Path, list[np.ndarray]]:
+    """A recording of at least ten thousand moving transforms, and the positions they were made of."""
+    writer, reader = sessions
+    path = tmp_path / "run.mcap"
+    with StatePublisher(writer, panda, "r1") as publisher, Recorder(reader, path) as recorder:
+        settle(writer, "r1", "joint_states", "tf")
+        sent = publish_paced(publisher, recorder, reader, 1300)
+    assert recorder.failure is None
+    stats = recorder.stats
+    assert (stats.dropped, stats.missed, stats.refused, stats.unwritten) == (0, 0, {}, 0)
+    return path, sent
+
+
+@pytest.mark.robots
+def test_ten_thousand_transforms_are_read_by_others_without_any_difference(ten_thousand, panda: RobotModel):
+    path, sent = ten_thousand
+    kinematics = Kinematics(panda)
+    for reader in OTHERS:
+        compared = 0
+        samples = (message for topic, message in reader(path) if topic == "/tf")
+        for k, message in enumerate(samples):
+            poses = dict(zip(kinematics.edges, kinematics.edge_poses(sent[k]), strict=True))
+            for edge in message.transforms:
+                move, turn = edge.transform.translation, edge.transform.rotation
+                pose = [move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w]
+                assert pose == poses[edge.header.frame_id, edge.child_frame_id].tolist()
+                assert stamp_of(edge.header) == STAMP + k * PERIOD
+                compared += 1
+        assert compared >= 10_000
+
+
+@pytest.mark.robots
+def test_joint_states_are_read_by_others_bit_for_bit(ten_thousand, panda: RobotModel):
+    path, sent = ten_thousand
+    for reader in OTHERS:
+        states = [message for topic, message in reader(path) if topic == "/joint_states"]
+        assert len(states) == len(sent)
+        for k, (state, positions) in enumerate(zip(states, sent, strict=True)):
+            assert tuple(state.name) == panda.joint_names
+            assert list(state.position) == positions.tolist()
+            assert stamp_of(state.header) == STAMP + k * PERIOD
+
+
+@pytest.mark.robots
+def test_the_model_and_its_fixed_edges_are_in_the_recording(ten_thousand, panda: RobotModel):
+    path, _ = ten_thousand
+    for reader in OTHERS:
+        described = [message.data for topic, message in reader(path) if topic == "/robot_description"]
+        fixed = [message for topic, message in reader(path) if topic == "/tf_static"]
+        assert described == [panda.urdf]
+        children = {edge.child_frame_id for edge in fixed[0].transforms}
+        assert children == {joint.child for joint in panda.joints if joint.type == "fixed"}
+
+
+def test_several_robots_have_a_namespace_and_a_prefix_each(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "left") as left,
+        StatePublisher(writer, GRIPPER, "right") as right,
+        Recorder(reader, tmp_path / "run.mcap") as recorder,
+    ):
+        for robot in ("left", "right"):
+            settle(writer, robot, "joint_states", "tf")
+        left.publish([0.1, 0.2], stamp=STAMP)
+        right.publish(SineSource(GRIPPER).read(STAMP).positions, stamp=STAMP)
+        until(lambda: count(recorder, "left", "tf") == count(recorder, "right", "tf") == 1)
+        until(lambda: all(count(recorder, robot, "tf_static") for robot in ("left", "right")))
+    (state,) = read(tmp_path / "run.mcap", "/left/joint_states")
+    assert state.position.tolist() == [0.1, 0.2]
+    assert len(read(tmp_path / "run.mcap", "/right/joint_states")) == 1
+    assert {topic for topic, _ in by_rosbags(tmp_path / "run.mcap")} == {
+        *("/tf", "/tf_static", "/left/joint_states", "/left/robot_description"),
+        *("/right/joint_states", "/right/robot_description"),
+    }
+    said = {
+        edge.child_frame_id for message in read(tmp_path / "run.mcap", "/tf") for edge in message.transforms
+    }
+    said |= {
+        edge.child_frame_id
+        for message in read(tmp_path / "run.mcap", "/tf_static")
+        for edge in message.transforms
+    }
+    links = {f"left/{joint.child}" for joint in RRBOT.joints}
+    assert said == links | {f"right/{joint.child}" for joint in GRIPPER.joints}
+
+
+def test_a_robot_that_comes_later_stands_beside_the_first_one(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with (
+        Recorder(reader, tmp_path / "run.mcap") as recorder,
+        StatePublisher(writer, RRBOT, "first") as first,
+    ):
+        settle(writer, "first")
+        first.publish([0.0, 0.0], stamp=STAMP)
+        until(lambda: count(recorder, "first") == 1)
+        with StatePublisher(writer, RRBOT, "second") as second:
+            second.publish([0.0, 0.0], stamp=STAMP)
+            until(lambda: count(recorder, "second") == 1)
+    assert len(read(tmp_path / "run.mcap", "/joint_states")) == 1
+    assert len(read(tmp_path / "run.mcap", "/second/joint_states")) == 1
+
+
+def test_only_the_chosen_robots_are_recorded_and_one_alone_stands_in_the_root(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "left") as left,
+        StatePublisher(writer, RRBOT, "right") as right,
+        StatePublisher(writer, RRBOT, "third") as third,
+        Recorder(reader, tmp_path / "one.mcap", "left") as one,
+        Recorder(reader, tmp_path / "two.mcap", ["left", "right"]) as two,
+    ):
+        settle(writer, "left")
+        settle(writer, "right")
+        for publisher in (third, right, left):
+            publisher.publish([0.0, 0.0], stamp=STAMP)
+        until(lambda: count(one, "left") == count(two, "left") == count(two, "right") == 1)
+    assert {robot for robot, _ in one.stats.messages} == {"left"}
+    assert {robot for robot, _ in two.stats.messages} == {"left", "right"}
+    assert len(read(tmp_path / "one.mcap", "/joint_states")) == 1
+    assert len(read(tmp_path / "two.mcap", "/left/joint_states")) == 1
+
+
+def test_samples_before_the_description_are_in_the_recording_once_it_came(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
+        settle(writer, "r1")
+        with StatePublisher(writer, RRBOT, "r1", streams=("joint_states",)) as publisher:
+            publisher.publish([0.25, 0.5], stamp=STAMP)
+            until(lambda: recorder.stats.unwritten == 1)
+            with StatePublisher(writer, RRBOT, "r1", streams=("robot_description",)):
+                until(lambda: count(recorder, "r1") == 1)
+    assert recorder.stats.unwritten == 0
+    (state,) = read(tmp_path / "run.mcap", "/joint_states")
+    assert (state.name, state.position.tolist()) == (list(RRBOT.joint_names), [0.25, 0.5])
+
+
+def test_a_writer_that_starts_again_is_another_channel_with_its_own_name(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
+        for start in (1, 2):
+            with StatePublisher(writer, RRBOT, "r1") as publisher:
+                settle(writer, "r1")
+                publisher.publish([0.0, float(start)], stamp=STAMP + start)
+                until(lambda wanted=start: count(recorder, "r1") == wanted)
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        records = list(recording.records(["/joint_states"]))
+        metadata = [record.metadata for record in records]
+    assert len({facts["zstate.session"] for facts in metadata}) == 2
+    assert all(facts["zstate.robot"] == "r1" and " pid " in facts["zstate.program"] for facts in metadata)
+    assert [record.publish_time for record in records] == [STAMP + 1, STAMP + 2]
+    assert all(abs(record.log_time - time.time_ns()) < 60_000_000_000 for record in records)
+
+
+def test_static_edges_are_recorded_as_they_change_and_are_withdrawn(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
+        with StaticPublisher(writer, "r1", "mount") as statics:
+            statics.set(Transform("tool", "hook", (0.0, 0.0, 0.25), UPRIGHT))
+            until(lambda: count(recorder, "r1", "tf_static") == 1)
+            statics.set(Transform("fleet/map", "camera", (1.0, 0.0, 0.0), UPRIGHT))
+            until(lambda: count(recorder, "r1", "tf_static") == 2)
+        until(lambda: count(recorder, "r1", "tf_static") == 3)
+    said = [
+        [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
+        for message in read(tmp_path / "run.mcap", "/tf_static")
+    ]
+    assert said == [[("tool", "hook")], [("tool", "hook"), ("fleet/map", "camera")], []]
+
+
+def put_state(publisher: StreamPublisher, seq: int, stamp: int = STAMP) -> None:
+    names = ("a",)
+    state = JointState(stamp, seq, 5, order_digest(names), to_block([0.5]), None, None, names)
+    publisher.put(encode(state))
+
+
+def test_what_did_not_come_and_what_cannot_be_read_or_said_is_counted(sessions, tmp_path: Path):
+    writer, reader = sessions
+    key = "zstate/r1/joint_states"
+    with (
+        Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
+        StreamPublisher(writer, key, ENCODINGS[JointState]) as ours,
+        StreamPublisher(writer, key, "text/plain") as foreign,
+    ):
+        until(lambda: ours.has_readers and foreign.has_readers)
+        for seq in (7, 8, 12):
+            put_state(ours, seq)
+        put_state(ours, 13, stamp=0)
+        put_state(ours, 14, stamp=2**31 * 1_000_000_000)
+        ours.put(b"\x93")
+        foreign.put(b"hello")
+        put_state(ours, 15)
+        until(lambda: count(recorder, "r1") == 4)
+        until(lambda: sum(recorder.stats.refused.values()) == 4)
+    stats = recorder.stats
+    assert (stats.missed, stats.dropped) == (3, 0)
+    assert stats.refused == {"no stamp": 1, "stamp outside 1901 to 2038": 1, "malformed": 1, "foreign": 1}
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        assert [record.sequence for record in recording.records()] == [7, 8, 12, 15]
+
+
+def test_simulated_time_is_recorded_beside_the_robots(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with (
+        Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
+        StreamPublisher(writer, "zstate/clock", ENCODINGS[Clock]) as clock,
+    ):
+        until(lambda: clock.has_readers)
+        clock.put(encode(Clock(3_000_000_007, 0, 9)))
+        until(lambda: count(recorder, "ros", "clock") == 1)
+    (message,) = read(tmp_path / "run.mcap", "/clock")
+    assert (message.clock.sec, message.clock.nanosec) == (3, 7)
+
+
+def test_what_ros_nodes_say_is_recorded_as_they_say_it(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with (
+        Recorder(reader, tmp_path / "run.mcap", wire="ros2:domain=3") as recorder,
+        StatePublisher(writer, RRBOT, "r1", wires=("ros2:domain=3",)) as publisher,
+    ):
+        until(lambda: count(recorder, "ros", "robot_description") == 1)
+        until(lambda: count(recorder, "ros", "tf_static") == 1)
+        positions = [0.5, 0.25]
+        until(lambda: publisher.publish(positions) or count(recorder, "ros", "tf") > 3)
+    assert recorder.failure is None
+    assert (recorder.stats.missed, recorder.stats.refused) == (0, {})
+    state = read(tmp_path / "run.mcap", "/joint_states")[-1]
+    assert (state.name, state.position.tolist()) == (list(RRBOT.joint_names), positions)
+    fixed = {joint.child for joint in RRBOT.joints if joint.type == "fixed"}
+    (said,) = read(tmp_path / "run.mcap", "/tf_static")
+    assert {edge.child_frame_id for edge in said.transforms} == fixed
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        programs = {channel.metadata["zstate.program"] for channel in recording.channels()}
+    assert len(programs) == 1
+
+
+def test_each_file_of_a_split_recording_can_be_understood_by_itself(sessions, tmp_path: Path):
+    writer, reader = sessions
+    path = tmp_path / "run.mcap"
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        Recorder(reader, path, max_bytes=1 << 16) as recorder,
+    ):
+        settle(writer, "r1", "joint_states", "tf")
+        sent = publish_paced(publisher, recorder, reader, 1000)
+        files = recorder.stats.files
+    assert len(files) > 2
+    counts: Counter[str] = Counter()
+    for file in files:
+        with file.open("rb") as stream:
+            topics = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
+        assert {"/robot_description", "/tf_static"} <= set(topics[:2])
+        counts.update(topics)
+    assert counts["/joint_states"] == counts["/tf"] == len(sent)
+    assert recorder.stats.files[-1] == tmp_path / f"run_{len(recorder.stats.files) - 1}.mcap"
+
+
+RECORDER = """
+    import sys, threading
+    from zstate import connect
+    from zstate.recording.recorder import Recorder
+    with connect() as session, Recorder(session, sys.argv[1], ["r1"]) as recorder:
+        print("ready")
+        recorder.wait()
+"""
+
+
+def test_of_a_recorder_that_is_killed_all_but_the_last_half_second_is_saved(sessions, spawn, tmp_path: Path):
+    from zstate.recording.mcap.recover import recover
+
+    writer = sessions[0]
+    child = spawn(RECORDER, str(tmp_path / "run.mcap"))
+    assert child.line() == "ready"
+    sent: list[int] = []
+    with StatePublisher(writer, RRBOT, "r1") as publisher:
+        settle(writer, "r1", "joint_states", "tf")
+        began = time.monotonic()
+        sine = iter(range(10**9))
+        while time.monotonic() < began + 2.0:
+            sent.append(time.time_ns())
+            publisher.publish([0.0, 0.001 * next(sine)], stamp=sent[-1])
+            until(lambda: time.time_ns() > sent[-1] + 3 * PERIOD)
+        child.kill()
+        killed = time.time_ns()
+    report = recover(tmp_path / "run.mcap", tmp_path / "saved.mcap")
+    saved = [stamp_of(state.header) for state in read(tmp_path / "saved.mcap", "/joint_states")]
+    assert saved == sent[: len(saved)]
+    # Half a second and what a busy machine adds.
+    assert sum(stamp < killed - 1_000_000_000 for stamp in sent) <= len(saved)
+    assert report.messages["/joint_states"] == len(saved)
+    assert abs(report.messages["/tf"] - len(saved)) <= 1
+    assert read(tmp_path / "saved.mcap", "/robot_description")[0].data == RRBOT.urdf
+
+
+ON_A_SMALL_DISK = """
+    import resource, sys
+    from zstate import connect
+    from zstate.recording.recorder import Recorder
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+    with connect() as session, Recorder(session, sys.argv[1], ["r1"]) as recorder:
+        print("ready")
+        print(recorder.wait(15.0))
+        print(type(recorder.failure).__name__, recorder.failure)
+        print(sum(recorder.stats.messages.values()))
+        recorder.close()
+    print("goes on")
+"""
+
+
+def test_a_full_disk_ends_the_recording_with_a_reason_and_leaves_it_readable(sessions, spawn, tmp_path: Path):
+    writer = sessions[0]
+    child = spawn(ON_A_SMALL_DISK, str(tmp_path / "run.mcap"))
+    assert child.line() == "ready"
+    with (
+        StatePublisher(writer, GRIPPER, "r1") as publisher,
+        StreamPublisher(writer, "zstate/r1/joint_states", "") as probe,
+    ):
+        until(lambda: probe.has_readers)
+        dice = np.random.default_rng(3)
+        count = len(GRIPPER.joint_names)
+        until(lambda: publisher.publish(dice.uniform(0.0, 0.01, count)) or not probe.has_readers)
+    assert child.line() == "True"
+    failure = child.line()
+    assert failure.startswith("RecordingError")
+    assert "cannot grow" in failure
+    written = int(child.line())
+    assert child.line() == "goes on"
+    assert (child.wait(), child.stderr) == (0, "")
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        assert not recording.complete
+        assert 0 < sum(1 for _ in recording.records()) <= written
+
+
+def test_closing_finishes_the_file_within_a_second_and_may_be_repeated(sessions, tmp_path: Path):
+    writer, reader = sessions
+    recorder = Recorder(reader, tmp_path / "run.mcap", ["r1"])
+    with StatePublisher(writer, RRBOT, "r1") as publisher:
+        settle(writer, "r1")
+        publisher.publish([0.0, 0.0], stamp=STAMP)
+        until(lambda: count(recorder, "r1") == 1)
+        assert not recorder.wait(0.0)
+        began = time.monotonic()
+        recorder.close()
+        recorder.close()
+        assert time.monotonic() - began < SOON_S
+        assert recorder.wait(0.0)
+        with StreamPublisher(writer, "zstate/r1/joint_states", "") as probe:
+            until(lambda: not probe.has_readers)
+    assert recorder.failure is None
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        assert recording.complete
+
+
+def test_what_was_heard_is_written_even_if_the_recording_ends_at_once(sessions, tmp_path: Path):
+    writer, reader = sessions
+    with (
+        Recorder(reader, tmp_path / "run.mcap") as recorder,
+        StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as publisher,
+    ):
+        until(lambda: publisher.has_readers)
+        with closing(Tap(reader, "zstate/r1/joint_states")) as tap:
+            for number in range(1, 20):
+                put_state(publisher, number)
+                tap.payloads(number)
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        sequences = [record.sequence for record in recording.records()]
+    assert sequences == list(range(1, len(sequences) + 1))
+    assert recorder.stats.messages == {("r1", "joint_states"): len(sequences)}
+
+
+def test_a_recording_of_nobody_is_a_complete_file(tmp_path: Path):
+    with connect() as session, Recorder(session, tmp_path / "run.mcap") as recorder:
+        assert recorder.stats.messages == {}
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        assert (recording.complete, recording.span) == (True, None)
+
+
+def test_a_session_that_is_closed_first_leaves_a_complete_file(tmp_path: Path):
+    session = connect()
+    recorder = Recorder(session, tmp_path / "run.mcap")
+    session.close()
+    recorder.close()
+    with RecordingReader(tmp_path / "run.mcap") as recording:
+        assert recording.complete
+
+
+def test_what_cannot_be_recorded_is_refused_and_no_file_made(sessions, tmp_path: Path):
+    session, path = sessions[0], tmp_path / "run.mcap"
+    with pytest.raises(InvalidInput, match="robot name 'a/b'"):
+        Recorder(session, path, ["a/b"])
+    with pytest.raises(InvalidInput, match="no wire 'dds'"):
+        Recorder(session, path, wire="dds")
+    with pytest.raises(InvalidInput, match="max_bytes"):
+        Recorder(session, path, max_bytes=5)
+    assert not path.exists()
+    path.write_text("mine")
+    with pytest.raises(RecordingError, match="exists"):
+        Recorder(session, path)
+    assert path.read_text() == "mine"
+    with StreamPublisher(session, "zstate/r1/joint_states", "") as probe:
+        until(lambda: not probe.has_readers)
+    with Recorder(session, path, overwrite=True):
+        pass
+    assert path.read_bytes().startswith(b"\x89MCAP")
+
+
+def test_what_is_latched_is_recorded_whole_beside_the_samples_in_a_thread_of_its_own(
+    sessions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """As if all of it were large: sets of edges in their order, and samples that wait for the description."""
+    monkeypatch.setattr("zstate.recording.recorder.LARGE_BYTES", 1)
+    writer, reader = sessions
+    with (
+        Recorder(reader, tmp_path / "run.mcap", "r1") as recorder,
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        StaticPublisher(writer, "r1") as statics,
+    ):
+        settle(writer, "r1", "joint_states", "tf")
+        for number in range(20):
+            publisher.publish([0.1, number / 100], stamp=STAMP + number * PERIOD)
+            statics.set(Transform("tool", f"mark_{number}", (0.0, 0.0, 0.1), UPRIGHT))
+            until(lambda: count(recorder, "r1", "tf_static") >= number + 2)  # noqa: B023  # called at once
+        until(lambda: count(recorder, "r1") == 20)
+    fixed = [
+        [edge.child_frame_id for edge in message.transforms]
+        for message in read(tmp_path / "run.mcap", "/tf_static")
+    ]
+    marks = [f"mark_{number}" for number in range(20)]
+    assert [children for children in fixed if "mark_0" in children] == [marks[: n + 1] for n in range(20)]
+    assert len(read(tmp_path / "run.mcap", "/joint_states")) == 20
+    assert recorder.stats.dropped == recorder.stats.unwritten == 0

@@ -1,0 +1,117 @@
+"""A recorded motion as a joint source: the same spacing, beginning now."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live import RRBOT
+from support import Stepping
+from tales import MS, START, Bag, S, Tale, swing, swing_rates
+
+from zstate.errors import InvalidInput
+from zstate.model.catalog import load_model
+from zstate.net.session import connect
+from zstate.nodes.publisher import StatePublisher
+from zstate.recording.source import RecordedSource
+
+NOW = 1_900_000_000 * S
+
+
+def arm(path: Path, count: int = 100, **options: object) -> Path:
+    with Tale(path, "arm") as tale:
+        tale.describe("arm")
+        for n in range(count):
+            tale.joints("arm", START + n * 10 * MS + n % 3, swing(n), swing_rates(n), **options)
+    return path
+
+
+def test_readings_are_the_recorded_numbers_moved_to_now(tmp_path: Path):
+    with RecordedSource(arm(tmp_path / "r.mcap"), "arm", RRBOT) as source:
+        for n in range(100):
+            reading = source.read(NOW + n * 10 * MS + n % 3)
+            assert reading is not None
+            assert reading.stamp == NOW + n * 10 * MS + n % 3
+            assert reading.positions.tolist() == swing(n)
+            assert reading.velocities is not None
+            assert reading.velocities.tolist() == swing_rates(n)
+        assert source.ended
+        assert source.read(NOW + 10 * S) is None
+
+
+def test_a_slower_reader_gets_the_newest_that_is_due(tmp_path: Path):
+    with RecordedSource(arm(tmp_path / "r.mcap"), "arm", RRBOT) as source:
+        assert source.read(NOW) is not None
+        reading = source.read(NOW + 57 * MS)
+        assert reading is not None
+        assert reading.positions.tolist() == swing(5)
+
+
+def test_nothing_new_is_none(tmp_path: Path):
+    with RecordedSource(arm(tmp_path / "r.mcap"), "arm", RRBOT) as source:
+        source.read(NOW)
+        assert source.read(NOW + 5 * MS) is None
+        assert not source.ended
+
+
+def test_the_only_robot_need_not_be_named(tmp_path: Path):
+    with RecordedSource(arm(tmp_path / "r.mcap"), None, RRBOT) as source:
+        assert source.robot == "arm"
+
+
+def test_other_robots_are_refused_with_those_there_are(tmp_path: Path):
+    with pytest.raises(InvalidInput, match="joint_states of 'leg'; it has those of 'arm'"):
+        RecordedSource(arm(tmp_path / "r.mcap"), "leg", RRBOT)
+    with Bag(tmp_path / "bag") as bag:
+        for robot in ("a", "b"):
+            bag.joints(START, {"shoulder": 0.0}, f"/{robot}/joint_states")
+    with pytest.raises(InvalidInput, match="of one robot; it has those of 'a', 'b'"):
+        RecordedSource(tmp_path / "bag", None, RRBOT)
+
+
+def test_states_that_do_not_fit_the_model_are_counted_and_passed_over(tmp_path: Path):
+    with Bag(tmp_path / "bag") as bag:
+        bag.joints(START, {"shoulder": 0.5})
+        bag.joints(START + 1, {"shoulder": 0.5, "elbow": np.nan})
+        bag.joints(START + 2, {"elbow": 0.25, "shoulder": 0.5})
+    with RecordedSource(tmp_path / "bag", None, RRBOT) as source:
+        reading = source.read(NOW)
+        assert reading is not None
+        assert reading.positions.tolist() == [0.5, 0.25]
+        assert source.refused == {"missing joints": 1, "bad numbers": 1}
+
+
+def test_a_writer_that_began_anew_follows_as_it_was_heard(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        tale.joints("arm", 500 * S, [1, 0], session=1, heard=START)
+        tale.joints("arm", 3 * S, [2, 0], session=2, heard=START + 2 * S)
+        tale.joints("arm", 4 * S, [3, 0], session=2, heard=START + 3 * S)
+    with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
+        stamps = [source.read(NOW + n * S) for n in range(4)]
+    told = [None if reading is None else (reading.stamp, reading.positions[0]) for reading in stamps]
+    assert told == [(NOW, 1.0), None, (NOW + 2 * S, 2.0), (NOW + 3 * S, 3.0)]
+
+
+def test_a_late_sample_does_not_take_the_robot_back(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        for number, millisecond in enumerate([0, 20, 10, 30]):
+            tale.joints("arm", START + millisecond * MS, [number, 0], heard=START + number * MS)
+    with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
+        seen = [source.read(NOW + n * 10 * MS) for n in range(4)]
+    assert [None if reading is None else reading.positions[0] for reading in seen] == [0.0, None, 1.0, 3.0]
+
+
+def test_a_publisher_runs_with_it(tmp_path: Path):
+    path = arm(tmp_path / "r.mcap", 10)
+    with (
+        connect() as session,
+        RecordedSource(path, "arm", RRBOT) as source,
+        StatePublisher(session, load_model("rrbot"), "arm", clock=Stepping()) as publisher,
+    ):
+        report = publisher.run(source, 1000.0, seconds=source.duration_s + 0.001)
+        assert source.ended
+        # From the description to the last state, 90 ms later, which took 200 us to be heard.
+        assert report.ticks == 91

@@ -1,0 +1,282 @@
+"""Decodes the records of a recording into the messages that listeners receive."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from hashlib import blake2b
+from itertools import islice
+from typing import NamedTuple
+
+from zstate.errors import MessageError, ModelError
+from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
+from zstate.recording.encode import StaticAccumulator
+from zstate.recording.reader import RecordingReader
+from zstate.recording.storage import ROBOT, Channel, Record
+from zstate.wire.joint_order import JointOrder
+from zstate.wire.keys import Stream
+from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.hearing import RosHearing
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.topics import SHARED, robot_of_topic, type_of
+
+STREAMS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
+"""The streams that are decoded."""
+
+LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
+"""Streams whose messages are in effect until the next."""
+
+_SESSION, _PREFIX = "zstate.session", "zstate.frame_prefix"
+
+_MAX_TRIED = 100
+"""Joint states that are tried for one that has all joints of the model."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedWriter:
+    """One writer of one stream, as one channel of a recording describes it.
+
+    ``robot`` is empty for the clock. ``static_writer`` is the name under which static edges were written,
+    each time all of them; None in the bags of ROS, where those of several messages add up. ``program`` is
+    the writer's program, ``session`` one start of it. ``foreign`` channels do not describe writers: their
+    robot is the topic's namespace, and all writers of a topic count as one.
+    """
+
+    robot: str
+    stream: Stream
+    session: int
+    static_writer: str | None
+    program: str | None
+    foreign: bool
+
+    @classmethod
+    def from_channel(cls, channel: Channel) -> RecordedWriter | None:
+        """The writer of ``channel``; None if it is no stream of a robot."""
+        name = channel.topic.rpartition("/")[2]
+        for stream in STREAMS:
+            if name == stream and channel.type_name == type_of(stream).name:
+                break
+        else:
+            return None
+        facts = channel.metadata
+        foreign = _SESSION not in facts
+        robot = robot_of_topic(channel.topic) if foreign else facts.get(ROBOT, "")
+        return cls(
+            robot="" if stream == "clock" else robot,
+            stream=stream,
+            session=_session_of(channel.topic) if foreign else int(facts[_SESSION]),
+            static_writer=facts.get("zstate.writer"),
+            program=facts.get("zstate.program"),
+            foreign=foreign,
+        )
+
+
+class DecodedMessage(NamedTuple):
+    """One message, its writer, and when it was recorded [ns]."""
+
+    writer: RecordedWriter
+    message: Message
+    log_time: int
+
+
+class DecodedRecording:
+    """The messages of a recording by zstate, or of a bag of ROS 2.
+
+    Messages that cannot be decoded are left out; ``refuse(reason, text)`` is called for each. Sequence
+    numbers are the writers', or count the messages of a foreign channel.
+    """
+
+    def __init__(self, reader: RecordingReader, refuse: Callable[[str, str], None]) -> None:
+        self._reader = reader
+        self._refuse = refuse
+        self._known: dict[Channel, _ChannelDecoder | None] = {}
+        self._counts: Counter[RecordedWriter] = Counter()
+        self._topics: dict[str, set[RecordedWriter]] = {}
+        self.ignored: tuple[Channel, ...] = ()
+        for channel in reader.channels():
+            decoder = self._decoder(channel)
+            if decoder is None:
+                self.ignored += (channel,)
+            else:
+                self._counts[decoder.writer] += channel.count
+                self._topics.setdefault(channel.topic, set()).add(decoder.writer)
+
+    @property
+    def writers(self) -> dict[RecordedWriter, int]:
+        """All writers with at least one message, and their number of messages."""
+        return {writer: count for writer, count in self._counts.items() if count}
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots in the recording, by name; "ros" for what is in no namespace of a bag."""
+        return tuple(sorted({writer.robot for writer in self.writers if writer.robot}))
+
+    def writers_of(self, robots: Collection[str] | None) -> set[RecordedWriter]:
+        """The writers of ``robots`` (None: of all).
+
+        The clock belongs to every robot, and so do the transforms that are in no namespace of a bag.
+        """
+        return {writer for writer in self.writers if robots is None or _belongs_to(writer, robots)}
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last log time [ns] of the whole recording; None when it is empty."""
+        return self._reader.span
+
+    def messages(
+        self,
+        robots: Collection[str] | None = None,
+        streams: Collection[Stream] = STREAMS,
+        begin: int | None = None,
+        end: int | None = None,
+    ) -> Iterator[DecodedMessage]:
+        """The messages of ``writers_of(robots)`` on ``streams``, by log time in [begin, end)."""
+        selected = {writer for writer in self.writers_of(robots) if writer.stream in streams}
+        topics = {topic for topic, writers in self._topics.items() if writers & selected}
+        counts: Counter[RecordedWriter] = Counter()
+        # Without topics there is nothing to read, while None would mean all.
+        for record in self._reader.records(topics, begin, end) if topics else ():
+            decoder = self._decoder(record.channel)
+            if decoder is not None and decoder.writer in selected:
+                counts[decoder.writer] += 1
+                yield from self._decode(record, decoder, counts[decoder.writer])
+
+    def _decode(self, record: Record, decoder: _ChannelDecoder, count: int) -> Iterator[DecodedMessage]:
+        writer = decoder.writer
+        seq = count if writer.foreign else record.sequence
+        try:
+            messages = decoder.hearing.messages(
+                writer.stream, record.payload, writer.session, seq, decoder.names
+            )
+        except MessageError as error:
+            self._refuse(error.reason, f"{record.topic}: {error}")
+            return
+        for message in messages:
+            yield DecodedMessage(writer, message, record.log_time)
+
+    def _decoder(self, channel: Channel) -> _ChannelDecoder | None:
+        if channel not in self._known:
+            writer = RecordedWriter.from_channel(channel)
+            decoder = None
+            if writer is not None:
+                options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
+                decoder = _ChannelDecoder(writer, FrameNames(options, writer.robot or SHARED), RosHearing())
+            self._known[channel] = decoder
+        return self._known[channel]
+
+
+class _ChannelDecoder(NamedTuple):
+    """The writer of a channel, and the decoder of its messages."""
+
+    writer: RecordedWriter
+    names: FrameNames
+    hearing: RosHearing
+
+
+class LatchedState:
+    """The robot descriptions and static edges in effect at one point of a recording."""
+
+    def __init__(self) -> None:
+        self._descriptions: dict[str, DecodedMessage] = {}
+        self._statics: dict[tuple[str, str], DecodedMessage] = {}
+        self._accumulated: dict[RecordedWriter, StaticAccumulator] = {}
+
+    @property
+    def descriptions(self) -> dict[str, DecodedMessage]:
+        """By robot."""
+        return dict(self._descriptions)
+
+    @property
+    def statics(self) -> tuple[DecodedMessage, ...]:
+        """One of each static writer, with all of its edges."""
+        return tuple(self._statics.values())
+
+    def update(self, decoded: DecodedMessage) -> DecodedMessage | None:
+        """The message if it changes the state; None if it repeats what is in effect, or is a sample.
+
+        Static edges that add up, as in the bags of ROS, are returned all together.
+        """
+        writer, message, _ = decoded
+        if isinstance(message, RobotDescription):
+            before = self._descriptions.get(writer.robot)
+            self._descriptions[writer.robot] = decoded
+            if before is not None and isinstance(before.message, RobotDescription):
+                return None if before.message.urdf == message.urdf else decoded
+            return decoded
+        if not isinstance(message, StaticTransforms):
+            return None
+        if writer.static_writer is None:
+            edges = self._accumulated.setdefault(writer, StaticAccumulator(writer.session))
+            message = edges.with_edges(message)
+            decoded = decoded._replace(message=message)
+        key = static_key(writer)
+        before = self._statics.get(key)
+        self._statics[key] = decoded
+        if before is None or not isinstance(before.message, StaticTransforms):
+            return decoded
+        is_same = (before.message.edges, before.message.poses) == (message.edges, message.poses)
+        return None if is_same else decoded
+
+
+def static_key(writer: RecordedWriter) -> tuple[str, str]:
+    """The robot of static edges, and the name of their static writer, "recorded" for a bag."""
+    return writer.robot, writer.static_writer or "recorded"
+
+
+def joint_order(model: RobotModel) -> JointOrder:
+    """Reader of the joint states of a robot with this model."""
+    return JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
+
+
+def first_descriptions(
+    recording: DecodedRecording, robots: Collection[str] | None = None
+) -> dict[str, DecodedMessage]:
+    """The first description of each robot."""
+    described = [writer.robot for writer in recording.writers if writer.stream == "robot_description"]
+    missing = {robot for robot in described if robots is None or robot in robots}
+    found: dict[str, DecodedMessage] = {}
+    for decoded in recording.messages(missing, ("robot_description",)):
+        found.setdefault(decoded.writer.robot, decoded)
+        if found.keys() == missing:
+            break
+    return found
+
+
+def recorded_model(
+    recording: DecodedRecording, description: DecodedMessage, refuse: Callable[[str, str], None]
+) -> RobotModel | None:
+    """The model of a described robot, or None if its joint states cannot be used with it.
+
+    That is the case without joint states, with a URDF that cannot be parsed, and if none of the first joint
+    states has all joints: in a bag of ROS they may come in parts, from several topics.
+    """
+    robot, message = description.writer.robot, description.message
+    assert isinstance(message, RobotDescription)
+    try:
+        # The text only: a URDF from a file opens no other files and runs no xacro.
+        model = parse_urdf(message.urdf, f"the URDF of {robot!r}")
+    except ModelError as error:
+        refuse("robot description", f"{robot!r}: {error}")
+        return None
+    order = joint_order(model)
+    for decoded in islice(recording.messages((robot,), ("joint_states",)), _MAX_TRIED):
+        assert isinstance(decoded.message, JointState)
+        try:
+            order.read(decoded.message)
+        except MessageError:
+            continue
+        return model
+    return None
+
+
+def _belongs_to(writer: RecordedWriter, robots: Collection[str]) -> bool:
+    is_shared = writer.foreign and writer.robot == SHARED and writer.stream in ("tf", "tf_static")
+    return writer.stream == "clock" or is_shared or writer.robot in robots
+
+
+def _session_of(topic: str) -> int:
+    return int.from_bytes(blake2b(topic.encode(), digest_size=4).digest(), "little")

@@ -1,0 +1,401 @@
+"""Encodes robot messages as ROS 2 messages and writes them to a recording."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, OrderedDict, defaultdict
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from types import MappingProxyType
+
+from zstate._util.bounded_queue import BoundedQueue
+from zstate.errors import InvalidInput, ModelError
+from zstate.locks import new_lock
+from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.model.urdf import parse_urdf
+from zstate.recording.mcap.writer import ChannelId, RecordingWriter
+from zstate.recording.storage import ROBOT
+from zstate.wire.keys import Stream
+from zstate.wire.messages import (
+    POSE_BYTES,
+    Clock,
+    JointState,
+    Message,
+    RobotDescription,
+    Sample,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+)
+from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
+from zstate.wire.ros2.qos import STREAM_QOS
+from zstate.wire.ros2.times import to_time
+from zstate.wire.ros2.topics import SHARED, RmwKeys, type_of
+from zstate.wire.sample_names import SampleNames
+
+MAX_LATCHED = 256
+"""Descriptions and sets of static edges of one robot that are latched, one of each static writer."""
+
+MAX_PENDING = 1024
+"""Samples of one robot that wait for the description that names their numbers."""
+MAX_PENDING_BYTES = 1 << 22
+"""Limit of their bytes, if that is reached first."""
+
+MAX_OPEN_CHANNELS = 1024
+"""Channels of one robot that are open at once; the least recently used one is released."""
+CHANNEL_BURST = 1000
+CHANNELS_PER_S = 10.0
+"""Rate at which a robot opens channels, per second of log time, after the first ``CHANNEL_BURST``."""
+
+_STREAMS: dict[type[Message], Stream] = {
+    JointState: "joint_states",
+    TransformSample: "tf",
+    StaticTransforms: "tf_static",
+    RobotDescription: "robot_description",
+    Clock: "clock",
+}
+_NO_ADDRESS = TopicAddress("", "", None)
+_NAMED = SampleNames()
+
+
+class RecordingEncoder:
+    """Writes the messages of robots, each writer's on channels of its own.
+
+    Samples are written from one thread, latched messages from the same or from one other thread: large ones
+    take long to encode, and do not block samples.
+
+    ``alone`` is the robot in the root of ROS's names (see ``RosNamespaces``). ``refuse(reason, text)`` is
+    called for each message that cannot be written: CDR cannot represent it ("no stamp", "stamp outside 1901
+    to 2038", "not sayable"), its model is unusable ("unusable model"), or its robot has opened too many
+    channels ("too many writers", see ``OpenChannels``). ``programs`` maps sessions to program names, as far
+    as known when the first message of a session is written.
+    """
+
+    def __init__(
+        self,
+        writer: RecordingWriter,
+        refuse: Callable[[str, str], None],
+        *,
+        alone: str | None = None,
+        programs: Mapping[int, str] = MappingProxyType({}),
+    ) -> None:
+        self._writer = writer
+        self._refuse = refuse
+        self._namespaces = RosNamespaces(alone)
+        self._programs = programs
+        self._lock = new_lock()
+        self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
+        self._latched: dict[str, dict[str, ChannelWriter]] = {}
+        self._statics: dict[tuple[str, int], StaticAccumulator] = {}
+        self._orders: dict[str, OrderRegistry] = {}
+        self._pending = PendingSamples()
+        self._counts: Counter[tuple[str, Stream]] = Counter()
+
+    @property
+    def messages(self) -> dict[tuple[str, Stream], int]:
+        """Messages written, by robot and stream; repetitions of latched ones are not counted."""
+        return dict(self._counts)
+
+    @property
+    def unwritten(self) -> int:
+        """Samples without a matching description: dropped ones, and those that still wait."""
+        return self._pending.dropped + self._pending.waiting
+
+    def write_message(
+        self, robot: str, message: Message, log_time: int, static_writer: str | None = None
+    ) -> bool:
+        """Write ``message`` of ``robot``, received at ``log_time`` [ns]; the clock belongs to SHARED.
+
+        ``static_writer`` is the name under which static edges are written; without one, as in ROS, those of a
+        session add up. Returns False if the robot has no channel left for that writer. Raises RecordingError
+        if the file cannot grow.
+        """
+        try:
+            if isinstance(message, StaticTransforms):
+                if static_writer is None:
+                    key = robot, message.session
+                    edges = self._statics.setdefault(key, StaticAccumulator(message.session))
+                    message, static_writer = edges.with_edges(message), f"ros-{message.session}"
+                self._latch(robot, message, log_time, f"{robot}/{static_writer}", static_writer)
+            elif isinstance(message, RobotDescription):
+                self._write_description(robot, message, log_time)
+            elif isinstance(message, Sample | Clock):
+                with self._lock:
+                    self._write_sample(robot, message, log_time)
+        except _TooManyWriters as error:
+            self._refuse("too many writers", f"{robot!r}: {error}")
+            return False
+        except InvalidInput as error:
+            self._refuse(_reason(message), f"{robot!r}: {error}")
+        return True
+
+    def withdraw(self, robot: str, static_writer: str, log_time: int) -> None:
+        """Write that a static writer has withdrawn all its edges."""
+        with self._lock:
+            key = f"{robot}/{static_writer}"
+            channel = self._latched.get(robot, {}).pop(key, None)
+            if channel is not None:
+                channel.latch(key, channel.encode(StaticTransforms(0, (), b"")), log_time)
+                channel.unlatch(key)
+                self._counts[robot, "tf_static"] += 1
+
+    def _write_sample(self, robot: str, message: Sample | Clock, log_time: int) -> None:
+        sample_names = self._orders_of(robot).sample_names(message)
+        if sample_names is None:
+            self._pending.append(robot, message, log_time)
+            return
+        stream = _STREAMS[type(message)]
+        self._channel(robot, stream, message.session, log_time).write(message, sample_names, log_time)
+        self._counts[robot, stream] += 1
+
+    def _write_description(self, robot: str, description: RobotDescription, log_time: int) -> None:
+        self._latch(robot, description, log_time, robot)
+        try:
+            self._orders_of(robot).add(description, robot)
+        except ModelError as error:
+            self._refuse("unusable model", str(error))
+        with self._lock:
+            pending = self._pending.pop(robot)
+        for sample, received in pending:
+            self.write_message(robot, sample, received)
+
+    def _latch(
+        self,
+        robot: str,
+        message: StaticTransforms | RobotDescription,
+        log_time: int,
+        key: str,
+        static_writer: str = "",
+    ) -> None:
+        stream = _STREAMS[type(message)]
+        with self._lock:
+            latched = self._latched.setdefault(robot, {})
+            if key not in latched and len(latched) >= MAX_LATCHED:
+                raise _TooManyWriters(
+                    f"it has {MAX_LATCHED} static writers, and {static_writer!r} is one more"
+                )
+            channel = self._channel(robot, stream, message.session, log_time, static_writer)
+        payload = channel.encode(message)
+        with self._lock:
+            channel.latch(key, payload, log_time)
+            before = latched.get(key, channel)
+            if before is not channel:
+                before.unlatch(key)
+            latched[key] = channel
+            self._counts[robot, stream] += 1
+
+    def _orders_of(self, robot: str) -> OrderRegistry:
+        # Atomic: descriptions are added from another thread, without the lock.
+        return self._orders.setdefault(robot, OrderRegistry())
+
+    def _channel(
+        self, robot: str, stream: Stream, session: int, log_time: int, static_writer: str = ""
+    ) -> ChannelWriter:
+        key = (stream, session, static_writer)
+        opened = self._channels[robot]
+        channel = opened.find(key)
+        if channel is not None:
+            return channel
+        if not opened.allow(log_time):
+            raise _TooManyWriters("its writers start too often, each with channels of its own")
+        options = self._namespaces.options(robot)
+        metadata = {"zstate.session": str(session)}
+        if stream != "clock":
+            metadata |= {ROBOT: robot, "zstate.frame_prefix": options.frame_prefix}
+        if static_writer:
+            metadata["zstate.writer"] = static_writer
+        if session in self._programs:
+            metadata["zstate.program"] = self._programs[session]
+        topic = RmwKeys(options).topic(robot, stream)
+        number = self._writer.channel(topic, type_of(stream), STREAM_QOS[stream], metadata)
+        channel = ChannelWriter(self._writer, number, stream, FrameNames(options, robot))
+        opened.add(key, channel, self._latched.get(robot, {}).values())
+        return channel
+
+
+class ChannelWriter:
+    """Encodes and writes the messages of one writer on ``stream``. Raises InvalidInput if CDR cannot."""
+
+    def __init__(
+        self, writer: RecordingWriter, channel: ChannelId, stream: Stream, names: FrameNames
+    ) -> None:
+        self._writer = writer
+        self._channel = channel
+        self._stream: Stream = stream
+        self._names = names
+        self._sample_names = _NAMED
+        self._encoder = RosStreamEncoder(stream, _NO_ADDRESS, names, _NAMED)
+
+    def write(self, message: Sample | Clock, sample_names: SampleNames, log_time: int) -> None:
+        """Write one sample; ``sample_names`` names its numbers."""
+        payload = self.encode(message, sample_names)
+        # MCAP begins in 1970; the payload keeps an earlier stamp.
+        publish_time = max(message.stamp, 0)
+        self._writer.write(self._channel, payload, log_time, publish_time, sequence=message.seq)
+
+    def latch(self, key: str, payload: bytes, log_time: int) -> None:
+        """Write a payload that is latched until the next of this ``key``."""
+        self._writer.latch(self._channel, key, payload, log_time, log_time)
+
+    def unlatch(self, key: str) -> None:
+        """Stop repeating the payload of ``key``: another channel has a newer one."""
+        self._writer.unlatch(self._channel, key)
+
+    def release(self) -> None:
+        """Leave the channel out of the files that follow."""
+        self._writer.release(self._channel)
+
+    def encode(self, message: Message, sample_names: SampleNames = _NAMED) -> bytes:
+        """The payload of ``message``; slow for a large latched one."""
+        if sample_names is not self._sample_names:
+            self._sample_names = sample_names
+            self._encoder = RosStreamEncoder(self._stream, _NO_ADDRESS, self._names, sample_names)
+        return self._encoder.encode(message)
+
+
+class OpenChannels:
+    """The open channels of one robot. New ones are opened at a bounded rate.
+
+    Each session has channels of its own, since readers distinguish the starts of a writer by them. The bound
+    keeps a robot whose writers restart endlessly from using up all channels of a recording.
+    """
+
+    def __init__(self) -> None:
+        self._channels: OrderedDict[Hashable, ChannelWriter] = OrderedDict()
+        self._allowed = float(CHANNEL_BURST)
+        self._filled_at = 0
+
+    def find(self, key: Hashable) -> ChannelWriter | None:
+        """The channel of ``key``, if it is open."""
+        channel = self._channels.get(key)
+        if channel is not None:
+            self._channels.move_to_end(key)
+        return channel
+
+    def add(self, key: Hashable, channel: ChannelWriter, kept: Collection[ChannelWriter]) -> None:
+        """Add a channel; beyond the maximum, release the least recently used one that is not ``kept``."""
+        self._channels[key] = channel
+        if len(self._channels) > MAX_OPEN_CHANNELS:
+            unused = next(other for other, channel in self._channels.items() if channel not in kept)
+            self._channels.pop(unused).release()
+
+    def allow(self, log_time: int) -> bool:
+        """Whether another channel may be opened now, which counts as opening it."""
+        passed_s = max(0, log_time - self._filled_at) / 1e9
+        self._filled_at = log_time
+        self._allowed = min(float(CHANNEL_BURST), self._allowed + passed_s * CHANNELS_PER_S)
+        if self._allowed < 1.0:
+            return False
+        self._allowed -= 1.0
+        return True
+
+
+class OrderRegistry:
+    """Joint and edge orders of one robot by digest; older ones are kept."""
+
+    def __init__(self) -> None:
+        self._joints: dict[bytes, SampleNames] = {}
+        self._edges: dict[bytes, SampleNames] = {}
+
+    def add(self, description: RobotDescription, robot: str) -> None:
+        """Add the orders of a description. Raises ModelError if its joints cannot be parsed."""
+        edges = description.moving_edges
+        self._edges.setdefault(order_digest(edges), SampleNames(moving_edges=edges))
+        order = order_digest(description.joint_names)
+        if description.joint_names and order not in self._joints:
+            model = parse_urdf(description.urdf, f"the description of {robot!r}")
+            self._joints[order] = SampleNames(coordinate_names(model), velocity_slots(model))
+
+    def sample_names(self, sample: Sample | Clock) -> SampleNames | None:
+        """The names of the numbers in ``sample``, or None before a description with its order."""
+        if isinstance(sample, JointState):
+            return self._joints.get(sample.order) if sample.names is None else _NAMED
+        if isinstance(sample, TransformSample):
+            return self._edges.get(sample.order) if sample.edges is None else _NAMED
+        return _NAMED
+
+
+class PendingSamples:
+    """Samples received before the description that names their numbers, the newest of each robot.
+
+    ``dropped`` counts those that were replaced by newer ones.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._robots: dict[str, BoundedQueue[tuple[Sample | Clock, int]]] = {}
+
+    @property
+    def waiting(self) -> int:
+        """Number of samples held."""
+        return sum(len(pending) for pending in list(self._robots.values()))
+
+    def append(self, robot: str, sample: Sample | Clock, log_time: int) -> None:
+        """Hold a sample received at ``log_time``, unless it alone exceeds the limit."""
+        pending = self._robots.setdefault(robot, BoundedQueue(MAX_PENDING, MAX_PENDING_BYTES))
+        self.dropped += pending.append((sample, log_time), _size(sample))
+
+    def pop(self, robot: str) -> Iterable[tuple[Sample | Clock, int]]:
+        """Remove the samples of ``robot``, and return them with their log times."""
+        return self._robots.pop(robot, ())
+
+
+class RosNamespaces:
+    """The ROS namespace and the frame prefix of each robot in one recording.
+
+    ``alone`` and what belongs to no robot are in the root, with unchanged frame names, where every ROS tool
+    finds them. Any other robot has a namespace and a frame prefix of its own.
+    """
+
+    def __init__(self, alone: str | None = None) -> None:
+        self._root = {SHARED, alone}
+        self._namespaces: dict[str, str] = {}
+
+    def options(self, robot: str) -> Ros2Options:
+        """Raises InvalidInput for an invalid robot name."""
+        if robot in self._root:
+            return Ros2Options()
+        if robot not in self._namespaces:
+            # "arm-1" and "arm.1" are valid robots for zstate, but not valid names in ROS.
+            name = re.sub(r"\W|^(?=\d)", "_", robot, flags=re.ASCII)
+            while name in self._namespaces.values():
+                name += "_"
+            self._namespaces[robot] = name
+        return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
+
+
+class StaticAccumulator:
+    """All static edges of one session so far, as those of a ROS node add up; the newest of each child."""
+
+    def __init__(self, session: int) -> None:
+        self._session = session
+        self._edges: dict[str, tuple[str, bytes]] = {}
+
+    def with_edges(self, statics: StaticTransforms) -> StaticTransforms:
+        """Add these edges; all edges so far."""
+        for row, (parent, child) in enumerate(statics.edges):
+            self._edges[child] = parent, statics.poses[row * POSE_BYTES : (row + 1) * POSE_BYTES]
+        edges = tuple((parent, child) for child, (parent, _) in self._edges.items())
+        return StaticTransforms(self._session, edges, b"".join(pose for _, pose in self._edges.values()))
+
+
+class _TooManyWriters(InvalidInput):
+    """The robot has used up its channels."""
+
+
+def _reason(message: Message) -> str:
+    stamp = message.stamp if isinstance(message, Sample | Clock) else 1
+    if not stamp:
+        return "no stamp"
+    try:
+        to_time(stamp)
+    except InvalidInput:
+        return "stamp outside 1901 to 2038"
+    return "not sayable"
+
+
+def _size(sample: Sample | Clock) -> int:
+    if isinstance(sample, JointState):
+        return sum(len(block or b"") for block in (sample.positions, sample.velocities, sample.efforts))
+    return len(sample.poses) if isinstance(sample, TransformSample) else 0

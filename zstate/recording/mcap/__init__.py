@@ -1,0 +1,1 @@
+"""The MCAP storage: files read, indexed, recovered and written without trust in their contents."""

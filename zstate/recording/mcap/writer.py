@@ -1,0 +1,420 @@
+"""MCAP writer that splits, and repeats latched messages so that any part of a recording is readable."""
+
+from __future__ import annotations
+
+import errno
+import io
+import math
+import os
+import uuid
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple, NewType, TypeAlias
+
+from mcap.writer import CompressionType, Writer
+
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, RecordingError
+from zstate.locks import new_lock
+from zstate.recording.mcap.split_files import IDENTITY, later_splits, split_path
+from zstate.recording.storage import CDR
+from zstate.wire.ros2.qos import Qos
+from zstate.wire.ros2.types import RosType
+
+LIBRARY = f"zstate {version('zstate')}"
+
+MIN_BYTES = 1 << 16
+MIN_SECONDS = 1.0
+MAX_CHANNELS = 60_000
+"""Of one file; MCAP numbers channels in 16 bits."""
+
+GROUP_NS = 10_000_000_000
+"""Interval at which latched messages are repeated [ns of log time]."""
+
+_MESSAGE_SIZE = 31  # of a message's record, without its payload
+_SEQUENCE = (1 << 32) - 1
+_END_OF_TIME = 1 << 63
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+ChannelId = NewType("ChannelId", int)
+"""A channel of a whole recording; its MCAP id may differ between files."""
+ChannelKey: TypeAlias = tuple[str, str, frozenset[tuple[str, str]]]
+
+
+class ChannelDeclaration(NamedTuple):
+    """A channel as every file of the recording declares it."""
+
+    topic: str
+    type: RosType
+    metadata: Mapping[str, str]
+
+    @property
+    def key(self) -> ChannelKey:
+        """Hashable, and the same for equal channels."""
+        return self.topic, self.type.hash, frozenset(self.metadata.items())
+
+
+class RecordedMessage(NamedTuple):
+    """One message of a declared channel."""
+
+    channel: ChannelId
+    payload: bytes
+    log_time: int
+    publish_time: int
+    sequence: int
+
+
+class _ChunkBuffer(io.BytesIO):
+    """Output of MCAP's writer, written to the file in one go: whole chunks, or nothing of them.
+
+    The writer calls ``tell`` for the offsets in its index.
+    """
+
+    def __init__(self, file: io.FileIO) -> None:
+        super().__init__()
+        self._file = file
+        self.file_size = 0
+
+    def tell(self) -> int:
+        return self.file_size + super().tell()
+
+    def flush(self) -> None:
+        data = self.getvalue()
+        try:
+            written = 0
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError:
+            with suppress(OSError):
+                self._file.truncate(self.file_size)
+            raise
+        self.file_size += len(data)
+        self.seek(0)
+        self.truncate()
+
+
+class McapOutput:
+    """An MCAP file being written. After a failure it is closed, and ends with a whole chunk.
+
+    ``writer`` is MCAP's own; its output is in memory until ``flush``. Its public ``flush`` (since mcap 1.5)
+    ends the chunk in progress, which its ``chunk_size`` does also.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool, profile: str = "ros2", library: str = LIBRARY) -> None:
+        self.path = path
+        with self._errors():
+            self._file = io.FileIO(path, "w" if overwrite else "x")
+        self._buffer = _ChunkBuffer(self._file)
+        self.writer = Writer(self._buffer, compression=CompressionType.ZSTD)
+        self.writer.start(profile, library)
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._buffer.file_size
+
+    @property
+    def has_waiting(self) -> bool:
+        """Whether a whole chunk is in memory."""
+        return self._buffer.tell() > self._buffer.file_size
+
+    def flush(self) -> None:
+        """End the chunk in progress and write it to the system, where ``kill -9`` cannot lose it."""
+        with self._close_on_failure():
+            self.writer.flush()
+
+    def finish(self) -> None:
+        """Write the index, and close the file."""
+        with self._close_on_failure():
+            self.writer.finish()
+            self._buffer.flush()
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        with suppress(OSError):
+            self._file.close()
+
+    @contextmanager
+    def _close_on_failure(self) -> Generator[None, None, None]:
+        try:
+            with self._errors():
+                yield
+        except RecordingError:
+            self.abandon()
+            raise
+
+    @contextmanager
+    def _errors(self) -> Generator[None, None, None]:
+        name = repr(str(self.path))
+        try:
+            yield
+        except FileExistsError as error:
+            text = f"{name} exists; choose another name, or pass overwrite=True"
+            raise RecordingError(text, path=str(self.path)) from error
+        except OSError as error:
+            text = f"{name} cannot be written: {error.strerror}"
+            if error.errno in _FULL:
+                text = (
+                    f"{name} cannot grow: {error.strerror}; free some space. What was written before "
+                    "stays readable, and `zstate recover` makes a complete file of it"
+                )
+            elif error.errno == errno.ENOENT:
+                text = f"{name} cannot be written: there is no folder {str(self.path.parent)!r}"
+            raise RecordingError(text, path=str(self.path)) from error
+
+
+class SplitFile:
+    """One file of a recording: its channels, and groups of chunks that begin with the latched messages."""
+
+    def __init__(self, path: Path, *, overwrite: bool, recording: str, part: int) -> None:
+        self._output = McapOutput(path, overwrite=overwrite)
+        self._output.writer.add_metadata(IDENTITY, {"id": recording, "part": str(part)})
+        self._output.flush()
+        self._schemas: dict[str, int] = {}
+        self._numbers: dict[ChannelKey, int] = {}
+        self._number_of: dict[ChannelId, int] = {}
+        self._waiting = 0
+        self._opening = 0
+        self._first: int | None = None
+        self._group = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file."""
+        return self._output.size
+
+    @property
+    def channel_count(self) -> int:
+        """Channels in the file."""
+        return len(self._numbers)
+
+    def declare(self, channel: ChannelId, declaration: ChannelDeclaration) -> None:
+        """Add a channel, unless the file has an equal one."""
+        key = declaration.key
+        if key not in self._numbers:
+            topic, kind, metadata = declaration
+            writer = self._output.writer
+            if kind.name not in self._schemas:
+                text = kind.definition.encode()
+                self._schemas[kind.name] = writer.register_schema(kind.name, "ros2msg", text)
+            self._numbers[key] = writer.register_channel(topic, CDR, self._schemas[kind.name], dict(metadata))
+        self._number_of[channel] = self._numbers[key]
+
+    def is_over(self, log_time: int, max_bytes: float, max_ns: float) -> bool:
+        """Whether a message of that log time belongs into the next file."""
+        if self._first is None:
+            return False
+        grown = self.size + self._waiting - self._opening
+        return grown >= max_bytes or abs(log_time - self._first) >= max_ns
+
+    def group_is_over(self, log_time: int) -> bool:
+        """Whether a message of that log time starts a group."""
+        return self._first is None or abs(log_time - self._group) >= GROUP_NS
+
+    def start_group(self, log_time: int, latched: Iterable[RecordedMessage]) -> None:
+        """Start a chunk, with the latched messages under this log time."""
+        self.flush()
+        self._group = log_time
+        for message in latched:
+            self.add(message._replace(log_time=log_time))
+        if self._first is None:
+            self._first = log_time
+            self._opening = self.size + self._waiting
+
+    def add(self, message: RecordedMessage) -> None:
+        """Write it: into memory, until the chunk is full."""
+        channel, payload, log_time, publish_time, sequence = message
+        number = self._number_of[channel]
+        self._output.writer.add_message(number, log_time, payload, publish_time, sequence & _SEQUENCE)
+        self._waiting += len(payload) + _MESSAGE_SIZE
+        if self._output.has_waiting:
+            self.flush()
+
+    def flush(self) -> None:
+        """End the chunk, and write it to the system."""
+        self._output.flush()
+        self._waiting = 0
+
+    def finish(self) -> None:
+        """Write the index, and close."""
+        self._output.finish()
+
+
+class RecordingWriter(Closing):
+    """Writes CDR messages into ``path``, and into path_1, path_2 ... when it splits. Any thread may write.
+
+    A file ends once it has grown by ``max_bytes`` (the chunk in progress counted without compression, the
+    index at its end not counted), its log times span ``max_seconds`` or it has 60,000 channels. The next file
+    starts with all channels that were not released, and the latched values. These are also repeated every
+    10 s of log time, at the start of a chunk, so that any remaining part of a recording is readable.
+
+    ``flush()``, to be called every half a second, makes written messages safe from ``kill -9``. Raises
+    RecordingError if the file exists (unless ``overwrite``), cannot be created, or cannot grow; what was
+    written stays readable, and the recording is then closed.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        if max_bytes is not None and max_bytes < MIN_BYTES:
+            raise InvalidInput(f"max_bytes is {max_bytes}; give {MIN_BYTES} or more")
+        if max_seconds is not None and not MIN_SECONDS <= max_seconds < math.inf:
+            raise InvalidInput(f"max_seconds is {max_seconds:g}; give {MIN_SECONDS:g} or more")
+        self._first = Path(path)
+        self._max_bytes = math.inf if max_bytes is None else max_bytes
+        self._max_ns = math.inf if max_seconds is None else max_seconds * 1e9
+        self._overwrite = overwrite
+        if not overwrite and (max_bytes or max_seconds) and self._first.parent.is_dir():
+            for _, file in later_splits(self._first):
+                text = (
+                    f"{str(file)!r} exists, and this recording may need the name; move it, or choose another"
+                )
+                raise RecordingError(f"{text} (or overwrite=True)", path=str(file))
+        self._lock = new_lock()
+        self._recording = uuid.uuid4().hex
+        self._declared: dict[ChannelId, ChannelDeclaration] = {}
+        self._ids: dict[ChannelKey, ChannelId] = {}
+        self._id = 0
+        self._latched: dict[tuple[ChannelId, str], RecordedMessage] = {}
+        self._files: list[Path] = []
+        self._finished_bytes = 0
+        self._is_open = True
+        self._split = self._new_split()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files written so far, the current one last."""
+        return tuple(self._files)
+
+    @property
+    def size(self) -> int:
+        """Bytes in all files so far, without unflushed ones."""
+        return self._finished_bytes + self._split.size
+
+    def channel(
+        self, topic: str, type: RosType, qos: Qos, metadata: Mapping[str, str] | None = None
+    ) -> ChannelId:
+        """Declare a channel; an equal declaration returns the same id."""
+        facts = {"offered_qos_profiles": qos.to_rosbag_yaml(), "topic_type_hash": type.hash}
+        declaration = ChannelDeclaration(topic, type, {**facts, **(metadata or {})})
+        key = declaration.key
+        with self._lock, self._close_on_failure():
+            self._check_open()
+            known = self._ids.get(key)
+            if known is not None:
+                return known
+            if self._split.channel_count >= MAX_CHANNELS:
+                self._start_split()
+            self._id += 1
+            channel = self._ids[key] = ChannelId(self._id)
+            self._declared[channel] = declaration
+            self._split.declare(channel, declaration)
+            return channel
+
+    def release(self, channel: ChannelId) -> None:
+        """Leave a channel without latched messages out of the files that follow."""
+        with self._lock:
+            declaration = self._declared.pop(channel, None)
+            if declaration is not None:
+                del self._ids[declaration.key]
+
+    def write(
+        self, channel: ChannelId, payload: bytes, log_time: int, publish_time: int, *, sequence: int = 0
+    ) -> None:
+        """Write a message. Log times [ns] need not increase; ``sequence`` is cut to 32 bits."""
+        message = self._checked(RecordedMessage(channel, payload, log_time, publish_time, sequence))
+        with self._lock, self._close_on_failure():
+            self._make_room(log_time)
+            self._split.add(message)
+
+    def latch(
+        self,
+        channel: ChannelId,
+        key: str,
+        payload: bytes,
+        log_time: int,
+        publish_time: int,
+        *,
+        sequence: int = 0,
+    ) -> None:
+        """Write a message that is repeated, in the following files too, until the next of this ``key``.
+
+        A repetition carries the log time of the message it precedes, and its own publish time.
+        """
+        message = self._checked(RecordedMessage(channel, bytes(payload), log_time, publish_time, sequence))
+        with self._lock, self._close_on_failure():
+            self._latched[channel, key] = message
+            if not self._make_room(log_time):
+                self._split.add(message)
+
+    def unlatch(self, channel: ChannelId, key: str) -> None:
+        """Stop repeating it."""
+        with self._lock:
+            self._latched.pop((channel, key), None)
+
+    def flush(self) -> None:
+        """Write everything to the operating system, in a chunk of its own."""
+        with self._lock, self._close_on_failure():
+            if self._is_open:
+                self._split.flush()
+
+    def close(self) -> None:
+        with self._lock:
+            if self._is_open:
+                self._is_open = False
+                self._split.finish()
+
+    def _make_room(self, log_time: int) -> bool:
+        """Start the file or the group that this log time belongs into; whether a group was started."""
+        self._check_open()
+        if self._split.is_over(log_time, self._max_bytes, self._max_ns):
+            self._start_split()
+        if not self._split.group_is_over(log_time):
+            return False
+        self._split.start_group(log_time, self._latched.values())
+        return True
+
+    def _start_split(self) -> None:
+        self._split.finish()
+        self._finished_bytes += self._split.size
+        self._split = self._new_split()
+
+    def _new_split(self) -> SplitFile:
+        part = len(self._files)
+        path = split_path(self._first, part)
+        split = SplitFile(path, overwrite=self._overwrite, recording=self._recording, part=part)
+        self._files.append(path)
+        for channel, declaration in self._declared.items():
+            split.declare(channel, declaration)
+        return split
+
+    @contextmanager
+    def _close_on_failure(self) -> Generator[None, None, None]:
+        """Close the recording after a disk error."""
+        try:
+            yield
+        except RecordingError:
+            self._is_open = False
+            raise
+
+    def _checked(self, message: RecordedMessage) -> RecordedMessage:
+        # MCAP's writer would notice half way through a record, or not at all.
+        if message.channel not in self._declared:
+            text = f"{message.channel} is no channel of {str(self._first)!r}; declare it with channel()"
+            raise InvalidInput(text)
+        for time in (message.log_time, message.publish_time):
+            if not 0 <= time < _END_OF_TIME:
+                raise InvalidInput(f"a time is {time}; give nanoseconds since 1970, below 2**63")
+        return message
+
+    def _check_open(self) -> None:
+        if not self._is_open:
+            raise RecordingError(f"the recording {str(self._first)!r} is closed", path=str(self._first))

@@ -1,0 +1,321 @@
+"""Publishers of one playback pass, with new writer identities."""
+
+from __future__ import annotations
+
+import secrets
+from collections import Counter
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+
+from zstate._util.refusals import Refusals
+from zstate.clock import SIMULATED, ManualClock
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.ingest.model_filter import ModelEdgeFilter
+from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
+from zstate.net.claims import Claim
+from zstate.net.placing import Edge, named_edges, placing
+from zstate.net.presence import writer_here
+from zstate.net.session import Session
+from zstate.net.wires import wire_named
+from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
+from zstate.nodes.publisher import StatePublisher
+from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, joint_order, static_key
+from zstate.wire.keys import MODEL_WRITER, Stream
+from zstate.wire.messages import (
+    JointState,
+    Message,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+)
+from zstate.wire.writer import Announced
+
+
+class PlaybackPublishers(Closing):
+    """Publishes recorded messages as new writers.
+
+    Robots with one of ``models`` get a StatePublisher, which recomputes their transforms if their own
+    publisher wrote them; all other messages are published unchanged. ``latched`` is in effect from the start.
+    Messages that cannot be published are counted in ``refusals``. Raises SecondWriter if another writer
+    publishes the same, unless ``takeover``.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        wires: Sequence[str],
+        writers: Collection[RecordedWriter],
+        *,
+        models: Mapping[str, RobotModel],
+        latched: LatchedState,
+        refusals: Refusals,
+        takeover: bool = False,
+    ) -> None:
+        self._session = session
+        self._wires = wires
+        self._takeover = takeover
+        self._refusals = refusals
+        self._latched = latched
+        self._modelled, self._computed = ModelEdgeFilter(), ModelEdgeFilter()
+        self._sessions: set[int] = set()
+        self._robots: dict[str, _RobotPublisher] = {}
+        self._others: dict[str, PassthroughPublisher] = {}
+        with ExitStack() as opening:
+            opening.callback(self._close_robots)
+            for robot, model in models.items():
+                self._robots[robot] = self._open(robot, model, _is_computed(robot, writers))
+            for robot, streams in self._other_streams(writers).items():
+                self._others[robot] = PassthroughPublisher(
+                    session, wires, robot, streams, sessions=self._sessions, takeover=takeover
+                )
+                opening.enter_context(self._others[robot])
+            for decoded in (*latched.descriptions.values(), *latched.statics):
+                self._publish_counted(decoded)
+            self._opened = opening.pop_all()
+
+    def _open(self, robot: str, model: RobotModel, is_computed: bool) -> _RobotPublisher:
+        self._modelled.set_model(robot, model)
+        if is_computed:
+            self._computed.set_model(robot, model)
+        opened = _RobotPublisher(self._session, self._wires, robot, model, is_computed, self._takeover)
+        self._sessions.add(opened.session_id)
+        return opened
+
+    def _other_streams(self, writers: Iterable[RecordedWriter]) -> dict[str, list[Stream]]:
+        streams: dict[str, list[Stream]] = {}
+        for writer in writers:
+            if writer.robot:
+                found = streams.setdefault(writer.robot, [])
+                robot = self._robots.get(writer.robot)
+                own: Collection[Stream] = () if robot is None else robot.streams
+                if writer.stream in ("joint_states", "tf") and writer.stream not in (*own, *found):
+                    found.append(writer.stream)
+        return streams
+
+    def publish(self, decoded: DecodedMessage) -> bool:
+        """Publish it; False for a repetition and for what cannot be published."""
+        if isinstance(decoded.message, RobotDescription | StaticTransforms):
+            changed = self._latched.update(decoded)
+            return changed is not None and self._publish_counted(changed)
+        return self._publish_counted(decoded)
+
+    def _publish_counted(self, decoded: DecodedMessage) -> bool:
+        try:
+            return self._publish(decoded.writer, decoded.message)
+        except MessageError as error:
+            self._refusals.count(error.reason, f"{decoded.writer.robot!r}: {error}")
+        except InvalidInput as error:
+            self._refusals.count("not sayable", f"{decoded.writer.robot!r}: {error}")
+        except ModelError as error:
+            self._refusals.count("robot description", f"{decoded.writer.robot!r}: {error}")
+        return False
+
+    def _publish(self, writer: RecordedWriter, message: Message) -> bool:
+        robot = self._robots.get(writer.robot)
+        if isinstance(message, StaticTransforms):
+            return self._set_statics(writer, message)
+        if isinstance(message, RobotDescription):
+            return self._describe(writer, message)
+        if isinstance(message, JointState) and robot is not None:
+            robot.publish(message)
+        elif isinstance(message, TransformSample):
+            rest = self._computed.filter_sample(writer.robot, message)
+            if rest is None or (robot is not None and "tf" in robot.streams):
+                return False
+            self._others[writer.robot].publish(rest)
+        elif isinstance(message, JointState):
+            self._others[writer.robot].publish(message)
+        return True
+
+    def _describe(self, writer: RecordedWriter, description: RobotDescription) -> bool:
+        robot = self._robots.get(writer.robot)
+        if robot is None:
+            self._others[writer.robot].describe(description, MODEL_WRITER)
+        elif robot.model.urdf != description.urdf:
+            model = parse_urdf(description.urdf, f"the URDF of {writer.robot!r}")
+            robot.close()
+            self._robots[writer.robot] = self._open(writer.robot, model, "tf" in robot.streams)
+        return True
+
+    def _set_statics(self, writer: RecordedWriter, statics: StaticTransforms) -> bool:
+        if writer.static_writer == MODEL_WRITER and writer.robot in self._robots:
+            return False
+        rest = self._modelled.filter_statics(writer.robot, statics)
+        self._others[writer.robot].set_statics(rest, static_key(writer)[1])
+        return True
+
+    def close(self) -> None:
+        """Close all publishers. A second call does nothing."""
+        self._opened.close()
+
+    def _close_robots(self) -> None:
+        for robot in self._robots.values():
+            robot.close()
+
+
+class _RobotPublisher(Closing):
+    """StatePublisher of a robot with a known model."""
+
+    def __init__(  # noqa: PLR0917 - one use, just above
+        self,
+        session: Session,
+        wires: Sequence[str],
+        robot: str,
+        model: RobotModel,
+        is_computed: bool,
+        takeover: bool,
+    ) -> None:
+        self.model = model
+        self.streams: tuple[Stream, ...] = ("joint_states", "tf_static", "robot_description")
+        if is_computed:
+            self.streams += ("tf",)
+        self._order = joint_order(model)
+        self._publisher = StatePublisher(
+            session,
+            model,
+            robot,
+            wires,
+            streams=self.streams,
+            # Every sample has its own stamp; the clock only marks them as simulated time.
+            clock=ManualClock(domain=SIMULATED),
+            takeover=takeover,
+        )
+
+    @property
+    def session_id(self) -> int:
+        """The session id in its messages."""
+        return self._publisher.description().session
+
+    def publish(self, state: JointState) -> None:
+        """Raises MessageError and InvalidInput for a state that cannot be published."""
+        positions, velocities, efforts = self._order.read(state)
+        self._publisher.publish(positions, velocities, efforts, state.stamp)
+
+    def close(self) -> None:
+        self._publisher.close()
+
+
+class PassthroughPublisher(Closing):
+    """Publishes messages of ``robot`` unchanged on all ``wires``, with its own session and sequence numbers.
+
+    ``streams`` are announced at once, latched values with the first of their name. A message that one of
+    the wires cannot encode raises InvalidInput, and is published on none. Raises SecondWriter if another
+    live writer publishes the same on the native wire, unless ``takeover``. Static edges of the ``sessions``
+    of this playback, its own included, may place the same frame, as in the recording.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        wires: Sequence[str],
+        robot: str,
+        streams: Sequence[Stream],
+        *,
+        sessions: set[int],
+        takeover: bool = False,
+    ) -> None:
+        self._session = session
+        self._session_id = secrets.randbits(32)
+        self._robot = robot
+        self._sessions = sessions
+        self._is_alone = "native" in wires and not takeover
+        self._seqs: Counter[Stream] = Counter()
+        self._latched: dict[tuple[Stream, str], list[LatchedWriter]] = {}
+        self._placed: dict[str, set[Edge]] = {}
+        self._writer = writer = writer_here(self._session_id)
+        sessions.add(self._session_id)
+        with ExitStack() as opening:
+            self._claim = self._claimed(opening, [Announced(robot, stream, writer) for stream in streams])
+            self._wire_writers = [
+                opening.enter_context(WireWriter(session, wire_named(wire), robot, writer)) for wire in wires
+            ]
+            self._streams: dict[Stream, list[SampleWriter]] = {
+                stream: [one.open_stream(stream) for one in self._wire_writers] for stream in streams
+            }
+            self._opened = opening.pop_all()
+
+    def publish(self, message: JointState | TransformSample) -> None:
+        """Publish one sample."""
+        if self._claim is not None:
+            self._claim.check()
+        stream: Stream = "joint_states" if isinstance(message, JointState) else "tf"
+        head = (message.stamp, self._seqs[stream], self._session_id, message.order)
+        if isinstance(message, JointState):
+            numbers = (message.positions, message.velocities, message.efforts)
+            again = JointState(*head, *numbers, message.names)
+        else:
+            again = TransformSample(*head, message.poses, message.edges)
+        write_all(self._streams[stream], again)
+        self._seqs[stream] += 1
+
+    def describe(self, description: RobotDescription, writer: str) -> None:
+        """Publish the robot's description (latched)."""
+        again = RobotDescription(
+            self._session_id,
+            description.urdf,
+            description.digest,
+            description.joint_names,
+            description.moving_edges,
+            SIMULATED,
+        )
+        write_all(self._latch("robot_description", writer), again)
+
+    def set_statics(self, statics: StaticTransforms, writer: str) -> None:
+        """Publish all static edges of one ``writer``; an empty set withdraws the previous ones."""
+        key: tuple[Stream, str] = ("tf_static", writer)
+        if statics.edges:
+            writers = self._latch(*key)
+            with self._placing(statics, writer):
+                write_all(writers, StaticTransforms(self._session_id, statics.edges, statics.poses))
+        else:
+            for latched in self._latched.get(key, ()):
+                latched.withdraw()
+            self._placed.pop(writer, None)
+
+    def _latch(self, stream: Stream, writer: str) -> list[LatchedWriter]:
+        if (stream, writer) not in self._latched:
+            announced = self._announced(stream, writer)
+            with ExitStack() as opening:
+                claim = self._claimed(opening, [announced])
+                opened = [one.open_latched(stream, writer) for one in self._wire_writers]
+                if claim is not None:
+                    claim.settle()
+                self._opened.push(opening.pop_all())
+            self._latched[stream, writer] = opened
+        return self._latched[stream, writer]
+
+    def _announced(self, stream: Stream, writer: str) -> Announced:
+        return Announced(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
+
+    def _claimed(self, opening: ExitStack, wanted: Sequence[Announced]) -> Claim | None:
+        return opening.enter_context(Claim(self._session, wanted)) if self._is_alone and wanted else None
+
+    @contextmanager
+    def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:
+        """Own new edges of ``writer`` during their publication."""
+        edges = set(named_edges(self._robot, statics.edges))
+        new = sorted(edges - self._placed.get(writer, set())) if self._is_alone else []
+        with ExitStack() as placed:
+            if new:
+                announced = self._announced("tf_static", writer)
+                placed.enter_context(placing(self._session, announced, new, beside=self._sessions))
+            yield
+        self._placed[writer] = edges
+
+    def close(self) -> None:
+        """Stop; readers keep the latched values. A second call does nothing."""
+        self._opened.close()
+
+
+def _is_computed(robot: str, writers: Collection[RecordedWriter]) -> bool:
+    """Whether the transforms of a robot with a model follow from its joint states.
+
+    That is the case without recorded transforms, or if the writer of the joint states wrote them too.
+    """
+    sessions: dict[Stream, set[int]] = {"tf": set(), "joint_states": set()}
+    for writer in writers:
+        if writer.robot == robot and writer.stream in sessions:
+            sessions[writer.stream].add(writer.session)
+    return sessions["tf"] <= sessions["joint_states"]

@@ -1,0 +1,428 @@
+"""Records robot streams from the network into MCAP files that every ROS tool opens."""
+
+from __future__ import annotations
+
+import atexit
+import math
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate.clock import SystemClock, wait_in_slices
+from zstate.closing import Closing
+from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
+from zstate.ingest.counters import Counters
+from zstate.ingest.sequence import GapCounter
+from zstate.locks import new_lock, outlive_fork
+from zstate.net.forked import forked_text
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.presence import announce_reader, watch
+from zstate.net.session import Session
+from zstate.net.streams import StreamSubscriber, capacity_for
+from zstate.net.wires import wire_named
+from zstate.rate import Rate
+from zstate.recording.encode import RecordingEncoder
+from zstate.recording.mcap.writer import RecordingWriter
+from zstate.wire.keys import ANY, Stream, check_robot
+from zstate.wire.messages import Clock, Message, Sample
+from zstate.wire.protocol import SerializedSample
+from zstate.wire.ros2.topics import SHARED
+from zstate.wire.writer import Announced
+
+FLUSH_NS = 500_000_000
+"""Interval at which everything received goes to the file, where ``kill -9`` cannot reach it."""
+
+QUEUE_BYTES = 64 * 2**20
+QUEUE_LENGTH = 8192
+"""Samples that wait in the queue; more wait in the rings of the subscriptions, which drop the oldest."""
+
+LARGE_BYTES = 1 << 16
+"""Latched values from this size on are decoded and encoded in a thread of their own."""
+_LARGE_WAITING_BYTES = 1 << 26
+
+_WRITES_HZ = 20.0
+# Robots that start together should be discovered together: it decides their namespaces in the file.
+_DISCOVERY_NS = 300_000_000
+# Closing takes a second at most, subscriptions included.
+_DRAIN_S = 0.5
+_JOIN_WITHIN_S = 0.9
+
+_LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
+_SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
+
+
+class Batch(NamedTuple):
+    """Samples of one stream, oldest first. ``robot`` is None if only their keys name it.
+
+    ``stamp`` [ns] is when they were received, by the system clock; ``overflowed`` is True if a ring of this
+    process dropped samples before or among them.
+    """
+
+    stream: Stream
+    robot: str | None
+    arrivals: list[SerializedSample]
+    stamp: int
+    overflowed: bool
+
+
+class MessageQueue(Closing):
+    """Samples of several subscriptions, with their time of reception, in one queue for one thread."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._batches: list[Batch] = []
+        self._waiting = self._bytes = 0
+        self._has_room = outlive_fork(threading.Condition())
+        self._is_open = True
+        self._opened = ExitStack()
+
+    def subscribe(self, stream: Stream, expression: str, robot: str | None) -> None:
+        """Subscribe to samples."""
+        capacity = capacity_for(expression)
+
+        def put(arrivals: list[SerializedSample]) -> None:
+            self._put(Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity))
+
+        self._opened.enter_context(StreamSubscriber(self._session, expression, put))
+
+    def subscribe_latched(self, stream: Stream, expression: str, robot: str | None) -> None:
+        """Subscribe to latched values; an empty payload is a withdrawn one."""
+
+        def put(arrival: SerializedSample) -> None:
+            self._put(Batch(stream, robot, [arrival], time.time_ns(), overflowed=False))
+
+        self._opened.enter_context(LatchedSubscriber(self._session, expression, put))
+
+    def pop_all(self) -> list[Batch]:
+        """Remove and return all batches, in the order of reception."""
+        with self._has_room:
+            batches, self._batches = self._batches, []
+            self._waiting = self._bytes = 0
+            self._has_room.notify_all()
+        return batches
+
+    def close(self) -> None:
+        """Unsubscribe, within a second; what is in the queue can still be read."""
+        with self._has_room:
+            self._is_open = False
+            self._has_room.notify_all()
+        self._opened.close()
+
+    def _put(self, batch: Batch) -> None:
+        with self._has_room:
+            # A slow reader must not fill the memory: the subscription's ring drops samples, and counts them.
+            while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= QUEUE_BYTES):
+                self._has_room.wait()
+            if self._is_open:
+                self._batches.append(batch)
+                self._waiting += len(batch.arrivals)
+                self._bytes += sum(len(arrival.payload) for arrival in batch.arrivals)
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStats:
+    """Counts since the recorder opened.
+
+    ``messages`` were written, by robot and stream (the clock belongs to the robot "ros"); ``bytes`` is the
+    size of all ``files``. Messages were ``dropped`` by a full ring of this process, by a full queue or at the
+    end of the recording, ``missed`` between the writers' sequence numbers, ``unwritten`` without a matching
+    description; ``refused`` counts others that could not be written, by reason.
+    """
+
+    messages: Mapping[tuple[str, Stream], int]
+    bytes: int
+    files: tuple[Path, ...]
+    dropped: int
+    missed: int
+    refused: Mapping[str, int]
+    unwritten: int
+
+
+class Recorder(Closing):
+    """Records ``robots``, or all robots, on ``wire`` into ``path``; a context manager.
+
+    Subscribes to all of their streams, /tf too, which makes their publishers compute it. A single selected
+    robot, or the only robot when the recording starts, is in the file's root with unchanged frame names;
+    others have a namespace and a frame prefix. ``max_bytes``, ``max_seconds`` and ``overwrite`` are those of
+    RecordingWriter. Raises RecordingError if the file cannot be created, InvalidInput for invalid names.
+
+    When the disk is full or gone, the recording ends: ``wait`` returns, ``failure`` is the reason, and what
+    was written stays readable.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        path: str | os.PathLike[str],
+        robots: Sequence[str] = (),
+        *,
+        wire: str = "native",
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        self.failure: Exception | None = None
+        selected = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
+        self._selected = tuple(map(check_robot, selected))
+        self._wire = wire_named(wire)
+        self._counters = Counters()
+        self._gaps = GapCounter(self._counters)
+        self._programs: BoundedDict[int, str] = BoundedDict()
+        self._discovered: set[str] = set()
+        self._pending: list[Batch] = []
+        self._ends_at = math.inf
+        self._starts_at: int | None = None
+        self._encoder: RecordingEncoder | None = None
+        self._closing = new_lock()
+        self._stop = outlive_fork(threading.Event())
+        self._ended = outlive_fork(threading.Event())
+        self._large = _LargeValues(self._write_arrival, self._counters)
+        with ExitStack() as opening:
+            self._queue = opening.enter_context(MessageQueue(session))
+            robot = self._selected[0] if len(self._selected) == 1 else ANY
+            opening.enter_context(watch(session, robot, self._on_writer, wire))
+            self._subscribe()
+            for robot in self._selected or (ANY,):
+                for announcement in announce_reader(session, self._wire, robot, (*_LATCHED, *_SAMPLES)):
+                    opening.enter_context(announcement)
+            self._writer = RecordingWriter(
+                path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
+            )
+            self._opened = opening.pop_all()
+        self._pid = os.getpid()
+        # Before sessions are closed at the exit of a program that forgets to close: it finishes the file.
+        atexit.register(self.close)
+        self._thread = threading.Thread(target=self._run, name="zstate recorder", daemon=True)
+        self._thread.start()
+
+    def _subscribe(self) -> None:
+        """Subscribe to every stream; if two robots share an expression, keys distinguish them."""
+        for stream in (*_LATCHED, *_SAMPLES):
+            robots: dict[str, set[str]] = {}
+            for robot in self._selected or (ANY,):
+                robots.setdefault(self._wire.expression(robot, stream), set()).add(robot)
+            subscribe = self._queue.subscribe_latched if stream in _LATCHED else self._queue.subscribe
+            for expression, named in robots.items():
+                subscribe(stream, expression, named.pop() if self._selected and len(named) == 1 else None)
+        clock = self._wire.expression(self._selected[0] if self._selected else ANY, "clock")
+        self._queue.subscribe("clock", clock, SHARED)
+
+    @property
+    def stats(self) -> RecorderStats:
+        """Counts so far."""
+        received, encoder, writer = self._counters.stats(), self._encoder, self._writer
+        return RecorderStats(
+            messages={} if encoder is None else encoder.messages,
+            bytes=writer.size,
+            files=writer.files,
+            dropped=received.dropped,
+            missed=received.missed,
+            refused=received.refused,
+            unwritten=0 if encoder is None else encoder.unwritten,
+        )
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Block until the recording has ended, or for ``timeout_s``; whether it has ended.
+
+        Raises Closed in a forked process, where the recorder does not run.
+        """
+        if os.getpid() != self._pid:
+            raise Closed(forked_text(f"this recorder belongs to process {self._pid}"))
+        return wait_in_slices(self._ended, timeout_s)
+
+    def close(self) -> None:
+        """End the recording within a second: write what was received, and finish the file."""
+        atexit.unregister(self.close)
+        self._unsubscribe()
+        self._ends_at = min(self._ends_at, time.monotonic() + _DRAIN_S)
+        self._stop.set()
+        self._thread.join(_JOIN_WITHIN_S)
+
+    def _unsubscribe(self) -> None:
+        with self._closing:
+            self._opened.close()
+
+    def _on_writer(self, announced: Announced, alive: bool) -> None:
+        if alive:
+            self._programs[announced.writer.session] = str(announced.writer)
+            if not self._selected:
+                self._discovered.add(announced.robot)
+
+    def _run(self) -> None:
+        try:
+            self._write_until_stopped()
+        except Exception as error:  # any error is reported as ``failure``
+            self.failure = error
+            self._unsubscribe()
+        finally:
+            self._large.close()
+            self._ended.set()
+
+    def _write_until_stopped(self) -> None:
+        flushed = 0
+        for now in Rate(_WRITES_HZ, SystemClock(), self._stop):
+            self._write_pending()
+            if now // FLUSH_NS != flushed:
+                flushed = now // FLUSH_NS
+                self._writer.flush()
+            if self._large.failure is not None:
+                raise self._large.failure
+        self._write_pending()
+        self._large.finish(self._ends_at)
+        self._writer.close()
+
+    def _write_pending(self) -> None:
+        self._pending += self._queue.pop_all()
+        if self._encoder is None:
+            self._encoder = self._new_encoder()
+        if self._encoder is None:
+            return
+        for batch in self._pending:
+            self._write(batch)
+        self._pending = []
+
+    def _new_encoder(self) -> RecordingEncoder | None:
+        """None until it is known which robots the recording starts with."""
+        robots = set(self._selected)
+        if not robots:
+            for batch in self._pending:
+                if batch.stream != "clock":
+                    named = (self._robot(batch, arrival) for arrival in batch.arrivals)
+                    robots.update(robot for robot in named if robot is not None)
+            robots |= self._discovered.copy()
+            if robots and self._starts_at is None:
+                self._starts_at = time.monotonic_ns() + _DISCOVERY_NS
+            is_complete = self._starts_at is not None and time.monotonic_ns() >= self._starts_at
+            if not is_complete and not self._stop.is_set():
+                return None
+        others = robots - {SHARED}
+        alone = others.pop() if len(others) == 1 else None
+        return RecordingEncoder(
+            self._writer, self._counters.count_refusal, alone=alone, programs=self._programs
+        )
+
+    def _write(self, batch: Batch) -> None:
+        self._gaps.start_batch(overflowed=batch.overflowed)
+        for arrival in batch.arrivals:
+            if time.monotonic() > self._ends_at:
+                self._counters.count("dropped")
+                continue
+            robot = self._robot(batch, arrival)
+            if robot is None:
+                continue
+            if batch.stream in _LATCHED and self._large.accepts(robot, len(arrival.payload)):
+                self._large.put(robot, batch, arrival)
+            else:
+                self._write_arrival(robot, batch, arrival)
+
+    def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
+        encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
+        assert encoder is not None
+        static_writer = self._wire.statics_writer(arrival.key) if stream == "tf_static" else None
+        if not arrival.payload and stream in _LATCHED:
+            if static_writer is not None:
+                encoder.withdraw(robot, static_writer, stamp)
+            return
+        messages: Sequence[Message] = ()
+        try:
+            messages = self._wire.decode(stream, arrival, robot)
+        except MessageError as error:
+            self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
+        for message in messages:
+            is_known = encoder.write_message(robot, message, stamp, static_writer)
+            if is_known and isinstance(message, Sample | Clock):
+                self._gaps.add((robot, stream, message.session), message.seq)
+
+    def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:
+        try:
+            if batch.stream == "tf_static":
+                self._wire.statics_writer(arrival.key)  # raises for a key without one
+            return self._wire.robot_of(arrival.key) if batch.robot is None else batch.robot
+        except InvalidInput as error:
+            self._counters.count_refusal("foreign", str(error))
+            return None
+
+
+class _LargeValues:
+    """Writes large latched values in a thread of its own, so that they do not block samples.
+
+    A latched value that follows a large one of the same robot waits behind it. Beyond the maximum of waiting
+    bytes, the oldest values are dropped and counted.
+    """
+
+    def __init__(self, write: Callable[[str, Batch, SerializedSample], None], counters: Counters) -> None:
+        self.failure: Exception | None = None
+        self._write = write
+        self._counters = counters
+        self._waiting: deque[tuple[str, Batch, SerializedSample]] = deque()
+        self._bytes = 0
+        self._behind: Counter[str] = Counter()
+        self._changed = outlive_fork(threading.Condition())
+        self._is_open = True
+        self._thread: threading.Thread | None = None
+
+    def accepts(self, robot: str, size: int) -> bool:
+        """Whether a latched value of ``robot`` with this size is written here."""
+        return size >= LARGE_BYTES or self._behind[robot] > 0
+
+    def put(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
+        """Queue a value."""
+        with self._changed:
+            self._waiting.append((robot, batch, arrival))
+            self._behind[robot] += 1
+            self._bytes += len(arrival.payload)
+            while self._bytes > _LARGE_WAITING_BYTES and len(self._waiting) > 1:
+                self._drop_oldest()
+            self._changed.notify_all()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="zstate recorder latched", daemon=True)
+            self._thread.start()
+
+    def finish(self, until_s: float) -> None:
+        """Wait until all is written, or the monotonic clock reads ``until_s``; the rest is dropped."""
+        with self._changed:
+            self._changed.wait_for(lambda: not +self._behind, max(0.0, until_s - time.monotonic()))
+        self.close()
+        if self.failure is not None:
+            raise self.failure
+
+    def close(self) -> None:
+        """Drop what waits, and end the thread."""
+        with self._changed:
+            self._is_open = False
+            while self._waiting:
+                self._drop_oldest()
+            self._changed.notify_all()
+
+    def _drop_oldest(self) -> None:
+        robot, _, arrival = self._waiting.popleft()
+        self._bytes -= len(arrival.payload)
+        self._behind[robot] -= 1
+        self._counters.count("dropped")
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or not self._is_open)
+                if not self._is_open:
+                    return
+                robot, batch, arrival = self._waiting.popleft()
+                self._bytes -= len(arrival.payload)
+            try:
+                self._write(robot, batch, arrival)
+            except RecordingError as error:
+                if self._is_open:  # else the recording ended first
+                    self.failure = error
+                self._counters.count("dropped")
+            except Exception as error:  # it ends the recording, as it would in its own thread
+                self.failure = error
+            with self._changed:
+                self._behind[robot] -= 1
+                self._changed.notify_all()

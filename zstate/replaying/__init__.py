@@ -1,1 +1,0 @@
-"""What a replay consists of: its pace, what stands at an instant, and the writers of one pass."""
