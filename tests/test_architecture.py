@@ -19,8 +19,8 @@ FLOORS = (
     {"closing", "errors", "locks", "_kernel"},
     {"checks", "extension"},
     {"clock"},
-    {"se3", "rate", "facts"},
-    {"transform", "twist"},
+    {"se3", "rate"},
+    {"transform"},
     {"model", "buffer", "wire"},
     {"net", "record"},
     {"sources", "following", "moving_edges", "status", "lookup_service"},
@@ -43,12 +43,6 @@ FLOORS = (
 NEIGHBOURS = {
     ("buffer", "model"),  # joint tracks are kept as positions, and become poses in a lookup
     ("cli", "view"),  # `zstate view` starts it
-}
-
-# Constructors that users look for on the class, and that are made elsewhere, loaded when they are called.
-CONSTRUCTORS = {
-    ("buffer/buffer.py", "following"),  # TransformBuffer.from_recording
-    ("buffer/buffer.py", "record"),
 }
 
 HOMES = {
@@ -154,8 +148,7 @@ def imports_that_look_up(source: Source) -> Iterator[str]:
     for top, *rest in source.imports():
         # ``from zstate import connect`` goes through the front door, ``from zstate import se3`` does not.
         room = rest[0] if rest and rest[0] in rooms else "zstate"
-        is_known = may_know(source.room, room) or (source.path, room) in CONSTRUCTORS
-        if top == "zstate" and not is_known:
+        if top == "zstate" and not may_know(source.room, room):
             yield f"{source.path} imports {room!r}"
 
 

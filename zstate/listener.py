@@ -165,7 +165,7 @@ class TransformListener(Closing):
 
     def end_after_fork(self) -> None:
         """In a forked child: nothing fills the buffer there."""
-        self.buffer.end(
+        self.buffer.stop(
             f"its listener belongs to process {self._pid} and does not run after a fork: no more data comes; "
             "call connect() and open a listener in the child processes alone, or start them with the 'spawn' "
             "or 'forkserver' method"

@@ -42,7 +42,12 @@ class Recording(Closing):
         return f"<Recording {str(self.info.path)!r}: {self.info.duration_s:g} s, robots {robots}>"
 
     def buffer(self) -> TransformBuffer:
-        """All of it in a buffer, as ``TransformBuffer.from_recording`` makes one."""
+        """A buffer that holds the whole recording, of ``robot`` or of all robots.
+
+        Its lookups are those of a listener's buffer at the time of the recording; restarts are treated as
+        ``zstate.following.recorded`` describes. Unusable messages are skipped, and
+        logged once for each reason.
+        """
         buffer = TransformBuffer(HISTORY_S)
         fill(buffer, self._reader, self.robot)
         return buffer

@@ -1,8 +1,9 @@
 /* The hot loops of the buffer: histories of samples, and compiled paths over them.
  *
- * What each thing means is said by the Python that it stands in for, which stays complete:
- * zstate/buffer/history.py (History), path.py, cells.py and steps.py (Path), zstate/facts.py
- * (Facts), zstate/model/edges.py (Edges). Differences to those are bugs, and tests compare both.
+ * Each type is specified by its reference in Python, which stays complete:
+ * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
+ * (TransformFields), zstate/model/edges.py (Edges). Differences to those are bugs, and tests
+ * compare both.
  *
  * Threads. Whatever changes or takes references runs with the GIL. The rows of a block that a
  * window covers are never written again, so a batch that holds references to its blocks reads them
@@ -27,14 +28,14 @@
 #include "_kernel/block.h"
 #include "_kernel/history.h"
 #include "_kernel/motion.h"
-#include "_kernel/facts.h"
+#include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
 #include "_kernel/path.h"
 #include "_kernel/edges.h"
 
 /* Grows with every change of what Python sees of these files, so that a library built from an older
  * source (an editable install that was not built again) is recognised and not used. */
-#define REVISION 5
+#define REVISION 6
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
@@ -56,7 +57,8 @@ static struct PyModuleDef kernel_module = {
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {&Block_type, &History_type, &Facts_type, &Path_type, &Edges_type};
+    PyTypeObject *types[] = {&Block_type, &History_type, &TransformFields_type, &Path_type,
+                             &Edges_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;

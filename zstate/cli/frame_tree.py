@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
 
 
 def short_name(frame: FrameInfo) -> str:

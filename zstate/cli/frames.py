@@ -11,7 +11,7 @@ from zstate.cli.words import words_of
 from zstate.cli.worker import Worker
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.listener import TransformListener
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session

@@ -107,7 +107,7 @@ class MeteredBuffer(MeasuredBuffer):
 
     def _is_told(self, robot: str) -> bool:
         """Whether the clock here tells the time that stamps the samples of ``robot``."""
-        return (self.domain.of(robot) or self.clock.domain) == self.clock.domain
+        return (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain
 
     def measure(self, robot: str, since: Mark, until: Mark) -> Measure:
         """How samples of ``robot`` came in between two marks of its meter."""

@@ -18,7 +18,7 @@ from zstate.wire.messages import RobotDescription
 from zstate.wire.wire import Arrival
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.listener import Follow, TransformListener
     from zstate.net.session import Session
     from zstate.wire.keys import Stream

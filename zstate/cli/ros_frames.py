@@ -9,7 +9,7 @@ from zstate.cli.console import fail, note
 from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.listener import TransformListener
     from zstate.net.session import Session
 

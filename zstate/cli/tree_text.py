@@ -11,7 +11,7 @@ from zstate.cli.layout import Guides, chain_lines, in_columns, letters_for, tree
 from zstate.errors import printable
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
 
 _HEADINGS = ("frame", "edge", "rate", "age", "writer")
 

@@ -12,7 +12,7 @@ from zstate.cli.console import count_text
 from zstate.cli.probe import silent_rendezvous
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.presence import RobotInfo
     from zstate.wire.keys import Stream
 

@@ -195,7 +195,7 @@ class Follower(ABC):
         """Set the clock domain of the followed writer; whether that is another one than before."""
         # A robot may be described by another program than the one whose samples are followed.
         domain = self._domain if self._session is None else self._domains.get(self._session, self._domain)
-        before = self._buffer.domain.of(self.robot)
+        before = self._buffer.domain.domain_of(self.robot)
         return domain is not None and self._buffer.set_domain(self.robot, domain) and bool(before)
 
     def _reach(self, sample: Sample) -> bool:

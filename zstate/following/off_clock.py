@@ -57,7 +57,7 @@ class OffClock:
             self._tally.note(f"off clock {' '.join(key)}", text)
 
     def _keeps_system_time(self, robot: str, sample: Sample) -> bool:
-        kept = self._buffer.domain.of(robot)
+        kept = self._buffer.domain.domain_of(robot)
         if kept is None and self._is_described:
             # Whose time it is stands in the description, which is on its way, or will never come.
             return isinstance(sample, TransformSample) and sample.edges is not None

@@ -26,7 +26,7 @@ from itertools import count
 from typing import NamedTuple
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.edge import Edge
+from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused
 from zstate.following.bounded import remember
@@ -375,7 +375,7 @@ class FrameOwnership:
 
     def _standing(self) -> tuple[dict[str, _Standing], set[str]]:
         """What places frames in the buffer and is no claim of ours, by child; and the roots of models."""
-        layout = self.buffer.layout()
+        layout = self.buffer.tree_snapshot()
         standing: dict[str, _Standing] = {}
         for child, edge in layout.edges.items():
             if edge is not None and (edge.robot is not None or not self._is_claimed(edge)):
@@ -393,7 +393,9 @@ class FrameOwnership:
         placed = self._placed.get(edge.child)
         if edge.kind == "static":
             return (
-                placed is not None and placed.parent == edge.parent and edge.own_writer == placed.source.name
+                placed is not None
+                and placed.parent == edge.parent
+                and edge.static_writer == placed.source.name
             )
         claims = self._claims.get(edge.child, ())
         return any(claim.pose is None and claim.parent == edge.parent for claim in claims)

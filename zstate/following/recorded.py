@@ -63,7 +63,7 @@ def fill(
     Raises InvalidInput when it tells nothing of ``robot``.
     """
     tally = Tally()
-    buffer.home.is_recording = True
+    buffer.is_recording = True
     transcript = Transcript(reader, tally.refuse)
     robots = None if robot is None else (check_recorded(transcript, robot),)
     shares_frames = any(speaker.foreign or _is_of_ros(speaker) for speaker in transcript.speakers)
@@ -77,7 +77,7 @@ def fill(
     for count, said in enumerate(transcript.said(robots), 1):
         followed.take(said)
         if stamps is not None and not count % batch:
-            buffer.keep_around(stamps)
+            buffer.keep_only_around(stamps)
     return tally.stats()
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.tracks import Offset
-from zstate.clock import SYSTEM
+from zstate.clock import SYSTEM, ClockOffset
 from zstate.closing import Closing
 from zstate.net.clock_offset import OffsetMeter
 from zstate.net.session import Session
@@ -20,7 +19,7 @@ class WriterClocks(Closing):
         self._offsets = buffer.clock_offsets
         self._is_wanted = buffer.clock.domain == SYSTEM
         self._meter = OffsetMeter(session, buffer.clock)
-        self._ours: dict[Writer, Callable[[], Offset | None]] = {}
+        self._ours: dict[Writer, Callable[[], ClockOffset | None]] = {}
 
     def note(self, announced: Announced, *, alive: bool) -> None:
         """A writer has come or gone."""

@@ -63,9 +63,9 @@ index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t a
     if (at <= stamps[low])
         return low;
     /* From here on stamps[low] < at <= stamps[high]. Differences may exceed what int64 holds. */
-    double way = (double)((uint64_t)at - (uint64_t)stamps[low]);
+    double difference = (double)((uint64_t)at - (uint64_t)stamps[low]);
     double whole = (double)((uint64_t)stamps[high] - (uint64_t)stamps[low]);
-    Py_ssize_t guess = low + (Py_ssize_t)(way / whole * (double)(high - low));
+    Py_ssize_t guess = low + (Py_ssize_t)(difference / whole * (double)(high - low));
     guess = guess > high ? high : guess;
     prefetch_rows(block, guess);
     Py_ssize_t step = 1;
@@ -262,26 +262,28 @@ history_insert(History *self, PyObject *const *args, Py_ssize_t count)
     }
     if (!checked_stamp(args[0], &stamp) || get_doubles(args[1], &row, 0) < 0)
         return NULL;
-    PyObject *taken = NULL;
+    PyObject *inserted = NULL;
     if (count_of(&row) != self->width)
         PyErr_Format(PyExc_ValueError, "a row has %zd numbers, not %zd", self->width,
                      count_of(&row));
     else if (!history_reaches(self, stamp))
-        taken = Py_False;
+        inserted = Py_False;
     else if (slot_for(self, stamp, &slot) == 0) {
         /* memmove: the row may be a view of the very memory it goes to. */
         memmove(slot_write_stamp(&slot, stamp), row.buf, (size_t)row.len);
         slot_publish(self, &slot);
-        taken = Py_True;
+        inserted = Py_True;
     }
     PyBuffer_Release(&row);
-    Py_XINCREF(taken);
-    return taken;
+    Py_XINCREF(inserted);
+    return inserted;
 }
 
-/* Writes positions, then velocities or NaN in their stead. 1 taken, 0 too old, -1 MemoryError. */
+/* Writes positions, then velocities or NaN in their stead. 1 inserted, 0 too old, -1 MemoryError.
+ */
 static int
-take_numbers(History *self, int64_t stamp, const Py_buffer *positions, const Py_buffer *velocities)
+insert_numbers(History *self, int64_t stamp, const Py_buffer *positions,
+               const Py_buffer *velocities)
 {
     Slot slot;
     if (!history_reaches(self, stamp))
@@ -300,10 +302,11 @@ take_numbers(History *self, int64_t stamp, const Py_buffer *positions, const Py_
 }
 
 static PyObject *
-history_take(History *self, PyObject *const *args, Py_ssize_t count)
+history_try_insert(History *self, PyObject *const *args, Py_ssize_t count)
 {
     if (count != 4) {
-        PyErr_SetString(PyExc_TypeError, "take(stamp, positions, velocities, position_count)");
+        PyErr_SetString(PyExc_TypeError,
+                        "try_insert(stamp, positions, velocities, position_count)");
         return NULL;
     }
     Py_ssize_t position_count = PyLong_AsSsize_t(args[3]);
@@ -322,11 +325,11 @@ history_take(History *self, PyObject *const *args, Py_ssize_t count)
         PyBuffer_Release(&positions);
         Py_RETURN_NONE;
     }
-    int taken = take_numbers(self, stamp, &positions, has_velocities ? &velocities : NULL);
+    int inserted = insert_numbers(self, stamp, &positions, has_velocities ? &velocities : NULL);
     PyBuffer_Release(&positions);
     if (has_velocities)
         PyBuffer_Release(&velocities);
-    return taken < 0 ? NULL : PyBool_FromLong(taken);
+    return inserted < 0 ? NULL : PyBool_FromLong(inserted);
 }
 
 static bool
@@ -404,8 +407,9 @@ history_oldest_stamp(History *self, void *Py_UNUSED(closure))
 static PyMethodDef history_methods[] = {
     {"insert", (PyCFunction)(void (*)(void))history_insert, METH_FASTCALL,
      "insert(stamp, row): False when the stamp is older than the history reaches."},
-    {"take", (PyCFunction)(void (*)(void))history_take, METH_FASTCALL,
-     "take(stamp, positions, velocities, position_count): as insert, of arrays, positions also as "
+    {"try_insert", (PyCFunction)(void (*)(void))history_try_insert, METH_FASTCALL,
+     "try_insert(stamp, positions, velocities, position_count): as insert, of arrays, positions "
+     "also as "
      "a block; None for what is not plain."},
     {"replace", (PyCFunction)(void (*)(void))history_replace, METH_FASTCALL,
      "replace(stamps, rows): hold copies of these samples and no others."},

@@ -1,8 +1,8 @@
-/* Path: the way between two frames, compiled, for zstate/buffer/path.py. */
+/* Path: a compiled path between two frames, for zstate/buffer/path.py. */
 
 typedef struct {
     PyObject_HEAD
-    PyTypeObject *type; /* of the answers: Transform, which derives from Facts */
+    PyTypeObject *type; /* of the answers: Transform, which derives from TransformFields */
     PyObject *target;
     PyObject *source;
     PyObject *histories; /* a tuple: the tracks that the path passes */
@@ -38,7 +38,7 @@ window_of(const Path *self, Py_ssize_t index)
 
 /* False where the track does not reach. */
 static inline bool
-rows_around(const Window *window, int64_t at, Between *now)
+rows_around(const Window *window, int64_t at, Bracket *now)
 {
     const Block *block = window->block;
     Py_ssize_t after = index_not_before(block, window->first, window->end, at);
@@ -60,7 +60,7 @@ rows_around(const Window *window, int64_t at, Between *now)
 }
 
 static Pose
-pose_at(const Path *self, const Between *nows)
+pose_at(const Path *self, const Bracket *nows)
 {
     Pose source_from_top = chain_pose(self->steps + self->to_target, self->to_source, nows);
     if (self->to_target == 0)
@@ -90,12 +90,12 @@ answer_static(const Path *self, PyObject *stamp)
     Pose pose = pose_at(self, NULL);
     if (!is_finite(pose))
         Py_RETURN_NONE;
-    return facts_new(self->type, self->target, self->source, pose, stamp, kind_static);
+    return fields_new(self->type, self->target, self->source, pose, stamp, kind_static);
 }
 
 /* The answer at an instant, or None; `stamp` is NULL or the very object it was asked with. */
 static PyObject *
-answer_at(const Path *self, int64_t at, PyObject *stamp, Between *nows)
+answer_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
 {
     PyObject *kind = kind_exact;
     for (Py_ssize_t i = 0; i < track_count(self); i++) {
@@ -109,11 +109,11 @@ answer_at(const Path *self, int64_t at, PyObject *stamp, Between *nows)
     if (!is_finite(pose))
         Py_RETURN_NONE;
     if (stamp != NULL)
-        return facts_new(self->type, self->target, self->source, pose, stamp, kind);
+        return fields_new(self->type, self->target, self->source, pose, stamp, kind);
     stamp = PyLong_FromLongLong(at);
     if (stamp == NULL)
         return NULL;
-    PyObject *answer = facts_new(self->type, self->target, self->source, pose, stamp, kind);
+    PyObject *answer = fields_new(self->type, self->target, self->source, pose, stamp, kind);
     Py_DECREF(stamp);
     return answer;
 }
@@ -137,10 +137,10 @@ path_at(Path *self, PyObject *const *args, Py_ssize_t count)
         if (!newest_common(self, &at))
             Py_RETURN_NONE;
     }
-    Between few[FEW_TRACKS];
+    Bracket few[FEW_TRACKS];
     if (tracks <= FEW_TRACKS)
         return answer_at(self, at, stamp, few);
-    Between *nows = PyMem_New(Between, (size_t)tracks);
+    Bracket *nows = PyMem_New(Bracket, (size_t)tracks);
     if (nows == NULL)
         return PyErr_NoMemory();
     PyObject *answer = answer_at(self, at, stamp, nows);
@@ -148,7 +148,7 @@ path_at(Path *self, PyObject *const *args, Py_ssize_t count)
     return answer;
 }
 
-/* blame(stamp): which track cannot answer, in the order of zstate/buffer/path.py. */
+/* failure_at(stamp): which track cannot answer, in the order of zstate/buffer/path.py. */
 
 typedef enum { IN_PAST, NO_DATA, IN_FUTURE } Failure;
 
@@ -167,7 +167,7 @@ failure_of(const Path *self, Failure failure, Py_ssize_t index, PyObject *stamp)
 }
 
 static PyObject *
-path_blame(Path *self, PyObject *stamp)
+path_failure_at(Path *self, PyObject *stamp)
 {
     int64_t at = 0, worst_oldest = 0, worst_newest = 0;
     Py_ssize_t young = -1, empty = -1, behind = -1;
@@ -203,7 +203,7 @@ path_blame(Path *self, PyObject *stamp)
 
 typedef struct {
     Window *windows;
-    Between *nows;
+    Bracket *nows;
     Py_ssize_t tracks;
     int64_t oldest; /* the instants between these two can be answered */
     int64_t newest;
@@ -227,7 +227,7 @@ batch_begin(const Path *self, Batch *batch)
     batch->oldest = INT64_MIN;
     batch->newest = INT64_MAX;
     batch->windows = PyMem_New(Window, (size_t)tracks + 1);
-    batch->nows = PyMem_New(Between, (size_t)tracks + 1);
+    batch->nows = PyMem_New(Bracket, (size_t)tracks + 1);
     if (batch->windows == NULL || batch->nows == NULL) {
         PyMem_Free(batch->windows);
         PyMem_Free(batch->nows);
@@ -375,8 +375,8 @@ path_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
                                      &answers, &target, &source, &PyTuple_Type, &to_target,
                                      &PyTuple_Type, &to_source, &PyTuple_Type, &histories))
         return NULL;
-    if (!PyType_IsSubtype(answers, &Facts_type)) {
-        PyErr_SetString(PyExc_TypeError, "answers are of a type that derives from Facts");
+    if (!PyType_IsSubtype(answers, &TransformFields_type)) {
+        PyErr_SetString(PyExc_TypeError, "answers are of a type that derives from TransformFields");
         return NULL;
     }
     Path *self = (Path *)type->tp_alloc(type, 0);
@@ -411,8 +411,9 @@ path_dealloc(Path *self)
 static PyMethodDef path_methods[] = {
     {"at", (PyCFunction)(void (*)(void))path_at, METH_FASTCALL,
      "at(stamp=None): the Transform, or None where the reference has to be asked."},
-    {"blame", (PyCFunction)path_blame, METH_O,
-     "blame(stamp): (failure, track, stamp, oldest, newest, rate_hz), or None when there is none."},
+    {"failure_at", (PyCFunction)path_failure_at, METH_O,
+     "failure_at(stamp): (failure, track, stamp, oldest, newest, rate_hz), or None when there is "
+     "none."},
     {"poses", (PyCFunction)(void (*)(void))path_poses, METH_FASTCALL,
      "poses(stamps, out, valid): many at once; NaN and False where there is no answer."},
     {NULL},
@@ -421,7 +422,7 @@ static PyMethodDef path_methods[] = {
 static PyTypeObject Path_type = {
     PyVarObject_HEAD_INIT(NULL, 0)
     .tp_name = "zstate._kernel.Path",
-    .tp_doc = "The way between two frames, compiled.",
+    .tp_doc = "A compiled path between two frames.",
     .tp_basicsize = sizeof(Path),
     .tp_new = path_new,
     .tp_dealloc = (destructor)path_dealloc,

@@ -27,8 +27,7 @@ from zstate.errors import LookupFailed
 if TYPE_CHECKING:
     from zstate.cli.awaited_pose import AwaitedPose
     from zstate.listener import TransformListener
-    from zstate.transform import Transform
-    from zstate.twist import Twist
+    from zstate.transform import Transform, Twist
 
 # So long without a newer answer is worth a word.
 _SILENCE_S = 2.0

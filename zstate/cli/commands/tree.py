@@ -15,7 +15,7 @@ from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.cli.words import Words
 
 

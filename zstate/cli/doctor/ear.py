@@ -12,7 +12,7 @@ from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.following.events import Event
 from zstate.listener import Follow, TransformListener
-from zstate.net.clock_offset import ClockOffset
+from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
 from zstate.net.replies import query
@@ -48,7 +48,7 @@ class Ear(Closing):
         self.description: RobotDescription | None = None
         self.statuses: dict[int, Status] = {}
         self.events: list[Event] = []
-        self.offsets: tuple[ClockOffset, ...] = ()
+        self.offsets: tuple[MeasuredOffset, ...] = ()
         self.stuck: set[Writer] = set()
         self._session, self._wire = session, wire_named(wire)
         with ExitStack() as opening:

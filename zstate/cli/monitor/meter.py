@@ -22,7 +22,7 @@ from zstate.wire.messages import JointState, Sample, TransformSample
 from zstate.wire.wire import Arrival
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.clock import Clock
     from zstate.net.session import Session
 

@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
-from zstate.buffer.frames import FrameInfo
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.awaited_pose import AwaitedPose
 from zstate.cli.console import fail, is_terminal, note, say, say_json, terminal_width
 from zstate.cli.monitor.meter import PathMeter

@@ -13,7 +13,7 @@ from zstate.cli.pictures.svg import ALARM, LINE, MUTED, WRITERS, Svg, text_width
 from zstate.clock import SYSTEM
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
 
 _NAME, _NOTE = 13.0, 11.0
 _MARGIN, _HEAD = 20.0, 30.0
