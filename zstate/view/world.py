@@ -6,6 +6,8 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.clock import Clock
@@ -48,9 +50,9 @@ class World(Closing):
         self._shown = frozenset(robots)
         self._version = 0
         self._models: Mapping[str, RobotModel] = {}
-        self._table: FrameTable | None = None
         # By robot: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
         self._seen: dict[str, tuple[int, float]] = {}
+        self._table = FrameTable((), np.empty(0, np.intp), (), ())
         self._refresh()
 
     @classmethod
@@ -87,13 +89,15 @@ class World(Closing):
         A robot is still drawn at its newest sample half a second after that; later, as before its
         oldest one, its poses are not known.
         """
+        poses = self.buffer.snapshot(at, robots=self._shown, hold_s=_HOLD_S)
+        self._adopt(poses.tree)
         self.look()
-        return self.buffer.snapshot(at, robots=self._shown, hold_s=_HOLD_S)
+        return poses
 
     def look(self) -> None:
         """See which robots have said something new. ``moment`` does; between moments, look often."""
         now = time.monotonic()
-        for robot, track in self._refresh().robots.items():
+        for robot, track in self._table.robots.items():
             newest = track.newest
             seen = self._seen.get(robot)
             if newest is not None and (seen is None or seen[0] != newest):
@@ -107,10 +111,11 @@ class World(Closing):
     def _is_shown(self, robot: str) -> bool:
         return not self._shown or robot in self._shown
 
-    def _refresh(self) -> FrameTable:
-        table = self.buffer.frame_table(self._shown)
+    def _refresh(self) -> None:
+        self._adopt(self.buffer.frame_table(self._shown))
+
+    def _adopt(self, table: FrameTable) -> None:
         if table is not self._table:
             self._table = table
             self._models = {name: track.model for name, track in table.robots.items()}
             self._version += 1
-        return table
