@@ -45,6 +45,9 @@ NEIGHBOURS = {
     ("cli", "view"),  # `zstate view` starts it
 }
 
+# The modules of the buffer that other packages may import.
+BUFFER_MODULES = {"buffer", "frame_tree", "snapshot", "tracks"}
+
 HOMES = {
     "pinocchio": "model",
     "xacro": "model",
@@ -178,7 +181,15 @@ def impurities(source: Source) -> Iterator[str]:
                 yield f"{source.path}:{node.lineno} uses {module}.{part}"
 
 
-RULES = (imports_that_look_up, libraries_out_of_place, impurities)
+def buffer_internals(source: Source) -> Iterator[str]:
+    """Histories, paths and interpolators are private to the buffer; other packages use its methods."""
+    for top, *rest in source.imports():
+        is_outside = top == "zstate" and rest[:1] == ["buffer"] and source.room != "buffer"
+        if is_outside and rest[1] not in BUFFER_MODULES:
+            yield f"{source.path} imports {'.'.join([top, *rest])!r}"
+
+
+RULES = (imports_that_look_up, libraries_out_of_place, impurities, buffer_internals)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -201,6 +212,7 @@ def test_every_file_keeps_the_rule(rule):
         (libraries_out_of_place, "buffer/plan.py", "from pinocchio import SE3"),
         (libraries_out_of_place, "model/xml.py", "import lxml.etree"),
         (libraries_out_of_place, "buffer/plan.py", "import_module('msgspec')"),
+        (buffer_internals, "view/world.py", "from zstate.buffer.history import HistoryView"),
         (impurities, "buffer/buffer.py", "threading.Thread(target=f)"),
         (impurities, "buffer/buffer.py", "from threading import Lock"),
         (impurities, "buffer/buffer.py", "now = time.time_ns()"),

@@ -1,4 +1,4 @@
-"""The C extension, made of buffer/_kernel.c. ``zstate.extension`` says whether it is there."""
+"""The C extension, made of buffer/_kernel.c. ``zstate.extension.kernel`` is "c" if it is used."""
 
 from typing import Any, TypeAlias
 

@@ -1,4 +1,4 @@
-"""Recording: what a file knows of robots."""
+"""Recording: lookups in a recorded file, of one robot or of all."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from zstate.record.transcript import Transcript
 
 
 class Recording(Closing):
-    """A recorded MCAP file or bag, asked about ``robot``, or about all robots in it.
+    """A recorded MCAP file or ROS 2 bag, read for ``robot``, or for all robots in it.
 
-    ``robots`` are those it tells of, ``info`` what else there is to say of it. Raises RecordingError
-    for what cannot be read, and InvalidInput when it tells nothing of ``robot``. A context manager.
+    ``robots`` are the robots it contains, ``info`` is its summary. Raises RecordingError
+    if it cannot be read, InvalidInput if it contains nothing of ``robot``. A context manager.
     """
 
     def __init__(self, path: str | Path, robot: str | None = None) -> None:
@@ -55,10 +55,10 @@ class Recording(Closing):
     def lookup_many(
         self, target: str, source: str, stamps: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """What ``buffer().lookup_many`` answers: pose7 at each stamp, (T, 7), and which are valid, (T,).
+        """As ``buffer().lookup_many``: pose7 at each stamp, (T, 7), and which are valid, (T,).
 
         Reads the recording once from its beginning to its end, and keeps only the samples around the
-        stamps [ns], which may stand in any order: memory grows with their number, not with the
+        stamps [ns], which may be in any order: memory grows with their number, not with the
         recording. Raises UnknownFrame, AmbiguousFrame and Disconnected.
         """
         instants = check_stamps(stamps)
@@ -67,5 +67,5 @@ class Recording(Closing):
         return buffer.lookup_many(target, source, instants)
 
     def close(self) -> None:
-        """Let go of the file. A second call does nothing."""
+        """Close the file. A second call does nothing."""
         self._reader.close()

@@ -5,14 +5,14 @@
  * (TransformFields), zstate/model/edges.py (Edges). Differences to those are bugs, and tests
  * compare both.
  *
- * Threads. Whatever changes or takes references runs with the GIL. The rows of a block that a
- * window covers are never written again, so a batch that holds references to its blocks reads them
- * without the GIL. A call with the GIL sees all histories between two inserts, because an insert,
- * also one into several histories (insert_together), runs no Python code between its first write
- * and its last.
+ * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
+ * covers are never written again, so a batch that holds references to its blocks reads them without
+ * the GIL. A call with the GIL sees all histories between two inserts, because an insert, also one
+ * into several histories (insert_together), runs no Python code between its first write and its
+ * last.
  *
- * Whatever a caller hands in is checked where it comes in (formats, sizes, columns, kinds), so that
- * no argument can make the code below read or write outside of what it owns.
+ * All arguments are checked on entry (formats, sizes, columns, kinds), so that none can make the
+ * code below read or write outside of its memory.
  */
 
 #define PY_SSIZE_T_CLEAN
@@ -33,8 +33,8 @@
 #include "_kernel/path.h"
 #include "_kernel/edges.h"
 
-/* Grows with every change of what Python sees of these files, so that a library built from an older
- * source (an editable install that was not built again) is recognised and not used. */
+/* Raised with every change of the interface to Python, so that a library built from older source
+ * (an editable install that was not rebuilt) is recognised and not used. */
 #define REVISION 6
 
 static PyMethodDef kernel_methods[] = {
@@ -47,11 +47,8 @@ static PyMethodDef kernel_methods[] = {
 };
 
 static struct PyModuleDef kernel_module = {
-    PyModuleDef_HEAD_INIT,
-    .m_name = "zstate._kernel",
-    .m_doc = "The hot loops of the buffer. zstate.extension says whether they are used.",
-    .m_size = -1,
-    .m_methods = kernel_methods,
+    PyModuleDef_HEAD_INIT, .m_name = "zstate._kernel",  .m_doc = "The hot loops of the buffer.",
+    .m_size = -1,          .m_methods = kernel_methods,
 };
 
 static int

@@ -26,15 +26,15 @@ is_empty(const History *self)
     return self->first == self->end;
 }
 
-/* The oldest stamp that is kept beside `newest`. */
+/* The oldest stamp that is kept together with `newest`. */
 static int64_t
 limit_of(const History *self, int64_t newest)
 {
     return newest < INT64_MIN + self->span_ns ? INT64_MIN : newest - self->span_ns;
 }
 
-/* The rows around a guess: in a history larger than the caches they are on their way while the
- * stamps are still being looked at. Columns of a wide row beyond these lines are waited for. */
+/* Prefetches the rows around a guess: in a history larger than the caches they are loaded while the
+ * stamps are still searched. Columns of a wide row beyond these lines are loaded later. */
 static inline void
 prefetch_rows(const Block *block, Py_ssize_t guess)
 {
@@ -50,8 +50,9 @@ prefetch_rows(const Block *block, Py_ssize_t guess)
 
 /* The first index whose stamp is not before `at`; `end` when there is none.
  *
- * Stamps of a track come at a nearly constant rate: where the mean period says, or near by, is a
- * better first guess than the middle. From there steps of doubled length find a stretch to bisect.
+ * Stamps of a track come at a nearly constant rate: the place that the mean period gives is a
+ * better first guess than the middle. From there steps of doubled length find an interval to
+ * bisect.
  */
 static Py_ssize_t
 index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t at)
@@ -97,7 +98,7 @@ index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t a
     return high;
 }
 
-/* Where a sample goes: the block (a new reference) and place for it, and the window afterwards. */
+/* The place of a new sample: its block (a new reference) and slot, and the window afterwards. */
 typedef struct {
     Block *block;
     Py_ssize_t at;
@@ -111,9 +112,9 @@ history_reaches(const History *self, int64_t stamp)
     return is_empty(self) || stamp >= limit_of(self, newest_of(self));
 }
 
-/* Moves the samples to the front of their block, where nobody else can see it: an array made of it,
- * or a batch that reads it, would hold a reference. False when it is seen, or little room would be
- * won. */
+/* Moves the samples to the front of their block, if the history alone refers to it: an array made
+ * of it, or a batch that reads it, holds a reference. False if there is another reference, or if
+ * little capacity would be gained. */
 static bool
 moved_to_front(History *self)
 {
@@ -138,7 +139,7 @@ slot_behind(History *self, Slot *slot)
         *slot = (Slot){block, self->end, self->first, self->end + 1};
         return 0;
     }
-    /* Both copies live for a moment, and a long history of a large robot is megabytes: room for an
+    /* Both copies exist for a moment, and a long history of a large robot is megabytes: room for an
      * eighth more is enough to copy each sample but a few times. */
     Block *fresh = block_new(SMALLEST_CAPACITY + size + size / 8, self->width);
     if (fresh == NULL)
@@ -165,7 +166,7 @@ slot_among(const History *self, int64_t stamp, Slot *slot)
     return 0;
 }
 
-/* Finds room; the samples stay what they are. -1 and MemoryError when there is none. */
+/* Finds a slot; the samples stay unchanged. -1 and MemoryError if there is no memory. */
 static int
 slot_for(History *self, int64_t stamp, Slot *slot)
 {
@@ -181,7 +182,7 @@ slot_write_stamp(const Slot *slot, int64_t stamp)
     return slot->block->rows + (size_t)slot->at * (size_t)slot->block->width;
 }
 
-/* Makes the sample in the slot part of the history, and forgets what has become too old. */
+/* Adds the sample in the slot to the history, and removes those that are too old now. */
 static void
 slot_publish(History *self, const Slot *slot)
 {
@@ -269,7 +270,7 @@ history_insert(History *self, PyObject *const *args, Py_ssize_t count)
     else if (!history_reaches(self, stamp))
         inserted = Py_False;
     else if (slot_for(self, stamp, &slot) == 0) {
-        /* memmove: the row may be a view of the very memory it goes to. */
+        /* memmove: the row may be a view of the destination. */
         memmove(slot_write_stamp(&slot, stamp), row.buf, (size_t)row.len);
         slot_publish(self, &slot);
         inserted = Py_True;
@@ -279,8 +280,7 @@ history_insert(History *self, PyObject *const *args, Py_ssize_t count)
     return inserted;
 }
 
-/* Writes positions, then velocities or NaN in their stead. 1 inserted, 0 too old, -1 MemoryError.
- */
+/* Writes positions, then velocities, NaN without. 1 inserted, 0 too old, -1 MemoryError. */
 static int
 insert_numbers(History *self, int64_t stamp, const Py_buffer *positions,
                const Py_buffer *velocities)
@@ -412,10 +412,10 @@ static PyMethodDef history_methods[] = {
      "also as "
      "a block; None for what is not plain."},
     {"replace", (PyCFunction)(void (*)(void))history_replace, METH_FASTCALL,
-     "replace(stamps, rows): hold copies of these samples and no others."},
+     "replace(stamps, rows): replace all samples by copies of these."},
     {"reaches", (PyCFunction)history_reaches_stamp, METH_O,
      "reaches(stamp): whether a sample of that stamp would be kept."},
-    {"clear", (PyCFunction)history_clear, METH_NOARGS, "clear(): forget every sample."},
+    {"clear", (PyCFunction)history_clear, METH_NOARGS, "clear(): remove every sample."},
     {NULL},
 };
 

@@ -12,7 +12,7 @@ typedef enum {
     STEP_KINDS
 } StepKind;
 
-/* How many numbers a step of each kind has, and how many columns of a row it reads. */
+/* The number of numbers of a step of each kind, and of columns of a row that it reads. */
 static const Py_ssize_t step_numbers[STEP_KINDS] = {7, 13, 12, 7, 7};
 static const Py_ssize_t step_columns[STEP_KINDS] = {0, 1, 1, 3, 7};
 

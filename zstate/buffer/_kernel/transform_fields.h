@@ -13,7 +13,7 @@ typedef struct {
 static PyTypeObject TransformFields_type;
 static PyObject *kind_static, *kind_exact, *kind_interpolated;
 
-/* A filled object of a class that is known to derive from TransformFields. */
+/* A new object of a class that derives from TransformFields, with all fields set. */
 static PyObject *
 fields_new(PyTypeObject *type, PyObject *target, PyObject *source, Pose pose, PyObject *stamp,
            PyObject *kind)
@@ -148,7 +148,7 @@ static PyGetSetDef fields_getset[] = {
 static PyTypeObject TransformFields_type = {
     PyVarObject_HEAD_INIT(NULL, 0)
     .tp_name = "zstate._kernel.TransformFields",
-    .tp_doc = "What a Transform holds.",
+    .tp_doc = "The data of a Transform.",
     .tp_basicsize = sizeof(TransformFields),
     .tp_new = PyType_GenericNew,
     .tp_dealloc = (destructor)fields_dealloc,
