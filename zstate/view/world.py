@@ -52,7 +52,7 @@ class World(Closing):
         self._models: Mapping[str, RobotModel] = {}
         # By robot: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
         self._seen: dict[str, tuple[int, float]] = {}
-        self._table = FrameTable((), np.empty(0, np.intp), (), ())
+        self._table: FrameTable = FrameTable((), np.empty(0, np.intp), (), ())
         self._refresh()
 
     @classmethod
