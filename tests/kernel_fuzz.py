@@ -70,7 +70,7 @@ class Fuzz:
         self.histories: list[Any] = [kernel.History(width, 10**9) for width in (0, 1, 7, 14, 40)]
         self.paths: list[Any] = []
         self.kept: list[Any] = []
-        self.transform = type("Transform", (kernel.Facts,), {"__slots__": ()})
+        self.transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
         self.calls: tuple[Callable[[], object], ...] = (
             self.make_history,
             *(self.write,) * 8,
@@ -131,7 +131,7 @@ class Fuzz:
             numbers = self.array(size)
             if isinstance(numbers, np.ndarray) and self.random.random() < 0.4:
                 numbers = numbers.tobytes()[self.pick(0, 0, 0, 1, 8) :]
-            history.take(self.stamp(), numbers, rates, count)
+            history.try_insert(self.stamp(), numbers, rates, count)
             self.kernel.block_of(numbers, count)
         history.reaches(self.stamp())
 
@@ -168,7 +168,7 @@ class Fuzz:
             bad[self.random.randrange(5)] = self.pick(-1, 5, 2**31, 2**62, 2**70, (1.0,) * 7, *ODD)
             steps[-1] = tuple(bad)
         chains = tuple(steps[:2]), tuple(steps[2:])
-        of = self.pick(self.transform, self.transform, self.transform, self.kernel.Facts, int, *ODD)
+        of = self.pick(self.transform, self.transform, self.transform, self.kernel.TransformFields, int, *ODD)
         self.paths.append(self.kernel.Path(of, *self.pick(("a", "b"), ODD[:2]), *chains, some))
 
     def make_good_path(self) -> None:
@@ -189,7 +189,7 @@ class Fuzz:
             answer = path.at(*self.pick((), (self.stamp(),), (1, 2)))
             if answer is not None:
                 repr((answer._pose, answer.stamp, answer.kind, answer.target, answer.predicted_s))
-            path.blame(self.stamp())
+            path.failure_at(self.stamp())
 
     def ask_many(self) -> None:
         for path in self.paths[-3:]:
@@ -246,7 +246,7 @@ class Fuzz:
 def beside_each_other(kernel: Any, seconds: float) -> None:
     """Batches without the GIL while another thread writes, late samples and clears included."""
     history = kernel.History(7, 5000)
-    transform = type("Transform", (kernel.Facts,), {"__slots__": ()})
+    transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
     step = (4, 0, 0, False, (0.0,) * 6 + (1.0,))
     path = kernel.Path(transform, "a", "b", (), (step,), (history,))
     stop = threading.Event()

@@ -11,9 +11,11 @@ from live import RRBOT
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from zstate.buffer.buffer import TransformBuffer
 from zstate.model.robot import RobotModel
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
+from zstate.recording.recording import Recording
 from zstate.transform import Transform
 from zstate.wire.messages import (
     JointState,
@@ -31,6 +33,12 @@ LATENCY = 200_000
 """From the stamp of a sample until it is recorded [ns]."""
 
 Edge = tuple[str, str]
+
+
+def recorded_buffer(path: Path, robot: str | None = None) -> TransformBuffer:
+    """The whole recording in a buffer."""
+    with Recording(path, robot) as recording:
+        return recording.buffer()
 
 
 class Tale:

@@ -27,8 +27,8 @@ FLOORS = (
     {"_util", "closing", "errors", "locks", "_kernel"},
     {"checks", "extension"},
     {"clock"},
-    {"se3", "rate", "facts"},
-    {"transform", "twist"},
+    {"se3", "rate"},
+    {"transform"},
     {"model", "buffer", "wire"},
     {"ingest"},
     {"net"},
@@ -45,10 +45,8 @@ NEIGHBOURS = {
     ("cli", "view"),  # `zstate view` starts it
 }
 
-# Constructors that users look for on the class, and that are made elsewhere, loaded when they are called.
-CONSTRUCTORS = {
-    ("buffer/buffer.py", "recording"),  # TransformBuffer.from_recording
-}
+# The modules of the buffer that other packages may import.
+BUFFER_MODULES = {"buffer", "frame_tree", "snapshot", "tracks"}
 
 HOMES = {
     "pinocchio": "model",
@@ -158,8 +156,7 @@ def imports_that_look_up(source: Source) -> Iterator[str]:
     for top, *rest in source.imports():
         # ``from zstate import connect`` goes through the front door, ``from zstate import se3`` does not.
         room = rest[0] if rest and rest[0] in rooms else "zstate"
-        is_known = may_know(source.room, room) or (source.path, room) in CONSTRUCTORS
-        if top == "zstate" and not is_known:
+        if top == "zstate" and not may_know(source.room, room):
             yield f"{source.path} imports {room!r}"
 
 
@@ -189,7 +186,15 @@ def impurities(source: Source) -> Iterator[str]:
                 yield f"{source.path}:{node.lineno} uses {module}.{part}"
 
 
-RULES = (imports_that_look_up, libraries_out_of_place, impurities)
+def buffer_internals(source: Source) -> Iterator[str]:
+    """Histories, paths and interpolators are private to the buffer; other packages use its methods."""
+    for top, *rest in source.imports():
+        is_outside = top == "zstate" and rest[:1] == ["buffer"] and source.room != "buffer"
+        if is_outside and rest[1] not in BUFFER_MODULES:
+            yield f"{source.path} imports {'.'.join([top, *rest])!r}"
+
+
+RULES = (imports_that_look_up, libraries_out_of_place, impurities, buffer_internals)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -212,6 +217,7 @@ def test_every_file_keeps_the_rule(rule):
         (libraries_out_of_place, "buffer/plan.py", "from pinocchio import SE3"),
         (libraries_out_of_place, "model/xml.py", "import lxml.etree"),
         (libraries_out_of_place, "buffer/plan.py", "import_module('msgspec')"),
+        (buffer_internals, "view/world.py", "from zstate.buffer.history import HistoryView"),
         (impurities, "buffer/buffer.py", "threading.Thread(target=f)"),
         (impurities, "buffer/buffer.py", "from threading import Lock"),
         (impurities, "buffer/buffer.py", "now = time.time_ns()"),

@@ -12,7 +12,7 @@ import pytest
 from live import RRBOT
 from support import SOON_S, Child, until
 
-from zstate.buffer.frames import FrameInfo
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.model.kinematics import Kinematics
 from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener

@@ -42,7 +42,7 @@ def test_both_ways_of_following_agree_with_kinematics_at_every_stamp(sessions, m
         settle(writer, "r1", "joint_states", "tf")
         for listener in (joints, transforms):
             # Who does not know yet whose time these are counts none as off the clock.
-            until(lambda listener=listener: listener.buffer.domain.of("r1") == "system")
+            until(lambda listener=listener: listener.buffer.domain.domain_of("r1") == "system")
         for stamp in stamps:
             publisher.publish(sine.read(stamp).positions, stamp=stamp)
         for listener in (joints, transforms):

@@ -102,7 +102,6 @@ SIGNATURES = {
     "TransformBuffer.wait": "(target, source, at=None, timeout_s=1.0)",
     "TransformBuffer.wait_async": "(target, source, at=None, timeout_s=1.0)",
     "TransformBuffer.frames": "(among=None)",
-    "TransformBuffer.from_recording": "(path, robot=None, *, clock=None)",
     "Recording": "(path, robot=None)",
     "Recording.buffer": "()",
     "Recording.lookup_many": "(target, source, stamps)",
@@ -229,8 +228,8 @@ def test_a_repr_is_one_short_line_that_tells_one_object_from_another(sessions, t
             statics: "<StaticPublisher 'mount' of 'r1': 1 edges>",
             listener: "<TransformListener of 'r1': 1 robots, 1 samples received>",
             listener.buffer: "<TransformBuffer: 8 frames of 'r1', 10 s of history>",
-            watch: "<Watch of 'camera' in 'world'>",
-            listener.buffer.join(samples(), "world"): "<Join with 'world': 0 joined>",
+            watch: "<TransformWatch of 'camera' in 'world'>",
+            listener.buffer.join(samples(), "world"): "<MessageFilter for 'world': 0 joined>",
             zstate.Kinematics(model): "<Kinematics of 'rrbot', 7 links>",
             model: "RobotModel('rrbot', 7 links, 2 driven joints)",
         }

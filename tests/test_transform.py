@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from zstate.clock import ManualClock
 from zstate.errors import FrameMismatch, InvalidInput
-from zstate.transform import Transform, worst_kind
-from zstate.twist import Twist
+from zstate.transform import Transform, Twist, worst_kind
 
 NAN, INF = math.nan, math.inf
 TURN = (0.5, -0.5, 0.5, 0.5)

@@ -46,8 +46,7 @@ if TYPE_CHECKING:
     from zstate.nodes.static_publisher import StaticPublisher
     from zstate.recording.recording import Recording
     from zstate.sources import JointReading, SineSource
-    from zstate.transform import Transform
-    from zstate.twist import Twist
+    from zstate.transform import Transform, Twist
 
 __version__ = "0.1.0"
 
@@ -100,7 +99,7 @@ _HOMES = {
     "Transform": "transform",
     "TransformBuffer": "buffer.buffer",
     "TransformListener": "nodes.listener",
-    "Twist": "twist",
+    "Twist": "transform",
     "connect": "net.session",
     "discover": "net.presence",
     "kernel": "extension",

@@ -1,4 +1,4 @@
-"""The C extension, made of buffer/_kernel.c. ``zstate.extension`` says whether it is there."""
+"""The C extension, made of buffer/_kernel.c. ``zstate.extension.kernel`` is "c" if it is used."""
 
 from typing import Any, TypeAlias
 
@@ -9,8 +9,8 @@ from zstate.transform import Transform
 
 REVISION: int
 
-Description: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
-Blame: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
+StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
+FailureTuple: TypeAlias = tuple[int, int, int | None, int | None, int | None, float | None]
 
 def block_of(numbers: object, count: int, /) -> bytes | None: ...
 
@@ -33,7 +33,7 @@ class History:
     @property
     def oldest(self) -> int | None: ...
     def insert(self, stamp: int, row: NDArray[Any], /) -> bool: ...
-    def take(
+    def try_insert(
         self, stamp: object, positions: object, velocities: object, position_count: int, /
     ) -> bool | None: ...
     def replace(self, stamps: NDArray[Any], rows: NDArray[Any], /) -> None: ...
@@ -41,7 +41,7 @@ class History:
     def clear(self) -> None: ...
 
 class Edges:
-    def __init__(self, width: int, steps: tuple[Description, ...]) -> None: ...
+    def __init__(self, width: int, steps: tuple[StepTuple, ...]) -> None: ...
     def poses(self, positions: NDArray[Any], out: NDArray[Any], /) -> None: ...
 
 class Path:
@@ -50,10 +50,10 @@ class Path:
         type: type[Transform],
         target: str,
         source: str,
-        to_target: tuple[Description, ...],
-        to_source: tuple[Description, ...],
+        to_target: tuple[StepTuple, ...],
+        to_source: tuple[StepTuple, ...],
         histories: tuple[object, ...],
     ) -> None: ...
     def at(self, stamp: object = None, /) -> Transform | None: ...
-    def blame(self, stamp: object, /) -> Blame | None: ...
+    def failure_at(self, stamp: object, /) -> FailureTuple | None: ...
     def poses(self, stamps: NDArray[Any], out: NDArray[Any], valid: NDArray[Any], /) -> None: ...

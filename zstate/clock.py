@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +28,13 @@ SIMULATED = "sim"
 
 SET_BACK_NS = 100_000_000
 """The clock of a writer was set back if the next samples are stamped by more before those it sent earlier."""
+
+
+class ClockOffset(NamedTuple):
+    """How far another clock is ahead of this host's, and the uncertainty of that [ns]."""
+
+    offset_ns: int
+    uncertainty_ns: int
 
 
 class Clock(Protocol):

@@ -12,7 +12,7 @@ from typing import Literal
 from zstate.errors import InvalidInput
 
 VARIABLE = "ZSTATE_KERNEL"
-REVISION = 5
+REVISION = 6
 """What the extension's own REVISION has to be; see there."""
 
 

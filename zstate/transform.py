@@ -1,6 +1,6 @@
-"""Transform: a pose that knows which frames it speaks of.
+"""Transform: a pose with the names of its two frames; Twist: the velocity of a frame.
 
-One sentence holds it together: ``p_a = a_from_b @ p_b``. A ``Transform(target="a", source="b", ...)``
+The one convention is ``p_a = a_from_b @ p_b``. A ``Transform(target="a", source="b", ...)``
 is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in b into a.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +17,11 @@ from zstate import se3
 from zstate.checks import check_names, real_numbers
 from zstate.clock import Clock, check_stamp, stamp_text
 from zstate.errors import FrameMismatch, InvalidInput, duration_text
-from zstate.facts import Facts, Kind
+from zstate.extension import kernel
 
 Array: TypeAlias = NDArray[np.float64]
+Kind: TypeAlias = Literal["static", "exact", "interpolated", "predicted"]
+F = TypeVar("F", bound="TransformFields")
 
 # A path is as good as its least certain part: the later kind wins.
 KINDS: tuple[Kind, ...] = ("static", "exact", "interpolated", "predicted")
@@ -53,7 +55,55 @@ def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
     return (*values[:3], *(value / norm for value in values[3:]))
 
 
-class Transform(Facts):
+if TYPE_CHECKING or kernel == "reference":
+
+    class TransformFields:
+        """The data of a Transform, set once; the C extension makes one in a tenth of the time."""
+
+        __slots__ = ("_pose", "kind", "predicted_s", "source", "stamp", "target")
+
+        target: str
+        source: str
+        stamp: int | None
+        kind: Kind
+        predicted_s: float
+        _pose: tuple[float, ...]
+
+        def _fill(  # noqa: PLR0917 - one call for all fields, on the hot path
+            self,
+            target: str,
+            source: str,
+            pose: tuple[float, ...],
+            stamp: int | None,
+            kind: Kind,
+            predicted_s: float = 0.0,
+        ) -> None:
+            values = zip(
+                TransformFields.__slots__, (pose, kind, predicted_s, source, stamp, target), strict=True
+            )
+            for name, value in values:
+                object.__setattr__(self, name, value)
+
+        @classmethod
+        def trusted(  # noqa: PLR0917 - the buffer's hot path
+            cls: type[F],
+            target: str,
+            source: str,
+            pose: tuple[float, ...],
+            stamp: int | None,
+            kind: Kind,
+            predicted_s: float = 0.0,
+        ) -> F:
+            """From seven floats that are known to be a pose: for the buffer, which checked at insert."""
+            fields = cls.__new__(cls)
+            fields._fill(target, source, pose, stamp, kind, predicted_s)
+            return fields
+
+else:
+    from zstate._kernel import TransformFields
+
+
+class Transform(TransformFields):
     """The pose of frame ``source`` in frame ``target``, at one instant or for ever.
 
     ``translation`` is x y z [m] in target axes, ``rotation`` the unit quaternion x y z w, ``stamp``
@@ -255,8 +305,8 @@ class Transform(Facts):
         return cls(*(values[name] for name in names), kind=values.get("kind"))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        facts = (self.target, self.source, self._pose, self.stamp, self.kind, self.predicted_s)
-        return (Transform.trusted, facts)
+        fields = (self.target, self.source, self._pose, self.stamp, self.kind, self.predicted_s)
+        return (Transform.trusted, fields)
 
     def __eq__(self, other: object) -> bool:
         """The same frames, instant and motion; q and -q are the same turn."""
@@ -287,3 +337,44 @@ def _frozen(numbers: Sequence[float]) -> Array:
     array = np.array(numbers)
     array.flags.writeable = False
     return array
+
+
+class Twist:
+    """The velocity of ``frame`` in ``reference``: d/dt of ``reference_from_frame``.
+
+    ``linear`` [m/s] is the velocity of the frame's origin, ``angular`` [rad/s] that of its axes;
+    both are vectors in the axes of ``reference``. ``stamp`` is None if nothing can move.
+    """
+
+    __slots__ = ("angular", "frame", "linear", "reference", "stamp")
+
+    def __init__(
+        self, frame: str, reference: str, linear: ArrayLike, angular: ArrayLike, stamp: int | None
+    ) -> None:
+        self.frame = frame
+        self.reference = reference
+        self.linear = np.array(linear, dtype=np.float64)
+        self.angular = np.array(angular, dtype=np.float64)
+        self.stamp = stamp
+        self.linear.flags.writeable = self.angular.flags.writeable = False
+
+    @property
+    def expressed_in(self) -> str:
+        """The frame in whose axes both vectors are given."""
+        return self.reference
+
+    @property
+    def about(self) -> str:
+        """The frame at whose origin ``linear`` is measured."""
+        return self.frame
+
+    def __repr__(self) -> str:
+        when = "" if self.stamp is None else f" at {stamp_text(self.stamp)}"
+        return (
+            f"<twist of {self.frame} in {self.reference}{when}: linear {_vector_text(self.linear)} m/s, "
+            f"angular {_vector_text(self.angular)} rad/s>"
+        )
+
+
+def _vector_text(vector: NDArray[np.float64]) -> str:
+    return "[" + ", ".join(f"{round(value, 4) + 0.0:.4f}" for value in vector.tolist()) + "]"

@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 from support import DEADLINE_S
 from worlds import EVERY_JOINT, NOW, S, every_joint, filled, moving
 
-from zstate.buffer import history as reference
-from zstate.buffer import kernel as compiled
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.compiled import CompiledPath
-from zstate.buffer.path import Path
+from zstate.buffer.history import History, ReferenceHistory, insert_together
+from zstate.buffer.path import CompiledPath, TransformPath
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
 from zstate.extension import kernel
@@ -49,7 +47,7 @@ def kept(history) -> tuple[list[int], list[list[float]]]:
 
 @given(stamps, orders, st.integers(0, 3), st.booleans())
 def test_histories_keep_the_same_samples(column, order, width: int, shuffled: bool) -> None:
-    ours, theirs = compiled.History(width, SPAN_NS), reference.History(width, SPAN_NS)
+    ours, theirs = History(width, SPAN_NS), ReferenceHistory(width, SPAN_NS)
     column = [int(stamp) for stamp in column]
     if shuffled:
         order.shuffle(column)
@@ -58,7 +56,7 @@ def test_histories_keep_the_same_samples(column, order, width: int, shuffled: bo
         assert ours.reaches(stamp) == theirs.reaches(stamp)
         assert ours.insert(stamp, row) == theirs.insert(stamp, row)
         assert kept(ours) == kept(theirs)
-    copy = compiled.History(width, SPAN_NS)
+    copy = History(width, SPAN_NS)
     copy.replace(theirs.view.kept_stamps(), theirs.view.kept_rows())
     assert kept(copy) == kept(theirs)
     assert ours.newest == theirs.newest == max(column, default=None)
@@ -70,16 +68,17 @@ def test_histories_keep_the_same_samples(column, order, width: int, shuffled: bo
 @given(st.lists(st.integers(0, 400), min_size=1, max_size=80, unique=True), st.lists(st.integers(-5, 405)))
 def test_any_spacing_of_stamps_is_searched_right(column: list[int], asked: list[int]) -> None:
     buffer = filled(*(moving("a", "b", NOW + n * n, x=float(n)) for n in sorted(column)), history_s=1e6)
-    path = buffer._path("a", "b")
+    paths = both_paths(buffer, "a", "b")
     for stamp in [NOW + n for n in (*asked, *(n * n for n in asked))]:
-        assert_agree(path, stamp)
+        assert_agree(*paths, stamp)
 
 
-def reference_of(path: Path) -> Path:
-    """The same path without the extension."""
+def both_paths(buffer: TransformBuffer, target: str, source: str) -> tuple[TransformPath, TransformPath]:
+    """The same path with the extension and without."""
+    path, reference = buffer.path(target, source), buffer.path(target, source, compiled=False)
     assert isinstance(path, CompiledPath)
-    names = (path.target, path.source)
-    return Path(names, path.steps_to_target, path.steps_to_source, path.uses, path._take_views)
+    assert type(reference) is TransformPath
+    return path, reference
 
 
 def outcome(ask: Callable[[], Transform | None]) -> Transform | LookupFailed | None:
@@ -93,12 +92,12 @@ def facts_of(transform: Transform) -> tuple[object, ...]:
     return transform.target, transform.source, transform.stamp, transform.kind, transform.predicted_s
 
 
-def assert_agree(path: Path, stamp: int | None) -> None:
-    """One question to both."""
-    theirs = outcome(lambda: Transform.trusted(path.target, path.source, *reference_of(path).answer(stamp)))
+def assert_agree(path: TransformPath, reference: TransformPath, stamp: int | None) -> None:
+    """One lookup by both."""
+    theirs = outcome(lambda: reference.transform(stamp))
     if isinstance(theirs, LookupFailed):
         assert path.at(stamp) is None
-        ours = outcome(lambda: path.answer(stamp))
+        ours = outcome(lambda: path.transform(stamp))
         assert type(ours) is type(theirs)
         assert vars(ours) == vars(theirs)
         return
@@ -107,7 +106,7 @@ def assert_agree(path: Path, stamp: int | None) -> None:
     assert isinstance(theirs, Transform)
     assert facts_of(ours) == facts_of(theirs)
     assert_same_poses(ours.pose7, theirs.pose7)
-    assert path.refuse(stamp) is None
+    assert path.raise_if_outside(stamp) is None
 
 
 def assert_same_poses(ours: np.ndarray, theirs: np.ndarray) -> None:
@@ -151,13 +150,13 @@ instants = st.lists(st.integers(-1, 32).map(lambda n: NOW + n * S // 8), max_siz
 def test_paths_over_every_type_of_joint_agree(samples, target: str, source: str, asked: list[int]) -> None:
     buffer, _ = a_robot(samples)
     try:
-        path = buffer._path(target, source)
+        path, reference = both_paths(buffer, target, source)
     except LookupFailed:
         return
     for stamp in [None, *EXTREMES, *asked]:
-        assert_agree(path, stamp)
+        assert_agree(path, reference, stamp)
     column = np.array([*EXTREMES, *asked])
-    ours, theirs = path.poses(column), reference_of(path).poses(column)
+    ours, theirs = path.poses(column), reference.poses(column)
     assert ours[1].tolist() == theirs[1].tolist()
     assert_same_poses(ours[0], theirs[0])
 
@@ -167,30 +166,30 @@ def test_where_the_arithmetic_is_the_same_every_bit_is(numbers, joint: str) -> N
     """A single joint's own edge: nothing is multiplied out beforehand."""
     buffer, track = a_robot([numbers, numbers[::-1]])
     of = {one.name: one for one in track.model.joints}[joint]
-    path = buffer._path(of.parent, of.child)
+    path, reference = both_paths(buffer, of.parent, of.child)
     for stamp in range(NOW, NOW + S + 1, S // 7):
-        assert path.at(stamp).pose7.tolist() == list(reference_of(path).answer(stamp).pose)  # type: ignore[union-attr]
+        assert path.at(stamp).pose7.tolist() == list(reference.result(stamp).pose)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("spread", [1e-9, 1e-4, 0.1, 0.27, 0.29, 1.0, 3.0])
 def test_small_and_large_turns_agree(spread: float) -> None:
     buffer = filled(moving("a", "b", NOW), moving("a", "b", NOW + S, yaw=spread))
     for stamp in range(NOW, NOW + S + 1, S // 13):
-        assert_agree(buffer._path("a", "b"), stamp)
+        assert_agree(*both_paths(buffer, "a", "b"), stamp)
 
 
 def test_hermite_paths_stay_with_the_reference() -> None:
-    buffer, _ = every_joint("hermite")
-    buffer.insert_joints(buffer._tree.robots[""], NOW, [*(0.0,) * 6, 1.0, *(0.0,) * 6], np.zeros(12))
-    assert type(buffer._path("root", "tip")) is Path
+    buffer, track = every_joint("hermite")
+    buffer.insert_joints(track, NOW, [*(0.0,) * 6, 1.0, *(0.0,) * 6], np.zeros(12))
+    assert type(buffer.path("root", "tip")) is TransformPath
 
 
 def test_unusual_input_is_left_to_the_reference() -> None:
     """What the extension cannot take at once it says so of, and the reference speaks."""
-    history = compiled.History(3, SPAN_NS)
+    history = History(3, SPAN_NS)
     row = np.zeros(3)
     for plain in (True, 1.5, "now", None, 2**63, np.int64(3)):
-        assert history.take(plain, row, None, 3) is None
+        assert history.try_insert(plain, row, None, 3) is None
     for numbers in (
         [0, 0, 0],
         row.astype(np.float32),
@@ -203,13 +202,13 @@ def test_unusual_input_is_left_to_the_reference() -> None:
         row.astype(object),
         "abc",
     ):
-        assert history.take(1, numbers, None, 3) is None
+        assert history.try_insert(1, numbers, None, 3) is None
         assert block_of(numbers, 3) is None
     for block in (b"", b"x" * 24 + b"y", row.tobytes()[8:], (row * np.nan).tobytes(), bytearray(24)):
-        assert history.take(1, block, None, 3) is None
-    assert history.take(1, row, None, 3) is True
-    assert history.take(2, row.tobytes(), None, 3) is True
-    assert history.take(-(2**63), row, None, 3) is False
+        assert history.try_insert(1, block, None, 3) is None
+    assert history.try_insert(1, row, None, 3) is True
+    assert history.try_insert(2, row.tobytes(), None, 3) is True
+    assert history.try_insert(-(2**63), row, None, 3) is False
     assert len(history.view.kept_rows()) == 2
 
 
@@ -230,7 +229,7 @@ def test_a_block_is_made_of_plain_numbers_at_once_and_of_nothing_else() -> None:
 
 
 def test_views_cannot_be_written_to_and_outlive_their_history() -> None:
-    history = compiled.History(1, 10**9)
+    history = History(1, 10**9)
     history.insert(1, np.array([5.0]))
     view = history.view
     with pytest.raises(ValueError, match="read-only"):
@@ -243,12 +242,12 @@ def test_views_cannot_be_written_to_and_outlive_their_history() -> None:
 
 
 def test_one_instant_of_several_histories_is_all_or_nothing() -> None:
-    pair = compiled.History(1, SPAN_NS), compiled.History(2, SPAN_NS)
-    compiled.insert_together(pair, 5, (np.ones(1), np.ones(2)))
+    pair = History(1, SPAN_NS), History(2, SPAN_NS)
+    insert_together(pair, 5, (np.ones(1), np.ones(2)))
     with pytest.raises(ValueError, match="as wide as its history"):
-        compiled.insert_together(pair, 6, (np.ones(1), np.ones(3)))
+        insert_together(pair, 6, (np.ones(1), np.ones(3)))
     with pytest.raises(ValueError, match="each history once"):
-        compiled.insert_together((pair[0], pair[0]), 6, (np.ones(1), np.ones(1)))
+        insert_together((pair[0], pair[0]), 6, (np.ones(1), np.ones(1)))
     assert [kept(history)[0] for history in pair] == [[5], [5]]
 
 

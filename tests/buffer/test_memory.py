@@ -105,6 +105,6 @@ def test_late_samples_take_no_more_room_than_those_in_order(late: int) -> None:
     for n in range(3_000):
         # Every second sample comes before its neighbour when ``late``.
         buffer.insert(moving("a", "b", (n ^ late) * MS))
-    view = buffer._tree.frames["b"].track.history.view
+    view = buffer.tree_snapshot().edges["b"].track.history.view
     assert view.size == 1_001
     assert len(view.stamps) <= 2 * view.size

@@ -297,7 +297,7 @@ def test_a_sample_that_comes_while_one_who_waits_leaves_wakes_the_others() -> No
 
     with buffer.watch("a", "b", lambda news: heard.append(news.stamp)):
         leaving = buffer.watch("a", "b", lambda _: None)
-        buffer._room._by_track = Interrupted(buffer._room._by_track)
+        buffer._waiters._by_track = Interrupted(buffer._waiters._by_track)
         leaving.close()
         assert threads
     for thread in threads:

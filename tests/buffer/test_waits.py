@@ -35,10 +35,10 @@ class Waiting:
     def __init__(self, buffer: TransformBuffer, call: Callable[[], Transform]) -> None:
         self._buffer = buffer
         self.outcome: Transform | LookupFailed | None = None
-        seats = len(buffer._room._waiters)
+        seats = buffer.waiter_count
         self._thread = threading.Thread(target=self._run, args=(call,), daemon=True)
         self._thread.start()
-        until(lambda: len(buffer._room._waiters) != seats or not self._thread.is_alive(), LONG_S)
+        until(lambda: buffer.waiter_count != seats or not self._thread.is_alive(), LONG_S)
 
     def _run(self, call: Callable[[], Transform]) -> None:
         try:
@@ -128,7 +128,7 @@ def test_a_wait_for_the_past_ends_when_the_last_of_the_edges_knows_it(waiting) -
 def test_a_wait_for_the_past_is_woken_once_however_many_samples_come(waiting) -> None:
     buffer = filled(moving("a", "b", 10 * S))
     wait = waiting(buffer, "a", "b", 5 * S)
-    (waiter,) = buffer._room._waiters
+    (waiter,) = buffer._waiters._waiters
     wakes, wake = [], waiter.wake
     waiter.wake = lambda: wakes.append(None) or wake()
     for n in range(95, 49, -1):
@@ -274,13 +274,13 @@ def test_a_wait_of_asyncio_can_be_cancelled_and_leaves_no_waiter() -> None:
     async def cancel() -> None:
         task = asyncio.create_task(buffer.wait_async("a", "b", timeout_s=LONG_S))
         await asyncio.sleep(0)
-        assert len(buffer._room._waiters) == 1
+        assert buffer.waiter_count == 1
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task
 
     asyncio.run(cancel())
-    assert buffer._room._waiters == ()
+    assert buffer.waiter_count == 0
 
 
 def test_waits_of_asyncio_share_one_loop() -> None:
@@ -301,7 +301,7 @@ def test_an_insert_survives_a_waiter_whose_loop_is_closed() -> None:
     loop = asyncio.new_event_loop()
     task = loop.create_task(buffer.wait_async("a", "b", timeout_s=LONG_S))
     loop.run_until_complete(asyncio.sleep(0))
-    (waiter,) = buffer._room._waiters
+    (waiter,) = buffer._waiters._waiters
     task.cancel()
     loop.run_until_complete(asyncio.gather(task, return_exceptions=True))
     loop.close()

@@ -16,10 +16,10 @@ import pytest
 from worlds import MS, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.plan import compile_path
+from zstate.buffer.frame_tree import FrameTree
+from zstate.buffer.path import compile_path
 from zstate.buffer.tracks import JointTrack
-from zstate.buffer.tree import Tree
-from zstate.buffer.waiting import Expected
+from zstate.buffer.waiting import WakeCondition
 from zstate.errors import InsertRefused, UnknownFrame
 from zstate.model.catalog import load_model
 from zstate.transform import Transform
@@ -70,10 +70,10 @@ def test_a_sample_is_shown_only_to_those_who_wait_for_its_track() -> None:
     one, other = fleet(buffer, 2)
     for _ in range(30):
         watched(buffer, "r1/base", "r1/tool")
-    with calls(Expected.has_come) as asked:
+    with calls(WakeCondition.is_met) as asked:
         buffer.insert_joints(one, S, ZERO)
     assert asked == []
-    with calls(Expected.has_come) as asked:
+    with calls(WakeCondition.is_met) as asked:
         buffer.insert_joints(other, S, ZERO)
     # Once before it is woken, and once when it has taken what was there.
     assert len(asked) == 2 * 30
@@ -92,7 +92,7 @@ def test_who_waits_for_two_tracks_is_shown_the_samples_of_both() -> None:
 def test_a_sample_of_many_tracks_is_shown_to_everybody_once() -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
     watched(buffer, "a", "c")
-    with calls(Expected.has_come) as asked:
+    with calls(WakeCondition.is_met) as asked:
         buffer.insert_many([("a", "b"), ("b", "c")], S, [(0, 0, 0, 0, 0, 0, 1)] * 2)
     assert asked == ["notify", "expect"]
 
@@ -135,9 +135,9 @@ def test_an_unknown_frame_is_looked_for_once_for_each_change_and_near_misses_nev
     with calls(difflib.get_close_matches) as searched:
         fleet(buffer, 20)
     assert searched == []
-    with calls(Tree.footing) as footings:
+    with calls(FrameTree.dependencies) as searches:
         buffer.insert_static(static("table", "cup"))
-    assert footings == []
+    assert searches == []
 
 
 def test_near_misses_are_those_of_when_the_frame_was_unknown() -> None:
@@ -227,4 +227,4 @@ def test_who_has_left_is_nowhere() -> None:
     buffer.insert_joints(track, S, ZERO)
     buffer.wait("base", "tool", S)
     assert watch.failures == 0
-    assert (buffer._room._waiters, buffer._room._by_track) == ((), {})
+    assert (buffer.waiter_count, buffer._waiters._by_track) == (0, {})

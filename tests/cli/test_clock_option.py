@@ -46,7 +46,7 @@ def test_publish_stamps_and_paces_by_the_simulated_time():
         until(lambda: [f.count for f in listener.buffer.frames() if f.kind == "joint"] == [250, 250])
         frame = next(frame for frame in listener.buffer.frames() if frame.kind == "joint")
         assert frame.newest - frame.oldest == 249 * 20 * MS
-        assert listener.buffer.domain.of("rrbot") == "sim"
+        assert listener.buffer.domain.domain_of("rrbot") == "sim"
         assert listener.stats.off_clock == 0
 
 

@@ -8,13 +8,12 @@ from looking import RRBOT, Spawn, failure, interrupted, standing, started, zstat
 from support import until
 
 from zstate import StaticPublisher, Transform, connect, load_model
-from zstate.buffer.frames import FrameInfo
-from zstate.buffer.tracks import Offset
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.monitor.meter import EdgeMeasure, EdgeStatistics
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between
 from zstate.cli.monitor.report import Row, report_text
-from zstate.clock import ManualClock
+from zstate.clock import ClockOffset, ManualClock
 from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
@@ -42,7 +41,7 @@ TREE = (
 MEASURE = EdgeMeasure(99.96, 0.0004, 0.0021, 0.00011, 3, 0.004)
 
 
-def rows(offset: Offset | None = None) -> list[Row]:
+def rows(offset: ClockOffset | None = None) -> list[Row]:
     begin, legs = path_between(TREE, "base", "hand")
     measured = [
         Row(leg.frame, leg.edge, MEASURE if leg.edge.kind == "joint" else None, offset) for leg in legs
@@ -62,7 +61,7 @@ def test_the_path_goes_up_and_down_over_the_frame_that_both_hang_on():
 
 
 def test_joints_of_one_robot_come_together_and_are_told_once():
-    assert report_text(rows(Offset(10_000, 200_000))).splitlines() == [
+    assert report_text(rows(ClockOffset(10_000, 200_000))).splitlines() == [
         "frame  edge    rate      latency   max     jitter    missed  clock  writer",
         "base",
         "torso  static                                                       driver@jetson pid 412",
@@ -72,7 +71,7 @@ def test_joints_of_one_robot_come_together_and_are_told_once():
 
 
 def test_a_clock_that_is_off_is_told_with_what_that_means():
-    *table, note = report_text(rows(Offset(-1_200_000_000, 100_000))).splitlines()
+    *table, note = report_text(rows(ClockOffset(-1_200_000_000, 100_000))).splitlines()
     assert "  -1.2 s  " in table[3]
     assert note == (
         f"the clock of {DRIVER} is 1.2 s behind the one here (± 100.0 us), and its latencies are off by that"

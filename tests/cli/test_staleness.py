@@ -7,7 +7,7 @@ import time
 import pytest
 
 from zstate import Transform, TransformBuffer, connect
-from zstate.buffer.frames import FrameInfo
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.samples import StreamSamples
 from zstate.cli.metered_buffer import MeteredBuffer
 from zstate.cli.monitor.meter import EdgeStatistics

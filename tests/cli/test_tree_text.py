@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zstate.buffer.frames import FrameInfo
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.output.frames import tree_text
 
 NOW = 5_000_000_000

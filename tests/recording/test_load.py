@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
-from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, swing, swing_rates
+from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, recorded_buffer, swing, swing_rates
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Disconnected, InvalidInput, RecordingError, UnknownFrame
@@ -36,7 +36,7 @@ def test_answers_are_bit_for_bit_those_of_a_live_buffer(tmp_path: Path):
             seconds = n / 100
             state = tale.joints("arm", START + n * 10 * MS + n % 7, swing(seconds), swing_rates(seconds))
             ingest.insert_sample(state, overflowed=False)
-    recorded = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    recorded = recorded_buffer(tmp_path / "r.mcap")
     newest = live.latest("world", "tool")
     stamps = np.random.default_rng(3).integers(newest - 10 * S, newest, 500)
     expected, valid = live.lookup_many("world", "tool", stamps)
@@ -52,7 +52,7 @@ def test_nothing_of_a_long_recording_is_forgotten(tmp_path: Path):
         tale.describe("arm")
         for n in range(200):
             tale.joints("arm", START + n * 60 * S, swing(n))
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     first = buffer.lookup("world", "tool", START)
     (tool,) = (n for n, link in enumerate(RRBOT.links) if link == "tool")
     assert np.allclose(first.pose7, Kinematics(RRBOT).link_poses(swing(0))[tool], rtol=0, atol=1e-12)
@@ -64,7 +64,7 @@ def test_samples_recorded_before_their_description_are_not_lost(tmp_path: Path):
         for n in range(3000):
             bag.joints(START - S + n, dict(zip(RRBOT.joint_names, swing(n), strict=True)))
         bag.describe()
-    buffer = TransformBuffer.from_recording(tmp_path / "bag")
+    buffer = recorded_buffer(tmp_path / "bag")
     assert buffer.can_lookup("world", "tool", START - S)
 
 
@@ -73,7 +73,7 @@ def test_a_writer_that_is_restarted_goes_on_in_the_same_history(tmp_path: Path):
         tale.describe("arm")
         for n in range(10):
             tale.joints("arm", START + n * S, swing(n), session=1 + n // 5)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.can_lookup("world", "tool", START)
     assert buffer.can_lookup("world", "tool", START + 9 * S)
 
@@ -85,7 +85,7 @@ def test_a_new_writer_whose_clock_is_back_begins_anew(tmp_path: Path):
             tale.joints("arm", 5 * S + n * MS, swing(n), session=1, heard=START + n)
         for n in range(10):
             tale.joints("arm", 3 * S + n * MS, swing(n), session=2, heard=START + S + n)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.latest("world", "tool") == 3 * S + 9 * MS
     assert not buffer.can_lookup("world", "tool", 5 * S)
 
@@ -99,7 +99,7 @@ def test_a_clock_that_is_set_back_begins_anew_with_the_second_sample_as_live(tmp
         for number, stamp in enumerate([100 * S, 101 * S, 5 * S, 6 * S, 7 * S]):
             state = tale.joints("arm", stamp, swing(number), heard=START + number)
             ingest.insert_sample(state, overflowed=False)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     for known in (live, buffer):
         assert [known.can_lookup("world", "tool", s * S) for s in (5, 6, 7, 100)] == [
             False,
@@ -114,7 +114,7 @@ def test_a_single_sample_of_long_ago_changes_nothing(tmp_path: Path):
         tale.describe("arm")
         for number, stamp in enumerate([100 * S, 101 * S, 5 * S, 102 * S, 6 * S, 103 * S]):
             tale.joints("arm", stamp, swing(number), heard=START + number)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.can_lookup("world", "tool", 100 * S)
     assert not buffer.can_lookup("world", "tool", 50 * S)
 
@@ -124,7 +124,7 @@ def test_a_late_sample_is_sorted_in(tmp_path: Path):
         tale.describe("arm")
         for number, second in enumerate([0, 2, 1, 3]):
             tale.joints("arm", START + second * S, swing(second), heard=START + number * S)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("world", "tool", START + S).kind == "exact"
 
 
@@ -135,7 +135,7 @@ def test_edges_beyond_the_model_come_from_tf(tmp_path: Path):
             stamp = START + n * 10 * MS
             tale.joints("arm", stamp, swing(n))
             tale.edges("arm", stamp, {("odom", "world"): pose(n), ("base", "upper"): IDENTITY})
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("odom", "world", START + 45 * MS).translation[0] == 4.5
     # The model knows better where its links are than what was said of them on tf.
     kinds = {frame.name: frame.kind for frame in buffer.frames()}
@@ -146,7 +146,7 @@ def test_a_robot_without_a_description_is_known_by_its_tf(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "cart") as tale:
         for n in range(10):
             tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("base", "mast"): pose(z=n)})
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("odom", "mast", START + 30 * MS).translation.tolist() == [3.0, 0.0, 3.0]
 
 
@@ -156,7 +156,7 @@ def test_joint_states_that_tell_only_a_part_leave_the_robot_to_its_tf(tmp_path: 
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.1})
             bag.tf(START + n, [Transform("base", "upper", [0, 0, n], [0, 0, 0, 1], START + n)])
-    buffer = TransformBuffer.from_recording(tmp_path / "bag")
+    buffer = recorded_buffer(tmp_path / "bag")
     assert buffer.lookup("base", "upper", START + 3).translation[2] == 3.0
     assert "no robot_description fits" in caplog.text
 
@@ -166,7 +166,7 @@ def test_edges_of_a_clock_that_goes_back_begin_anew_and_others_stay(tmp_path: Pa
         for n, second in enumerate([100, 101, 102, 5, 6, 7]):
             bag.tf(START + n, [Transform("odom", "base", [second, 0, 0], [0, 0, 0, 1], second * S)])
             bag.tf(START + n, [Transform("map", "odom", [n, 0, 0], [0, 0, 0, 1], (200 + n) * S)])
-    buffer = TransformBuffer.from_recording(tmp_path / "bag")
+    buffer = recorded_buffer(tmp_path / "bag")
     assert buffer.latest("odom", "base") == 7 * S
     assert not buffer.can_lookup("odom", "base", 100 * S)
     assert buffer.can_lookup("map", "odom", 200 * S)
@@ -177,7 +177,7 @@ def test_a_new_writer_of_an_edge_goes_on_where_the_old_one_ended(tmp_path: Path)
         for n in range(10):
             edges = {("odom", "base"): pose(n)}
             tale.edges("cart", START + n * 10 * MS, edges, session=10 + n // 5)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.can_lookup("odom", "base", START)
     assert buffer.can_lookup("odom", "base", START + 90 * MS)
 
@@ -189,7 +189,7 @@ def test_static_edges_of_all_writers_hold(tmp_path: Path):
         tale.statics("arm", START, {("tool", "gripper"): pose(z=0.2)}, writer="gripper", session=4)
         tale.statics("arm", START, {("world", "base"): IDENTITY}, writer=MODEL_WRITER, session=1)
         tale.joints("arm", START, swing(0))
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert np.allclose(buffer.lookup("camera", "gripper").translation, [0, 0, 0.1])
 
 
@@ -198,7 +198,7 @@ def test_withdrawn_edges_hold_until_something_else_places_the_frame(tmp_path: Pa
         tale.statics("arm", START, {("table", "cup"): pose(x=1.0), ("table", "plate"): pose(x=2.0)})
         tale.scribe.withdraw("arm", "camera", START + S)
         tale.statics("arm", START + 2 * S, {("tray", "cup"): pose(x=3.0)}, writer="other", session=9)
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("table", "plate").translation[0] == 2.0
     assert buffer.lookup("tray", "cup").translation[0] == 3.0
     with pytest.raises(Disconnected):
@@ -211,7 +211,7 @@ def test_a_repeated_static_value_does_not_come_back(tmp_path: Path):
         tale.statics("arm", START, {("table", "cup"): pose(x=1.0)})
         for second in range(1, 30):
             tale.edges("arm", START + second * S, {("table", "cup"): pose(x=second)})
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("table", "cup", START + 15 * S).translation[0] == 15.0
 
 
@@ -219,7 +219,7 @@ def test_static_edges_of_a_bag_add_up(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n, child in enumerate(("lidar", "camera", "lidar")):
             bag.tf(START + n, [Transform("base", child, [n, 0, 0], [0, 0, 0, 1], 0)], "/tf_static")
-    buffer = TransformBuffer.from_recording(tmp_path / "bag")
+    buffer = recorded_buffer(tmp_path / "bag")
     assert buffer.lookup("base", "lidar").translation[0] == 2.0
     assert buffer.lookup("base", "camera").translation[0] == 1.0
 
@@ -239,7 +239,7 @@ def test_a_bag_of_a_whole_robot_answers(tmp_path: Path, storage: StoragePlugin):
             bag.tf(
                 stamp + LATENCY, [Transform("map", "world", [n * 0.02, 0, 0], [0, 0, 0, 1], stamp + LATENCY)]
             )
-    buffer = TransformBuffer.from_recording(tmp_path / "bag")
+    buffer = recorded_buffer(tmp_path / "bag")
     found = buffer.lookup("world", "tool", START + 20 * 20 * MS)
     expected = kinematics.link_poses(swing(20 / 50))[tool]
     assert np.allclose(found.pose7, expected, rtol=0, atol=1e-12)
@@ -253,8 +253,8 @@ def test_a_robot_is_chosen_by_its_name(tmp_path: Path):
         for robot in ("r1", "r2"):
             tale.describe(robot)
             tale.joints(robot, START, swing(0))
-    both = TransformBuffer.from_recording(tmp_path / "r.mcap")
-    one = TransformBuffer.from_recording(tmp_path / "r.mcap", "r2")
+    both = recorded_buffer(tmp_path / "r.mcap")
+    one = recorded_buffer(tmp_path / "r.mcap", "r2")
     assert both.can_lookup("r1/world", "r1/tool", START)
     assert one.can_lookup("world", "tool", START)
     with pytest.raises(UnknownFrame):
@@ -265,13 +265,13 @@ def test_another_robot_is_refused_with_those_there_are(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         tale.describe("arm")
     with pytest.raises(InvalidInput, match="no robot 'leg'; its robots: 'arm'"):
-        TransformBuffer.from_recording(tmp_path / "r.mcap", "leg")
+        recorded_buffer(tmp_path / "r.mcap", "leg")
 
 
 def test_what_is_no_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     with pytest.raises(RecordingError, match="not a recording"):
-        TransformBuffer.from_recording(tmp_path / "x.mcap")
+        recorded_buffer(tmp_path / "x.mcap")
 
 
 def test_a_clock_set_back_by_less_than_ten_seconds_begins_anew_in_a_recording_too(tmp_path: Path):
@@ -282,7 +282,7 @@ def test_a_clock_set_back_by_less_than_ten_seconds_begins_anew_in_a_recording_to
             tale.edges(
                 "cart", START + second * S, {("floor", "cart"): pose(number)}, heard=START + number * S
             )
-    buffer = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    buffer = recorded_buffer(tmp_path / "r.mcap")
     for frames in (("world", "tool"), ("floor", "cart")):
         assert buffer.latest(*frames) == START + 7 * S
         assert not buffer.can_lookup(*frames, START + 11 * S)

@@ -13,7 +13,7 @@ import pytest
 from live import Tap, await_reader, settle
 from rosbags.rosbag2 import StoragePlugin
 from support import Stepping, until
-from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, swing, swing_rates
+from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, recorded_buffer, swing, swing_rates
 
 from zstate import Recording, StatePublisher, StaticPublisher, TransformBuffer, TransformListener
 from zstate.errors import InvalidInput
@@ -89,7 +89,7 @@ def replayed(sessions: tuple[Session, Session], path: Path, **options: object) -
 def test_a_replay_gives_the_answers_of_the_file(sessions, arm: Path, rate: float):
     buffer = replayed(sessions, arm, rate=rate)
     stamps = np.random.default_rng(1).integers(START, START + (COUNT - 1) * 10 * MS, 300)
-    assert_same(answers(buffer, stamps), answers(TransformBuffer.from_recording(arm), stamps))
+    assert_same(answers(buffer, stamps), answers(recorded_buffer(arm), stamps))
 
 
 def test_live_replayed_and_looked_up_are_the_same(sessions, tmp_path: Path):
@@ -111,7 +111,7 @@ def test_live_replayed_and_looked_up_are_the_same(sessions, tmp_path: Path):
         until(lambda: listener.buffer.can_lookup("tool", "lens"))
         stamps = np.random.default_rng(2).integers(START, START + (COUNT - 1) * 10 * MS, 300)
         live = answers(listener.buffer, stamps)
-    assert_same(live, answers(TransformBuffer.from_recording(path), stamps))
+    assert_same(live, answers(recorded_buffer(path), stamps))
     with Recording(path, "arm") as recording:
         assert_same(live, [recording.lookup_many(*frames, stamps)[0] for frames in PATHS])
     # The publisher of the lens has gone since, which the replay says as well: its edge is withdrawn.
@@ -300,7 +300,7 @@ def test_a_robot_without_a_model_is_said_as_it_was(sessions, tmp_path: Path):
         with Player(writer, path, rate=math.inf) as replayer:
             assert replayer.run().samples == 20
         found = listener.buffer.wait("map", "base", START + 55 * MS, timeout_s=5.0)
-        expected = TransformBuffer.from_recording(path).lookup("map", "base", START + 55 * MS)
+        expected = recorded_buffer(path).lookup("map", "base", START + 55 * MS)
     assert np.array_equal(found.pose7, expected.pose7)
     samples = [decode(p, ENCODINGS[TransformSample], TransformSample) for p in tap.payloads(20)]
     assert [(sample.stamp, sample.seq) for sample in samples] == [(START + n * 10 * MS, n) for n in range(20)]
@@ -318,7 +318,7 @@ def test_a_bag_of_ros_is_replayed_natively(sessions, tmp_path: Path, storage: St
             bag.tf(stamp, [Transform("map", "world", [n, 0, 0], [0, 0, 0, 1], stamp)])
     writer, reader = sessions
     stamps = np.random.default_rng(4).integers(START, START + 490 * MS, 100)
-    known = TransformBuffer.from_recording(tmp_path / "bag")
+    known = recorded_buffer(tmp_path / "bag")
     with (
         TransformListener(reader, "ros") as joints,
         TransformListener(reader, "ros", follow="tf") as edges,
@@ -347,7 +347,7 @@ def test_a_robot_is_replayed_to_ros(sessions, arm: Path):
         until(lambda: listener.stats.received == COUNT)
         until(lambda: listener.buffer.can_lookup("tool", "lens"))
         stamps = np.arange(START, START + 900 * MS, 7 * MS)
-        assert_same(answers(listener.buffer, stamps), answers(TransformBuffer.from_recording(arm), stamps))
+        assert_same(answers(listener.buffer, stamps), answers(recorded_buffer(arm), stamps))
 
 
 def test_a_model_that_is_replaced_midway_is_replaced_again(sessions, tmp_path: Path):
@@ -366,7 +366,7 @@ def test_a_model_that_is_replaced_midway_is_replaced_again(sessions, tmp_path: P
         until(lambda: listener.stats.received == 20)
         # Models come apart from samples, and between two of them there is none.
         until(lambda: listener.buffer.wait("lower", "tool", timeout_s=5.0).translation[2] == 0.9)
-    known = TransformBuffer.from_recording(tmp_path / "r.mcap")
+    known = recorded_buffer(tmp_path / "r.mcap")
     assert known.lookup("lower", "tool").translation[2] == 0.9
 
 

@@ -11,7 +11,7 @@ import viser
 from support import until
 
 from zstate import se3
-from zstate.view.moment import Moment, Tree
+from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.view.scene.scene import Scene
 
 Pose = Sequence[float]
@@ -22,19 +22,21 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Pose
     return (x, y, z, *se3.quaternion_of_rpy(0.0, 0.0, yaw))
 
 
-def tree(parents: Mapping[str, str | None]) -> Tree:
+def tree(parents: Mapping[str, str | None]) -> FrameTable:
     """Frames by name with their parents, which stand before them."""
     names = tuple(parents)
     rows = [-1 if parent is None else names.index(parent) for parent in parents.values()]
     kinds = tuple("root" if parent is None else "joint" for parent in parents.values())
-    return Tree(names, np.array(rows, dtype=np.intp), kinds, (None,) * len(names))
+    return FrameTable(names, np.array(rows, dtype=np.intp), kinds, (None,) * len(names))
 
 
-def moment(of: Tree, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequence[str] = ()) -> Moment:
+def moment(
+    of: FrameTable, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequence[str] = ()
+) -> FramePoses:
     """Frames that are not named are where their parents are."""
     rows = np.array([poses.get(name, HERE) for name in of.names])
     known = np.array([name not in unknown for name in of.names])
-    return Moment(stamp, of, rows, known)
+    return FramePoses(stamp, of, rows, known)
 
 
 def drawn(scene: Scene, shown) -> None:

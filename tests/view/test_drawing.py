@@ -94,7 +94,7 @@ def test_a_robot_is_drawn_with_its_meshes_where_its_links_are(robot: str, look, 
         assert shown.view.scene.missing_meshes(robot) == ()
         moment = shown.world.moment()
         fixed = f"{robot}/{load_model(robot).root}"
-        placed = moment.placed(fixed)
+        placed = moment.poses_in(fixed)
         framing = framing_of(moment, placed, 1.0, shown.view.scene.corners(moment.tree, placed))
         assert framing is not None
         height, width = surface.shape

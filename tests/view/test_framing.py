@@ -9,17 +9,17 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of, sights
-from zstate.view.moment import Moment, Tree
 
 
-def moment_of(*frames: tuple[str, tuple[float, float, float]]) -> Moment:
+def moment_of(*frames: tuple[str, tuple[float, float, float]]) -> FramePoses:
     """Frames that all stand on the first."""
     names = tuple(name for name, _ in frames)
     poses = np.array([[*place, 0.0, 0.0, 0.0, 1.0] for _, place in frames])
     parents = np.array([-1] + [0] * (len(frames) - 1), dtype=np.intp)
-    tree = Tree(names, parents, ("root",) + ("static",) * (len(frames) - 1), (None,) * len(frames))
-    return Moment(None, tree, poses, np.ones(len(frames), dtype=np.bool_))
+    tree = FrameTable(names, parents, ("root",) + ("static",) * (len(frames) - 1), (None,) * len(frames))
+    return FramePoses(None, tree, poses, np.ones(len(frames), dtype=np.bool_))
 
 
 coordinates = st.floats(-20.0, 20.0)
@@ -46,7 +46,7 @@ def in_picture(framing: Framing, points: Sequence[tuple[float, float, float]], a
 def test_every_frame_of_a_robot_and_all_that_is_drawn_is_in_the_picture(points, corners, aspect: float):
     origin = ("a/root", (0.0, 0.0, 0.0))
     moment = moment_of(origin, *((f"a/l{n}", point) for n, point in enumerate(points)))
-    framing = framing_of(moment, moment.placed("a/root"), aspect, np.reshape(corners, (-1, 3)))
+    framing = framing_of(moment, moment.poses_in("a/root"), aspect, np.reshape(corners, (-1, 3)))
     assert framing is not None
     assert all(in_picture(framing, [(0.0, 0.0, 0.0), *points, *corners], aspect))
 
@@ -60,19 +60,19 @@ def test_a_robot_is_in_a_picture_where_one_of_its_frames_is(points, position, lo
     robots = [f"r{n}" for n in range(len(points))]
     bases = ((f"{robot}/base", point) for robot, point in zip(robots, points, strict=True))
     moment = moment_of(("map", (0.0, 0.0, 0.0)), *bases)
-    found = sights(moment, moment.placed("map"), framing, aspect, robots)
+    found = sights(moment, moment.poses_in("map"), framing, aspect, robots)
     assert [one.is_seen for one in found] == in_picture(framing, points, aspect)
 
 
 def test_a_robot_that_is_not_in_a_picture_has_a_reason():
     names = ("map", "a/base", "a/tip", "b/base", "c/base")
-    tree = Tree(names, np.array([-1, 0, 1, 0, 0]), ("root",) + ("static",) * 4, (None,) * 5)
+    tree = FrameTable(names, np.array([-1, 0, 1, 0, 0]), ("root",) + ("static",) * 4, (None,) * 5)
     known = np.array([True, True, False, False, True])
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (5, 1))
     poses[4, :3] = (-50.0, 0.0, 0.0)
-    moment = Moment(None, tree, poses, known, {2: "no joint sample of 'a'", 3: "no sample of 'b'"})
+    moment = FramePoses(None, tree, poses, known, {2: "no joint sample of 'a'", 3: "no sample of 'b'"})
     camera = Framing((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 3)
-    found = list(sights(moment, moment.placed("map"), camera, 1.0, ["a", "b", "c", "d"]))
+    found = list(sights(moment, moment.poses_in("map"), camera, 1.0, ["a", "b", "c", "d"]))
     assert [(one.robot, one.is_seen, one.root) for one in found] == [
         ("a", True, "map"),
         ("b", False, "map"),
@@ -89,7 +89,7 @@ def test_a_robot_that_is_not_in_a_picture_has_a_reason():
 
 def test_it_looks_from_in_front_and_above():
     moment = moment_of(("a/root", (0.0, 0.0, 0.0)), ("a/tip", (0.0, 0.0, 1.0)))
-    framing = framing_of(moment, moment.placed("a/root"))
+    framing = framing_of(moment, moment.poses_in("a/root"))
     assert framing is not None
     assert framing.look_at == (0.0, 0.0, 0.5)
     assert framing.position[0] > 0.0
@@ -99,13 +99,13 @@ def test_it_looks_from_in_front_and_above():
 def test_the_floor_is_where_a_robot_stands_that_is_placed_by_its_hip():
     walker = moment_of(("a/hip", (0.0, 0.0, 0.0)), ("a/foot", (0.0, 0.0, -1.0)))
     arm = moment_of(("a/base", (0.0, 0.0, 0.0)), ("a/tip", (0.0, 0.0, 1.0)))
-    framings = [framing_of(walker, walker.placed("a/hip")), framing_of(arm, arm.placed("a/base"))]
+    framings = [framing_of(walker, walker.poses_in("a/hip")), framing_of(arm, arm.poses_in("a/base"))]
     assert [framing.floor for framing in framings if framing] == [-1.0, 0.0]
 
 
 def test_the_floor_goes_beyond_every_robot():
     moment = moment_of(("a/root", (0.0, 0.0, 0.0)), ("b/root", (0.0, -7.5, 0.0)))
-    framing = framing_of(moment, moment.placed("a/root"))
+    framing = framing_of(moment, moment.poses_in("a/root"))
     assert framing is not None
     assert framing.reach > 8
 
@@ -113,7 +113,7 @@ def test_the_floor_goes_beyond_every_robot():
 def test_a_map_that_begins_far_away_does_not_make_the_robot_small():
     frames = (("a/root", (100.0, 0.0, 0.0)), ("a/tip", (100.0, 0.0, 1.0)))
     far = moment_of(("map", (0.0, 0.0, 0.0)), *frames)
-    framing = framing_of(far, far.placed("map"))
+    framing = framing_of(far, far.poses_in("map"))
     assert framing is not None
     assert np.linalg.norm(np.subtract(framing.position, framing.look_at)) < 5.0
 

@@ -8,8 +8,8 @@ from datetime import datetime
 import numpy as np
 import pytest
 
+from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.net.graph import Graph, StreamUse, WriterState
-from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.graph_panel import graph_html
 from zstate.view.panels.robots_panel import apart_html, silence_text, unplaced_html
@@ -34,11 +34,11 @@ def test_names_out_of_the_network_are_text_and_nothing_else():
         assert "&lt;img" in made
 
 
-def moment(names: tuple[str, ...], reasons: dict[int, str]) -> Moment:
+def moment(names: tuple[str, ...], reasons: dict[int, str]) -> FramePoses:
     count = len(names)
-    tree = Tree(names, np.full(count, -1, dtype=np.intp), ("root",) * count, (None,) * count)
+    tree = FrameTable(names, np.full(count, -1, dtype=np.intp), ("root",) * count, (None,) * count)
     known = np.array([row not in reasons for row in range(count)])
-    return Moment(None, tree, np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1)), known, reasons)
+    return FramePoses(None, tree, np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1)), known, reasons)
 
 
 def test_frames_that_have_no_pose_for_one_reason_are_told_of_together():
@@ -57,12 +57,12 @@ def test_one_frame_without_a_pose_is_told_of_in_the_singular():
 def test_robots_that_stand_on_nothing_in_common_are_told_of_with_what_joins_them():
     parents = np.array([-1, 0, -1, 2, -1], dtype=np.intp)
     names = ("a/base", "a/tip", "b/base", "b/tip", "map")
-    tree = Tree(names, parents, ("root", "joint", "root", "joint", "root"), (None,) * 5)
+    tree = FrameTable(names, parents, ("root", "joint", "root", "joint", "root"), (None,) * 5)
     text = plain(apart_html(tree, "a/tip"))
     assert "2 frames are not joined to the fixed frame" in text
     assert "b/base, and 1 below it\nmap" in text
     assert "zstate static a/base b/base --xyz 1 0 0" in text
-    joined = Tree(names[:2], parents[:2], ("root", "joint"), (None,) * 2)
+    joined = FrameTable(names[:2], parents[:2], ("root", "joint"), (None,) * 2)
     assert not apart_html(joined, "a/base")
 
 

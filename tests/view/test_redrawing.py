@@ -15,8 +15,8 @@ pytest.importorskip("viser")
 
 from zstate import StatePublisher, StaticPublisher, Transform, load_model
 from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.snapshot import FramePoses
 from zstate.view.framing import Camera, Sight, framing_of
-from zstate.view.moment import Moment
 from zstate.view.page import Page
 from zstate.view.view import View
 from zstate.view.world import World
@@ -46,7 +46,7 @@ class FailingWorld(World):
     fails = False
     tries = 0
 
-    def moment(self, at: int | None = None) -> Moment:
+    def moment(self, at: int | None = None) -> FramePoses:
         self.tries += 1
         if self.fails:
             raise ValueError(f"try number {self.tries}")
@@ -115,7 +115,7 @@ def test_a_picture_that_is_held_is_of_one_instant_with_the_camera_fitted_to_it(p
             assert view.draw() is moment
         np.testing.assert_array_equal([camera.position, camera.look_at], before)
         assert view.sights() == (Sight("r1", True, "", "r1/world"),)
-    placed = moment.placed("r1/world")
+    placed = moment.poses_in("r1/world")
     corners = view.scene.corners(moment.tree, placed)
     framing = framing_of(moment, placed, 1.0, corners)
     assert framing is not None
@@ -130,7 +130,7 @@ def test_a_page_begins_with_the_frame_and_the_camera_that_were_asked_for(page):
     with World(None, buffer=buffer) as world:
         with View(world, page, fixed_frame="r1/tool", camera=camera) as view:
             view.draw()
-        at_tool = world.moment().placed("r1/tool")
+        at_tool = world.moment().poses_in("r1/tool")
         handle = page.server.scene.get_handle_by_name("/frames/0")
         assert handle is not None
         np.testing.assert_allclose(handle.position, at_tool[0, :3], atol=1e-6)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from zstate.buffer.snapshot import TimeSpan
 from zstate.errors import InvalidInput
-from zstate.view.replay_clock import ReplayClock, Span
+from zstate.view.replay_clock import ReplayClock
 
 SECOND = 1_000_000_000
 
@@ -35,8 +36,8 @@ def recorded(time) -> ReplayClock:
     return ReplayClock(live=False, now_s=time)
 
 
-def span(oldest_s: float, newest_s: float) -> Span:
-    return Span(round(oldest_s * SECOND), round(newest_s * SECOND))
+def span(oldest_s: float, newest_s: float) -> TimeSpan:
+    return TimeSpan(round(oldest_s * SECOND), round(newest_s * SECOND))
 
 
 def test_it_begins_in_the_present(live):

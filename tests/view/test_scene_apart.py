@@ -49,7 +49,7 @@ def test_robots_without_a_common_frame_are_all_drawn_and_none_reaches_into_anoth
     expected = {f"{name} (place unknown)" for name in NAMES[1:]} | {"bot1"}
     assert labels(server) == expected
     # What is known stays so: nothing is said of where they are.
-    assert np.isnan(shown.placed("bot1/base")[2:]).all()
+    assert np.isnan(shown.poses_in("bot1/base")[2:]).all()
 
 
 def test_names_with_numbers_stand_in_their_order(scene):

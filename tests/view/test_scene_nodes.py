@@ -20,12 +20,12 @@ POSES = {"arm/base": at(1, 2, 0, pi / 2), "arm/upper": at(0, 0, 0.5, 0.3), "arm/
 
 
 def show(nodes: Nodes, shown, fixed: str, wanted: frozenset[str]) -> None:
-    nodes.show(shown, shown.placed(fixed), wanted)
+    nodes.show(shown, shown.poses_in(fixed), wanted)
 
 
 def assert_placed(server, nodes: Nodes, shown, fixed: str) -> None:
     """Every frame that has a place is at it, as viser has been told."""
-    for name, expected in zip(shown.tree.names, shown.placed(fixed), strict=True):
+    for name, expected in zip(shown.tree.names, shown.poses_in(fixed), strict=True):
         path = nodes.paths[name]
         assert nodes.is_shown(name) == bool(np.isfinite(expected[0]))
         if nodes.is_shown(name):

@@ -31,7 +31,7 @@ def world_of(*robots: str, shown: tuple[str, ...] = ()) -> World:
 
 
 def track_of(world: World, robot: str):
-    return world.buffer.layout().robots[robot]
+    return world.buffer.tree_snapshot().robots[robot]
 
 
 def test_every_pose_is_what_the_buffer_says_of_that_edge():
@@ -82,7 +82,7 @@ def test_an_edge_without_samples_says_so():
     assert unknown == {"joint"}
     assert moment.stamp is None
     row = moment.tree.row("a/upper")
-    assert moment.reasons[row] == "no joint sample of 'a' has come (no writer)"
+    assert moment.reasons[row] == "no joint sample of 'a' received (no writer)"
 
 
 def test_a_robot_that_ends_early_is_drawn_a_little_longer_and_then_no_more():

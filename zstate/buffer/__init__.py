@@ -1,1 +1,1 @@
-"""Where things were: histories of joints and poses, and exact answers at any stamp of them."""
+"""Time-indexed transform buffer: histories of joints and poses, and lookups at any stamp in them."""

@@ -1,17 +1,18 @@
 /* The hot loops of the buffer: histories of samples, and compiled paths over them.
  *
- * What each thing means is said by the Python that it stands in for, which stays complete:
- * zstate/buffer/history.py (History), path.py, cells.py and steps.py (Path), zstate/facts.py
- * (Facts), zstate/model/edges.py (Edges). Differences to those are bugs, and tests compare both.
+ * Each type is specified by its reference in Python, which stays complete:
+ * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
+ * (TransformFields), zstate/model/edges.py (Edges). Differences to those are bugs, and tests
+ * compare both.
  *
- * Threads. Whatever changes or takes references runs with the GIL. The rows of a block that a
- * window covers are never written again, so a batch that holds references to its blocks reads them
- * without the GIL. A call with the GIL sees all histories between two inserts, because an insert,
- * also one into several histories (insert_together), runs no Python code between its first write
- * and its last.
+ * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
+ * covers are never written again, so a batch that holds references to its blocks reads them without
+ * the GIL. A call with the GIL sees all histories between two inserts, because an insert, also one
+ * into several histories (insert_together), runs no Python code between its first write and its
+ * last.
  *
- * Whatever a caller hands in is checked where it comes in (formats, sizes, columns, kinds), so that
- * no argument can make the code below read or write outside of what it owns.
+ * All arguments are checked on entry (formats, sizes, columns, kinds), so that none can make the
+ * code below read or write outside of its memory.
  */
 
 #define PY_SSIZE_T_CLEAN
@@ -27,14 +28,14 @@
 #include "_kernel/block.h"
 #include "_kernel/history.h"
 #include "_kernel/motion.h"
-#include "_kernel/facts.h"
+#include "_kernel/transform_fields.h"
 #include "_kernel/step.h"
 #include "_kernel/path.h"
 #include "_kernel/edges.h"
 
-/* Grows with every change of what Python sees of these files, so that a library built from an older
- * source (an editable install that was not built again) is recognised and not used. */
-#define REVISION 5
+/* Raised with every change of the interface to Python, so that a library built from older source
+ * (an editable install that was not rebuilt) is recognised and not used. */
+#define REVISION 6
 
 static PyMethodDef kernel_methods[] = {
     {"insert_together", insert_together, METH_VARARGS,
@@ -46,17 +47,15 @@ static PyMethodDef kernel_methods[] = {
 };
 
 static struct PyModuleDef kernel_module = {
-    PyModuleDef_HEAD_INIT,
-    .m_name = "zstate._kernel",
-    .m_doc = "The hot loops of the buffer. zstate.extension says whether they are used.",
-    .m_size = -1,
-    .m_methods = kernel_methods,
+    PyModuleDef_HEAD_INIT, .m_name = "zstate._kernel",  .m_doc = "The hot loops of the buffer.",
+    .m_size = -1,          .m_methods = kernel_methods,
 };
 
 static int
 fill_module(PyObject *module)
 {
-    PyTypeObject *types[] = {&Block_type, &History_type, &Facts_type, &Path_type, &Edges_type};
+    PyTypeObject *types[] = {&Block_type, &History_type, &TransformFields_type, &Path_type,
+                             &Edges_type};
     for (size_t i = 0; i < sizeof(types) / sizeof(types[0]); i++)
         if (PyModule_AddType(module, types[i]) < 0)
             return -1;

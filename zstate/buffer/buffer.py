@@ -1,65 +1,60 @@
-"""TransformBuffer: where was it, at that instant? The exact answer, or the reason why there is none."""
+"""Time-indexed transform buffer: exact lookups, or an error that says why not."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import AsyncIterable, Callable
+from collections.abc import AsyncIterable, Callable, Collection
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.join import Join, frame_of, stamp_of
-from zstate.buffer.plan import Plan, joints_path
-from zstate.buffer.questions import Question, Questions, seconds
+from zstate.buffer.core import BufferCore, Query, check_duration
+from zstate.buffer.message_filter import MessageFilter, frame_of, stamp_of
+from zstate.buffer.path import joints_path
+from zstate.buffer.plan import Plan
+from zstate.buffer.snapshot import (
+    FramePoses,
+    FrameTable,
+    JointHistory,
+    SnapshotReader,
+    TimeSpan,
+    joint_history,
+)
 from zstate.buffer.tracks import JointTrack
-from zstate.buffer.watch import Watch
+from zstate.buffer.waiting import TransformWatch
 from zstate.checks import check_names
 from zstate.clock import Clock, check_stamp, check_stamps, wait_in_slices
 from zstate.errors import Closed, InvalidInput, LookupFailed, NotFinite, timed_out
-from zstate.transform import Transform
-from zstate.twist import Twist
+from zstate.transform import Transform, Twist
 
 S = TypeVar("S")
 
+# The number of choices of robots whose snapshot readers are cached.
+_MAX_CACHED_READERS = 16
 
-class TransformBuffer(Questions):
-    """The recent past of every frame it is told of, and exact answers about it.
+
+class TransformBuffer(BufferCore):
+    """The recent history of frames, and exact lookups in it.
 
     ``lookup("a", "b")`` is ``a_from_b``: the pose of b in a, which maps coordinates in b into a.
-    ``history_s`` [s] is kept for each track, counted back from its own newest sample; ``clock`` is
-    asked for the present only by ``max_age_s`` (default: the system's). Any method may be called
-    from any thread.
+    ``history_s`` [s] is kept for each track, counted back from its own newest sample. Only ``max_age_s``
+    reads the ``clock`` (default: the system's). Any method may be called from any thread.
     """
+
+    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+        super().__init__(history_s, clock)
+        self._snapshot_readers: dict[frozenset[str], SnapshotReader] = {}
 
     def __repr__(self) -> str:
         robots = [repr(track.name) for track in list(self._tree.robots.values()) if track is not None]
         more = f" and {len(robots) - 3} more" if len(robots) > 3 else ""
         named = f" of {', '.join(robots[:3])}{more}" if robots else ""
-        kept = "of a recording" if self.home.is_recording else f"{self.history_s:g} s of history"
+        kept = "of a recording" if self.is_recording else f"{self.history_s:g} s of history"
         return f"<TransformBuffer: {len(self._tree.frames)} frames{named}, {kept}>"
-
-    @classmethod
-    def from_recording(
-        cls, path: str | Path, robot: str | None = None, *, clock: Clock | None = None
-    ) -> TransformBuffer:
-        """A buffer that holds a whole recording, an MCAP file or a bag, of ``robot`` or of all robots.
-
-        It answers as a listener's buffer did while that was recorded; ``zstate.recording.load``
-        tells what becomes of restarts. Messages that cannot be used are left out, and logged once for
-        each reason. Raises RecordingError, and InvalidInput when there is nothing of ``robot`` in it.
-        """
-        from zstate.recording.load import HISTORY_S, load_into  # noqa: PLC0415 - looked for here, made there
-        from zstate.recording.reader import RecordingReader  # noqa: PLC0415 - as above
-
-        buffer = cls(HISTORY_S, clock)
-        with RecordingReader(path) as reader:
-            load_into(buffer, reader, robot)
-        return buffer
 
     def lookup(
         self,
@@ -73,45 +68,45 @@ class TransformBuffer(Questions):
     ) -> Transform:
         """The pose of ``source`` in ``target`` at the stamp ``at`` [ns].
 
-        ``at=None`` is the newest instant that every moving edge between the frames knows; on a path
-        of static edges only, the answer then has no stamp. ``timeout_s`` waits for what is not there
-        yet. ``max_age_s`` refuses an older answer. ``predict_s`` allows instants up to so far beyond
-        the newest sample, from published velocities; such an answer is of kind "predicted".
+        ``at=None`` is the newest instant that every moving edge between the frames has reached; on a path
+        of static edges only, the transform then has no stamp. ``timeout_s`` waits for frames and samples
+        that are missing. An older transform than ``max_age_s`` is an error. ``predict_s`` allows instants up
+        to so long after the newest sample, from published velocities; its transforms are of kind "predicted".
 
         Raises UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch, NoData, InPast, InFuture, Stale or
         NotFinite, all of them LookupFailed; after a wait also a TimeoutError. Raises InvalidInput for names
-        that are no frame names.
+        that cannot be frame names.
         """
         if max_age_s is None and timeout_s == 0.0 and predict_s == 0.0:
             try:
-                known = self._paths.get((target, source))
+                cached = self._paths.get((target, source))
             except TypeError:  # of a list, which has no hash and is no name
-                known = None
-            if known is not None and known[0] == self._tree.version:
-                transform = known[1].at(at)
+                cached = None
+            if cached is not None and cached[0] == self._tree.version:
+                transform = cached[1].at(at)
                 if transform is not None:
                     return transform
-                if not self._ended:
-                    known[1].refuse(at)
-        question = self._question(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
-        if seconds("timeout_s", timeout_s) > 0.0 and not self._ended:
-            return self._wait(question, timeout_s)
-        return self._answer(question)
+                if not self._stop_reason:
+                    cached[1].raise_if_outside(at)
+        query = self._query(target, source, at, predict_s=predict_s, max_age_s=max_age_s)
+        if check_duration("timeout_s", timeout_s) > 0.0 and not self._stop_reason:
+            return self._wait(query, timeout_s)
+        return self._lookup(query)
 
     def lookup_between(
         self, target: str, target_at: int | None, source: str, source_at: int | None, fixed: str
     ) -> Transform:
-        """Where ``source`` was at one instant, seen from where ``target`` was at another.
+        """The pose of ``source`` at one instant in ``target`` at another (tf2's advanced form).
 
-        Both are joined through ``fixed``, which is taken not to have moved meanwhile (tf2's advanced
-        form). None for an instant is the newest of that side. The answer has the target side's stamp.
+        ``fixed`` is assumed not to move between the two. None for an instant is the newest of that side. The
+        transform has the target side's stamp.
         """
         check_names(target, source, fixed)
         for name in (target, source, fixed):
             self._tree.resolve(name, target, source)
-        # A missing connection, or two clocks, are blamed before a bad time, on either side.
-        self._path(fixed, source)
-        self._path(target, source)
+        # A missing connection, or two clocks, are reported before a bad time, on either side.
+        self.path(fixed, source)
+        self.path(target, source)
         target_from_fixed = self.lookup(target, fixed, target_at)
         fixed_from_source = self.lookup(fixed, source, source_at)
         try:
@@ -126,85 +121,85 @@ class TransformBuffer(Questions):
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """pose7 of ``source`` in ``target`` at each stamp: (T, 7), and which are valid: (T,).
 
-        Rows that have no answer are NaN. Stamps are integers [ns] or datetime64[ns]. Raises UnknownFrame,
+        Rows without a transform are NaN. Stamps are integers [ns] or datetime64[ns]. Raises UnknownFrame,
         AmbiguousFrame, Disconnected and ClockMismatch.
         """
-        return self._path(target, source).poses(check_stamps(stamps))
+        return self.path(target, source).poses(check_stamps(stamps))
 
     def plan(self, target: str, source: str) -> Plan:
-        """The same question for many instants, compiled. Raises as ``lookup`` for unknown frames."""
-        return Plan(target, source, self._tree, lambda: self._path(target, source))
+        """Compiled lookup of one pair of frames. Raises as ``lookup`` for unknown frames."""
+        return Plan(target, source, self._tree, lambda: self.path(target, source))
 
     def twist(self, frame: str, reference: str, at: int | None = None) -> Twist:
-        """How fast ``frame`` moves in ``reference``: d/dt of ``reference_from_frame``.
+        """The velocity of ``frame`` in ``reference``: d/dt of ``reference_from_frame``.
 
         Linear at the frame's origin, both vectors in the axes of ``reference``. Exact from published
         velocities where there are any, else the slope between the samples around the instant. Raises
-        as ``lookup``, and NoData where one sample without velocities tells no rate.
+        as ``lookup``, and NoData if there is one sample only, without velocities.
         """
-        question = self._question(reference, frame, at)
-        motion, stamp = self._path(reference, frame).motion(question.at)
+        query = self._query(reference, frame, at)
+        motion, stamp = self.path(reference, frame).motion(query.at)
         return Twist(frame, reference, motion.linear, motion.angular, stamp)
 
     def latest(self, target: str, source: str) -> int:
-        """The newest stamp [ns] that every moving edge between the frames knows.
+        """The newest stamp [ns] that every moving edge between the frames has reached.
 
-        Raises NoData when every edge is static, for then there is no such instant, and Stale when the
-        history of one edge begins after the last sample of another, which is silent.
+        Raises NoData if every edge is static, and Stale if the history of one edge begins after the last
+        sample of another, which is silent.
         """
-        return self._path(target, source).latest()
+        return self.path(target, source).latest_common_stamp()
 
     def can_lookup(self, target: str, source: str, at: int | None = None) -> bool:
-        """Whether ``lookup`` would answer now. Raises InvalidInput for what can be no name or stamp."""
+        """Whether ``lookup`` would succeed now. Raises InvalidInput for invalid names and stamps."""
         reason = self.explain(target, source, at)
         if isinstance(reason, InvalidInput):
             raise reason
         return reason is None
 
     def explain(self, target: str, source: str, at: int | None = None) -> LookupFailed | InvalidInput | None:
-        """The error ``lookup`` would raise now, or None when it would answer. Never raises one.
+        """The error ``lookup`` would raise now, or None if it would succeed. Never raises one.
 
-        InvalidInput is returned for what can be no name or stamp.
+        InvalidInput is returned for invalid names and stamps.
         """
         try:
-            self._answer(self._question(target, source, at))
+            self._lookup(self._query(target, source, at))
         except (LookupFailed, InvalidInput) as reason:
             return reason
         return None
 
     def wait(self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0) -> Transform:
-        """``lookup`` as soon as it has an answer; unknown and unconnected frames are waited for, too.
+        """``lookup`` as soon as it succeeds; waits for unknown and unconnected frames, too.
 
-        Raises at once what waiting cannot mend: InPast for an ``at`` more than ``history_s`` before the
-        newest sample of an edge, and anything in a process forked from that of the listener which fills
-        this buffer. Anything later may still come: late samples are sorted in, and a listener that has
-        just opened requests the past from the writers. After ``timeout_s`` raises the reason of the last
+        Raises at once if waiting cannot help: InPast for an ``at`` more than ``history_s`` before the
+        newest sample of an edge, and every error in a process forked from that of the listener which fills
+        this buffer. Later samples may still come: late ones are sorted in, and a listener that has
+        just opened requests history from the writers. After ``timeout_s`` raises the reason of the last
         try, as an error that is also a TimeoutError.
         """
-        question, timeout_s = self._question(target, source, at), seconds("timeout_s", timeout_s)
-        return self._answer(question) if self._ended else self._wait(question, timeout_s)
+        query, timeout_s = self._query(target, source, at), check_duration("timeout_s", timeout_s)
+        return self._lookup(query) if self._stop_reason else self._wait(query, timeout_s)
 
     async def wait_async(
         self, target: str, source: str, at: int | None = None, timeout_s: float = 1.0
     ) -> Transform:
-        """``wait`` for asyncio: nothing blocks, and cancelling the task ends it."""
-        import asyncio  # noqa: PLC0415  # who calls this has it already, and others do not need it
+        """``wait`` for asyncio: it does not block the loop, and cancelling the task ends it."""
+        import asyncio  # noqa: PLC0415  # a caller has it already, and others do not need it
 
-        question = self._question(target, source, at)
-        if self._ended:
-            return self._answer(question)
+        query = self._query(target, source, at)
+        if self._stop_reason:
+            return self._lookup(query)
         loop, event = asyncio.get_running_loop(), asyncio.Event()
-        deadline = loop.time() + seconds("timeout_s", timeout_s)
+        deadline = loop.time() + check_duration("timeout_s", timeout_s)
 
         def wake() -> None:
-            # The loop may be closed by the time an insert wakes those who waited in it.
+            # The loop may be closed by the time an insert wakes its tasks.
             with suppress(RuntimeError):
                 loop.call_soon_threadsafe(event.set)
 
-        with self._room.seat(wake) as waiter:
+        with self._waiters.register(wake) as waiter:
             while True:
                 event.clear()
-                outcome = self._try(question, waiter)
+                outcome = self._lookup_or_expect(query, waiter)
                 if isinstance(outcome, Transform):
                     return outcome
                 try:
@@ -212,13 +207,13 @@ class TransformBuffer(Questions):
                 except (TimeoutError, asyncio.TimeoutError):
                     raise timed_out(outcome, timeout_s) from None
 
-    def _wait(self, question: Question, timeout_s: float) -> Transform:
+    def _wait(self, query: Query, timeout_s: float) -> Transform:
         event = threading.Event()
         deadline = time.monotonic() + timeout_s
-        with self._room.seat(event.set) as waiter:
+        with self._waiters.register(event.set) as waiter:
             while True:
                 event.clear()
-                outcome = self._try(question, waiter)
+                outcome = self._lookup_or_expect(query, waiter)
                 if isinstance(outcome, Transform):
                     return outcome
                 if not wait_in_slices(event, deadline - time.monotonic()):
@@ -232,18 +227,17 @@ class TransformBuffer(Questions):
         *,
         translation_m: float | None = None,
         rotation_rad: float | None = None,
-    ) -> Watch:
+    ) -> TransformWatch:
         """Call ``callback(transform)`` with each newest ``target_from_source``, until the watch is closed.
 
-        With thresholds, only once the source has moved or turned so far since the last call. Frames may
-        still be unknown. The callback runs on the thread that inserts: keep it short.
+        With thresholds, only once the source has moved or rotated so far since the last call. The frames need
+        not exist yet. The callback runs on the thread that inserts: keep it short.
         """
-
-        if self._ended:
-            raise Closed(self._ended)
-        look = partial(self._newest, self._question(target, source, None))
+        if self._stop_reason:
+            raise Closed(self._stop_reason)
+        lookup_newest = partial(self._lookup_newest, self._query(target, source, None))
         limits = {"translation_m": translation_m, "rotation_rad": rotation_rad}
-        return Watch(self._room, (target, source), look, callback, **limits)
+        return TransformWatch(self._waiters, (target, source), lookup_newest, callback, **limits)
 
     def join(
         self,
@@ -253,17 +247,17 @@ class TransformBuffer(Questions):
         frame: Callable[[S], str] = frame_of,
         stamp: Callable[[S], int] = stamp_of,
         timeout_s: float = 1.0,
-    ) -> Join[S]:
+    ) -> MessageFilter[S]:
         """``async for sample, transform in buffer.join(samples, target)``: each with its own transform.
 
-        ``transform`` is ``target_from_frame`` at the sample's stamp; ``frame`` and ``stamp`` say where to
-        find both (default: the attributes of those names). A sample that gets no transform within
-        ``timeout_s`` is left out, counted by its reason in ``dropped``; one whose frame or stamp cannot be
+        ``transform`` is ``target_from_frame`` at the sample's stamp; ``frame`` and ``stamp`` return both
+        of a sample (default: its attributes of those names). A sample that gets no transform within
+        ``timeout_s`` is left out and counted by its error in ``dropped``; one whose frame or stamp cannot be
         any raises InvalidInput.
         """
         check_names(target)
-        seconds("timeout_s", timeout_s)
-        return Join(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
+        check_duration("timeout_s", timeout_s)
+        return MessageFilter(self.wait_async, samples, target, frame=frame, stamp=stamp, timeout_s=timeout_s)
 
     def joint_positions(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """All joints of one robot at a stamp, and that stamp: (nq,) as ``track.model.joint_names``.
@@ -271,13 +265,13 @@ class TransformBuffer(Questions):
         ``at=None`` is the robot's newest sample. Between samples joints are interpolated as in lookups.
         Raises NoData, InPast, InFuture or NotFinite, and InsertRefused as ``insert_joints``.
         """
-        self._check_ours(track)
-        path = joints_path(track, self._take_views)
-        reading = path.read(None if at is None else check_stamp(at))
-        positions = np.hstack([np.empty(0), *reading.values[0]])
+        self._check_owned(track)
+        path = joints_path(track, self._read_views)
+        readout = path.read(None if at is None else check_stamp(at))
+        positions = np.hstack([np.empty(0), *readout.values[0]])
         if not np.isfinite(positions).all():
-            raise path.not_finite(reading.values, reading.stamp)
-        return positions, reading.stamp
+            raise path.not_finite(readout.values, readout.stamp)
+        return positions, readout.stamp
 
     def link_poses(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of one robot at a stamp, and that stamp: (L, 7), rows as ``track.model.links``.
@@ -291,3 +285,51 @@ class TransformBuffer(Questions):
             link = track.model.links[int(unknown.argmax())]
             raise NotFinite(track.frame(track.model.root), track.frame(link), requested=stamp)
         return poses, stamp
+
+    def joint_history(
+        self, track: JointTrack, until: int, duration_s: float, points: int = 240
+    ) -> JointHistory:
+        """The samples of ``duration_s`` up to ``until`` [ns]; every n-th of more than ``points``."""
+        return joint_history(track, until, duration_s, points)
+
+    def snapshot(
+        self, at: int | None = None, *, robots: Collection[str] = (), hold_s: float = 0.0
+    ) -> FramePoses:
+        """The pose of every frame in its parent at ``at`` [ns]; by default, at each track's newest sample.
+
+        ``robots`` restricts it to the frames of these, and those above them. A track is still read at its
+        newest sample for ``hold_s`` after that. Beyond its samples poses are not known, with a reason.
+        """
+        return self._snapshot_reader(robots).read(self.joint_positions, at, round(hold_s * 1e9))
+
+    def frame_table(self, robots: Collection[str] = ()) -> FrameTable:
+        """The frames that ``snapshot`` reads; the same object while neither the tree nor a writer changes."""
+        return self._snapshot_reader(robots).table
+
+    def _snapshot_reader(self, robots: Collection[str]) -> SnapshotReader:
+        key = frozenset(robots)
+        reader = self._snapshot_readers.get(key)
+        if reader is None or not reader.is_current(self._tree.version):
+            if len(self._snapshot_readers) >= _MAX_CACHED_READERS:
+                self._snapshot_readers = {}
+            reader = self._snapshot_readers[key] = SnapshotReader(self.tree_snapshot(), key)
+        return reader
+
+    def span(self) -> TimeSpan | None:
+        """The stamps of all samples, at most the last ``history_s`` of them; None without samples.
+
+        Of robots with two clocks, those with the clock that the buffer's domain names.
+        """
+        with self._lock:
+            moving = self._tree.moving()
+        default = self.domain.name
+        views = [
+            view
+            for track, edge in moving.items()
+            if (view := track.history.view).size and (self._tree.domain_of(edge) or default) == default
+        ]
+        if not views:
+            return None
+        newest = max(view.newest for view in views)
+        oldest = min(view.oldest for view in views)
+        return TimeSpan(max(oldest, newest - round(self.history_s * 1e9)), newest)

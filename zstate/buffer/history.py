@@ -1,23 +1,27 @@
-"""One stamp column, and rows of numbers beside it.
+"""History of one track: a ring of stamps and rows of numbers that readers use without a lock.
 
-Readers take ``view`` and never a lock: rows that a view covers are never written again. A sample
-at the end goes into spare room behind the view; everything else (a late sample, a second sample of
-one stamp, room running out) writes a new copy. Then the new view is published by one assignment.
+A reader gets a ``HistoryView``; the rows that a view covers are never written again. A sample newer than
+all others goes into spare capacity behind the view. Every other insert (a late sample, a second sample of
+one stamp, no capacity left) writes a new copy. The new view is then published by one assignment.
+
+``History`` is the class of the C extension if that is used, else ``ReferenceHistory``; both behave the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-_SMALLEST_CAPACITY = 16
+from zstate.extension import kernel
+
+_MIN_CAPACITY = 16
 
 
-class View(NamedTuple):
-    """What a reader may rely on: rows ``first`` up to, not including, ``end``; ascending stamps."""
+class HistoryView(NamedTuple):
+    """Rows ``first`` up to, not including, ``end`` of a history; stamps [ns] ascend."""
 
     stamps: NDArray[np.int64]
     rows: NDArray[np.float64]
@@ -26,7 +30,7 @@ class View(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many samples there are."""
+        """The number of samples."""
         return self.end - self.first
 
     @property
@@ -40,15 +44,15 @@ class View(NamedTuple):
         return int(self.stamps[self.end - 1])
 
     def kept_stamps(self) -> NDArray[np.int64]:
-        """The stamp column without spare room: (size,)."""
+        """The stamp column without spare capacity: (size,)."""
         return self.stamps[self.first : self.end]
 
     def kept_rows(self) -> NDArray[np.float64]:
-        """The rows without spare room: (size, width)."""
+        """The rows without spare capacity: (size, width)."""
         return self.rows[self.first : self.end]
 
 
-class History:
+class ReferenceHistory:
     """Samples of ``width`` numbers each, kept until ``span_ns`` older than the newest.
 
     One writer at a time (the buffer's lock); readers at any time, through ``view``.
@@ -57,11 +61,11 @@ class History:
     def __init__(self, width: int, span_ns: int) -> None:
         self.width = width
         self.span_ns = span_ns
-        self.view = self._empty(_SMALLEST_CAPACITY)
+        self.view = self._empty(_MIN_CAPACITY)
 
-    def _empty(self, capacity: int) -> View:
+    def _empty(self, capacity: int) -> HistoryView:
         stamps = np.empty(capacity, dtype=np.int64)
-        return View(stamps, np.empty((capacity, self.width)), 0, 0)
+        return HistoryView(stamps, np.empty((capacity, self.width)), 0, 0)
 
     @property
     def newest(self) -> int | None:
@@ -76,25 +80,27 @@ class History:
         return view.oldest if view.size else None
 
     def replace(self, stamps: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
-        """Hold a copy of these samples, ascending and already within the span, and no others."""
-        fresh = self._empty(max(_SMALLEST_CAPACITY, len(stamps)))
+        """Replace all samples by a copy of these, which ascend and are within the span."""
+        fresh = self._empty(max(_MIN_CAPACITY, len(stamps)))
         fresh.stamps[: len(stamps)] = stamps
         fresh.rows[: len(stamps)] = rows
         self.view = fresh._replace(end=len(stamps))
 
     def clear(self) -> None:
-        """Forget every sample."""
-        self.view = self._empty(_SMALLEST_CAPACITY)
+        """Remove every sample."""
+        self.view = self._empty(_MIN_CAPACITY)
 
     def reaches(self, stamp: int) -> bool:
         """Whether a sample of that stamp would be kept: at most ``span_ns`` older than the newest."""
         return not self.view.size or stamp >= self.view.newest - self.span_ns
 
-    def take(self, stamp: object, positions: object, velocities: object, position_count: int) -> bool | None:
-        """Insert unchecked input, where that can be done and checked in one go. None: it cannot, ever."""
+    def try_insert(
+        self, stamp: object, positions: object, velocities: object, position_count: int
+    ) -> bool | None:
+        """Insert unchecked input if it can be checked and inserted in one call. None here: it never can."""
 
     def insert(self, stamp: int, row: NDArray[np.float64]) -> bool:
-        """Take a sample; False when it is older than the history reaches."""
+        """Insert a sample; False if it is older than the history reaches."""
         view = self.view
         if view.end == view.first or stamp > view.stamps[view.end - 1]:
             self._append(stamp, row)
@@ -107,24 +113,18 @@ class History:
     def _append(self, stamp: int, row: NDArray[np.float64]) -> None:
         view = self.view
         if view.end == len(view.stamps):
-            view = self._with_room(view)
+            # An eighth more: both copies exist for a moment; a long history of a large robot is megabytes.
+            fresh = self._empty(_MIN_CAPACITY + view.size + view.size // 8)
+            fresh.stamps[: view.size] = view.kept_stamps()
+            fresh.rows[: view.size] = view.kept_rows()
+            view = fresh._replace(end=view.size)
         stamps, rows, first, end = view
         stamps[end] = stamp
         rows[end] = row
         limit = stamp - self.span_ns
         if stamps[first] < limit:
             first += int(stamps[first:end].searchsorted(limit))
-        self.view = View(stamps, rows, first, end + 1)
-
-    def _with_room(self, view: View) -> View:
-        """The same samples at the front of arrays with room for an eighth more.
-
-        Both copies live for a moment, and a long history of a large robot is megabytes.
-        """
-        fresh = self._empty(_SMALLEST_CAPACITY + view.size + view.size // 8)
-        fresh.stamps[: view.size] = view.kept_stamps()
-        fresh.rows[: view.size] = view.kept_rows()
-        return fresh._replace(end=view.size)
+        self.view = HistoryView(stamps, rows, first, end + 1)
 
     def _splice(self, stamp: int, row: NDArray[np.float64]) -> None:
         stamps, rows = self.view.kept_stamps(), self.view.kept_rows()
@@ -137,14 +137,44 @@ class History:
         self.view = fresh._replace(end=end)
 
 
-def insert_together(histories: Sequence[History], stamp: int, rows: Sequence[NDArray[np.float64]]) -> None:
-    """One instant of several histories, none of which it is too old for."""
-    for history, row in zip(histories, rows, strict=True):
-        history.insert(stamp, row)
+if TYPE_CHECKING or kernel == "reference":
+    History = ReferenceHistory
+
+    def insert_together(
+        histories: Sequence[History], stamp: int, rows: Sequence[NDArray[np.float64]]
+    ) -> None:
+        """Insert one instant into several histories, none of which it is too old for."""
+        for history, row in zip(histories, rows, strict=True):
+            history.insert(stamp, row)
+
+else:
+    from zstate import _kernel
+
+    insert_together = _kernel.insert_together
+
+    class History(_kernel.History):
+        """``ReferenceHistory`` over memory of the extension."""
+
+        __slots__ = ("_arrays",)
+
+        def replace(self, stamps: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
+            super().replace(np.ascontiguousarray(stamps), np.ascontiguousarray(rows))
+
+        @property
+        def view(self) -> HistoryView:
+            """The samples for readers in Python; these arrays cannot be written to."""
+            block, first, end = self.window
+            arrays = getattr(self, "_arrays", (None,))
+            if arrays[0] is not block:
+                # Made once for each block, because waiters read after every insert.
+                stamps = np.frombuffer(block, np.int64, block.capacity)
+                rows = np.frombuffer(block, np.float64, offset=stamps.nbytes)
+                arrays = self._arrays = (block, stamps, rows.reshape(block.capacity, block.width))
+            return HistoryView(arrays[1], arrays[2], first, end)
 
 
-def thin(history: History, stamps: NDArray[np.int64]) -> None:
-    """Keep the first sample, the last, and of each of ``stamps`` [ns] those around it."""
+def keep_only_around(history: History, stamps: NDArray[np.int64]) -> None:
+    """Keep the first sample, the last, and those around each of ``stamps`` [ns]."""
     view = history.view
     kept = view.kept_stamps()
     after, before = kept.searchsorted(stamps), kept.searchsorted(stamps, "right") - 1

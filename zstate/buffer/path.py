@@ -1,39 +1,69 @@
-"""Path: the way between two frames, compiled once, evaluated at any instant.
+"""Paths between two frames: compiled once from the edges of the tree, evaluated at any stamp.
 
-A lookup searches once in each track it passes, reads only the joints on its way, and multiplies.
+An evaluation searches once in each track of the path, reads only the joints on it, and multiplies.
+``TransformPath`` is the reference in Python. ``CompiledPath`` evaluates lookups in the C extension, which has
+no formula for cubic interpolation, prediction and velocities: the reference computes those.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate import se3
-from zstate.buffer.cells import Between, Cell
-from zstate.buffer.history import View
-from zstate.buffer.steps import Motion, Step, Values, chain_motion, chain_pose
-from zstate.buffer.tracks import JointTrack, Track, coverage, of_track
+from zstate.buffer.frame_tree import Edge, TreePath
+from zstate.buffer.history import HistoryView
+from zstate.buffer.interpolation import (
+    AngleInterpolator,
+    Interpolator,
+    LinearInterpolator,
+    Motion,
+    PlanarStep,
+    PoseInterpolator,
+    PoseStep,
+    PrismaticStep,
+    RevoluteStep,
+    StaticStep,
+    Step,
+    Values,
+    bracket_at,
+    brackets_at,
+    chain_motion,
+    chain_pose,
+    newest_bracket,
+)
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage, with_track_info
 from zstate.errors import InFuture, InPast, LookupFailed, NoData, NotFinite, Stale
+from zstate.extension import kernel
 from zstate.transform import Kind, Transform
 
+if TYPE_CHECKING or kernel == "c":
+    from zstate import _kernel
+
 Stamps: TypeAlias = NDArray[np.int64]
-ViewTaker: TypeAlias = Callable[[Sequence["TrackUse"]], list[View]]
+ViewReader: TypeAlias = Callable[[Sequence["TrackUse"]], list[HistoryView]]
+StepTuple: TypeAlias = tuple[int, int, int, bool, tuple[float, ...]]
+"""A step as the extension takes it: kind, track, column, whether the angle is continuous, numbers."""
+
+# In the order of the extension's StepKind and Failure.
+_KINDS = (StaticStep, RevoluteStep, PrismaticStep, PlanarStep, PoseStep)
+_FAILURES: tuple[type[LookupFailed], ...] = (InPast, NoData, InFuture)
 
 
 class TrackUse(NamedTuple):
-    """A track that the path passes: which of its cells, and the first of its edges on the way."""
+    """A track of a path, with the interpolators that read it and the first of its edges on the path."""
 
     track: Track
-    cells: tuple[Cell, ...]
+    interpolators: tuple[Interpolator, ...]
     edge: tuple[str, str]
 
 
-class Answer(NamedTuple):
-    """What a path says: target_from_source as seven floats, when, and how that was found."""
+class PathResult(NamedTuple):
+    """target_from_source as seven floats, its stamp [ns], and how it was made."""
 
     pose: se3.Pose
     stamp: int | None
@@ -41,8 +71,8 @@ class Answer(NamedTuple):
     predicted_s: float = 0.0
 
 
-class Reading(NamedTuple):
-    """The values of all cells of a path at an instant, and how they were found."""
+class JointReadout(NamedTuple):
+    """The values of all interpolators of a path at an instant, and how they were made."""
 
     values: list[list[se3.Component]]
     stamp: int
@@ -50,13 +80,11 @@ class Reading(NamedTuple):
     predicted_ns: int
 
 
-class Path:
-    """From ``source`` to ``target`` by way of where their branches meet.
+class TransformPath:
+    """From ``source`` to ``target`` by their common ancestor.
 
     ``domain`` is the clock domain of its moving edges, empty if none is known.
     """
-
-    domain = ""
 
     def __init__(
         self,
@@ -64,71 +92,81 @@ class Path:
         steps_to_target: Sequence[Step],
         steps_to_source: Sequence[Step],
         uses: Sequence[TrackUse],
-        take_views: ViewTaker,
+        read_views: ViewReader,
+        *,
+        domain: str = "",
     ) -> None:
         self.target, self.source = names
         self.steps_to_target = steps_to_target
         self.steps_to_source = steps_to_source
         self.uses = tuple(uses)
         self.tracks = tuple(use.track for use in uses)
-        self._take_views = take_views
+        self.domain = domain
+        self._read_views = read_views
 
     def at(self, stamp: object = None, /) -> Transform | None:
-        """The answer where that is found at once; None where ``answer`` has to be asked."""
+        """The transform, if it is found at once; None if ``result`` has to be used."""
 
-    def refuse(self, stamp: object, /) -> None:
-        """Raise the reason where it is known at once that there is no answer at this moment."""
+    def raise_if_outside(self, stamp: object, /) -> None:
+        """Raises the reason why there is no transform now, if it is found at once."""
 
-    def latest(self) -> int:
-        """The newest instant that every moving edge knows [ns]. Raises NoData or Stale."""
+    def transform(self, stamp: int | None, predict_ns: int = 0) -> Transform:
+        """The transform at ``stamp``, or at the latest instant. Raises as ``result``."""
+        transform = self.at(stamp)
+        if transform is not None:
+            return transform
+        return Transform.trusted(self.target, self.source, *self.result(stamp, predict_ns))
+
+    def latest_common_stamp(self) -> int:
+        """The newest instant that every moving edge has reached [ns]. Raises NoData or Stale."""
         if not self.uses:
             raise NoData(self.target, self.source)
-        return self._latest(self._take_views(self.uses))
+        return self._latest(self._read_views(self.uses))
 
-    def answer(self, stamp: int | None, predict_ns: int = 0) -> Answer:
+    def result(self, stamp: int | None, predict_ns: int = 0) -> PathResult:
         """The pose at ``stamp``, or at the latest instant.
 
         Raises NoData, InPast, InFuture, Stale or NotFinite.
         """
         if not self.uses:
-            return Answer(self._finite_pose((), stamp), stamp, "static")
-        reading = self.read(stamp, predict_ns)
-        pose = se3.normalize(self._finite_pose(reading.values, reading.stamp), se3.SCALARS)
-        return Answer(pose, reading.stamp, reading.kind, reading.predicted_ns * 1e-9)
+            return PathResult(self._finite_pose((), stamp), stamp, "static")
+        readout = self.read(stamp, predict_ns)
+        pose = se3.normalize(self._finite_pose(readout.values, readout.stamp), se3.SCALARS)
+        return PathResult(pose, readout.stamp, readout.kind, readout.predicted_ns * 1e-9)
 
-    def read(self, stamp: int | None, predict_ns: int = 0) -> Reading:
-        """What the cells of each track say at ``stamp``, or at the latest instant. Raises as ``answer``."""
-        views = self._take_views(self.uses)
+    def read(self, stamp: int | None, predict_ns: int = 0) -> JointReadout:
+        """The values of each track at ``stamp``, or at the latest instant. Raises as ``result``."""
+        views = self._read_views(self.uses)
         at = self._latest(views) if stamp is None else stamp
         kind: Kind = "exact"
         predicted_ns = 0
         values: list[list[se3.Component]] = []
         for use, view in zip(self.uses, views, strict=True):
-            now = _between(view, at)
+            now = bracket_at(view, at)
             if now is not None:
-                values.append([cell.value(now) for cell in use.cells])
+                values.append([one.value(now) for one in use.interpolators])
                 kind = "interpolated" if now.seconds and kind == "exact" else kind
             else:
-                ahead = self._ahead(use, view, at, predict_ns)
-                if ahead is None:
-                    raise self.blame(at, views, predict_ns)
+                predicted = self._extrapolate(use, view, at, predict_ns)
+                if predicted is None:
+                    raise self.failure_at(at, views, predict_ns)
                 kind, predicted_ns = "predicted", max(predicted_ns, at - view.newest)
-                values.append(ahead)
-        return Reading(values, at, kind, predicted_ns)
+                values.append(predicted)
+        return JointReadout(values, at, kind, predicted_ns)
 
     def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
-        """Pose and velocity of the source in the target. Raises as ``answer``, and NoData without a rate."""
-        views = self._take_views(self.uses)
+        """Pose and velocity of the source in the target. Raises as ``result``, and NoData without a rate."""
+        views = self._read_views(self.uses)
         at = stamp if stamp is not None or not self.uses else self._latest(views)
         values: list[list[se3.Component]] = []
         rates: list[list[se3.Component]] = []
         for use, view in zip(self.uses, views, strict=True):
-            now = None if at is None else _between(view, at, moving=True)
+            now = None if at is None else bracket_at(view, at, for_rate=True)
             if now is None:
-                raise self.blame(at or 0, views)
-            values.append([cell.value(now) for cell in use.cells])
-            rates.append([cell.rate(now) for cell in use.cells])
-        if any(np.isnan(_numbers(cells)).any() for cells in rates):
+                raise self.failure_at(at or 0, views)
+            values.append([one.value(now) for one in use.interpolators])
+            rates.append([one.rate(now) for one in use.interpolators])
+        if any(np.isnan(_flat(numbers)).any() for numbers in rates):
             raise self._no_rate(views)
         above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
         motion = above_target.inverse().then(chain_motion(self.steps_to_source, values, rates, se3.SCALARS))
@@ -138,18 +176,18 @@ class Path:
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
-        views = self._take_views(self.uses)
+        views = self._read_views(self.uses)
         valid = np.ones(len(stamps), dtype=np.bool_)
         for view in views:
-            valid &= _within(view, stamps)
+            valid &= (stamps >= view.oldest) & (stamps <= view.newest) if view.size else False
         known = stamps[valid]
         poses = np.full((len(stamps), 7), np.nan)
         if not len(known):
             return poses, valid
         with np.errstate(over="ignore", invalid="ignore"):
             values = [
-                [cell.value(now) for cell in use.cells]
-                for use, now in zip(self.uses, (_between_many(view, known) for view in views), strict=True)
+                [one.value(now) for one in use.interpolators]
+                for use, now in zip(self.uses, (brackets_at(view, known) for view in views), strict=True)
             ]
             pose = se3.normalize(self._pose(values, se3.ARRAYS), se3.ARRAYS)
         found = np.stack(np.broadcast_arrays(*pose, known)[:7], axis=-1)
@@ -159,9 +197,9 @@ class Path:
         return poses, valid
 
     def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
-        """The error for an answer that is too old, naming the edge that is most behind."""
+        """The error for a transform that is too old, naming the edge that is most behind."""
         use = min(self.uses, key=lambda use: coverage(use.track.history.view).newest or 0)
-        facts = coverage(use.track.history.view)
+        samples = coverage(use.track.history.view)
         failure = Stale(
             self.target,
             self.source,
@@ -169,18 +207,18 @@ class Path:
             max_age_s=max_age_s,
             edge=use.edge,
             requested=stamp,
-            oldest=facts.oldest,
-            newest=facts.newest,
-            rate_hz=facts.rate_hz,
+            oldest=samples.oldest,
+            newest=samples.newest,
+            rate_hz=samples.rate_hz,
             writer=use.track.writer,
         )
-        return of_track(failure, use.track)
+        return with_track_info(failure, use.track)
 
-    def _silent(self, views: Sequence[View]) -> Stale:
+    def _silent(self, views: Sequence[HistoryView]) -> Stale:
         """The error for an edge whose last sample is older than all that another one keeps."""
         number = min(range(len(views)), key=lambda n: views[n].newest)
         other = max(range(len(views)), key=lambda n: views[n].oldest)
-        use, facts = self.uses[number], coverage(views[number])
+        use, samples = self.uses[number], coverage(views[number])
         failure = Stale(
             self.target,
             self.source,
@@ -188,15 +226,15 @@ class Path:
             other=self.uses[other].edge,
             other_newest=views[other].newest,
             edge=use.edge,
-            oldest=facts.oldest,
-            newest=facts.newest,
-            rate_hz=facts.rate_hz,
+            oldest=samples.oldest,
+            newest=samples.newest,
+            rate_hz=samples.rate_hz,
             writer=use.track.writer,
         )
-        return of_track(failure, use.track)
+        return with_track_info(failure, use.track)
 
-    def blame(self, at: int, views: Sequence[View], predict_ns: int = 0) -> LookupFailed:
-        """Which track cannot answer at ``at``: too young, then empty, then not there yet."""
+    def failure_at(self, at: int, views: Sequence[HistoryView], predict_ns: int = 0) -> LookupFailed:
+        """The error of the limiting track: one that begins later, else an empty one, else one that ends."""
         numbered = list(enumerate(views))
         too_young = [(view.oldest, n) for n, view in numbered if view.size and at < view.oldest]
         if too_young:
@@ -207,7 +245,7 @@ class Path:
         newest = [
             (view.newest, n)
             for n, view in numbered
-            if at > view.newest and self._ahead(self.uses[n], view, at, predict_ns) is None
+            if at > view.newest and self._extrapolate(self.uses[n], view, at, predict_ns) is None
         ]
         failure = self._failure(InFuture, min(newest)[1], views, at)
         if predict_ns and at <= min(newest)[0] + predict_ns:
@@ -215,10 +253,10 @@ class Path:
         return failure
 
     def _failure(
-        self, error: type[LookupFailed], number: int, views: Sequence[View], at: int | None
+        self, error: type[LookupFailed], number: int, views: Sequence[HistoryView], at: int | None
     ) -> LookupFailed:
-        facts = coverage(views[number])
-        return self._error(error, number, at, facts.oldest, facts.newest, facts.rate_hz)
+        samples = coverage(views[number])
+        return self._error(error, number, at, samples.oldest, samples.newest, samples.rate_hz)
 
     def _error(  # noqa: PLR0917 - what a failed lookup in a control loop costs
         self,
@@ -240,15 +278,15 @@ class Path:
             rate_hz=rate_hz,
             writer=use.track.writer,
         )
-        return of_track(failure, use.track)
+        return with_track_info(failure, use.track)
 
-    def _no_rate(self, views: Sequence[View]) -> LookupFailed:
-        lonely = [number for number, view in enumerate(views) if view.size < 2]
-        failure = self._failure(NoData, lonely[0] if lonely else 0, views, None)
+    def _no_rate(self, views: Sequence[HistoryView]) -> LookupFailed:
+        short = [number for number, view in enumerate(views) if view.size < 2]
+        failure = self._failure(NoData, short[0] if short else 0, views, None)
         failure.note = "a rate of change needs two samples, or published velocities"
         return failure
 
-    def _latest(self, views: Sequence[View]) -> int:
+    def _latest(self, views: Sequence[HistoryView]) -> int:
         for number, view in enumerate(views):
             if not view.size:
                 raise self._failure(NoData, number, views, None)
@@ -267,7 +305,7 @@ class Path:
         """The error for numbers that are too large, naming the edge with the largest."""
         if not self.uses:
             return NotFinite(self.target, self.source, requested=at)
-        sizes = [np.abs(_numbers(cells)).max(initial=0.0) for cells in values]
+        sizes = [np.abs(_flat(numbers)).max(initial=0.0) for numbers in values]
         views = [use.track.history.view for use in self.uses[: len(sizes)]]
         failure = self._failure(NotFinite, int(np.argmax(sizes)), views, at)
         assert isinstance(failure, NotFinite)
@@ -281,73 +319,191 @@ class Path:
         return se3.compose(se3.invert(target_from_top), source_from_top)
 
     @staticmethod
-    def _ahead(use: TrackUse, view: View, at: int, predict_ns: int) -> list[se3.Component] | None:
-        """The cells' values beyond the newest sample, at their last rates; None where that cannot be."""
+    def _extrapolate(
+        use: TrackUse, view: HistoryView, at: int, predict_ns: int
+    ) -> list[se3.Component] | None:
+        """The values beyond the newest sample, at the last rates; None if that is not possible."""
         if not view.size or not view.newest < at <= view.newest + predict_ns:
             return None
-        now = _last_stretch(view, use)
-        rates = [cell.rate(now) for cell in use.cells]
-        if np.isnan(_numbers(rates)).any():
+        now = newest_bracket(view, has_rates=isinstance(use.track, JointTrack))
+        rates = [one.rate(now) for one in use.interpolators]
+        if np.isnan(_flat(rates)).any():
             return None
         seconds = (at - view.newest) * 1e-9
         return [
-            cell.ahead(now.b, rate, seconds, se3.SCALARS)  # type: ignore[arg-type]
-            for cell, rate in zip(use.cells, rates, strict=True)
+            one.extrapolate(now.b, rate, seconds, se3.SCALARS)  # type: ignore[arg-type]
+            for one, rate in zip(use.interpolators, rates, strict=True)
         ]
 
 
-def _numbers(cells: Sequence[se3.Component]) -> NDArray[np.float64]:
-    """The values or rates of the cells of one track, all in one array; there may be none."""
-    return np.concatenate([np.empty(0), *(np.ravel(cell) for cell in cells)])
+def _flat(numbers: Sequence[se3.Component]) -> NDArray[np.float64]:
+    """The values or rates of one track, all in one array; there may be none."""
+    return np.concatenate([np.empty(0), *(np.ravel(number) for number in numbers)])
 
 
-def _row(view: View, index: int) -> list[float]:
-    return view.rows[index].tolist()
+class CompiledPath(TransformPath):
+    """The same results as ``TransformPath``, in a hundredth of the time."""
+
+    def __init__(
+        self,
+        names: tuple[str, str],
+        steps_to_target: Sequence[Step],
+        steps_to_source: Sequence[Step],
+        uses: Sequence[TrackUse],
+        read_views: ViewReader,
+        *,
+        domain: str = "",
+    ) -> None:
+        super().__init__(names, steps_to_target, steps_to_source, uses, read_views, domain=domain)
+        self._compiled = _kernel.Path(
+            Transform,
+            *names,
+            _step_tuples(steps_to_target, self.uses),
+            _step_tuples(steps_to_source, self.uses),
+            tuple(use.track.history for use in uses),
+        )
+        # An attribute of the instance: a method in between would cost a third of the whole lookup.
+        self.at = self._compiled.at
+
+    def result(self, stamp: int | None, predict_ns: int = 0) -> PathResult:
+        if not predict_ns:
+            self.raise_if_outside(stamp)
+        return super().result(stamp, predict_ns)
+
+    def raise_if_outside(self, stamp: object, /) -> None:
+        failure = self._compiled.failure_at(stamp)
+        if failure is not None:
+            raise self._error(_FAILURES[failure[0]], *failure[1:])
+
+    def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        poses, valid = np.empty((len(stamps), 7)), np.empty(len(stamps), np.bool_)
+        self._compiled.poses(stamps, poses, valid)
+        if not valid.all():
+            # Its order of operations may overflow where that of the reference, which raises, does not.
+            poses[~valid], valid[~valid] = super().poses(stamps[~valid])
+        return poses, valid
 
 
-def _between(view: View, at: int, *, moving: bool = False) -> Between | None:
-    """The rows around ``at``; None outside of them. An exact hit is one row, unless ``moving``
-    asks for a stretch of time to measure a rate on."""
-    stamps, _, first, end = view
-    index = first + int(stamps[first:end].searchsorted(at))
-    if index == end:
-        return None
-    stamp = int(stamps[index])
-    if stamp == at and not (moving and view.size > 1):
-        row = _row(view, index)
-        return Between(row, row, 0.0, 0.0, se3.SCALARS)
-    if index == first:
-        if stamp != at:
-            return None
-        index += 1
-        stamp = int(stamps[index])
-    before = int(stamps[index - 1])
-    ratio = (at - before) / (stamp - before)
-    return Between(_row(view, index - 1), _row(view, index), ratio, (stamp - before) * 1e-9, se3.SCALARS)
+def compile_path(
+    target: str, source: str, edges: TreePath, read_views: ViewReader, *, compiled: bool = True
+) -> TransformPath:
+    """The path over ``edges``; the reference if ``compiled`` is False or the extension cannot evaluate it."""
+    table = _TrackUseTable()
+    steps_to_target = _steps(edges.to_target, table)
+    steps_to_source = _steps(edges.to_source, table)
+    uses = table.uses()
+    is_cubic = any(getattr(one, "cubic", False) for use in uses for one in use.interpolators)
+    kind = CompiledPath if compiled and kernel == "c" and not is_cubic else TransformPath
+    return kind((target, source), steps_to_target, steps_to_source, uses, read_views, domain=edges.domain)
 
 
-def _last_stretch(view: View, use: TrackUse) -> Between:
-    """What the rates of a prediction are measured on: published at the newest row, or the last two."""
-    last = _row(view, view.end - 1)
-    if isinstance(use.track, JointTrack) or view.size < 2:
-        return Between(last, last, 0.0, 0.0, se3.SCALARS)
-    span_ns = int(view.stamps[view.end - 1] - view.stamps[view.end - 2])
-    return Between(_row(view, view.end - 2), last, 1.0, span_ns * 1e-9, se3.SCALARS)
+def joints_path(track: JointTrack, read_views: ViewReader) -> TransformPath:
+    """A path without steps that reads every joint of a robot."""
+    joints = [(index, joint) for index, joint in enumerate(track.model.joints) if joint.driven]
+    interpolators = tuple(one for index, _ in joints for one in _joint_interpolators(track, index))
+    root = track.frame(track.model.root)
+    edge = track.edge(track.forms[joints[0][0]]) if joints else (root, root)
+    return TransformPath((root, root), (), (), [TrackUse(track, interpolators, edge)], read_views)
 
 
-def _within(view: View, stamps: Stamps) -> NDArray[np.bool_]:
-    if not view.size:
-        return np.zeros(len(stamps), dtype=np.bool_)
-    return (stamps >= view.oldest) & (stamps <= view.newest)
+class _TrackUseTable:
+    """The tracks of a path and the interpolators that read each, in the order of their edges."""
+
+    def __init__(self) -> None:
+        self._tracks: list[Track] = []
+        self._edges: list[tuple[str, str]] = []
+        self._interpolators: list[list[Interpolator]] = []
+
+    def add(self, edge: Edge, track: Track, interpolators: Sequence[Interpolator]) -> tuple[int, int]:
+        """The index of the track, and that of the first of ``interpolators`` among its own."""
+        if track not in self._tracks:
+            self._tracks.append(track)
+            self._edges.append(edge.names)
+            self._interpolators.append([])
+        use = self._tracks.index(track)
+        known = self._interpolators[use]
+        if interpolators[0] not in known:
+            known.extend(interpolators)
+        return use, known.index(interpolators[0])
+
+    def uses(self) -> list[TrackUse]:
+        parts = zip(self._tracks, self._interpolators, self._edges, strict=True)
+        return [TrackUse(track, tuple(interpolators), edge) for track, interpolators, edge in parts]
 
 
-def _between_many(view: View, stamps: Stamps) -> Between:
-    """The rows around each of ``stamps``, all of which the view covers; columns come first."""
-    kept = view.kept_stamps()
-    after = kept.searchsorted(stamps)
-    exact = kept[after] == stamps
-    before = np.where(exact, after, after - 1)
-    span_ns = kept[after] - kept[before]
-    ratio = np.where(exact, 0.0, (stamps - kept[before]) / np.where(exact, 1, span_ns))
-    rows = view.kept_rows()
-    return Between(rows[before].T, rows[after].T, ratio, span_ns * 1e-9, se3.ARRAYS)
+def _steps(edges: Sequence[Edge], table: _TrackUseTable) -> list[Step]:
+    """One step for each edge; consecutive static ones multiplied."""
+    steps: list[Step] = []
+    for edge in edges:
+        step = _step(edge, table)
+        last = steps[-1] if steps else None
+        if isinstance(step, StaticStep) and isinstance(last, StaticStep):
+            steps[-1] = StaticStep(se3.compose(last.constant, step.constant))
+        else:
+            steps.append(step)
+    return steps
+
+
+def _step(edge: Edge, table: _TrackUseTable) -> Step:
+    if edge.track is None:
+        return StaticStep(edge.pose)
+    if isinstance(edge.track, PoseTrack):
+        return PoseStep(se3.IDENTITY, *table.add(edge, edge.track, [PoseInterpolator(7 * edge.index)]))
+    form = edge.track.forms[edge.index]
+    place = table.add(edge, edge.track, _joint_interpolators(edge.track, edge.index))
+    if form.kind == "hinge":
+        return RevoluteStep(form, *place)
+    if form.kind == "slide":
+        return PrismaticStep(form, *place)
+    if form.kind == "planar":
+        return PlanarStep(form, *place)
+    return PoseStep(form.origin, *place)
+
+
+def _joint_interpolators(track: JointTrack, index: int) -> list[Interpolator]:
+    form = track.forms[index]
+    column, velocity = form.column, -1
+    if track.has_velocities:
+        velocity = track.model.position_count + form.velocity_column
+    cubic = track.interpolation == "hermite"
+    if form.kind == "floating":
+        return [PoseInterpolator(column, velocity)]
+    if form.kind == "planar":
+        offsets = (0, 1, 2) if velocity >= 0 else (0, 0, 0)
+        x, y, yaw = ((column + n, velocity + offsets[n], cubic) for n in range(3))
+        return [LinearInterpolator(*x), LinearInterpolator(*y), AngleInterpolator(*yaw)]
+    kind = AngleInterpolator if track.is_continuous(index) else LinearInterpolator
+    return [kind(column, velocity, cubic)]
+
+
+def _step_tuples(steps: Sequence[Step], uses: Sequence[TrackUse]) -> tuple[StepTuple, ...]:
+    """The steps for the extension, with each static pose multiplied into the moving step behind it."""
+    tuples: list[StepTuple] = []
+    before = se3.IDENTITY
+    for step in steps:
+        if isinstance(step, StaticStep):
+            before = se3.compose(before, step.constant)
+        else:
+            one = uses[step.use].interpolators[step.column]
+            is_angle, numbers = isinstance(one, AngleInterpolator), _step_numbers(step, before)
+            tuples.append((_KINDS.index(type(step)), step.use, one.column, is_angle, numbers))
+            before = se3.IDENTITY
+    if before != se3.IDENTITY or not tuples:
+        tuples.append((0, 0, 0, False, before))
+    return tuple(tuples)
+
+
+def _step_numbers(
+    step: RevoluteStep | PrismaticStep | PlanarStep | PoseStep, before: se3.Pose
+) -> tuple[float, ...]:
+    if isinstance(step, PlanarStep):
+        return se3.compose(before, step.form.origin)
+    if isinstance(step, PoseStep):
+        return se3.compose(before, step.origin)
+    form = step.form
+    placed = se3.compose(before, (*form.t0, *form.q_cos))
+    if isinstance(step, RevoluteStep):
+        axis = se3.multiply(before[3:], form.q_sin)
+    else:
+        axis = se3.rotate(before[3:], form.t1)
+    return (form.scale, form.shift, *placed[3:], *placed[:3], *axis)

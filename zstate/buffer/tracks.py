@@ -1,54 +1,45 @@
-"""Tracks: one publisher's history each, with one stamp column for everything it knows."""
+"""Tracks: the histories of one publisher, with one stamp column for all of its joints or poses."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.buffer.history import View
-from zstate.buffer.kernel import History
+from zstate.buffer.history import History, HistoryView
+from zstate.clock import ClockOffset
 from zstate.errors import LookupFailed
 from zstate.model.edges import EdgeForm, EdgeTable
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 
 Interpolation = Literal["linear", "hermite"]
+ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
 
 
-class Offset(NamedTuple):
-    """How far another clock is ahead of the one here, and how far off that may be [ns]."""
-
-    offset_ns: int
-    uncertainty_ns: int
-
-
-ClockOffsets: TypeAlias = dict[str, Callable[[], Offset | None]]
-
-
-class Home:
-    """The buffer that a track belongs to, as far as its tracks and their errors know it."""
+class TrackOwner:
+    """Facts about a buffer that its tracks and their errors need."""
 
     __slots__ = ("clock_offsets", "is_recording")
 
     def __init__(self) -> None:
         self.clock_offsets: ClockOffsets = {}
-        """By writer: how far its clock is ahead of the one here."""
+        """By writer: how far its clock is ahead of the clock of this host."""
         self.is_recording = False
-        """Whether its samples come from a file: nothing is added to the history later."""
+        """Whether the samples come from a file: no sample is added later."""
 
 
 class JointTrack:
-    """The joint positions of one robot, and velocities from the first sample on that has them.
+    """The joint positions of one robot, and its velocities from the first sample that has them.
 
     A row is the positions in the order of ``model.joint_names``, then the velocities; velocities
-    that were not published are NaN. ``prefix`` stands before the names of all links. ``writer`` is who
-    publishes the positions and ``model_writer`` who publishes the model, where that is known. ``home`` is
-    None once the robot was removed from its buffer.
+    that were not published are NaN. ``prefix`` precedes the names of all links. ``writer`` publishes the
+    positions and ``model_writer`` the model, where they are known. ``owner`` is the buffer; None once the
+    robot was removed from it.
     """
 
     def __init__(
@@ -61,10 +52,10 @@ class JointTrack:
         self.interpolation = interpolation
         self.writer: str | None = None
         self.model_writer: str | None = None
-        self.home: Home | None = None
+        self.owner: TrackOwner | None = None
         self.history = History(model.position_count, span_ns)
-        # Quaternions of floating joints have to be looked at and normalised.
-        self._plain = all(form.kind != "floating" for form in self.forms)
+        # Quaternions of floating joints have to be checked and normalised.
+        self._has_plain_joints = all(form.kind != "floating" for form in self.forms)
         self._position_count = model.position_count
 
     def __repr__(self) -> str:
@@ -76,22 +67,32 @@ class JointTrack:
         return self.prefix or self.model.name
 
     @property
+    def newest(self) -> int | None:
+        """The stamp of the newest sample [ns]; None without any."""
+        return self.history.newest
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The mean rate of the samples kept [Hz]; None with fewer than two."""
+        return coverage(self.history.view).rate_hz
+
+    @property
     def has_velocities(self) -> bool:
         """Whether rows have columns for velocities."""
         return self.history.width > self.model.position_count
 
     @cached_property
     def kinematics(self) -> Kinematics:
-        """What gives the poses of all links at once."""
+        """The forward kinematics of all links at once."""
         return Kinematics(self.model)
 
-    def turns(self, index: int) -> bool:
-        """Whether the joint behind an edge is continuous: any number of turns, encoders that wrap."""
+    def is_continuous(self, index: int) -> bool:
+        """Whether the joint of an edge is continuous: any number of turns, encoders that wrap."""
         master = self.model.mimic_of(self.model.joints[index]).joint
         return any(joint.name == master and joint.type == "continuous" for joint in self.model.driven_joints)
 
     def frame(self, link: str) -> str:
-        """What a link is called in the buffer."""
+        """The name of a link's frame in the buffer."""
         return f"{self.prefix}/{link}" if self.prefix else link
 
     def edge(self, form: EdgeForm) -> tuple[str, str]:
@@ -99,30 +100,30 @@ class JointTrack:
         return (self.frame(form.parent), self.frame(form.child))
 
     def check_positions(self, positions: ArrayLike) -> NDArray[np.float64]:
-        """As ``RobotModel.check_positions``, or of a block; floating joints' quaternions at length one."""
+        """As ``RobotModel.check_positions``, also of bytes; normalises floating joints' quaternions."""
         if isinstance(positions, bytes) and len(positions) % 8 == 0:
             positions = np.frombuffer(positions, "<f8")
         return self._table.normalised(self.model.check_positions(positions))
 
-    def take(self, stamp: object, positions: object, velocities: object) -> bool | None:
-        """``insert`` of what may be anything; None where it has to be looked at more closely first."""
-        if not self._plain:
+    def try_insert(self, stamp: object, positions: object, velocities: object) -> bool | None:
+        """``insert`` of unchecked input; None if ``check_positions`` and ``insert`` have to be used."""
+        if not self._has_plain_joints:
             return None
-        return self.history.take(stamp, positions, velocities, self._position_count)
+        return self.history.try_insert(stamp, positions, velocities, self._position_count)
 
     def insert(
         self, stamp: int, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None
     ) -> bool:
-        """Take one instant; False when it is older than the history reaches."""
+        """Insert one instant; False if it is older than the history reaches."""
         if velocities is not None and not self.has_velocities:
-            self._make_room_for_velocities()
+            self._add_velocity_columns()
         if not self.has_velocities:
             return self.history.insert(stamp, positions)
         if velocities is None:
             velocities = np.full(self.model.velocity_count, np.nan)
         return self.history.insert(stamp, np.concatenate((positions, velocities)))
 
-    def _make_room_for_velocities(self) -> None:
+    def _add_velocity_columns(self) -> None:
         old = self.history.view
         missing = np.full((old.size, self.model.velocity_count), np.nan)
         wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
@@ -131,7 +132,7 @@ class JointTrack:
 
 
 class PoseTrack:
-    """Poses of one or several moving edges that one publisher always gives together.
+    """Poses of one or several moving edges that one publisher always sends together.
 
     Columns 7 i to 7 i + 7 of a row are ``parent_from_child`` of ``edges[i]``.
     """
@@ -139,7 +140,7 @@ class PoseTrack:
     def __init__(self, edges: tuple[tuple[str, str], ...], span_ns: int, writer: str | None) -> None:
         self.edges = edges
         self.writer = writer
-        self.home: Home | None = None
+        self.owner: TrackOwner | None = None
         self.history = History(7 * len(edges), span_ns)
 
     def __repr__(self) -> str:
@@ -152,7 +153,7 @@ class PoseTrack:
         return f"{first} and {more} more" if more else first
 
     def split(self) -> list[PoseTrack]:
-        """The same samples as one track for each edge: their publishers went separate ways."""
+        """The same samples as one track for each edge."""
         view = self.history.view
         singles: list[PoseTrack] = []
         for index, edge in enumerate(self.edges):
@@ -169,15 +170,15 @@ Track: TypeAlias = JointTrack | PoseTrack
 F = TypeVar("F", bound=LookupFailed)
 
 
-def of_track(failure: F, track: Track) -> F:
-    """The same failure, with what is known of the track behind it and its writer's clock."""
+def with_track_info(failure: F, track: Track) -> F:
+    """The same failure, with what is known of the track and of its writer's clock."""
     failure.track = track.name
-    home = track.home
-    if home is None:
+    owner = track.owner
+    if owner is None:
         return failure
-    failure.is_recorded = home.is_recording
-    ask = None if track.writer is None else home.clock_offsets.get(track.writer)
-    offset = None if ask is None else ask()
+    failure.is_recorded = owner.is_recording
+    measured = None if track.writer is None else owner.clock_offsets.get(track.writer)
+    offset = None if measured is None else measured()
     if offset is not None:
         failure.clock_offset_ns, failure.clock_uncertainty_ns = offset
     return failure
@@ -185,7 +186,7 @@ def of_track(failure: F, track: Track) -> F:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """What a track holds, in the words of errors and of ``frames()``."""
+    """The samples of a track as errors and ``frames()`` describe them: stamps [ns], mean rate, count."""
 
     oldest: int | None
     newest: int | None
@@ -193,8 +194,8 @@ class Coverage:
     count: int
 
 
-def coverage(view: View) -> Coverage:
-    """How far the samples of a track reach, and how many there are in a second."""
+def coverage(view: HistoryView) -> Coverage:
+    """The range, mean rate and number of the samples of a track."""
     if not view.size:
         return Coverage(None, None, None, 0)
     oldest, newest = view.oldest, view.newest

@@ -1,91 +1,103 @@
-"""Waiting for data: woken by the insert that brings it, never by a clock that ticks."""
+"""Waiting for data: an insert wakes exactly the waiters whose samples it brings; nothing polls.
+
+A waiter registers with the ``WaiterRegistry`` of the buffer and sets its ``WakeCondition``: the samples or
+the change of the tree after which a failed lookup may succeed.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from numbers import Real
 from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
-from zstate.buffer.footing import Footing
+from zstate import se3
+from zstate.buffer.frame_tree import FrameTree, PathDependencies
 from zstate.buffer.tracks import Track
-from zstate.buffer.tree import Tree
+from zstate.closing import Closing
+from zstate.errors import InvalidInput, LookupFailed
 from zstate.locks import new_lock
+from zstate.transform import Transform
 
-Marks: TypeAlias = Mapping[Track, int | None]
-"""How new each track has to be [ns]; None is reached by any sample at all."""
+RequiredStamps: TypeAlias = Mapping[Track, int | None]
+"""The stamp that each track has to reach [ns]; None is reached by any sample."""
 
 
-class Expected(NamedTuple):
-    """What ends a wait: another footing in the tree, or each track at its mark and around ``instant``.
+class WakeCondition(NamedTuple):
+    """Wakes when the dependencies change, or when each track has reached its stamp and covers ``instant``.
 
-    A track that accepts no more samples as old as ``instant`` ends it too: no answer can come any more.
+    A track that accepts no more samples as old as ``instant`` wakes too: no transform can come any more.
     """
 
-    footing: Footing = Footing()
-    marks: Marks = MappingProxyType({})
+    dependencies: PathDependencies = PathDependencies()
+    required: RequiredStamps = MappingProxyType({})
     instant: int | None = None
 
-    def has_come(self) -> bool:
-        """Whether samples have, or can never. Runs with each insert into one of the tracks."""
-        instant, missing = self.instant, not self.marks
-        for track, stamp in self.marks.items():
+    def is_met(self) -> bool:
+        """Whether the samples are there, or can never come. Runs with each insert into one of the tracks."""
+        instant, is_missing = self.instant, not self.required
+        for track, stamp in self.required.items():
             history = track.history
             newest, oldest = history.newest, history.oldest
             if newest is None or oldest is None:
-                missing = True
+                is_missing = True
             elif (stamp is not None and newest < stamp) or (instant is not None and instant < oldest):
-                missing = True
+                is_missing = True
                 if instant is not None and not history.reaches(instant):
                     return True
-        return not missing
+        return not is_missing
 
     def is_hopeless(self) -> bool:
         """Whether a track accepts no more samples as old as ``instant``."""
         instant = self.instant
-        return instant is not None and not all(track.history.reaches(instant) for track in self.marks)
+        return instant is not None and not all(track.history.reaches(instant) for track in self.required)
 
 
 class Waiter:
-    """Somebody who sleeps until what is expected has come. ``wake`` may be called once too often."""
+    """A waiting thread or task. ``wake`` may be called spuriously."""
 
-    def __init__(self, room: WaitingRoom, wake: Callable[[], None]) -> None:
+    def __init__(self, registry: WaiterRegistry, wake: Callable[[], None]) -> None:
         self.wake = wake
-        self.expected = Expected()
-        self.tracks = self.expected.marks.keys()
-        """Where the room has it; the room's business."""
-        self._room = room
+        self.condition = WakeCondition()
+        self.tracks = self.condition.required.keys()
+        """The tracks that the registry lists it under; changed only by the registry."""
+        self._registry = registry
 
-    def expect(self, expected: Expected, version: int) -> None:
-        """Sleep; or be woken at once where what is expected has come by now.
+    def expect(self, condition: WakeCondition, version: int) -> None:
+        """Set the condition; wakes at once if it is met by now.
 
-        ``version`` is that of the tree before the question was asked: a change since then may be one that
-        the expectation does not know of, and of which nobody will tell again.
+        ``version`` is that of the tree before the lookup: a change since then may be one that the
+        condition does not cover, and no later notification would report it.
         """
-        self.expected = expected
-        if expected.marks.keys() != self.tracks:
-            self._room.sort(self)
-        if self._room.tree.version != version or expected.has_come():
+        self.condition = condition
+        if condition.required.keys() != self.tracks:
+            self._registry.update(self)
+        if self._registry.tree.version != version or condition.is_met():
             self.wake()
 
 
-class WaitingRoom:
-    """Everybody who waits for this buffer, sorted by the tracks they wait for.
+class WaiterRegistry:
+    """All waiters of a buffer, by the tracks they wait for.
 
-    A sample is the business of those who wait for its track; a change of the tree is shown to everybody.
+    A sample concerns only the waiters for its track; a change of the tree is checked for all of them.
     """
 
-    def __init__(self, tree: Tree) -> None:
+    def __init__(self, tree: FrameTree) -> None:
         self.tree = tree
         self._lock = new_lock()
         # Tuples that are replaced, never changed: ``notify`` takes no lock.
         self._waiters: tuple[Waiter, ...] = ()
         self._by_track: dict[Track, tuple[Waiter, ...]] = {}
-        self._shown = tree.version
+        self._notified_version = tree.version
+
+    def __len__(self) -> int:
+        return len(self._waiters)
 
     @contextmanager
-    def seat(self, wake: Callable[[], None]) -> Generator[Waiter]:
-        """A waiter that is told of inserts for as long as the context lasts."""
+    def register(self, wake: Callable[[], None]) -> Generator[Waiter]:
+        """A waiter that is notified while the context lasts."""
         waiter = Waiter(self, wake)
         with self._lock:
             self._waiters = (*self._waiters, waiter)
@@ -94,49 +106,49 @@ class WaitingRoom:
         finally:
             with self._lock:
                 self._waiters = _without(self._waiters, waiter)
-                self._put(waiter, {})
+                self._list_under(waiter, {})
 
-    def sort(self, waiter: Waiter) -> None:
-        """Have ``waiter`` where the tracks are that it expects samples of."""
+    def update(self, waiter: Waiter) -> None:
+        """List ``waiter`` under the tracks of its condition."""
         with self._lock:
-            # A watch that was closed meanwhile must not come back.
+            # A watch that was closed since then must not come back.
             if waiter in self._waiters:
-                self._put(waiter, waiter.expected.marks)
+                self._list_under(waiter, waiter.condition.required)
 
-    def _put(self, waiter: Waiter, marks: Marks) -> None:
-        before, waiter.tracks = waiter.tracks, marks.keys()
-        for track in marks.keys() - before:
+    def _list_under(self, waiter: Waiter, required: RequiredStamps) -> None:
+        before, waiter.tracks = waiter.tracks, required.keys()
+        for track in required.keys() - before:
             self._by_track[track] = (*self._by_track.get(track, ()), waiter)
-        for track in before - marks.keys():
+        for track in before - required.keys():
             left = _without(self._by_track[track], waiter)
-            # In one step: whoever notifies meanwhile finds those who stay.
+            # In one step: a concurrent ``notify`` finds the remaining waiters.
             if left:
                 self._by_track[track] = left
             else:
                 del self._by_track[track]
 
     def notify(self, *tracks: Track) -> None:
-        """Wake those whose data is there: samples of ``tracks`` have come, or the tree has changed."""
-        if self._shown != self.tree.version:
-            self._shown = self.tree.version
-            self._show_tree()
+        """Wake the waiters whose condition is met: ``tracks`` have new samples, or the tree has changed."""
+        if self._notified_version != self.tree.version:
+            self._notified_version = self.tree.version
+            self._notify_tree_change()
         elif self._by_track:
-            for waiter in self._at(tracks):
-                if waiter.expected.has_come():
+            for waiter in self._waiting_for(tracks):
+                if waiter.condition.is_met():
                     waiter.wake()
 
-    def _show_tree(self) -> None:
+    def _notify_tree_change(self) -> None:
         for waiter in self._waiters:
-            expected = waiter.expected
-            if not self.tree.holds(expected.footing) or expected.has_come():
+            condition = waiter.condition
+            if not self.tree.is_current(condition.dependencies) or condition.is_met():
                 waiter.wake()
 
-    def begin_anew(self, *tracks: Track) -> None:
-        """Wake whoever waits for ``tracks``: their samples are gone, and newer ones may have older stamps."""
-        for waiter in self._at(tracks):
+    def notify_restart(self, *tracks: Track) -> None:
+        """Wake all waiters for ``tracks``: their samples are gone, and newer ones may have older stamps."""
+        for waiter in self._waiting_for(tracks):
             waiter.wake()
 
-    def _at(self, tracks: Sequence[Track]) -> Iterable[Waiter]:
+    def _waiting_for(self, tracks: Sequence[Track]) -> Iterable[Waiter]:
         if len(tracks) == 1:
             return self._by_track.get(tracks[0], ())
         # Once each, though many wait for several of them.
@@ -145,3 +157,91 @@ class WaitingRoom:
 
 def _without(waiters: tuple[Waiter, ...], waiter: Waiter) -> tuple[Waiter, ...]:
     return tuple(other for other in waiters if other is not waiter)
+
+
+NewestLookup: TypeAlias = Callable[[Waiter], Transform | LookupFailed]
+"""The newest transform, with the condition for a newer one set; or the reason why there is none."""
+
+
+class TransformWatch(Closing):
+    """Calls ``callback(transform)`` with each newest transform of a pair, until closed.
+
+    With ``translation_m`` or ``rotation_rad``, only once the source has moved or rotated so far in the target
+    since the last call. The callback runs on the thread whose insert brought the sample: keep it short. Its
+    exceptions are counted in ``failures``; ``last_failure`` is the last of them. A context manager.
+    """
+
+    def __init__(
+        self,
+        waiters: WaiterRegistry,
+        names: tuple[str, str],
+        lookup_newest: NewestLookup,
+        callback: Callable[[Transform], object],
+        *,
+        translation_m: float | None,
+        rotation_rad: float | None,
+    ) -> None:
+        for name, value in (("translation_m", translation_m), ("rotation_rad", rotation_rad)):
+            if value is not None and not (isinstance(value, Real) and 0.0 <= value < math.inf):
+                raise InvalidInput(f"{name} is zero or more; got {value!r}")
+        self.target, self.source = names
+        self.failures = 0
+        self.last_failure: Exception | None = None
+        self._lookup_newest = lookup_newest
+        self._callback = callback
+        self._thresholds = (translation_m, rotation_rad)
+        self._last: Transform | None = None
+        self._is_pending = False
+        self._lock = new_lock()
+        self._registration = ExitStack()
+        self._waiter = self._registration.enter_context(waiters.register(self._on_insert))
+        self._on_insert()
+
+    def __repr__(self) -> str:
+        failures = f", {self.failures} failures" if self.failures else ""
+        return f"<TransformWatch of {self.source!r} in {self.target!r}{failures}>"
+
+    def close(self) -> None:
+        """No more calls. A second call does nothing."""
+        self._registration.close()
+
+    def _on_insert(self) -> None:
+        """Runs with each insert that may bring a newer transform, on any thread; calls never overlap."""
+        self._is_pending = True
+        while self._is_pending and self._lock.acquire(blocking=False):
+            # A thread that finds the lock taken leaves its transform to the thread that holds it.
+            try:
+                self._is_pending = False
+                self._call_back()
+            finally:
+                self._lock.release()
+
+    def _call_back(self) -> None:
+        try:
+            transform = self._lookup_newest(self._waiter)
+        except LookupFailed:
+            return  # an ambiguous name; a change of the tree may resolve it
+        if not isinstance(transform, Transform) or not self._has_moved(transform):
+            return
+        self._last = transform
+        try:
+            self._callback(transform)
+        except Exception as error:
+            # It belongs to the author of the callback, not to the caller of the insert.
+            self.failures += 1
+            self.last_failure = error
+
+    def _has_moved(self, transform: Transform) -> bool:
+        last = self._last
+        if last is None:
+            return True
+        if last.stamp == transform.stamp and last == transform:
+            return False
+        translation_m, rotation_rad = self._thresholds
+        if translation_m is None and rotation_rad is None:
+            return True
+        (x, y, z, *qa), (*at, bx, by, bz, bw) = last.pose7.tolist(), transform.pose7.tolist()
+        turned = se3.multiply(se3.conjugate((qa[0], qa[1], qa[2], qa[3])), (bx, by, bz, bw))
+        return (translation_m is not None and math.dist((x, y, z), at) >= translation_m) or (
+            rotation_rad is not None and math.hypot(*se3.rotation_vector(turned, se3.SCALARS)) >= rotation_rad
+        )

@@ -66,7 +66,7 @@ class MeteredBuffer(MeasuredBuffer):
 
     def _is_comparable(self, robot: str) -> bool:
         """Whether the clock here tells the time that stamps the samples of ``robot``."""
-        return (self.domain.of(robot) or self.clock.domain) == self.clock.domain
+        return (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain
 
     def measure(self, robot: str, within_ns: int = _WINDOW_NS) -> RobotMeasure:
         """How the samples of ``robot`` arrived."""

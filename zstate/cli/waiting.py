@@ -29,7 +29,7 @@ from zstate.errors import (
 )
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.session import Session
     from zstate.nodes.listener import Follow, TransformListener
     from zstate.transform import Transform

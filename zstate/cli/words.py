@@ -11,7 +11,7 @@ from zstate._util.suggestions import did_you_mean
 from zstate.cli.output.console import count_text
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.presence import RobotInfo
     from zstate.wire.keys import Stream
 

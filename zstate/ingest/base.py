@@ -201,7 +201,7 @@ class StreamIngest(ABC):
         """Pass the clock domain of the current writer to the buffer; True if it replaces another one."""
         # The description may come from another program than the samples.
         domain = self._domain if self._session is None else self._domains.get(self._session, self._domain)
-        before = self._buffer.domain.of(self.robot)
+        before = self._buffer.domain.domain_of(self.robot)
         return domain is not None and self._buffer.set_domain(self.robot, domain) and bool(before)
 
     def _advance(self, sample: Sample) -> bool:

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 from zstate._util.bounded_dict import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.edge import Edge
+from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
@@ -370,7 +370,7 @@ class FrameOwnership:
 
     def _caller_edges(self) -> tuple[dict[str, _AcceptedEdge], set[str]]:
         """The edges in the buffer that are no claims, by child; and the roots of models."""
-        layout = self.buffer.layout()
+        layout = self.buffer.tree_snapshot()
         accepted: dict[str, _AcceptedEdge] = {}
         for child, edge in layout.edges.items():
             if edge is not None and (edge.robot is not None or not self._is_claimed(edge)):
@@ -389,7 +389,9 @@ class FrameOwnership:
         placed = self._placed.get(edge.child)
         if edge.kind == "static":
             return (
-                placed is not None and placed.parent == edge.parent and edge.own_writer == placed.source.name
+                placed is not None
+                and placed.parent == edge.parent
+                and edge.static_writer == placed.source.name
             )
         claims = self._claims.get(edge.child, ())
         return any(claim.pose is None and claim.parent == edge.parent for claim in claims)

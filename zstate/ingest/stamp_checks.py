@@ -70,7 +70,7 @@ class StampCheck:
             )
 
     def _is_on_system_clock(self, robot: str, sample: Sample) -> bool:
-        domain = self._buffer.domain.of(robot)
+        domain = self._buffer.domain.domain_of(robot)
         if domain is None and self._is_described:
             # The description names the clock, and may not have arrived yet.
             return isinstance(sample, TransformSample) and sample.edges is not None

@@ -89,5 +89,5 @@ class MeasuredBuffer(TransformBuffer):
 
     def _note_sample(self, robot: str, stamp: int) -> None:
         """A sample of ``robot`` with this stamp [ns] can be looked up now."""
-        if (self.domain.of(robot) or self.clock.domain) == self.clock.domain:
+        if (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain:
             self.latency.note((self.clock.now() - stamp) * 1e-9)

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from zstate.buffer.tracks import Offset
-from zstate.clock import Clock, SystemClock
+from zstate.clock import Clock, ClockOffset, SystemClock
 from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
 from zstate.locks import new_lock
@@ -45,7 +44,7 @@ _MEETING_S = 0.05
 
 
 @dataclass(frozen=True, order=True, slots=True)
-class ClockOffset:
+class MeasuredOffset:
     """The clock of ``writer`` is ``offset_ns`` ahead of the one here, plus or minus ``uncertainty_ns``.
 
     ``round_trip_ns`` is the shortest there was, from the question to the answer.
@@ -75,7 +74,7 @@ def measure_offsets(
     *,
     clock: Clock | None = None,
     timeout_s: float = 0.5,
-) -> tuple[ClockOffset, ...]:
+) -> tuple[MeasuredOffset, ...]:
     """How far the clock of each writer of ``robot`` ("*": of all robots) is ahead of ``clock``, sorted.
 
     ``clock`` is this machine's unless given. The best of so many ``rounds`` counts. None is there when
@@ -89,8 +88,8 @@ def measure_offsets(
 
 def _best(
     session: Session, expression: str, rounds: int, clock: Clock, timeout_s: float
-) -> Iterator[ClockOffset]:
-    best: dict[str, ClockOffset] = {}
+) -> Iterator[MeasuredOffset]:
+    best: dict[str, MeasuredOffset] = {}
     deadline = time.monotonic() + timeout_s
     while rounds:
         heard = list(_round(session, expression, clock, timeout_s))
@@ -107,7 +106,7 @@ def _best(
     yield from best.values()
 
 
-def _round(session: Session, expression: str, clock: Clock, timeout_s: float) -> Iterator[ClockOffset]:
+def _round(session: Session, expression: str, clock: Clock, timeout_s: float) -> Iterator[MeasuredOffset]:
     asked_ns, now = time.monotonic_ns(), clock.now()
     replies = query(
         session.zenoh,
@@ -123,7 +122,7 @@ def _round(session: Session, expression: str, clock: Clock, timeout_s: float) ->
             if told is not None:
                 robot, writer, stamp = told
                 half = round_trip_ns // 2
-                yield ClockOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
+                yield MeasuredOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
 
 
 def _told(sample: zenoh.Sample) -> tuple[str, Writer, int] | None:
@@ -152,7 +151,7 @@ class OffsetMeter(Closing):
         self._is_running = False
         self._is_open = True
 
-    def follow(self, robot: str, writer: Writer) -> Callable[[], Offset | None]:
+    def follow(self, robot: str, writer: Writer) -> Callable[[], ClockOffset | None]:
         """What tells how far the clock of ``writer`` is ahead: measured now, and when asked after 30 s."""
         measured = _Measured(self, robot, clock_key(robot, writer.identity))
         measured()
@@ -199,7 +198,7 @@ class _Measured:
     def __init__(self, meter: OffsetMeter, robot: str, key: str) -> None:
         self.robot = robot
         self.key = key
-        self.offset: Offset | None = None
+        self.offset: ClockOffset | None = None
         self._unanswered = 0
         self._meter = meter
         self._wanted_s = -AGAIN_S
@@ -209,14 +208,14 @@ class _Measured:
         """How long it may take the writer to answer: longer, when it has not answered before."""
         return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
 
-    def take(self, found: Sequence[ClockOffset]) -> bool:
+    def take(self, found: Sequence[MeasuredOffset]) -> bool:
         """Keep what was measured; whether to try again, where the writer did not answer."""
         self._unanswered = 0 if found else self._unanswered + 1
         for one in found:
-            self.offset = Offset(one.offset_ns, one.uncertainty_ns)
+            self.offset = ClockOffset(one.offset_ns, one.uncertainty_ns)
         return 0 < self._unanswered < len(_TIMEOUTS_S)
 
-    def __call__(self) -> Offset | None:
+    def __call__(self) -> ClockOffset | None:
         now_s = time.monotonic()
         if now_s - self._wanted_s >= (_UNANSWERED_AGAIN_S if self.offset is None else AGAIN_S):
             self._wanted_s = now_s

@@ -9,8 +9,7 @@ from contextlib import ExitStack
 from typing import Literal, ParamSpec, TypeVar
 
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.tracks import Offset
-from zstate.clock import SYSTEM, Clock
+from zstate.clock import SYSTEM, Clock, ClockOffset
 from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.ingest.base import StreamIngest
@@ -185,7 +184,7 @@ class TransformListener(Closing):
 
     def end_after_fork(self) -> None:
         """End the buffer in a forked child, where nothing fills it."""
-        self.buffer.end(
+        self.buffer.stop(
             f"its listener belongs to process {self._pid} and does not run after a fork: no more data comes; "
             "call connect() and open a listener in the child processes alone, or start them with the 'spawn' "
             "or 'forkserver' method"
@@ -357,7 +356,7 @@ class _WriterClockOffsets(Closing):
         self._offsets = buffer.clock_offsets
         self._is_enabled = buffer.clock.domain == SYSTEM
         self._meter = OffsetMeter(session, buffer.clock)
-        self._measured: dict[Writer, Callable[[], Offset | None]] = {}
+        self._measured: dict[Writer, Callable[[], ClockOffset | None]] = {}
 
     def on_writer(self, announced: Announced, *, alive: bool) -> None:
         """Start or stop measuring the clock of a writer."""

@@ -75,7 +75,7 @@ def load_into(
     Raises InvalidInput if the recording has no ``robot``.
     """
     counters = Counters()
-    buffer.home.is_recording = True
+    buffer.is_recording = True
     transcript = DecodedRecording(reader, counters.count_refusal)
     robots = None if robot is None else (check_has_robot(transcript, robot),)
     shares_frames = any(
@@ -92,7 +92,7 @@ def load_into(
     for count, decoded in enumerate(transcript.messages(robots), 1):
         loader.insert(decoded)
         if stamps is not None and not count % batch:
-            buffer.keep_around(stamps)
+            buffer.keep_only_around(stamps)
     return counters.stats()
 
 

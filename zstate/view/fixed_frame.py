@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zstate.view.moment import Tree
+from zstate.buffer.snapshot import FrameTable
 
 
 class FixedFrame:
@@ -13,17 +13,17 @@ class FixedFrame:
     def __init__(self, chosen: str = "") -> None:
         self.chosen = chosen
         """What was asked for; empty for nothing in particular."""
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         self._default = ""
 
-    def of(self, tree: Tree) -> str:
+    def of(self, tree: FrameTable) -> str:
         """Its name; empty where there is no frame at all."""
         if tree is not self._tree:
             self._tree, self._default = tree, default_fixed_frame(tree)
         return self.chosen if self.chosen in tree.index else self._default
 
 
-def default_fixed_frame(tree: Tree) -> str:
+def default_fixed_frame(tree: FrameTable) -> str:
     """The root with the most frames, of equal ones the first; empty where there is none."""
     if not tree.names:
         return ""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.view.moment import Mask, Moment, Poses
+from zstate.buffer.snapshot import FramePoses, Mask, Poses
 
 FIELD_OF_VIEW = math.radians(45.0)
 """Of the camera, from the upper to the lower edge of the picture [rad]."""
@@ -61,7 +61,7 @@ class Sight(NamedTuple):
 
 
 def framing_of(
-    moment: Moment, placed: Poses, aspect: float = 1.0, corners: NDArray[np.float64] = _NOTHING
+    moment: FramePoses, placed: Poses, aspect: float = 1.0, corners: NDArray[np.float64] = _NOTHING
 ) -> Framing | None:
     """What shows all robots of a moment at once; None where none has a place in the fixed frame.
 
@@ -94,7 +94,7 @@ def seen_by(framing: Framing, points: NDArray[np.float64], aspect: float) -> Mas
 
 
 def sights(
-    moment: Moment, placed: Poses, framing: Framing, aspect: float, robots: Iterable[str]
+    moment: FramePoses, placed: Poses, framing: Framing, aspect: float, robots: Iterable[str]
 ) -> Iterator[Sight]:
     """Which of the robots are in the picture. A robot is where one of its frames is."""
     tree = moment.tree
@@ -115,7 +115,7 @@ def sights(
         yield Sight(robot, bool(seen[own].any()), reason, root)
 
 
-def _reason_above(moment: Moment, row: int) -> str:
+def _reason_above(moment: FramePoses, row: int) -> str:
     """Why a frame that the one of that row stands on has no pose, if so."""
     while row >= 0 and row not in moment.reasons:
         row = int(moment.tree.parents[row])
@@ -132,7 +132,7 @@ def _axes(ahead: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack((ahead, right, np.cross(right, ahead)), axis=1)
 
 
-def _robots(moment: Moment) -> NDArray[np.bool_]:
+def _robots(moment: FramePoses) -> NDArray[np.bool_]:
     """The frames of robots: those that are called robot/link."""
     named = np.array(["/" in name for name in moment.tree.names], dtype=np.bool_)
     return named if named.any() else np.ones_like(named)

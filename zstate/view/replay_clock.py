@@ -5,17 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
 
+from zstate.buffer.snapshot import TimeSpan
 from zstate.errors import InvalidInput
 from zstate.locks import new_lock
-
-
-class Span(NamedTuple):
-    """From the oldest stamp [ns] that is known to the newest."""
-
-    oldest: int
-    newest: int
 
 
 class ReplayClock:
@@ -31,7 +24,7 @@ class ReplayClock:
         self._now_s = now_s
         self._lock = new_lock()
         self._speed = 1.0
-        self._span: Span | None = None
+        self._span: TimeSpan | None = None
         # Where it was, and when that was; None for the present, or for an instant still to be known.
         self._at: int | None = None
         self._since_s = now_s()
@@ -60,7 +53,7 @@ class ReplayClock:
             self._settle()
             self._speed = speed
 
-    def stamp(self, span: Span | None) -> int | None:
+    def stamp(self, span: TimeSpan | None) -> int | None:
         """The instant to look at [ns], of those in ``span``; None for the newest of everything."""
         with self._lock:
             self._span = span

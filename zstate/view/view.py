@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import viser
 
+from zstate.buffer.snapshot import FramePoses, Poses
 from zstate.clock import SystemClock, wait_in_slices
 from zstate.closing import Closing
 from zstate.model.robot import RobotModel
 from zstate.rate import Rate
 from zstate.view.framing import FIELD_OF_VIEW, Camera, Framing, Sight, framing_of, sights
-from zstate.view.moment import Moment, Poses
 from zstate.view.page import Page
 from zstate.view.panels.board import Board
 from zstate.view.scene.scene import Scene
@@ -69,7 +69,7 @@ class View(Closing):
         self._framed_busy = False  # and meshes were still to come
         self._framing: Framing | None = None
         self._is_to_hold = False
-        self._held: Moment | None = None
+        self._held: FramePoses | None = None
         self._placed: Poses | None = None
         self._holds = threading.Event()
         self._panels_due_s = 0.0
@@ -100,7 +100,7 @@ class View(Closing):
                 if not self._page.connected.is_set():
                     break
 
-    def draw(self) -> Moment:
+    def draw(self) -> FramePoses:
         """Show the world as it is now, or at the instant that was chosen on the page."""
         moment = self._held
         if moment is None:
@@ -184,7 +184,7 @@ class View(Closing):
                 self.scene.set_robot(name, model, base=self._folders.get(model.urdf))
                 self._drawn[name] = model
 
-    def _frame(self, moment: Moment, fixed: str, placed: Poses) -> None:
+    def _frame(self, moment: FramePoses, fixed: str, placed: Poses) -> None:
         """Look at all robots when there are others than before, or when they stand or are seen otherwise."""
         subject = fixed, tuple(self._drawn), self.scene.arrangement
         unknown = int(np.count_nonzero(~moment.known))

@@ -6,17 +6,20 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from zstate.buffer.buffer import TransformBuffer
-from zstate.buffer.layout import Layout
-from zstate.buffer.tracks import JointTrack
+from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.clock import Clock
 from zstate.closing import Closing
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.nodes.listener import TransformListener
-from zstate.view.moment import Moment
-from zstate.view.readings import Readings, readings_of, tracks_of
+from zstate.recording.recording import Recording
 from zstate.wire.keys import ANY
+
+_HOLD_S = 0.5
+"""A robot is drawn for so long after its newest sample: robots end a recording one by one."""
 
 
 class World(Closing):
@@ -47,15 +50,16 @@ class World(Closing):
         self._shown = frozenset(robots)
         self._version = 0
         self._models: Mapping[str, RobotModel] = {}
-        self._tracks: Mapping[str, JointTrack] = {}
         # By robot: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
         self._seen: dict[str, tuple[int, float]] = {}
-        self._readings = self._read_layout(self.buffer.layout())
+        self._table: FrameTable = FrameTable((), np.empty(0, np.intp), (), ())
+        self._refresh()
 
     @classmethod
     def of_recording(cls, path: str | Path) -> World:
         """The robots of a recording, an MCAP file or a bag. Raises RecordingError."""
-        return cls(None, buffer=TransformBuffer.from_recording(path))
+        with Recording(path) as recording:
+            return cls(None, buffer=recording.buffer())
 
     def close(self) -> None:
         """Follow nothing any more; the buffer keeps what it has. A second call does nothing."""
@@ -79,21 +83,22 @@ class World(Closing):
         heard = () if self.listener is None else self.listener.robots()
         return tuple(sorted({*self.models, *filter(self._is_shown, heard)}))
 
-    def moment(self, at: int | None = None) -> Moment:
+    def moment(self, at: int | None = None) -> FramePoses:
         """Where every frame was ``at`` a stamp [ns]; with None, at the newest sample of each robot.
 
         A robot is still drawn at its newest sample half a second after that; later, as before its
         oldest one, its poses are not known.
         """
-        readings = self._refresh()
+        poses = self.buffer.snapshot(at, robots=self._shown, hold_s=_HOLD_S)
+        self._adopt(poses.tree)
         self.look()
-        return readings.at(self.buffer, at)
+        return poses
 
     def look(self) -> None:
         """See which robots have said something new. ``moment`` does; between moments, look often."""
         now = time.monotonic()
-        for robot, track in self._tracks.items():
-            newest = track.history.newest
+        for robot, track in self._table.robots.items():
+            newest = track.newest
             seen = self._seen.get(robot)
             if newest is not None and (seen is None or seen[0] != newest):
                 self._seen[robot] = newest, now
@@ -106,32 +111,11 @@ class World(Closing):
     def _is_shown(self, robot: str) -> bool:
         return not self._shown or robot in self._shown
 
-    def _refresh(self) -> Readings:
-        readings = self._readings
-        # A writer is announced after its first samples: that is no change of the tree.
-        writers = tuple(use.track.writer for use in readings.uses)
-        if readings.version != self.buffer.version or readings.writers != writers:
-            readings = self._readings = self._read_layout(self.buffer.layout())
-        return readings
+    def _refresh(self) -> None:
+        self._adopt(self.buffer.frame_table(self._shown))
 
-    def _read_layout(self, layout: Layout) -> Readings:
-        shown = self._chosen(layout)
-        self._tracks = shown.robots
-        self._models = {name: track.model for name, track in shown.robots.items()}
-        self._version += 1
-        return readings_of(shown, tuple(track.writer for track in tracks_of(shown.edges.values())))
-
-    def _chosen(self, layout: Layout) -> Layout:
-        """What is shown of a layout: the chosen robots' frames, and those that they stand on."""
-        if not self._shown:
-            return layout
-        names: set[str] = set()
-        for name in layout.edges:
-            above: str | None = name if name.partition("/")[0] in self._shown else None
-            while above is not None and above not in names:
-                names.add(above)
-                edge = layout.edges[above]
-                above = None if edge is None else edge.parent
-        edges = {name: edge for name, edge in layout.edges.items() if name in names}
-        robots = {name: track for name, track in layout.robots.items() if name in self._shown}
-        return Layout(layout.version, edges, robots)
+    def _adopt(self, table: FrameTable) -> None:
+        if table is not self._table:
+            self._table = table
+            self._models = {name: track.model for name, track in table.robots.items()}
+            self._version += 1

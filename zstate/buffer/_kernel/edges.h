@@ -61,7 +61,7 @@ static void
 edges_run(const Edges *self, const double *positions, double *out, Py_ssize_t rows)
 {
     for (Py_ssize_t i = 0; i < rows; i++) {
-        const Between now = {positions, positions, 0.0};
+        const Bracket now = {positions, positions, 0.0};
         for (Py_ssize_t k = 0; k < self->count; k++, out += 7) {
             Pose pose = step_pose(&self->steps[k], &now);
             memcpy(out, &pose, sizeof(pose));

@@ -26,15 +26,15 @@ is_empty(const History *self)
     return self->first == self->end;
 }
 
-/* The oldest stamp that is kept beside `newest`. */
+/* The oldest stamp that is kept together with `newest`. */
 static int64_t
 limit_of(const History *self, int64_t newest)
 {
     return newest < INT64_MIN + self->span_ns ? INT64_MIN : newest - self->span_ns;
 }
 
-/* The rows around a guess: in a history larger than the caches they are on their way while the
- * stamps are still being looked at. Columns of a wide row beyond these lines are waited for. */
+/* Prefetches the rows around a guess: in a history larger than the caches they are loaded while the
+ * stamps are still searched. Columns of a wide row beyond these lines are loaded later. */
 static inline void
 prefetch_rows(const Block *block, Py_ssize_t guess)
 {
@@ -50,8 +50,9 @@ prefetch_rows(const Block *block, Py_ssize_t guess)
 
 /* The first index whose stamp is not before `at`; `end` when there is none.
  *
- * Stamps of a track come at a nearly constant rate: where the mean period says, or near by, is a
- * better first guess than the middle. From there steps of doubled length find a stretch to bisect.
+ * Stamps of a track come at a nearly constant rate: the place that the mean period gives is a
+ * better first guess than the middle. From there steps of doubled length find an interval to
+ * bisect.
  */
 static Py_ssize_t
 index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t at)
@@ -63,9 +64,9 @@ index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t a
     if (at <= stamps[low])
         return low;
     /* From here on stamps[low] < at <= stamps[high]. Differences may exceed what int64 holds. */
-    double way = (double)((uint64_t)at - (uint64_t)stamps[low]);
+    double difference = (double)((uint64_t)at - (uint64_t)stamps[low]);
     double whole = (double)((uint64_t)stamps[high] - (uint64_t)stamps[low]);
-    Py_ssize_t guess = low + (Py_ssize_t)(way / whole * (double)(high - low));
+    Py_ssize_t guess = low + (Py_ssize_t)(difference / whole * (double)(high - low));
     guess = guess > high ? high : guess;
     prefetch_rows(block, guess);
     Py_ssize_t step = 1;
@@ -97,7 +98,7 @@ index_not_before(const Block *block, Py_ssize_t first, Py_ssize_t end, int64_t a
     return high;
 }
 
-/* Where a sample goes: the block (a new reference) and place for it, and the window afterwards. */
+/* The place of a new sample: its block (a new reference) and slot, and the window afterwards. */
 typedef struct {
     Block *block;
     Py_ssize_t at;
@@ -111,9 +112,9 @@ history_reaches(const History *self, int64_t stamp)
     return is_empty(self) || stamp >= limit_of(self, newest_of(self));
 }
 
-/* Moves the samples to the front of their block, where nobody else can see it: an array made of it,
- * or a batch that reads it, would hold a reference. False when it is seen, or little room would be
- * won. */
+/* Moves the samples to the front of their block, if the history alone refers to it: an array made
+ * of it, or a batch that reads it, holds a reference. False if there is another reference, or if
+ * little capacity would be gained. */
 static bool
 moved_to_front(History *self)
 {
@@ -138,7 +139,7 @@ slot_behind(History *self, Slot *slot)
         *slot = (Slot){block, self->end, self->first, self->end + 1};
         return 0;
     }
-    /* Both copies live for a moment, and a long history of a large robot is megabytes: room for an
+    /* Both copies exist for a moment, and a long history of a large robot is megabytes: room for an
      * eighth more is enough to copy each sample but a few times. */
     Block *fresh = block_new(SMALLEST_CAPACITY + size + size / 8, self->width);
     if (fresh == NULL)
@@ -165,7 +166,7 @@ slot_among(const History *self, int64_t stamp, Slot *slot)
     return 0;
 }
 
-/* Finds room; the samples stay what they are. -1 and MemoryError when there is none. */
+/* Finds a slot; the samples stay unchanged. -1 and MemoryError if there is no memory. */
 static int
 slot_for(History *self, int64_t stamp, Slot *slot)
 {
@@ -181,7 +182,7 @@ slot_write_stamp(const Slot *slot, int64_t stamp)
     return slot->block->rows + (size_t)slot->at * (size_t)slot->block->width;
 }
 
-/* Makes the sample in the slot part of the history, and forgets what has become too old. */
+/* Adds the sample in the slot to the history, and removes those that are too old now. */
 static void
 slot_publish(History *self, const Slot *slot)
 {
@@ -262,26 +263,27 @@ history_insert(History *self, PyObject *const *args, Py_ssize_t count)
     }
     if (!checked_stamp(args[0], &stamp) || get_doubles(args[1], &row, 0) < 0)
         return NULL;
-    PyObject *taken = NULL;
+    PyObject *inserted = NULL;
     if (count_of(&row) != self->width)
         PyErr_Format(PyExc_ValueError, "a row has %zd numbers, not %zd", self->width,
                      count_of(&row));
     else if (!history_reaches(self, stamp))
-        taken = Py_False;
+        inserted = Py_False;
     else if (slot_for(self, stamp, &slot) == 0) {
-        /* memmove: the row may be a view of the very memory it goes to. */
+        /* memmove: the row may be a view of the destination. */
         memmove(slot_write_stamp(&slot, stamp), row.buf, (size_t)row.len);
         slot_publish(self, &slot);
-        taken = Py_True;
+        inserted = Py_True;
     }
     PyBuffer_Release(&row);
-    Py_XINCREF(taken);
-    return taken;
+    Py_XINCREF(inserted);
+    return inserted;
 }
 
-/* Writes positions, then velocities or NaN in their stead. 1 taken, 0 too old, -1 MemoryError. */
+/* Writes positions, then velocities, NaN without. 1 inserted, 0 too old, -1 MemoryError. */
 static int
-take_numbers(History *self, int64_t stamp, const Py_buffer *positions, const Py_buffer *velocities)
+insert_numbers(History *self, int64_t stamp, const Py_buffer *positions,
+               const Py_buffer *velocities)
 {
     Slot slot;
     if (!history_reaches(self, stamp))
@@ -300,10 +302,11 @@ take_numbers(History *self, int64_t stamp, const Py_buffer *positions, const Py_
 }
 
 static PyObject *
-history_take(History *self, PyObject *const *args, Py_ssize_t count)
+history_try_insert(History *self, PyObject *const *args, Py_ssize_t count)
 {
     if (count != 4) {
-        PyErr_SetString(PyExc_TypeError, "take(stamp, positions, velocities, position_count)");
+        PyErr_SetString(PyExc_TypeError,
+                        "try_insert(stamp, positions, velocities, position_count)");
         return NULL;
     }
     Py_ssize_t position_count = PyLong_AsSsize_t(args[3]);
@@ -322,11 +325,11 @@ history_take(History *self, PyObject *const *args, Py_ssize_t count)
         PyBuffer_Release(&positions);
         Py_RETURN_NONE;
     }
-    int taken = take_numbers(self, stamp, &positions, has_velocities ? &velocities : NULL);
+    int inserted = insert_numbers(self, stamp, &positions, has_velocities ? &velocities : NULL);
     PyBuffer_Release(&positions);
     if (has_velocities)
         PyBuffer_Release(&velocities);
-    return taken < 0 ? NULL : PyBool_FromLong(taken);
+    return inserted < 0 ? NULL : PyBool_FromLong(inserted);
 }
 
 static bool
@@ -404,14 +407,15 @@ history_oldest_stamp(History *self, void *Py_UNUSED(closure))
 static PyMethodDef history_methods[] = {
     {"insert", (PyCFunction)(void (*)(void))history_insert, METH_FASTCALL,
      "insert(stamp, row): False when the stamp is older than the history reaches."},
-    {"take", (PyCFunction)(void (*)(void))history_take, METH_FASTCALL,
-     "take(stamp, positions, velocities, position_count): as insert, of arrays, positions also as "
+    {"try_insert", (PyCFunction)(void (*)(void))history_try_insert, METH_FASTCALL,
+     "try_insert(stamp, positions, velocities, position_count): as insert, of arrays, positions "
+     "also as "
      "a block; None for what is not plain."},
     {"replace", (PyCFunction)(void (*)(void))history_replace, METH_FASTCALL,
-     "replace(stamps, rows): hold copies of these samples and no others."},
+     "replace(stamps, rows): replace all samples by copies of these."},
     {"reaches", (PyCFunction)history_reaches_stamp, METH_O,
      "reaches(stamp): whether a sample of that stamp would be kept."},
-    {"clear", (PyCFunction)history_clear, METH_NOARGS, "clear(): forget every sample."},
+    {"clear", (PyCFunction)history_clear, METH_NOARGS, "clear(): remove every sample."},
     {NULL},
 };
 

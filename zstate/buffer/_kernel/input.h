@@ -1,7 +1,7 @@
-/* Numbers and buffers that come from Python, checked where they come in. */
+/* Numbers and buffers from Python, checked on entry. */
 
-/* The stamp in an exact int of 64 bits. False, without an error, for anything else: the caller then
- * leaves the question to the reference, which accepts it or says what is wrong. */
+/* The stamp in an exact int of 64 bits. False, without an error, for anything else: the reference
+ * then accepts it or raises the error. */
 static bool
 plain_stamp(PyObject *number, int64_t *stamp)
 {
@@ -64,9 +64,9 @@ all_finite(const double *numbers, Py_ssize_t count)
     return sum == 0.0;
 }
 
-/* Whether its memory is all there is to it. Subclasses of numpy's array are left to the reference:
- * a masked one offers its memory, not its mask. Types go by name: numpy's headers are not needed
- * here. */
+/* Whether the object is no more than its memory. The reference handles subclasses of numpy's array:
+ * a masked one exports its memory, not its mask. Types are compared by name, so that numpy's
+ * headers are not needed. */
 static bool
 plain_array(PyObject *object)
 {
@@ -75,7 +75,7 @@ plain_array(PyObject *object)
            strcmp(type, "array.array") == 0;
 }
 
-/* So many finite doubles in a flat array. False, without an error, for anything else. */
+/* `count` finite doubles in a flat array. False, without an error, for anything else. */
 static bool
 plain_numbers(PyObject *object, Py_buffer *view, Py_ssize_t count)
 {
@@ -91,7 +91,8 @@ plain_numbers(PyObject *object, Py_buffer *view, Py_ssize_t count)
     return false;
 }
 
-/* The same as they travel: a block in bytes, which is little-endian; other machines leave it. */
+/* The same in bytes, little-endian as on the wire; big-endian machines leave it to the reference.
+ */
 static bool
 plain_block(PyObject *object, Py_buffer *view, Py_ssize_t count)
 {
@@ -104,7 +105,7 @@ plain_block(PyObject *object, Py_buffer *view, Py_ssize_t count)
     return false;
 }
 
-/* The block of a flat array of so many finite doubles; None for anything else. */
+/* The bytes of a flat array of `count` finite doubles; None for anything else. */
 static PyObject *
 block_of(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t count)
 {

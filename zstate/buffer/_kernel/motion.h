@@ -103,7 +103,7 @@ slerp_weights(double r, double less, double more, double *wa, double *wb)
 
 /* The pose of seven columns, between row a and row b. */
 static Pose
-pose_between(const double *a, const double *b, double r)
+interpolate_pose(const double *a, const double *b, double r)
 {
     if (a == b)
         return (Pose){a[0], a[1], a[2], a[3], a[4], a[5], a[6]};

@@ -1,11 +1,11 @@
-/* Path: the way between two frames, compiled, for zstate/buffer/path.py. */
+/* Path: a compiled path between two frames, for zstate/buffer/path.py. */
 
 typedef struct {
     PyObject_HEAD
-    PyTypeObject *type; /* of the answers: Transform, which derives from Facts */
+    PyTypeObject *type; /* of the results: Transform, which derives from TransformFields */
     PyObject *target;
     PyObject *source;
-    PyObject *histories; /* a tuple: the tracks that the path passes */
+    PyObject *histories; /* a tuple: of the tracks of the path */
     Step *steps;         /* those to the target, then those to the source */
     Py_ssize_t to_target;
     Py_ssize_t to_source;
@@ -20,7 +20,7 @@ typedef struct {
     Py_ssize_t end;
 } Window;
 
-/* So many tracks a path may pass before its calls need memory from the heap. */
+/* A path over more tracks than this needs memory from the heap in its calls. */
 #define FEW_TRACKS 16
 
 static Py_ssize_t
@@ -36,9 +36,9 @@ window_of(const Path *self, Py_ssize_t index)
     return (Window){history->block, history->first, history->end};
 }
 
-/* False where the track does not reach. */
+/* False if the window does not cover the instant. */
 static inline bool
-rows_around(const Window *window, int64_t at, Between *now)
+rows_around(const Window *window, int64_t at, Bracket *now)
 {
     const Block *block = window->block;
     Py_ssize_t after = index_not_before(block, window->first, window->end, at);
@@ -60,7 +60,7 @@ rows_around(const Window *window, int64_t at, Between *now)
 }
 
 static Pose
-pose_at(const Path *self, const Between *nows)
+pose_at(const Path *self, const Bracket *nows)
 {
     Pose source_from_top = chain_pose(self->steps + self->to_target, self->to_source, nows);
     if (self->to_target == 0)
@@ -69,7 +69,7 @@ pose_at(const Path *self, const Between *nows)
     return self->to_source == 0 ? target_from_top : compose(target_from_top, source_from_top);
 }
 
-/* The newest instant that all tracks know. False when one is empty. */
+/* The newest instant that all tracks have reached. False if one is empty. */
 static bool
 newest_common(const Path *self, int64_t *at)
 {
@@ -85,17 +85,17 @@ newest_common(const Path *self, int64_t *at)
 }
 
 static PyObject *
-answer_static(const Path *self, PyObject *stamp)
+static_transform(const Path *self, PyObject *stamp)
 {
     Pose pose = pose_at(self, NULL);
     if (!is_finite(pose))
         Py_RETURN_NONE;
-    return facts_new(self->type, self->target, self->source, pose, stamp, kind_static);
+    return fields_new(self->type, self->target, self->source, pose, stamp, kind_static);
 }
 
-/* The answer at an instant, or None; `stamp` is NULL or the very object it was asked with. */
+/* The transform at an instant, or None; `stamp` is NULL or the object that the caller passed. */
 static PyObject *
-answer_at(const Path *self, int64_t at, PyObject *stamp, Between *nows)
+transform_at(const Path *self, int64_t at, PyObject *stamp, Bracket *nows)
 {
     PyObject *kind = kind_exact;
     for (Py_ssize_t i = 0; i < track_count(self); i++) {
@@ -109,13 +109,13 @@ answer_at(const Path *self, int64_t at, PyObject *stamp, Between *nows)
     if (!is_finite(pose))
         Py_RETURN_NONE;
     if (stamp != NULL)
-        return facts_new(self->type, self->target, self->source, pose, stamp, kind);
+        return fields_new(self->type, self->target, self->source, pose, stamp, kind);
     stamp = PyLong_FromLongLong(at);
     if (stamp == NULL)
         return NULL;
-    PyObject *answer = facts_new(self->type, self->target, self->source, pose, stamp, kind);
+    PyObject *transform = fields_new(self->type, self->target, self->source, pose, stamp, kind);
     Py_DECREF(stamp);
-    return answer;
+    return transform;
 }
 
 static PyObject *
@@ -131,24 +131,24 @@ path_at(Path *self, PyObject *const *args, Py_ssize_t count)
         Py_RETURN_NONE;
     Py_ssize_t tracks = track_count(self);
     if (tracks == 0)
-        return answer_static(self, stamp);
+        return static_transform(self, stamp);
     if (stamp == Py_None) {
         stamp = NULL;
         if (!newest_common(self, &at))
             Py_RETURN_NONE;
     }
-    Between few[FEW_TRACKS];
+    Bracket few[FEW_TRACKS];
     if (tracks <= FEW_TRACKS)
-        return answer_at(self, at, stamp, few);
-    Between *nows = PyMem_New(Between, (size_t)tracks);
+        return transform_at(self, at, stamp, few);
+    Bracket *nows = PyMem_New(Bracket, (size_t)tracks);
     if (nows == NULL)
         return PyErr_NoMemory();
-    PyObject *answer = answer_at(self, at, stamp, nows);
+    PyObject *transform = transform_at(self, at, stamp, nows);
     PyMem_Free(nows);
-    return answer;
+    return transform;
 }
 
-/* blame(stamp): which track cannot answer, in the order of zstate/buffer/path.py. */
+/* failure_at(stamp): the limiting track, in the order of zstate/buffer/path.py. */
 
 typedef enum { IN_PAST, NO_DATA, IN_FUTURE } Failure;
 
@@ -167,7 +167,7 @@ failure_of(const Path *self, Failure failure, Py_ssize_t index, PyObject *stamp)
 }
 
 static PyObject *
-path_blame(Path *self, PyObject *stamp)
+path_failure_at(Path *self, PyObject *stamp)
 {
     int64_t at = 0, worst_oldest = 0, worst_newest = 0;
     Py_ssize_t young = -1, empty = -1, behind = -1;
@@ -203,9 +203,9 @@ path_blame(Path *self, PyObject *stamp)
 
 typedef struct {
     Window *windows;
-    Between *nows;
+    Bracket *nows;
     Py_ssize_t tracks;
-    int64_t oldest; /* the instants between these two can be answered */
+    int64_t oldest; /* every track covers the instants between these two */
     int64_t newest;
 } Batch;
 
@@ -218,7 +218,7 @@ batch_release(Batch *batch)
     PyMem_Free(batch->nows);
 }
 
-/* Takes the windows of all tracks at one moment, with references to their blocks. */
+/* Copies the windows of all tracks at one moment, with references to their blocks. */
 static int
 batch_begin(const Path *self, Batch *batch)
 {
@@ -227,7 +227,7 @@ batch_begin(const Path *self, Batch *batch)
     batch->oldest = INT64_MIN;
     batch->newest = INT64_MAX;
     batch->windows = PyMem_New(Window, (size_t)tracks + 1);
-    batch->nows = PyMem_New(Between, (size_t)tracks + 1);
+    batch->nows = PyMem_New(Bracket, (size_t)tracks + 1);
     if (batch->windows == NULL || batch->nows == NULL) {
         PyMem_Free(batch->windows);
         PyMem_Free(batch->nows);
@@ -353,7 +353,7 @@ path_fill(Path *self, PyObject *to_target, PyObject *to_source)
     for (Py_ssize_t i = 0; i < tracks; i++) {
         PyObject *history = PyTuple_GET_ITEM(self->histories, i);
         if (!PyObject_TypeCheck(history, &History_type)) {
-            PyErr_SetString(PyExc_TypeError, "a path passes histories");
+            PyErr_SetString(PyExc_TypeError, "the tracks of a path are histories");
             PyMem_Free(widths);
             return -1;
         }
@@ -369,24 +369,24 @@ path_new(PyTypeObject *type, PyObject *args, PyObject *keywords)
 {
     static char *names[] = {"type",      "target",    "source", "to_target",
                             "to_source", "histories", NULL};
-    PyTypeObject *answers;
+    PyTypeObject *result_type;
     PyObject *target, *source, *to_target, *to_source, *histories;
     if (!PyArg_ParseTupleAndKeywords(args, keywords, "O!OOO!O!O!:Path", names, &PyType_Type,
-                                     &answers, &target, &source, &PyTuple_Type, &to_target,
+                                     &result_type, &target, &source, &PyTuple_Type, &to_target,
                                      &PyTuple_Type, &to_source, &PyTuple_Type, &histories))
         return NULL;
-    if (!PyType_IsSubtype(answers, &Facts_type)) {
-        PyErr_SetString(PyExc_TypeError, "answers are of a type that derives from Facts");
+    if (!PyType_IsSubtype(result_type, &TransformFields_type)) {
+        PyErr_SetString(PyExc_TypeError, "results are of a type that derives from TransformFields");
         return NULL;
     }
     Path *self = (Path *)type->tp_alloc(type, 0);
     if (self == NULL)
         return NULL;
-    Py_INCREF(answers);
+    Py_INCREF(result_type);
     Py_INCREF(target);
     Py_INCREF(source);
     Py_INCREF(histories);
-    self->type = answers;
+    self->type = result_type;
     self->target = target;
     self->source = source;
     self->histories = histories;
@@ -410,18 +410,19 @@ path_dealloc(Path *self)
 
 static PyMethodDef path_methods[] = {
     {"at", (PyCFunction)(void (*)(void))path_at, METH_FASTCALL,
-     "at(stamp=None): the Transform, or None where the reference has to be asked."},
-    {"blame", (PyCFunction)path_blame, METH_O,
-     "blame(stamp): (failure, track, stamp, oldest, newest, rate_hz), or None when there is none."},
+     "at(stamp=None): the Transform, or None if the reference has to be used."},
+    {"failure_at", (PyCFunction)path_failure_at, METH_O,
+     "failure_at(stamp): (failure, track, stamp, oldest, newest, rate_hz), or None when there is "
+     "none."},
     {"poses", (PyCFunction)(void (*)(void))path_poses, METH_FASTCALL,
-     "poses(stamps, out, valid): many at once; NaN and False where there is no answer."},
+     "poses(stamps, out, valid): many at once; NaN and False where there is no transform."},
     {NULL},
 };
 
 static PyTypeObject Path_type = {
     PyVarObject_HEAD_INIT(NULL, 0)
     .tp_name = "zstate._kernel.Path",
-    .tp_doc = "The way between two frames, compiled.",
+    .tp_doc = "A compiled path between two frames.",
     .tp_basicsize = sizeof(Path),
     .tp_new = path_new,
     .tp_dealloc = (destructor)path_dealloc,

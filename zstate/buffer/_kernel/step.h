@@ -1,23 +1,30 @@
-/* Steps: one edge of a path each, for zstate/buffer/cells.py and steps.py. */
+/* Steps: one edge of a path each, for zstate/buffer/interpolation.py. */
 
 #define PI 3.14159265358979323846
 #define TAU 6.28318530717958647693
 
-typedef enum { FIXED, HINGE, SLIDE, PLANAR, GIVEN, STEP_KINDS } StepKind;
+typedef enum {
+    STEP_STATIC,
+    STEP_REVOLUTE,
+    STEP_PRISMATIC,
+    STEP_PLANAR,
+    STEP_POSE,
+    STEP_KINDS
+} StepKind;
 
-/* How many numbers a step of each kind has, and how many columns of a row it reads. */
+/* The number of numbers of a step of each kind, and of columns of a row that it reads. */
 static const Py_ssize_t step_numbers[STEP_KINDS] = {7, 13, 12, 7, 7};
 static const Py_ssize_t step_columns[STEP_KINDS] = {0, 1, 1, 3, 7};
 
 typedef struct {
     StepKind kind;
-    bool turns; /* the angle is a continuous joint's */
+    bool is_angle; /* the angle is a continuous joint's */
     Py_ssize_t use;
     Py_ssize_t column;
     double scale, shift;
     double q_cos[4], q_sin[4];
     double t0[3], t1[3];
-    Pose origin;    /* of fixed, planar and given steps; fixed ones have nothing else */
+    Pose origin;    /* of static, planar and pose steps; static ones have nothing else */
     bool at_origin; /* the origin is the identity */
 } Step;
 
@@ -26,34 +33,35 @@ typedef struct {
     const double *a;
     const double *b;
     double ratio;
-} Between;
+} Bracket;
 
 static inline double
-line_between(double a, double b, double ratio)
+interpolate_linear(double a, double b, double ratio)
 {
     return a + ratio * (b - a);
 }
 
 static inline double
-turn_between(double a, double b, double ratio)
+interpolate_angle(double a, double b, double ratio)
 {
-    double way = b - a;
-    if (fabs(way) > PI && fabs(a) <= PI && fabs(b) <= PI)
-        way = way > 0.0 ? way - TAU : way + TAU;
-    return a + ratio * way;
+    double difference = b - a;
+    if (fabs(difference) > PI && fabs(a) <= PI && fabs(b) <= PI)
+        difference = difference > 0.0 ? difference - TAU : difference + TAU;
+    return a + ratio * difference;
 }
 
 /* scale * joint + shift */
 static inline double
-travel(const Step *step, const Between *now)
+joint_value(const Step *step, const Bracket *now)
 {
     double a = now->a[step->column], b = now->b[step->column];
-    double value = step->turns ? turn_between(a, b, now->ratio) : line_between(a, b, now->ratio);
+    double value =
+        step->is_angle ? interpolate_angle(a, b, now->ratio) : interpolate_linear(a, b, now->ratio);
     return step->scale * value + step->shift;
 }
 
 static inline Pose
-hinge_pose(const Step *step, double angle)
+revolute_pose(const Step *step, double angle)
 {
     const double *a = step->q_cos, *b = step->q_sin;
     double half = 0.5 * angle, c = cos(half), s = sin(half);
@@ -62,7 +70,7 @@ hinge_pose(const Step *step, double angle)
 }
 
 static inline Pose
-slide_pose(const Step *step, double n)
+prismatic_pose(const Step *step, double n)
 {
     return (Pose){step->t0[0] + step->t1[0] * n,
                   step->t0[1] + step->t1[1] * n,
@@ -74,33 +82,34 @@ slide_pose(const Step *step, double n)
 }
 
 static Pose
-planar_pose(const Step *step, const Between *now)
+planar_pose(const Step *step, const Bracket *now)
 {
     const double *a = now->a + step->column, *b = now->b + step->column;
-    double x = line_between(a[0], b[0], now->ratio), y = line_between(a[1], b[1], now->ratio);
-    double half = 0.5 * turn_between(a[2], b[2], now->ratio);
+    double x = interpolate_linear(a[0], b[0], now->ratio);
+    double y = interpolate_linear(a[1], b[1], now->ratio);
+    double half = 0.5 * interpolate_angle(a[2], b[2], now->ratio);
     return compose(step->origin, (Pose){x, y, 0.0, 0.0, 0.0, sin(half), cos(half)});
 }
 
 static Pose
-given_pose(const Step *step, const Between *now)
+sampled_pose(const Step *step, const Bracket *now)
 {
-    Pose given = pose_between(now->a + step->column, now->b + step->column, now->ratio);
-    return step->at_origin ? given : compose(step->origin, given);
+    Pose sampled = interpolate_pose(now->a + step->column, now->b + step->column, now->ratio);
+    return step->at_origin ? sampled : compose(step->origin, sampled);
 }
 
 static inline Pose
-step_pose(const Step *step, const Between *nows)
+step_pose(const Step *step, const Bracket *nows)
 {
     switch (step->kind) {
-    case HINGE:
-        return hinge_pose(step, travel(step, &nows[step->use]));
-    case SLIDE:
-        return slide_pose(step, travel(step, &nows[step->use]));
-    case PLANAR:
+    case STEP_REVOLUTE:
+        return revolute_pose(step, joint_value(step, &nows[step->use]));
+    case STEP_PRISMATIC:
+        return prismatic_pose(step, joint_value(step, &nows[step->use]));
+    case STEP_PLANAR:
         return planar_pose(step, &nows[step->use]);
-    case GIVEN:
-        return given_pose(step, &nows[step->use]);
+    case STEP_POSE:
+        return sampled_pose(step, &nows[step->use]);
     default:
         return step->origin;
     }
@@ -108,7 +117,7 @@ step_pose(const Step *step, const Between *nows)
 
 /* top_from_bottom; the identity of no steps. */
 static Pose
-chain_pose(const Step *steps, Py_ssize_t count, const Between *nows)
+chain_pose(const Step *steps, Py_ssize_t count, const Bracket *nows)
 {
     if (count == 0)
         return identity;
@@ -118,19 +127,20 @@ chain_pose(const Step *steps, Py_ssize_t count, const Between *nows)
     return pose;
 }
 
-/* From (kind, use, column, turns, numbers). Uses and columns are checked by check_step. */
+/* From (kind, use, column, is_angle, numbers). Uses and columns are checked by check_step. */
 static int
 read_step(PyObject *description, Step *step)
 {
-    int kind, turns;
+    int kind, is_angle;
     PyObject *tuple;
     double n[13];
     memset(step, 0, sizeof(*step));
     if (!PyTuple_Check(description)) {
-        PyErr_SetString(PyExc_TypeError, "a step is a tuple (kind, use, column, turns, numbers)");
+        PyErr_SetString(PyExc_TypeError,
+                        "a step is a tuple (kind, use, column, is_angle, numbers)");
         return -1;
     }
-    if (!PyArg_ParseTuple(description, "innpO:step", &kind, &step->use, &step->column, &turns,
+    if (!PyArg_ParseTuple(description, "innpO:step", &kind, &step->use, &step->column, &is_angle,
                           &tuple))
         return -1;
     if (kind < 0 || kind >= STEP_KINDS) {
@@ -140,14 +150,14 @@ read_step(PyObject *description, Step *step)
     if (read_doubles(tuple, n, step_numbers[kind]) < 0)
         return -1;
     step->kind = (StepKind)kind;
-    step->turns = turns != 0;
-    if (kind == HINGE || kind == SLIDE) {
+    step->is_angle = is_angle != 0;
+    if (kind == STEP_REVOLUTE || kind == STEP_PRISMATIC) {
         step->scale = n[0];
         step->shift = n[1];
         memcpy(step->q_cos, n + 2, sizeof(step->q_cos));
         memcpy(step->t0, n + 6, sizeof(step->t0));
-        memcpy(kind == HINGE ? step->q_sin : step->t1, n + 9,
-               (kind == HINGE ? 4 : 3) * sizeof(double));
+        memcpy(kind == STEP_REVOLUTE ? step->q_sin : step->t1, n + 9,
+               (kind == STEP_REVOLUTE ? 4 : 3) * sizeof(double));
         return 0;
     }
     step->origin = (Pose){n[0], n[1], n[2], n[3], n[4], n[5], n[6]};
@@ -158,7 +168,7 @@ read_step(PyObject *description, Step *step)
 static int
 check_step(const Step *step, Py_ssize_t use_count, const Py_ssize_t *widths)
 {
-    if (step->kind == FIXED)
+    if (step->kind == STEP_STATIC)
         return 0;
     if (step->use >= 0 && step->use < use_count && step->column >= 0 &&
         step->column <= widths[step->use] - step_columns[step->kind])

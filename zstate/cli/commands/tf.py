@@ -28,8 +28,7 @@ from zstate.errors import LookupFailed
 if TYPE_CHECKING:
     from zstate.cli.waiting import PoseWaiter
     from zstate.nodes.listener import TransformListener
-    from zstate.transform import Transform
-    from zstate.twist import Twist
+    from zstate.transform import Transform, Twist
 
 # Without a second answer the period is not known: so long without one is worth a note.
 _UNKNOWN_S = 2.0

@@ -15,7 +15,7 @@ from zstate.cli.output.console import output_width, print_json, print_result
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.cli.words import Words
 
 

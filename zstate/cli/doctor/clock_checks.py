@@ -9,7 +9,7 @@ from zstate.cli.doctor.ear import Ear
 from zstate.clock import SYSTEM, stamp_text
 from zstate.errors import NoClock, duration_text
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
-from zstate.net.clock_offset import ClockOffset
+from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.session import Session
 from zstate.net.topic_statistics import Window
 
@@ -34,7 +34,7 @@ def clocks_check(ear: Ear) -> Check:
     return ok("clocks", text)
 
 
-def _offset_text(one: ClockOffset) -> str:
+def _offset_text(one: MeasuredOffset) -> str:
     side = "ahead of" if one.offset_ns > 0 else "behind"
     size, bound = duration_text(abs(one.offset_ns)), duration_text(one.uncertainty_ns)
     return f"that of {one.writer} is {size} {side} this one (± {bound})"

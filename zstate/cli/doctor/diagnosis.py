@@ -29,7 +29,7 @@ from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
 

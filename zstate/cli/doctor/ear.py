@@ -11,7 +11,7 @@ from zstate.cli.waiting import ConditionWaiter
 from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.ingest.events import WriterEvent
-from zstate.net.clock_offset import ClockOffset
+from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
 from zstate.net.replies import query
@@ -52,7 +52,7 @@ class Ear(Closing):
         self.description: RobotDescription | None = None
         self.statuses: dict[int, Status] = {}
         self.events: list[WriterEvent] = []
-        self.offsets: tuple[ClockOffset, ...] = ()
+        self.offsets: tuple[MeasuredOffset, ...] = ()
         self.stuck: set[Writer] = set()
         self._session, self._wire = session, wire_named(wire)
         self._on_change = on_change

@@ -16,7 +16,7 @@ from zstate.wire.keys import Stream, full_name
 from zstate.wire.messages import JointState, Sample, TransformSample
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.clock import Clock
     from zstate.net.session import Session
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
-from zstate.buffer.frames import FrameInfo
+from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.monitor.meter import EdgeStatistics
 from zstate.cli.monitor.overview import overview_text
 from zstate.cli.monitor.path import path_between

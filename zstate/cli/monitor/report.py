@@ -12,8 +12,8 @@ from zstate.cli.output.text_layout import Table
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
-    from zstate.buffer.tracks import Offset
+    from zstate.buffer.frame_tree import FrameInfo
+    from zstate.clock import ClockOffset
 
 _HEADINGS = ("frame", "edge", "rate", "latency", "max", "jitter", "missed", "clock", "writer")
 # What a narrow terminal does without, in this order.
@@ -32,7 +32,7 @@ class Row:
     frame: str
     edge: FrameInfo | None
     measure: EdgeMeasure | None
-    offset: Offset | None
+    offset: ClockOffset | None
 
     def facts(self) -> dict[str, Any] | None:
         """The same as JSON has it; None for the first frame."""
@@ -93,7 +93,7 @@ def _names(rows: Sequence[Row]) -> list[str]:
     return [name.partition("/")[2] or name for name in full] if len(robots) == 1 else full
 
 
-def measured_cells(measure: EdgeMeasure | None, offset: Offset | None) -> tuple[str, ...]:
+def measured_cells(measure: EdgeMeasure | None, offset: ClockOffset | None) -> tuple[str, ...]:
     """What was measured, from rate to clock."""
     if measure is None:
         return ("no sample", *NO_NUMBERS[1:])
@@ -113,7 +113,7 @@ def _time_text(seconds: float | None) -> str:
     return "-" if seconds is None else duration_text(round(seconds * 1e9))
 
 
-def _ahead_text(offset: Offset) -> str:
+def _ahead_text(offset: ClockOffset) -> str:
     """What is smaller than its uncertainty is none."""
     if abs(offset.offset_ns) <= offset.uncertainty_ns:
         return "0"

@@ -16,7 +16,7 @@ from zstate.cli import logs
 from zstate.errors import duration_text
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.rate import RateReport
 
 GRACE_S = 0.5

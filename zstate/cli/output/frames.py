@@ -14,7 +14,7 @@ from zstate.cli.words import words_of
 from zstate.ingest.deadline import is_stale
 
 if TYPE_CHECKING:
-    from zstate.buffer.frames import FrameInfo
+    from zstate.buffer.frame_tree import FrameInfo
     from zstate.cli.output.drawing import Drawing
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session

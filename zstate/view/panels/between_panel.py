@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import viser
 
+from zstate.buffer.snapshot import FrameTable
 from zstate.errors import LookupFailed
-from zstate.view.moment import Tree
 from zstate.view.panels import html
 from zstate.view.panels.choice import FrameChoice
 from zstate.view.panels.frames_panel import why_apart
@@ -22,7 +22,7 @@ class BetweenPanel:
 
     def __init__(self, gui: viser.GuiApi, world: World) -> None:
         self._world = world
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         self._source = FrameChoice(gui, "Pose of", _NONE)
         self._target = FrameChoice(gui, "in frame", _NONE)
         self._text = gui.add_html("")
@@ -39,7 +39,7 @@ class BetweenPanel:
 
     def _rows(self, look: Look, target: str, source: str) -> Rows:
         tree = look.moment.tree
-        pose = look.moment.placed(target)[tree.index[source]]
+        pose = look.moment.poses_in(target)[tree.index[source]]
         if np.isnan(pose).any():
             return [("no answer", why_apart(self._world, look, target, source))]
         return [*pose_rows(pose.tolist()), *self._motion(look, target, source)]

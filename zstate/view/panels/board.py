@@ -8,11 +8,10 @@ from typing import Protocol
 
 import viser
 
+from zstate.buffer.snapshot import FramePoses
 from zstate.closing import Closing
 from zstate.net.graph import GraphMonitor
 from zstate.view.fixed_frame import FixedFrame
-from zstate.view.frame_facts import FrameFacts
-from zstate.view.moment import Moment
 from zstate.view.panels import html
 from zstate.view.panels.between_panel import BetweenPanel
 from zstate.view.panels.display_panel import DisplayPanel, Switches
@@ -51,7 +50,6 @@ class Board(Closing):
     ) -> None:
         gui = server.gui
         self._world = world
-        self._facts = FrameFacts(world.buffer)
         self._fixed = FixedFrame(fixed_frame)
         self._opened = ExitStack()
         self.clock = ReplayClock(live=world.session is not None)
@@ -96,20 +94,20 @@ class Board(Closing):
     @property
     def stamp(self) -> int | None:
         """The instant to show [ns]; None for the newest of everything."""
-        return self.clock.stamp(self._facts.span())
+        return self.clock.stamp(self._world.buffer.span())
 
-    def fixed(self, moment: Moment) -> str:
+    def fixed(self, moment: FramePoses) -> str:
         """The frame to see ``moment`` from; empty where there is none."""
         return self._fixed.of(moment.tree)
 
-    def update(self, moment: Moment) -> None:
+    def update(self, moment: FramePoses) -> None:
         """Do what was chosen on the page since the last time, and tell there what is new."""
         buffer, is_present = self._world.buffer, self.clock.is_present
         domain = buffer.domain.name
         now = buffer.clock.now() if is_present and domain in (None, buffer.clock.domain) else None
         for panel in self._panels:
             # The panel of the fixed frame stands first: what was chosen there holds for the others.
-            panel.update(Look(moment, self.fixed(moment), self._facts, is_present, now, domain))
+            panel.update(Look(moment, self.fixed(moment), buffer, is_present, now, domain))
 
     def close(self) -> None:
         """Look no more at who writes what. A second call does nothing."""

@@ -6,8 +6,8 @@ from typing import Protocol
 
 import viser
 
+from zstate.buffer.snapshot import FrameTable
 from zstate.view.fixed_frame import FixedFrame
-from zstate.view.moment import Tree
 from zstate.view.panels import html
 from zstate.view.panels.choice import FrameChoice
 from zstate.view.panels.look import Look
@@ -31,7 +31,7 @@ class DisplayPanel:
     def __init__(self, gui: viser.GuiApi, scene: Switches, fixed: FixedFrame) -> None:
         self._scene = scene
         self._fixed = fixed
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         hint = "Everything is seen from this frame. Click and type to search."
         self._frames = FrameChoice(gui, "Fixed frame", _NO_FRAME, hint)
         self._unknown = gui.add_html("")

@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 import viser
 
+from zstate.buffer.snapshot import FrameTable
 from zstate.clock import SYSTEM
 from zstate.view.frame_search import found_frames
-from zstate.view.moment import Tree
 from zstate.view.panels import html
 from zstate.view.panels.choice import Choice, FrameChoice
 from zstate.view.panels.look import Look
@@ -33,7 +33,7 @@ class FramesPanel:
     def __init__(self, gui: viser.GuiApi, world: World, scene: Trails) -> None:
         self._world = world
         self._scene = scene
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         self._query = ""
         self._trailing: set[str] = set()
         hint = "Parts of a frame's name: hand, left gripper, ..."
@@ -65,7 +65,7 @@ class FramesPanel:
         self._drawn = set(self._trailing)
         self._clear.visible = bool(self._drawn)
 
-    def _find(self, tree: Tree, query: str) -> None:
+    def _find(self, tree: FrameTable, query: str) -> None:
         found, selected = found_frames(tree.names, query), self._selected.frame
         if selected not in found or query != self._query:
             selected = found[0] if found else None
@@ -74,7 +74,7 @@ class FramesPanel:
         self._found.content = html.paragraph(_found_text(found, tree, query), muted=True) if query else ""
 
     def _rows(self, frame: str, look: Look) -> Rows:
-        info = look.facts.info(frame)
+        info = next(iter(look.buffer.frames((frame,))), None)
         if info is None or frame not in look.moment.tree.index:
             return []
         rows: Rows = [("in", look.fixed), *self._pose(frame, look)]
@@ -88,7 +88,7 @@ class FramesPanel:
 
     def _pose(self, frame: str, look: Look) -> Rows:
         moment = look.moment
-        pose = moment.placed(look.fixed)[moment.tree.index[frame]]
+        pose = moment.poses_in(look.fixed)[moment.tree.index[frame]]
         if not np.isnan(pose).any():
             return pose_rows(pose.tolist())
         return [("no pose", self._reason(frame, look))]
@@ -110,7 +110,7 @@ def why_apart(world: World, look: Look, target: str, source: str) -> str:
     return "no known edges join the two" if reason is None else str(reason)
 
 
-def _found_text(found: Sequence[str], tree: Tree, query: str) -> str:
+def _found_text(found: Sequence[str], tree: FrameTable, query: str) -> str:
     if not found:
         return f"none of {len(tree.names)} frames is called anything like {query!r}"
     more = len(found) - 1 - _MOST_LISTED

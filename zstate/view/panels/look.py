@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.snapshot import FramePoses
 from zstate.errors import duration_text
-from zstate.view.frame_facts import FrameFacts
-from zstate.view.moment import Moment
 
 
 class Look(NamedTuple):
@@ -16,9 +16,9 @@ class Look(NamedTuple):
     stamps are not of the time that the buffer's clock tells. ``domain`` says whose time they are.
     """
 
-    moment: Moment
+    moment: FramePoses
     fixed: str
-    facts: FrameFacts
+    buffer: TransformBuffer
     is_present: bool
     now: int | None
     domain: str | None

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from zstate.model.coordinates import coordinate_names
-from zstate.view.joint_history import joint_history
 from zstate.view.panels.choice import Choice
 from zstate.view.panels.look import Look
 from zstate.view.world import World
@@ -44,14 +43,14 @@ class PlotsPanel:
     def update(self, look: Look) -> None:
         self._offer(tuple(self._world.models))
         robot, joint = self._robot.value, self._joint.value
-        track = look.facts.track(robot)
+        track = look.moment.tree.robots.get(robot)
         names = () if track is None else _columns(coordinate_names(track.model), joint)
         self._round += 1
         if track is None or not names or look.moment.stamp is None:
             self._clear()
         elif names != self._drawn or self._round % _EVERY == 0:
             until = look.moment.stamp
-            history = joint_history(track, until, _SECONDS)
+            history = look.buffer.joint_history(track, until, _SECONDS)
             columns = [coordinate_names(track.model).index(name) for name in names]
             seconds = (history.stamps - until) / 1e9
             self._draw(names, (seconds, *history.positions[:, columns].T))

@@ -6,11 +6,12 @@ from datetime import datetime
 
 import viser
 
+from zstate.buffer.snapshot import TimeSpan
 from zstate.clock import SYSTEM
 from zstate.view.panels import html
 from zstate.view.panels.choice import Choice
 from zstate.view.panels.look import Look
-from zstate.view.replay_clock import ReplayClock, Span
+from zstate.view.replay_clock import ReplayClock
 
 _SPEEDS: tuple[str, ...] = ("0.1x", "0.25x", "0.5x", "1x", "2x", "5x", "10x")
 _STEP_S = 0.01
@@ -31,7 +32,7 @@ class ReplayPanel:
         self._place = Choice[float](self._slider)
         speeds: viser.GuiDropdownHandle[str] = gui.add_dropdown("Speed", _SPEEDS, initial_value="1x")
         self._speed = Choice[str](speeds)
-        self._span: Span | None = None
+        self._span: TimeSpan | None = None
         self._buttons.on_click(self._press)
 
     def _press(self, event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
@@ -49,14 +50,14 @@ class ReplayPanel:
         if place is not None and self._span is not None:
             self._clock.seek(self._origin(self._span) + round(place * 1e9))
             return
-        span = look.facts.span()
+        span = look.buffer.span()
         if span is not None:
             self._show(span, look)
 
-    def _origin(self, span: Span) -> int:
+    def _origin(self, span: TimeSpan) -> int:
         return span.newest if self._clock.live else span.oldest
 
-    def _show(self, span: Span, look: Look) -> None:
+    def _show(self, span: TimeSpan, look: Look) -> None:
         is_present = self._clock.is_present
         if is_present and self._span is not None and self._place.value == 0.0:
             # Where nobody goes back, the slider need not say ten times a second how far one could go.

@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 import viser
 
+from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.ingest.deadline import is_stale
 from zstate.model.known import example_name
-from zstate.view.moment import Moment, Tree
 from zstate.view.panels import html
 from zstate.view.panels.look import Look
 from zstate.view.world import World
@@ -48,7 +48,7 @@ class RobotsPanel:
     def _silence(self, robot: str, look: Look) -> str | None:
         # Who is silent now was not when what is shown happened.
         silent_s = self._world.silent_s(robot) if look.is_present else None
-        if silent_s is None or not is_stale(silent_s, look.facts.rate_hz(robot)):
+        if silent_s is None or not is_stale(silent_s, _rate_hz(robot, look)):
             return None
         return silence_text(silent_s)
 
@@ -62,9 +62,9 @@ class RobotsPanel:
         return html.table(("Robot", "State"), rows, colors)
 
     def _state(self, robot: str, look: Look) -> str:
-        rate_hz = look.facts.rate_hz(robot)
+        rate_hz = _rate_hz(robot, look)
         if rate_hz is None:
-            return "no sample yet" if look.facts.track(robot) else "no model yet"
+            return "no sample yet" if robot in look.moment.tree.robots else "no model yet"
         return f"{'live' if look.is_present else 'in the past'}, {rate_hz:.1f} Hz"
 
     def _meshes(self, robots: Sequence[str]) -> str:
@@ -85,7 +85,12 @@ def silence_text(silent_s: float, now_s: float | None = None) -> str:
     return f"silent for {duration}, since {since:%H:%M:%S}"
 
 
-def apart_html(tree: Tree, fixed: str) -> str:
+def _rate_hz(robot: str, look: Look) -> float | None:
+    track = look.moment.tree.robots.get(robot)
+    return None if track is None else track.rate_hz
+
+
+def apart_html(tree: FrameTable, fixed: str) -> str:
     """The roots that nothing joins to the fixed frame, so that they are drawn beside it, anywhere."""
     if fixed not in tree.index:
         return ""
@@ -103,7 +108,7 @@ def apart_html(tree: Tree, fixed: str) -> str:
     return listing + html.paragraph(said, muted=True)
 
 
-def unplaced_html(moment: Moment) -> str:
+def unplaced_html(moment: FramePoses) -> str:
     """The frames that have no pose, with the reason; those together that have the same."""
     frames: dict[str, list[str]] = {}
     for row, reason in moment.reasons.items():

@@ -16,7 +16,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.view.moment import Moment, Poses, Rows, Tree
+from zstate.buffer.snapshot import FramePoses, FrameTable, Poses, Rows
 from zstate.view.scene.nodes import Nodes
 
 _GAP_M = 0.3
@@ -44,7 +44,7 @@ class Apart:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         self._found_for: tuple[int, int] | None = None
         self._boxes: dict[str, tuple[tuple[str, ...], int, _Box]] = {}
         self._offsets: dict[int, Offset] = {}
@@ -58,15 +58,15 @@ class Apart:
         """The frames on whose nodes a label hangs."""
         return frozenset(self._texts)
 
-    def placed(self, moment: Moment, fixed: str) -> Poses:
-        """As ``moment.placed(fixed)``, where every tree has a place. Raises UnknownFrame."""
+    def placed(self, moment: FramePoses, fixed: str) -> Poses:
+        """As ``moment.poses_in(fixed)``, where every tree has a place. Raises UnknownFrame."""
         tree = moment.tree
         root = int(tree.roots[tree.row(fixed)])
         found_for = root, int(np.count_nonzero(moment.known))
         if tree is not self._tree or found_for != self._found_for:
             self._tree, self._found_for = tree, found_for
             self._find_places(moment, root)
-        return moment.beside(fixed, self._offsets) if self._offsets else moment.placed(fixed)
+        return moment.poses_side_by_side(fixed, self._offsets) if self._offsets else moment.poses_in(fixed)
 
     def show(self, nodes: Nodes) -> None:
         """Draw the labels."""
@@ -84,7 +84,7 @@ class Apart:
             else:
                 self._labels[frame][1].text = text
 
-    def _find_places(self, moment: Moment, first: int) -> None:
+    def _find_places(self, moment: FramePoses, first: int) -> None:
         names = moment.tree.names
         members = _members(moment.tree)
         others = sorted((row for row in members if row != first), key=lambda row: _natural(names[row]))
@@ -101,7 +101,7 @@ class Apart:
             called = _called([names[member] for member in map(int, members[row])])
             self._texts[names[row]] = called if row == first else f"{called} (place unknown)"
 
-    def _box(self, moment: Moment, root: int, rows: Rows) -> _Box:
+    def _box(self, moment: FramePoses, root: int, rows: Rows) -> _Box:
         """The largest box that was found for the tree: it does not shrink while samples are missing."""
         tree = moment.tree
         names = tuple(tree.names[row] for row in map(int, rows))
@@ -115,7 +115,7 @@ class Apart:
         return box
 
 
-def _members(tree: Tree) -> dict[int, Rows]:
+def _members(tree: FrameTable) -> dict[int, Rows]:
     """The rows of each tree by that of its root, which stands first."""
     order = np.argsort(tree.roots, kind="stable")
     starts = np.flatnonzero(np.diff(tree.roots[order], prepend=-1))

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.view.moment import Mask, Poses
+from zstate.buffer.snapshot import Mask, Poses
 from zstate.view.scene.nodes import wxyzs
 from zstate.view.scene.posing import place
 

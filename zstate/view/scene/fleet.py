@@ -15,10 +15,10 @@ import viser
 from numpy.typing import NDArray
 
 from zstate import se3
+from zstate.buffer.snapshot import FrameTable, Mask, Poses, Rows
 from zstate.model.shapes import Shape
 from zstate.view.geometry.paths import Missing
 from zstate.view.meshes import Drawing
-from zstate.view.moment import Mask, Poses, Rows, Tree
 from zstate.view.scene.dress import OVER, Dress, role_of
 from zstate.view.scene.nodes import in_frame
 from zstate.view.scene.posing import place
@@ -67,7 +67,7 @@ class Fleet:
         self._wardrobes = [_Wardrobe(dress, shapes, path) for dress in OVER]
         self._orders: dict[Order, _Batch] = {}
         # What the rows of the links were found in.
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         self._lined_up: tuple[str, ...] = ()
         self._capacity = 0
         self.robots: dict[str, None] = {}
@@ -84,7 +84,7 @@ class Fleet:
             batch.drawing = made.drawing
         return True
 
-    def show(self, tree: Tree, placed: Poses, worn: Mapping[str, set[Dress]]) -> None:
+    def show(self, tree: FrameTable, placed: Poses, worn: Mapping[str, set[Dress]]) -> None:
         """Draw each robot in what it wears, at the poses of its links in the fixed frame."""
         if not self.robots:
             return
@@ -111,7 +111,7 @@ class Fleet:
         self._workshop.cancel(self._orders)
         self._orders.clear()
 
-    def _line_up(self, tree: Tree) -> None:
+    def _line_up(self, tree: FrameTable) -> None:
         """Find the rows of the links, -1 where a tree lacks one, and places for as many robots."""
         for wardrobe in self._wardrobes:
             links = [shape.link for shape in wardrobe.shapes]

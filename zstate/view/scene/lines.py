@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import viser
 
-from zstate.view.moment import Mask, Poses, Rows
+from zstate.buffer.snapshot import Mask, Poses, Rows
 
 _COLOR = (230, 150, 20)
 _WIDTH_PX = 2.0

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.view.moment import Mask, Moment
+from zstate.buffer.snapshot import FramePoses, Mask
 from zstate.view.scene.nodes import Nodes
 
 _SIZE = 0.85
@@ -30,7 +30,7 @@ class Names:
         self._labels: dict[str, tuple[str, viser.LabelHandle]] = {}
         self._drawn: tuple[bool, int, bytes] | None = None
 
-    def show(self, on: bool, moment: Moment, nodes: Nodes) -> None:
+    def show(self, on: bool, moment: FramePoses, nodes: Nodes) -> None:
         """Put one at each frame that has a place."""
         joined = _joined(moment, nodes.shown) if on else np.zeros(0, dtype=np.bool_)
         drawn = (on, nodes.version, joined.tobytes())
@@ -65,14 +65,14 @@ class Names:
             self._labels[frame] = (path, label)
 
 
-def _joined(moment: Moment, shown: Mask) -> Mask:
+def _joined(moment: FramePoses, shown: Mask) -> Mask:
     """Which frames are where their parents are."""
     parents = moment.tree.parents
     near: NDArray[np.bool_] = np.linalg.norm(moment.poses[:, :3], axis=1) < _SAME_PLACE_M
     return near & moment.known & (parents >= 0) & shown & shown[parents]
 
 
-def _texts(moment: Moment, shown: Mask, joined: Mask) -> dict[str, str]:
+def _texts(moment: FramePoses, shown: Mask, joined: Mask) -> dict[str, str]:
     """The label of each frame that has one."""
     names = moment.tree.names
     robots = {name.partition("/")[0] for name in names if "/" in name}

@@ -12,8 +12,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from zstate.buffer.snapshot import FramePoses, FrameTable, Mask, Poses, Rows
 from zstate.se3 import IDENTITY, to_matrix
-from zstate.view.moment import Mask, Moment, Poses, Rows, Tree
 from zstate.view.scene.posing import move, turn
 
 _Float = TypeVar("_Float", np.float32, np.float64)
@@ -39,12 +39,12 @@ class Nodes:
         self._hooks: list[viser.FrameHandle] = []
         self._wanted: frozenset[str] = frozenset()
         self._poses: Poses = np.empty((0, 7))
-        self.tree: Tree | None = None
+        self.tree: FrameTable | None = None
         self.paths: dict[str, str] = {}
         self.shown: Mask = np.empty(0, dtype=np.bool_)
         self.version = 0
 
-    def show(self, moment: Moment, placed: Poses, wanted: frozenset[str]) -> None:
+    def show(self, moment: FramePoses, placed: Poses, wanted: frozenset[str]) -> None:
         """Move every frame to its place in the fixed one (N, 7), with nodes for those ``wanted``."""
         if moment.tree is not self.tree or wanted != self._wanted:
             self._wanted = wanted
@@ -58,7 +58,7 @@ class Nodes:
         """Whether the frame has a place in the fixed one."""
         return self.tree is not None and frame in self.paths and bool(self.shown[self.tree.row(frame)])
 
-    def _grow(self, tree: Tree) -> None:
+    def _grow(self, tree: FrameTable) -> None:
         paths = self._paths(tree)
         for path in self._outermost_without(set(paths.values())):
             self._handles[path].remove()
@@ -74,7 +74,7 @@ class Nodes:
         self.tree, self.paths = tree, paths
         self.version += 1
 
-    def _paths(self, tree: Tree) -> dict[str, str]:
+    def _paths(self, tree: FrameTable) -> dict[str, str]:
         """Short ones, because every message has one; a frame keeps its number for good."""
         kept = np.array([name in self._wanted for name in tree.names], dtype=np.bool_)
         for row in range(len(kept) - 1, -1, -1):
@@ -91,7 +91,7 @@ class Nodes:
         gone = self._handles.keys() - kept
         return (path for path in gone if path.rpartition("/")[0] not in gone)
 
-    def _reveal(self, tree: Tree, shown: Mask) -> None:
+    def _reveal(self, tree: FrameTable, shown: Mask) -> None:
         """A node without a place is hidden, unless a frame below it has one: then it is only passed."""
         passed = shown.copy()
         for row in range(len(shown) - 1, -1, -1):
@@ -128,7 +128,7 @@ def in_frame(pose: Sequence[float], points: NDArray[np.float64]) -> NDArray[np.f
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _on_parents(moment: Moment, placed: Poses, shown: Mask) -> Poses:
+def _on_parents(moment: FramePoses, placed: Poses, shown: Mask) -> Poses:
     """Each frame on the node of its parent, which stands at the fixed frame while it has no place."""
     parents = moment.tree.parents
     on_shown = (parents >= 0) & shown[parents]

@@ -11,9 +11,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from zstate.buffer.snapshot import FrameTable, Poses
 from zstate.model.shapes import Shape
 from zstate.view.geometry.paths import Missing
-from zstate.view.moment import Poses, Tree
 from zstate.view.scene.body import Body
 from zstate.view.scene.dress import Dress
 from zstate.view.scene.fleet import Fleet
@@ -69,7 +69,9 @@ class Robots:
         fleets = [fleet for fleet in self._fleets.values() if name in fleet.robots]
         return fleets[0].missing if fleets else ()
 
-    def show(self, nodes: Nodes, tree: Tree, placed: Poses, dresses: Callable[[str], set[Dress]]) -> None:
+    def show(
+        self, nodes: Nodes, tree: FrameTable, placed: Poses, dresses: Callable[[str], set[Dress]]
+    ) -> None:
         """Draw each robot in its dresses, with all that the workshop has made since."""
         for made in self._workshop.fetch():
             any(one.take(made) for one in chain(self._bodies.values(), self._fleets.values()))

@@ -9,11 +9,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
 from zstate.model.findings import Finding
 from zstate.model.robot import RobotModel
 from zstate.model.shapes import Shape, read_shapes
 from zstate.view.meshes import Meshes
-from zstate.view.moment import Moment, Poses, Tree
 from zstate.view.scene.apart import Apart
 from zstate.view.scene.axes import Axes
 from zstate.view.scene.dress import Dress
@@ -99,10 +99,10 @@ class Scene:
         missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
         return self._faults.get(robot, ()) + missing
 
-    def show(self, moment: Moment, fixed: str) -> Poses:
+    def show(self, moment: FramePoses, fixed: str) -> Poses:
         """Draw everything as it was at a moment, seen from the frame ``fixed``.
 
-        Returns the place of each frame, as ``moment.placed(fixed)``, and of trees that nothing joins to the
+        Returns the place of each frame, as ``moment.poses_in(fixed)``, and of trees that nothing joins to the
         fixed frame as they are drawn beside it. Raises UnknownFrame.
         """
         placed = self._apart.placed(moment, fixed)
@@ -117,7 +117,7 @@ class Scene:
         self._apart.show(self._nodes)
         return placed
 
-    def corners(self, tree: Tree, placed: Poses) -> NDArray[np.float64]:
+    def corners(self, tree: FrameTable, placed: Poses) -> NDArray[np.float64]:
         """The corners of the boxes around all visuals that are there and have a place: (N, 3) [m]."""
         boxes = [np.empty((0, 3))]
         for frame, corners in self._robots.corners():
@@ -126,7 +126,7 @@ class Scene:
                 boxes.append(in_frame(placed[row].tolist(), corners))
         return np.concatenate(boxes)
 
-    def _wanted(self, tree: Tree) -> frozenset[str]:
+    def _wanted(self, tree: FrameTable) -> frozenset[str]:
         """The frames on which something hangs."""
         if self.names:
             return frozenset(tree.names)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import viser
 
-from zstate.view.moment import Tree
+from zstate.buffer.snapshot import FrameTable
 from zstate.view.scene.nodes import Nodes
 
 
@@ -15,7 +15,7 @@ class Silences:
         self._scene = scene
         self._texts: dict[str, str] = {}
         self._labels: dict[str, tuple[str, viser.LabelHandle]] = {}
-        self._tree: Tree | None = None
+        self._tree: FrameTable | None = None
         self._firsts: dict[str, str] = {}
 
     def set(self, robot: str, text: str | None) -> None:
@@ -29,7 +29,7 @@ class Silences:
         """Whether that was said last."""
         return robot in self._texts
 
-    def frames(self, tree: Tree) -> frozenset[str]:
+    def frames(self, tree: FrameTable) -> frozenset[str]:
         """The frame of each silent robot that its label hangs on: the first, for parents stand first."""
         if tree is not self._tree:
             self._tree, self._firsts = tree, {}

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.view.moment import Moment, Poses
+from zstate.buffer.snapshot import FramePoses, Poses
 
 _SEGMENTS = 400
 _SHORTEST_M = 0.002
@@ -59,7 +59,7 @@ class Trails:
             self._forget(frame)
             del self._trails[frame]
 
-    def show(self, moment: Moment, fixed: str, placed: Poses) -> None:
+    def show(self, moment: FramePoses, fixed: str, placed: Poses) -> None:
         """Go on to where the frames are."""
         if fixed != self._fixed:
             self._fixed = fixed

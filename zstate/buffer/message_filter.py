@@ -1,35 +1,35 @@
-"""Join: sensor samples, each with the transform of its own instant."""
+"""Message filter: sensor samples, each with the transform at its own stamp (tf2_ros ``MessageFilter``)."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from zstate.errors import LookupFailed
 from zstate.transform import Transform
 
 S = TypeVar("S")
 
-Wait = Callable[[str, str, int, float], Awaitable[Transform]]
+Wait: TypeAlias = Callable[[str, str, int, float], Awaitable[Transform]]
 """``wait_async`` of a buffer: target, source, stamp, timeout_s."""
 
 
 def frame_of(sample: Any) -> str:
-    """The frame a sample is given in: its attribute ``frame``."""
+    """The frame of a sample: its attribute ``frame``."""
     return sample.frame
 
 
 def stamp_of(sample: Any) -> int:
-    """When a sample was taken [ns]: its attribute ``stamp``."""
+    """The stamp of a sample [ns]: its attribute ``stamp``."""
     return sample.stamp
 
 
-class Join(Generic[S]):
-    """``async for sample, transform in join``: samples in their order, each with ``target_from_frame``.
+class MessageFilter(Generic[S]):
+    """``async for sample, transform in filter``: samples in their order, each with ``target_from_frame``.
 
-    A sample waits up to ``timeout_s`` for the transform of its stamp. One that gets none is left out
-    and counted in ``dropped`` by the name of the reason; ``last_reason`` tells of the latest in full.
+    A sample waits up to ``timeout_s`` for the transform at its stamp. One that gets none is left out
+    and counted in ``dropped`` by the name of the error; ``last_reason`` is the last of these errors.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Join(Generic[S]):
         self.dropped: Counter[str] = Counter()
         self.last_reason: LookupFailed | None = None
         self._wait = wait
-        # One iterator for all, so that a join can be left and taken up again.
+        # One iterator, so that a loop over the filter can be left and continued.
         self._samples = samples.__aiter__()
         self._frame = frame
         self._stamp = stamp
@@ -56,7 +56,7 @@ class Join(Generic[S]):
     def __repr__(self) -> str:
         reasons = ", ".join(f"{count} {name}" for name, count in self.dropped.items())
         dropped = f", {self.dropped.total()} dropped ({reasons})" if reasons else ""
-        return f"<Join with {self.target!r}: {self.joined} joined{dropped}>"
+        return f"<MessageFilter for {self.target!r}: {self.joined} joined{dropped}>"
 
     def __aiter__(self) -> AsyncIterator[tuple[S, Transform]]:
         return self
@@ -67,13 +67,10 @@ class Join(Generic[S]):
             try:
                 transform = await self._wait(self.target, frame, stamp, self._timeout_s)
             except LookupFailed as reason:
-                self._drop(reason)
+                self.last_reason = reason
+                # A timeout is counted under the error that the lookup ended with.
+                self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1
             else:
                 self.joined += 1
                 return sample, transform
         raise StopAsyncIteration
-
-    def _drop(self, reason: LookupFailed) -> None:
-        self.last_reason = reason
-        # A timeout is counted as what it still waited for.
-        self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1

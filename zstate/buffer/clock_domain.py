@@ -1,18 +1,17 @@
-"""Domain: which clock stamps the samples of each robot in a buffer."""
+"""Clock domain of each robot in a buffer: the clock that its samples are stamped by."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
 
-from zstate.buffer.edge import Edge
 from zstate.locks import new_lock
 
-# So many robots and frames are remembered; of more, the oldest are forgotten.
-_MOST = 4096
+_CAPACITY = 4096
+"""The number of robots and of frames that are remembered; then the oldest are dropped."""
 
 
-class Domain:
+class ClockDomain:
     """The clock domain of each robot. Robots of different domains may share one buffer.
 
     Stamps of two domains cannot be compared, so a path across both has no answer. ``name`` is the domain to
@@ -21,10 +20,10 @@ class Domain:
 
     def __init__(self, given: str | None = None) -> None:
         self.given = given
-        """The domain of the clock that the user gave, None without one."""
-        self._kept: dict[str, str] = {}
+        """The domain of the user's clock, None without one."""
+        self._by_robot: dict[str, str] = {}
         self._present: dict[str, None] = {}
-        self._placed: dict[str, str] = {}
+        self._robot_by_child: dict[str, str] = {}
         self._lock = new_lock()
 
     @property
@@ -37,41 +36,31 @@ class Domain:
 
     def _most_common(self) -> str | None:
         with self._lock:
-            counts = Counter(kept for robot in self._present if (kept := self._kept.get(robot)))
+            counts = Counter(domain for robot in self._present if (domain := self._by_robot.get(robot)))
         return next((domain for domain, _ in counts.most_common(1)), None)
 
-    def of(self, robot: str) -> str | None:
-        """The domain of ``robot``: empty if its wire does not carry it, None before its description."""
-        return self._kept.get(robot)
-
-    def of_edge(self, edge: Edge) -> str | None:
-        """The domain of the samples of a moving edge: that of the robot whose writer places it."""
-        return self._kept.get(self.robot_of(edge))
-
-    def robot_of(self, edge: Edge) -> str:
-        """The robot whose writer places ``edge``."""
-        if edge.robot is not None:
-            return edge.robot.prefix
-        return self.robot_placing(edge.child)
+    def domain_of(self, robot: str) -> str | None:
+        """The domain of ``robot``: empty if its wire format has none, None before its description."""
+        return self._by_robot.get(robot)
 
     def robot_placing(self, child: str) -> str:
         """The robot whose writer places the frame ``child``: that of its name, unless another one does."""
-        return self._placed.get(child) or child.partition("/")[0]
+        return self._robot_by_child.get(child) or child.partition("/")[0]
 
     def set(self, robot: str, domain: str) -> bool:
         """Set the domain of ``robot``, as its description gives it. Returns whether that is a change."""
         with self._lock:
-            before = self._kept.get(robot)
-            _remember(self._kept, robot, domain)
+            before = self._by_robot.get(robot)
+            _set_newest(self._by_robot, robot, domain)
         return before != domain
 
     def place(self, robot: str, children: Iterable[str]) -> None:
         """Record that writers of ``robot`` place the frames ``children``."""
         for child in children:
             if child.partition("/")[0] == robot:
-                self._placed.pop(child, None)
+                self._robot_by_child.pop(child, None)
             else:
-                _remember(self._placed, child, robot)
+                _set_newest(self._robot_by_child, child, robot)
 
     def join(self, robot: str) -> None:
         """Count ``robot`` for the majority: it has samples."""
@@ -84,8 +73,8 @@ class Domain:
             self._present.pop(robot, None)
 
 
-def _remember(known: dict[str, str], key: str, value: str) -> None:
-    known.pop(key, None)
-    known[key] = value
-    while len(known) > _MOST:
-        del known[next(iter(known))]
+def _set_newest(values: dict[str, str], key: str, value: str) -> None:
+    values.pop(key, None)
+    values[key] = value
+    while len(values) > _CAPACITY:
+        del values[next(iter(values))]

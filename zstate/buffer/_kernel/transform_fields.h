@@ -1,4 +1,4 @@
-/* Facts: what a Transform holds, for zstate/facts.py. */
+/* TransformFields: the data of a Transform, for zstate/transform.py. */
 
 typedef struct {
     PyObject_HEAD
@@ -8,33 +8,33 @@ typedef struct {
     PyObject *kind;
     double predicted_s;
     Pose pose;
-} Facts;
+} TransformFields;
 
-static PyTypeObject Facts_type;
+static PyTypeObject TransformFields_type;
 static PyObject *kind_static, *kind_exact, *kind_interpolated;
 
-/* A filled object of a class that is known to derive from Facts. */
+/* A new object of a class that derives from TransformFields, with all fields set. */
 static PyObject *
-facts_new(PyTypeObject *type, PyObject *target, PyObject *source, Pose pose, PyObject *stamp,
-          PyObject *kind)
+fields_new(PyTypeObject *type, PyObject *target, PyObject *source, Pose pose, PyObject *stamp,
+           PyObject *kind)
 {
-    Facts *facts = (Facts *)type->tp_alloc(type, 0);
-    if (facts == NULL)
+    TransformFields *fields = (TransformFields *)type->tp_alloc(type, 0);
+    if (fields == NULL)
         return NULL;
     Py_INCREF(target);
     Py_INCREF(source);
     Py_INCREF(stamp);
     Py_INCREF(kind);
-    facts->target = target;
-    facts->source = source;
-    facts->stamp = stamp;
-    facts->kind = kind;
-    facts->pose = pose;
-    return (PyObject *)facts;
+    fields->target = target;
+    fields->source = source;
+    fields->stamp = stamp;
+    fields->kind = kind;
+    fields->pose = pose;
+    return (PyObject *)fields;
 }
 
 static void
-facts_dealloc(Facts *self)
+fields_dealloc(TransformFields *self)
 {
     Py_CLEAR(self->target);
     Py_CLEAR(self->source);
@@ -62,19 +62,19 @@ read_doubles(PyObject *tuple, double *numbers, Py_ssize_t count)
 /* From (target, source, pose, stamp, kind, predicted_s=0.0). -1 and an exception for other
  * arguments. */
 static int
-facts_fill(Facts *self, PyObject *const *args, Py_ssize_t count)
+fields_fill(TransformFields *self, PyObject *const *args, Py_ssize_t count)
 {
     double n[7];
     if (count < 5 || count > 6) {
         PyErr_SetString(PyExc_TypeError,
-                        "facts are target, source, pose, stamp, kind, predicted_s=0.0");
+                        "fields are target, source, pose, stamp, kind, predicted_s=0.0");
         return -1;
     }
     double predicted_s = count == 6 ? PyFloat_AsDouble(args[5]) : 0.0;
     if ((predicted_s == -1.0 && PyErr_Occurred()) || read_doubles(args[2], n, 7) < 0)
         return -1;
     if (self->target != NULL) {
-        PyErr_SetString(PyExc_AttributeError, "facts are filled once");
+        PyErr_SetString(PyExc_AttributeError, "fields are filled once");
         return -1;
     }
     Py_INCREF(args[0]);
@@ -91,24 +91,24 @@ facts_fill(Facts *self, PyObject *const *args, Py_ssize_t count)
 }
 
 static PyObject *
-facts_trusted(PyObject *type, PyObject *const *args, Py_ssize_t count)
+fields_trusted(PyObject *type, PyObject *const *args, Py_ssize_t count)
 {
     PyObject *self = ((PyTypeObject *)type)->tp_alloc((PyTypeObject *)type, 0);
-    if (self != NULL && facts_fill((Facts *)self, args, count) < 0)
+    if (self != NULL && fields_fill((TransformFields *)self, args, count) < 0)
         Py_CLEAR(self);
     return self;
 }
 
 static PyObject *
-facts_fill_once(Facts *self, PyObject *const *args, Py_ssize_t count)
+fields_fill_once(TransformFields *self, PyObject *const *args, Py_ssize_t count)
 {
-    if (facts_fill(self, args, count) < 0)
+    if (fields_fill(self, args, count) < 0)
         return NULL;
     Py_RETURN_NONE;
 }
 
 static PyObject *
-facts_pose(Facts *self, void *Py_UNUSED(closure))
+fields_pose(TransformFields *self, void *Py_UNUSED(closure))
 {
     const Pose p = self->pose;
     if (self->target == NULL) {
@@ -118,38 +118,42 @@ facts_pose(Facts *self, void *Py_UNUSED(closure))
     return Py_BuildValue("(ddddddd)", p.x, p.y, p.z, p.qx, p.qy, p.qz, p.qw);
 }
 
-static PyMethodDef facts_methods[] = {
-    {"trusted", (PyCFunction)(void (*)(void))facts_trusted, METH_FASTCALL | METH_CLASS,
+static PyMethodDef fields_methods[] = {
+    {"trusted", (PyCFunction)(void (*)(void))fields_trusted, METH_FASTCALL | METH_CLASS,
      "trusted($type, target, source, pose, stamp, kind, predicted_s=0.0, /)\n--\n\n"
      "From seven floats that are known to be a pose: for the buffer, which checked at insert."},
-    {"_fill", (PyCFunction)(void (*)(void))facts_fill_once, METH_FASTCALL,
+    {"_fill", (PyCFunction)(void (*)(void))fields_fill_once, METH_FASTCALL,
      "As trusted, for constructors."},
     {NULL},
 };
 
-static PyMemberDef facts_members[] = {
-    {"target", T_OBJECT_EX, offsetof(Facts, target), READONLY, "The frame that it is given in."},
-    {"source", T_OBJECT_EX, offsetof(Facts, source), READONLY, "The frame whose pose it is."},
-    {"stamp", T_OBJECT_EX, offsetof(Facts, stamp), READONLY, "Its instant [ns], or None."},
-    {"kind", T_OBJECT_EX, offsetof(Facts, kind), READONLY, "How it was made."},
-    {"predicted_s", T_DOUBLE, offsetof(Facts, predicted_s), READONLY, "How far ahead [s]."},
+static PyMemberDef fields_members[] = {
+    {"target", T_OBJECT_EX, offsetof(TransformFields, target), READONLY,
+     "The frame that it is given in."},
+    {"source", T_OBJECT_EX, offsetof(TransformFields, source), READONLY,
+     "The frame whose pose it is."},
+    {"stamp", T_OBJECT_EX, offsetof(TransformFields, stamp), READONLY,
+     "Its instant [ns], or None."},
+    {"kind", T_OBJECT_EX, offsetof(TransformFields, kind), READONLY, "How it was made."},
+    {"predicted_s", T_DOUBLE, offsetof(TransformFields, predicted_s), READONLY,
+     "How far ahead [s]."},
     {NULL},
 };
 
-static PyGetSetDef facts_getset[] = {
-    {"_pose", (getter)facts_pose, NULL, "x y z qx qy qz qw.", NULL},
+static PyGetSetDef fields_getset[] = {
+    {"_pose", (getter)fields_pose, NULL, "x y z qx qy qz qw.", NULL},
     {NULL},
 };
 
-static PyTypeObject Facts_type = {
+static PyTypeObject TransformFields_type = {
     PyVarObject_HEAD_INIT(NULL, 0)
-    .tp_name = "zstate._kernel.Facts",
-    .tp_doc = "What a Transform holds.",
-    .tp_basicsize = sizeof(Facts),
+    .tp_name = "zstate._kernel.TransformFields",
+    .tp_doc = "The data of a Transform.",
+    .tp_basicsize = sizeof(TransformFields),
     .tp_new = PyType_GenericNew,
-    .tp_dealloc = (destructor)facts_dealloc,
+    .tp_dealloc = (destructor)fields_dealloc,
     .tp_flags = Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE,
-    .tp_methods = facts_methods,
-    .tp_members = facts_members,
-    .tp_getset = facts_getset,
+    .tp_methods = fields_methods,
+    .tp_members = fields_members,
+    .tp_getset = fields_getset,
 };

@@ -1,0 +1,564 @@
+"""Storage and lookups of a transform buffer, without waiting (tf2 ``BufferCore``)."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from numbers import Real
+from typing import NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from zstate.buffer.clock_domain import ClockDomain
+from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
+from zstate.buffer.history import HistoryView, insert_together, keep_only_around
+from zstate.buffer.path import TrackUse, TransformPath, compile_path
+from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
+from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack, Track, TrackOwner
+from zstate.buffer.waiting import RequiredStamps, Waiter, WaiterRegistry, WakeCondition
+from zstate.checks import check_names, name_problem
+from zstate.clock import Clock, SystemClock, check_stamp
+from zstate.errors import (
+    AmbiguousFrame,
+    ClockMismatch,
+    Disconnected,
+    InFuture,
+    InPast,
+    InsertRefused,
+    InvalidInput,
+    LookupFailed,
+    NotFinite,
+    Stale,
+    UnknownFrame,
+)
+from zstate.locks import outlive_fork
+from zstate.model.robot import RobotModel
+from zstate.transform import Transform
+
+# The number of pairs of frames whose paths are cached; more than any program uses on purpose.
+_MAX_CACHED_PATHS = 4096
+
+# No stamp of 64 bits is further away.
+_MAX_PREDICTION_S = 2e10
+
+# Errors that only a change of the tree can end.
+_NO_PATH = (UnknownFrame, AmbiguousFrame, Disconnected, ClockMismatch)
+
+
+class Query(NamedTuple):
+    """The checked arguments of a lookup."""
+
+    target: str
+    source: str
+    at: int | None
+    predict_ns: int = 0
+    max_age_s: float | None = None
+
+
+class CachedPath(NamedTuple):
+    """A compiled path, valid at the ``version`` of the tree and while its ``dependencies`` are current."""
+
+    version: int
+    path: TransformPath
+    dependencies: PathDependencies
+
+
+class BufferCore:
+    """Inserts and lookups. A refused insert changes nothing.
+
+    Inserts may come from any thread; a lock serialises them. Lookups take no lock.
+    """
+
+    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+        if not isinstance(history_s, Real) or not 0.0 < history_s < 1e9:
+            raise InvalidInput(f"history_s is a positive number of seconds, not {history_s!r}")
+        self.history_s = history_s
+        self.clock: Clock = clock or SystemClock()
+        self.domain = ClockDomain(None if clock is None else clock.domain)
+        """The clock domain of each robot."""
+        self.ignored = 0
+        """The number of samples that were older than the history reaches."""
+        self._owner = TrackOwner()
+        self._span_ns = round(history_s * 1e9)
+        self._lock = outlive_fork(threading.RLock())
+        self._writes = 0
+        self._tree = FrameTree(self.domain)
+        self._waiters = WaiterRegistry(self._tree)
+        self._pose_tracks = PoseTrackTable(self._tree, self._span_ns, self._owner)
+        self._paths: dict[tuple[str, str], CachedPath] = {}
+        self._stop_reason = ""
+
+    @property
+    def clock_offsets(self) -> ClockOffsets:
+        """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
+        return self._owner.clock_offsets
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether the samples come from a file: no sample is added later."""
+        return self._owner.is_recording
+
+    @is_recording.setter
+    def is_recording(self, value: bool) -> None:
+        self._owner.is_recording = value
+
+    @property
+    def version(self) -> int:
+        """Grows whenever a frame is added, or the edge that places one changes."""
+        return self._tree.version
+
+    @property
+    def waiter_count(self) -> int:
+        """The number of waiting threads and tasks, and of open watches."""
+        return len(self._waiters)
+
+    def stop(self, reason: str) -> None:
+        """No more samples will come: waits fail at once, and errors name the reason. Lookups go on."""
+        self._stop_reason = self._stop_reason or reason
+
+    def add_robot(
+        self, model: RobotModel, prefix: str = "", *, interpolation: Interpolation = "linear"
+    ) -> JointTrack:
+        """Add all links of ``model``; its fixed joints need no samples. Returns the track for the others.
+
+        With a ``prefix`` the frames are named ``prefix/link``. ``interpolation="hermite"`` connects
+        samples that have velocities by cubic curves. Raises InsertRefused if one of the links has a
+        parent already, InvalidInput for a prefix that cannot begin a frame name.
+        """
+        prefix = _check_prefix(prefix)
+        if interpolation not in get_args(Interpolation):
+            raise InvalidInput(
+                f"interpolation is one of {', '.join(get_args(Interpolation))}; got {interpolation!r}"
+            )
+        track = JointTrack(model, prefix, self._span_ns, interpolation)
+        track.owner = self._owner
+        with self._lock, self._tree.transaction():
+            if prefix and self._tree.robots.get(prefix) is not None:
+                raise InsertRefused(
+                    f"there is a robot {prefix!r} in this buffer; remove_robot first",
+                    reason="second writer",
+                    edge=(prefix, model.root),
+                )
+            self._tree.add_frame(track.frame(model.root))
+            for index in range(len(track.forms)):
+                self._attach_joint(track, index)
+            self._tree.robots[prefix] = track
+        self._waiters.notify()
+        return track
+
+    def _attach_joint(self, track: JointTrack, index: int) -> None:
+        form = track.forms[index]
+        parent, child = track.edge(form)
+        existing = self._tree.frames.get(child)
+        if existing is not None and existing.parent == parent:
+            raise second_writer(parent, child, existing, f"the model of {track.model.name!r}")
+        self._tree.check_edge(parent, child, f"the model of {track.model.name!r}")
+        if form.kind == "fixed":
+            edge = Edge(parent, child, "static", pose=form.origin, robot=track)
+        else:
+            edge = Edge(parent, child, "joint", track=track, index=index, robot=track)
+        self._tree.attach(edge)
+
+    def remove_robot(self, track: JointTrack) -> None:
+        """Remove a robot's edges and history. Its frames stay, without a parent.
+
+        Its track accepts no more samples. Raises InsertRefused for a track that is not of this buffer.
+        """
+        with self._lock:
+            self._check_owned(track)
+            track.owner = None
+            for name, edge in list(self._tree.frames.items()):
+                if edge is not None and edge.robot is track:
+                    self._tree.detach(name)
+            if self._tree.robots.get(track.prefix) is track:
+                self._tree.robots[track.prefix] = None
+
+    def name_robot(self, prefix: str) -> None:
+        """Let inserts use bare names for frames ``prefix/...``, as they may for a robot's."""
+        with self._lock:
+            self._tree.robots.setdefault(prefix, None)
+
+    def add_frames(self, names: Iterable[str]) -> None:
+        """Add frames by their full names, so that these names mean no robot's frames."""
+        with self._lock:
+            for name in names:
+                self._tree.add_frame(name)
+
+    def edge_named(self, names: EdgeNames) -> EdgeNames:
+        """The full names of an edge, as an insert resolves them; a name that is not unique is unchanged."""
+        with self._lock, suppress(InsertRefused):
+            return self._tree.resolve_for_insert(names[0]), self._tree.resolve_for_insert(names[1])
+        return names
+
+    def set_domain(self, robot: str, domain: str) -> bool:
+        """Set the clock ``domain`` that stamps the samples of ``robot``. Returns whether that is a change."""
+        with self._lock:
+            changed = self.domain.set(robot, domain)
+            if changed:
+                self._tree.version += 1
+        if changed:
+            self._waiters.notify()
+        return changed
+
+    def insert_joints(
+        self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
+    ) -> bool:
+        """One instant of a robot: positions (and velocities) in the order of its ``joint_names``.
+
+        ``positions`` may also be a block: the same as float64, little-endian, in bytes.
+        True, or False if it is older than the history reaches, which ``ignored`` counts. A second
+        sample of one stamp replaces the first. Raises InvalidInput for wrong counts, NaN and infinity,
+        and for a floating joint's quaternion that is not of length one; InsertRefused for the track of a
+        robot that was removed, or of another buffer.
+        """
+        with self._lock:
+            if track.owner is not self._owner:
+                raise _not_owned(track)
+            inserted = track.try_insert(stamp, positions, velocities)
+        if inserted:
+            # Nearly every sample ends here, without the call in between.
+            self._waiters.notify(track)
+            return True
+        if inserted is not None:
+            return self._count(inserted=False)
+        stamp = check_stamp(stamp)
+        checked = track.check_positions(positions)
+        rates = None if velocities is None else track.model.check_velocities(velocities)
+        with self._lock:
+            self._check_owned(track)  # again: the robot may have been removed since
+            had_velocities = track.has_velocities
+            inserted = track.insert(stamp, checked, rates)
+            if track.has_velocities != had_velocities:
+                self._tree.invalidate(track)
+        return self._count(track, inserted=inserted)
+
+    def _check_owned(self, track: Track) -> None:
+        if track.owner is not self._owner:
+            raise _not_owned(track)
+
+    def restart(self, track: JointTrack | PoseTrack) -> None:
+        """Begin a new epoch: remove the samples of one track, because its writer or its clock restarted.
+
+        Raises InsertRefused for a track that is not of this buffer.
+        """
+        with self._lock:
+            self._check_owned(track)
+            track.history.clear()
+        self._waiters.notify_restart(track)
+
+    def insert(self, transform: Transform, *, writer: str | None = None) -> bool:
+        """One sample of a moving edge: ``transform.target`` is the parent, ``source`` the child.
+
+        True, or False if it is older than the history reaches. Raises InsertRefused for a transform
+        without a stamp, a self edge, a loop, a second parent, or an edge of a robot's model.
+        """
+        edge = (transform.target, transform.source)
+        if transform.stamp is None:
+            raise InsertRefused(
+                f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves",
+                reason="no stamp",
+                edge=edge,
+            )
+        return self._insert_poses((edge,), transform.stamp, transform.pose7[None], writer)
+
+    def insert_many(
+        self, edges: Sequence[EdgeNames], stamp: int, poses: ArrayLike, *, writer: str | None = None
+    ) -> bool:
+        """One instant of many moving edges, all or nothing: row i is ``parent_from_child`` of edges[i].
+
+        ``poses`` is (N, 7), x y z [m], qx qy qz qw. Otherwise as ``insert``.
+        """
+        try:
+            names = tuple((parent, child) for parent, child in edges)
+        except (TypeError, ValueError):
+            raise InvalidInput(f"edges are pairs (parent, child) of frame names; got {edges!r}") from None
+        return self._insert_poses(names, check_stamp(stamp), check_poses(names, poses), writer)
+
+    def _insert_poses(
+        self, names: tuple[EdgeNames, ...], stamp: int, poses: Poses, writer: str | None
+    ) -> bool:
+        with self._lock:
+            try:
+                parts = self._pose_tracks.track_rows(names, stamp, writer)
+            except TooOld:
+                return self._count(inserted=False)
+            if len(parts) == 1:
+                track, rows = parts[0]
+                track.history.insert(stamp, poses[rows].ravel())
+            else:
+                # Odd while tracks disagree: a reader that sees it reads again under the lock.
+                self._writes += 1
+                histories = tuple(track.history for track, _ in parts)
+                insert_together(histories, stamp, tuple(poses[rows].ravel() for _, rows in parts))
+                self._writes += 1
+        return self._count(*(track for track, _ in parts), inserted=True)
+
+    def _count(self, *tracks: Track, inserted: bool) -> bool:
+        if inserted:
+            self._waiters.notify(*tracks)
+        else:
+            with self._lock:
+                self.ignored += 1
+        return inserted
+
+    def insert_static(self, transform: Transform, *, writer: str | None = None) -> None:
+        """An edge that never moves, valid at every instant; its stamp is not used.
+
+        Replaces the earlier edge of the child on that parent. Raises InsertRefused as ``insert``.
+        """
+        with self._lock, self._tree.transaction():
+            edge = self._pose_tracks.check_edge(transform.target, transform.source, writer)
+            self._pose_tracks.split_edge(edge)
+            pose = tuple(transform.pose7.tolist())
+            self._tree.attach(Edge(*edge, "static", pose=pose, static_writer=writer))  # type: ignore[arg-type]
+        self._waiters.notify()
+
+    def withdraw(self, child: str) -> None:
+        """Remove the edge that places ``child``, with its history; the frame stays.
+
+        Raises InvalidInput for an unknown frame, InsertRefused for a link of a robot's model.
+        """
+        check_names(child)
+        with self._lock:
+            name = self._tree.resolve_for_insert(child)
+            if name not in self._tree.frames:
+                near = self._tree.names.near(child)()
+                hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
+                raise InvalidInput(f"there is no frame {child!r} to withdraw{hint}")
+            edge = self._tree.frames[name]
+            if edge is not None and edge.robot is not None:
+                raise InsertRefused(
+                    f"{name!r} is placed by {edge.writer}; remove_robot removes the whole robot",
+                    reason="second writer",
+                    edge=edge.names,
+                )
+            if edge is not None:
+                self._pose_tracks.split_edge(edge.names)
+            self._tree.detach(name)
+
+    def clear(self) -> None:
+        """Remove every sample. Frames, static edges and robots stay."""
+        with self._lock:
+            tracks = [track for track in self._tree.moving() if track.history.view.size]
+            for track in tracks:
+                track.history.clear()
+        self._waiters.notify_restart(*tracks)
+
+    def keep_only_around(self, stamps: NDArray[np.int64]) -> None:
+        """Remove all samples but the first, the last, and those that lookups at ``stamps`` [ns] need.
+
+        Lookups there stay the same, whatever is inserted later: so a history of any length fits
+        into memory if few instants of it are needed.
+        """
+        with self._lock:
+            for track in self._tree.moving():
+                keep_only_around(track.history, stamps)
+
+    def frames(self, among: Iterable[str] | None = None) -> tuple[FrameInfo, ...]:
+        """All frames, in the order of their first mention; or those of the full names ``among``."""
+        with self._lock:
+            known = self._tree.frames
+            names = known if among is None else [name for name in among if name in known]
+            return tuple(map(self._tree.frame_info, names))
+
+    def tree_snapshot(self) -> TreeSnapshot:
+        """All frames with their edges and all robots with their tracks."""
+        with self._lock:
+            return self._tree.snapshot()
+
+    def use_clock(self, clock: Clock) -> None:
+        """Measure ages with ``clock``. Raises InvalidInput if a clock of another domain was given before."""
+        given = self.domain.given
+        if given not in (None, clock.domain):
+            raise InvalidInput(
+                f"the buffer was given a clock of {given!r} time, and now one of {clock.domain!r} time; "
+                "give both the same, or a buffer without a clock"
+            )
+        self.clock = clock
+        self.domain.given = clock.domain
+
+    def domain_between(self, target: str, source: str) -> str | None:
+        """The clock domain of transforms between two frames, None if not known. Raises as ``plan``."""
+        return self.path(target, source).domain or None
+
+    def path(self, target: str, source: str, *, compiled: bool = True) -> TransformPath:
+        """The cached path between two frames; a new one without the extension if not ``compiled``."""
+        if compiled:
+            return self._cached_path(target, source).path
+        with self._lock:
+            edges = self._tree.path(target, source)
+            return compile_path(target, source, edges, self._read_views, compiled=False)
+
+    def _cached_path(self, target: str, source: str) -> CachedPath:
+        version = self._tree.version
+        try:
+            cached = self._paths.get((target, source))
+        except TypeError:  # of a list, which has no hash and is no name
+            cached = None
+        if cached is not None and cached.version == version:
+            return cached
+        if cached is not None and self._tree.is_current(cached.dependencies):
+            cached = cached._replace(version=version)
+        else:
+            check_names(target, source)
+            with self._lock:
+                edges = self._tree.path(target, source)
+                path = compile_path(target, source, edges, self._read_views)
+                cached = CachedPath(self._tree.version, path, edges.dependencies)
+        if len(self._paths) >= _MAX_CACHED_PATHS:
+            self._paths = {}
+        self._paths[target, source] = cached
+        return cached
+
+    def _read_views(self, uses: Sequence[TrackUse]) -> list[HistoryView]:
+        """The views of several tracks at one moment between writes."""
+        before = self._writes
+        views = [use.track.history.view for use in uses]
+        if len(uses) < 2 or (before == self._writes and not before & 1):
+            return views
+        with self._lock:
+            return [use.track.history.view for use in uses]
+
+    def _query(
+        self,
+        target: str,
+        source: str,
+        at: int | None,
+        *,
+        predict_s: float = 0.0,
+        max_age_s: float | None = None,
+    ) -> Query:
+        check_names(target, source)
+        if max_age_s is not None:
+            check_duration("max_age_s", max_age_s)
+        predict_ns = round(check_duration("predict_s", predict_s, _MAX_PREDICTION_S) * 1e9)
+        return Query(target, source, None if at is None else check_stamp(at), predict_ns, max_age_s)
+
+    def _lookup(self, query: Query) -> Transform:
+        try:
+            path = self._cached_path(query.target, query.source).path
+            transform = path.transform(query.at, query.predict_ns)
+        except LookupFailed as reason:
+            if reason.requested is None:
+                reason.requested = query.at
+            if self._stop_reason:
+                reason.ended = self._stop_reason
+            raise
+        if query.max_age_s is not None:
+            self._check_age(path, transform, query.max_age_s)
+        return transform
+
+    def _check_age(self, path: TransformPath, transform: Transform, max_age_s: float) -> None:
+        if path.domain not in ("", self.clock.domain):
+            use = path.uses[0]
+            raise ClockMismatch(
+                path.target,
+                path.source,
+                edges=(use.edge,),
+                robots=(use.track.name,),
+                domains=(path.domain, self.clock.domain),
+            )
+        age_s = transform.age(self.clock)
+        if path.uses and age_s > max_age_s:
+            raise path.stale(transform.stamp, age_s, max_age_s)
+
+    def _lookup_or_expect(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
+        """The transform; or the reason against it, with the wake condition of ``waiter`` set.
+
+        Raises a reason that no later insert can end.
+        """
+        version = self._tree.version
+        try:
+            return self._lookup(query)
+        except LookupFailed as reason:
+            return self._expect_change(query, reason, waiter, version)
+
+    def _lookup_newest(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
+        """The newest transform, with ``waiter`` expecting a newer one; else as ``_lookup_or_expect``."""
+        version = self._tree.version
+        try:
+            _, path, dependencies = self._cached_path(query.target, query.source)
+            transform = path.transform(None)
+        except LookupFailed as reason:
+            return self._expect_change(query, reason, waiter, version)
+        newer = None if transform.stamp is None else transform.stamp + 1
+        waiter.expect(WakeCondition(dependencies, dict.fromkeys(path.tracks, newer)), version)
+        return transform
+
+    def _expect_change(
+        self, query: Query, reason: LookupFailed, waiter: Waiter, version: int
+    ) -> LookupFailed:
+        condition = self._wake_condition(query, reason)
+        waiter.expect(condition, version)
+        if _is_final(query, reason, condition):
+            raise reason
+        return reason
+
+    def _wake_condition(self, query: Query, reason: LookupFailed) -> WakeCondition:
+        if isinstance(reason, _NO_PATH):
+            with self._lock:
+                return WakeCondition(self._tree.dependencies(query.target, query.source))
+        try:
+            cached = self._cached_path(query.target, query.source)
+        except LookupFailed:
+            return WakeCondition()  # the tree has changed since, which its version shows
+        return WakeCondition(cached.dependencies, _required_stamps(query, reason, cached.path), query.at)
+
+
+def _required_stamps(query: Query, reason: LookupFailed, path: TransformPath) -> RequiredStamps:
+    """The stamp that each track of the path must reach before another lookup may succeed."""
+    at = None if query.at is None else query.at - query.predict_ns
+    if isinstance(reason, Stale | NotFinite):
+        # After a silent edge, where the query had no instant, any newer sample may help.
+        last = reason.newest if reason.requested is None else reason.requested
+        at = None if last is None else last + 1
+    required: dict[Track, int | None] = {use.track: at for use in path.uses}
+    if isinstance(reason, InFuture) and at is not None and reason.newest is not None:
+        # If prediction is not possible from the samples there are, only a newer one helps.
+        limiting = [use.track for use in path.uses if use.edge == reason.edge]
+        required.update((track, max(at, reason.newest + 1)) for track in limiting)
+    return required
+
+
+def _is_final(query: Query, reason: LookupFailed, condition: WakeCondition) -> bool:
+    """Whether no later insert can turn the reason into a transform."""
+    if isinstance(reason, InPast):
+        # Before that, late samples are sorted in, and the history of a new listener is back-filled.
+        return condition.is_hopeless()
+    if isinstance(reason, Stale | NotFinite):
+        return query.at is not None
+    if isinstance(reason, ClockMismatch):
+        # Each of two robots may restart with the clock of the other; the clock given by the user stays.
+        return len(reason.edges) < 2
+    return isinstance(reason, AmbiguousFrame)
+
+
+def check_duration(name: str, value: float, most: float = 1e300) -> float:
+    """``value`` if it is a number of seconds of at most ``most``; else raises InvalidInput."""
+    if not isinstance(value, Real) or not 0.0 <= value < math.inf:
+        raise InvalidInput(f"{name} is a number of seconds, zero or more; got {value!r}")
+    if value > most:
+        raise InvalidInput(f"{name} is at most {most:g} seconds; got {value!r}")
+    return value
+
+
+def _check_prefix(prefix: object) -> str:
+    if isinstance(prefix, str) and not prefix:
+        return ""
+    if problem := name_problem(prefix):
+        raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
+    return str(prefix).removesuffix("/")
+
+
+def _not_owned(track: Track) -> InsertRefused:
+    if isinstance(track, JointTrack) and track.owner is None:
+        what = f"the robot {track.name!r} was removed from its buffer; add_robot gives a new track"
+        reason = "removed robot"
+    else:
+        what = f"the track {track.name!r} belongs to another buffer; use the buffer that made it"
+        reason = "another buffer"
+    edge = (track.name, track.frame(track.model.root)) if isinstance(track, JointTrack) else track.edges[0]
+    return InsertRefused(what, reason=reason, edge=edge)

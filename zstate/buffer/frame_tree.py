@@ -1,0 +1,466 @@
+"""Frame tree: which edge places which frame, frame names, and the paths between frames.
+
+It knows no stamps; samples are in the tracks behind the edges.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from functools import partial
+from typing import Literal, NamedTuple
+
+from zstate import se3
+from zstate.buffer.clock_domain import ClockDomain
+from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage
+from zstate.checks import name_problem
+from zstate.errors import AmbiguousFrame, ClockMismatch, Disconnected, InsertRefused, UnknownFrame
+
+EdgeKind = Literal["joint", "pose", "static"]
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """An edge of the tree: it places ``child`` on ``parent``.
+
+    A static edge holds its ``pose``; a moving one its ``track`` and its ``index`` among the track's
+    edges. ``robot`` is the joint track of the model the edge belongs to, fixed joints included.
+    """
+
+    parent: str
+    child: str
+    kind: EdgeKind
+    pose: se3.Pose = se3.IDENTITY
+    track: JointTrack | PoseTrack | None = None
+    index: int = 0
+    robot: JointTrack | None = None
+    static_writer: str | None = None
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """(parent, child)."""
+        return (self.parent, self.child)
+
+    @property
+    def writer(self) -> str | None:
+        """The writer of this edge, if known."""
+        if self.robot is not None:
+            writer = self.robot.model_writer if self.kind == "static" else self.robot.writer
+            return writer or f"the model of {self.robot.model.name!r}"
+        return self.track.writer if self.track is not None else self.static_writer
+
+
+@dataclass(frozen=True, slots=True)
+class FrameInfo:
+    """One frame and the edge that places it, as ``frames()`` lists them.
+
+    ``kind`` is "joint" or "pose" for moving edges, "static", or "root" for a frame without a parent.
+    ``oldest`` and ``newest`` [ns], ``rate_hz`` and ``count`` are of the samples kept. ``domain`` is the clock
+    domain of the stamps: "system", the name of a simulated time, or None if that is not known.
+    """
+
+    name: str
+    parent: str | None
+    kind: Literal["joint", "pose", "static", "root"]
+    writer: str | None
+    rate_hz: float | None
+    oldest: int | None
+    newest: int | None
+    count: int
+    domain: str | None = None
+
+    def newest_in(self, domain: str) -> int | None:
+        """The newest stamp [ns] if it can be compared with a clock of ``domain``, else None."""
+        return self.newest if self.domain in (None, domain) else None
+
+
+class PathDependencies(NamedTuple):
+    """The names and edges that a compiled path depends on. The path stays valid while they are unchanged.
+
+    ``names`` are the names of the lookup, each with its frame, or None. ``edges`` are frames, each with the
+    edge that places it, or None. Edges are compared as objects: a replacement is another object.
+    ``domains`` are the clock domains of moving edges, one edge for each track.
+    """
+
+    names: tuple[tuple[str, str | None], ...] = ()
+    edges: tuple[tuple[str, Edge | None], ...] = ()
+    domains: tuple[tuple[Edge, str | None], ...] = ()
+
+
+class TreePath(NamedTuple):
+    """The edges from the common ancestor of two frames down to each, and what that depends on.
+
+    ``domain`` is the clock domain of the moving edges; empty if none is known.
+    """
+
+    to_target: Sequence[Edge]
+    to_source: Sequence[Edge]
+    domain: str
+    dependencies: PathDependencies
+
+
+class TreeSnapshot(NamedTuple):
+    """Every frame with the edge that places it, and every robot with its track, at one ``version``."""
+
+    version: int
+    edges: Mapping[str, Edge | None]
+    robots: Mapping[str, JointTrack]
+
+
+class FrameNameIndex:
+    """The names of all frames in the order of their first mention; none is ever removed.
+
+    A robot's frame, ``robot/link``, is also found by its bare name ``link`` while that is unique.
+    """
+
+    def __init__(self) -> None:
+        self._all: list[str] = []
+        self._by_bare: defaultdict[str, list[str]] = defaultdict(list)
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def add(self, name: str) -> None:
+        """Add a new name."""
+        self._all.append(name)
+        bare = _bare(name)
+        if bare:
+            self._by_bare[bare].append(name)
+
+    def truncate(self, count: int) -> list[str]:
+        """Remove all but the first ``count`` names again; returns the removed ones."""
+        added = self._all[count:]
+        for name in reversed(added):
+            bare = _bare(name)
+            if bare:
+                self._by_bare[bare].pop()
+        del self._all[count:]
+        return added
+
+    def with_bare(self, name: str) -> tuple[str, ...]:
+        """The frames that have the bare name ``name``."""
+        return tuple(self._by_bare.get(name, ()))
+
+    def near(self, name: str) -> Callable[[], list[str]]:
+        """A function that finds the names similar to ``name``, best first, bare ones where those are similar.
+
+        The search takes milliseconds among thousands of names, so it runs only when an error is read. It
+        covers the names there are now, even if others are added in between.
+        """
+        return partial(_near, name, self._all, len(self._all))
+
+
+def _near(name: str, names: list[str], count: int) -> list[str]:
+    known = names[:count]
+    return get_close_matches(name, known if "/" in name else _shortest(known), n=3, cutoff=0.7)
+
+
+def _shortest(frames: Sequence[str]) -> list[str]:
+    """The shortest unique name of each frame."""
+    bares = [_bare(frame) for frame in frames]
+    counts: defaultdict[str, int] = defaultdict(int)
+    for bare in bares:
+        counts[bare] += 1
+    return [bare if bare and counts[bare] == 1 else frame for frame, bare in zip(frames, bares, strict=True)]
+
+
+def _bare(name: str) -> str:
+    """The name without its robot; empty if it has none, or if the rest is no frame name."""
+    bare = name.partition("/")[2]
+    return "" if bare.startswith("/") else bare
+
+
+class _RemovedEdge(NamedTuple):
+    """An edge that was removed, its writer, and when, by a monotonic clock [s]."""
+
+    edge: tuple[str, str]
+    writer: str | None
+    at_s: float
+
+
+class FrameTree:
+    """Frames by name, one parent each. Changes need the buffer's lock.
+
+    ``version`` grows with every change of an edge, and of a robot's clock ``domain``; a cached path then
+    has to check that its dependencies are still current.
+    """
+
+    def __init__(self, domain: ClockDomain | None = None) -> None:
+        self.version = 0
+        self.domain = domain or ClockDomain()
+        self.frames: dict[str, Edge | None] = {}
+        self.robots: dict[str, JointTrack | None] = {}
+        self.names = FrameNameIndex()
+        self._removed: dict[str, _RemovedEdge] = {}
+        # The edges of frames before a transaction changed them; None outside of one.
+        self._before: dict[str, Edge | None] | None = None
+
+    def add_frame(self, name: str) -> None:
+        """Add ``name``; frames are never removed."""
+        if name not in self.frames:
+            self.frames[name] = None
+            self.names.add(name)
+            self.version += 1
+
+    @contextmanager
+    def transaction(self) -> Generator[None]:
+        """Changes inside the context are undone if it raises."""
+        count = len(self.names)
+        before: dict[str, Edge | None] = {}
+        self._before = before
+        try:
+            yield
+        except Exception:
+            self.frames.update(before)
+            for name in self.names.truncate(count):
+                del self.frames[name]
+            self.version += 1
+            raise
+        finally:
+            self._before = None
+
+    def attach(self, edge: Edge) -> None:
+        """Place a child, or replace the edge that places it. ``check_edge`` comes before."""
+        self.add_frame(edge.parent)
+        self.add_frame(edge.child)
+        self._place(edge.child, edge)
+
+    def detach(self, child: str) -> None:
+        """Remove the edge that places ``child``; the frame stays."""
+        edge = self.frames.get(child)
+        if edge is not None:
+            self._removed[child] = _RemovedEdge(edge.names, edge.writer, time.monotonic())
+        self._place(child, None)
+
+    def invalidate(self, track: JointTrack) -> None:
+        """Make paths over a robot's edges compile again, because the columns of its samples have changed."""
+        for _, child in map(track.edge, track.forms):
+            edge = self.frames.get(child)
+            if edge is not None and edge.track is track:
+                self._place(child, replace(edge))
+
+    def _place(self, child: str, edge: Edge | None) -> None:
+        if self._before is not None:
+            self._before.setdefault(child, self.frames[child])
+        self.frames[child] = edge
+        self.version += 1
+
+    def check_edge(self, parent: str, child: str, writer: str | None) -> None:
+        """Raises InsertRefused for bad names, a self edge, a second parent and a loop."""
+        self.check_names(parent, child)
+        if parent == child:
+            raise InsertRefused(
+                f"{parent!r} -> {child!r}: a frame cannot be placed on itself",
+                reason="self edge",
+                edge=(parent, child),
+            )
+        existing = self.frames.get(child)
+        if existing is not None and existing.parent != parent:
+            raise InsertRefused(
+                f"{child!r} has the parent {existing.parent!r}{_by(existing.writer)} and cannot get a second "
+                f"one, {parent!r}{_by(writer)}; withdraw({child!r}) first if it really moved",
+                reason="second parent",
+                edge=(parent, child),
+            )
+        if existing is None and child in self.frames:
+            self._check_loop(parent, child, writer)
+
+    @staticmethod
+    def check_names(parent: str, child: str) -> None:
+        """Raises InsertRefused if a name cannot be a frame name."""
+        for name in (parent, child):
+            if problem := name_problem(name):
+                raise InsertRefused(
+                    f"{parent!r} -> {child!r}: {problem}", reason="frame name", edge=(parent, child)
+                )
+
+    def _check_loop(self, parent: str, child: str, writer: str | None) -> None:
+        chain = list(self.edges_above(parent))
+        top = next((n for n, edge in enumerate(chain) if edge.parent == child), None)
+        if top is None:
+            return
+        edge = chain[top]
+        loop = " -> ".join(map(repr, (child, *(edge.child for edge in reversed(chain[: top + 1])))))
+        raise InsertRefused(
+            f"{parent!r} -> {child!r}{_by(writer)} would close the loop {loop} -> {child!r}; "
+            f"{edge.parent!r} -> {edge.child!r} is written{_by(edge.writer) or ' by hand'}",
+            reason="loop",
+            edge=(parent, child),
+        )
+
+    def edges_above(self, frame: str) -> Iterable[Edge]:
+        """The edges from ``frame`` up to its root, nearest first."""
+        edge = self.frames.get(frame)
+        while edge is not None:
+            yield edge
+            edge = self.frames.get(edge.parent)
+
+    def root(self, frame: str) -> str:
+        """The ancestor of ``frame`` that has no parent."""
+        for edge in self.edges_above(frame):
+            frame = edge.parent
+        return frame
+
+    def moving(self) -> dict[Track, Edge]:
+        """The tracks behind all moving edges, each with the last of its edges."""
+        edges = list(self.frames.values())
+        return {edge.track: edge for edge in edges if edge is not None and edge.track is not None}
+
+    def robot_of(self, edge: Edge) -> str:
+        """The robot whose writer places ``edge``."""
+        return edge.robot.prefix if edge.robot is not None else self.domain.robot_placing(edge.child)
+
+    def domain_of(self, edge: Edge) -> str | None:
+        """The clock domain of the samples of a moving edge: that of the robot whose writer places it."""
+        return self.domain.domain_of(self.robot_of(edge))
+
+    def frame_info(self, name: str) -> FrameInfo:
+        """The facts about one frame that is in the tree."""
+        edge = self.frames[name]
+        if edge is None:
+            return FrameInfo(name, None, "root", None, None, None, None, 0)
+        if edge.track is None:
+            return FrameInfo(name, edge.parent, "static", edge.writer, None, None, None, 0)
+        samples = coverage(edge.track.history.view)
+        return FrameInfo(
+            name,
+            edge.parent,
+            edge.kind,
+            edge.writer,
+            samples.rate_hz,
+            samples.oldest,
+            samples.newest,
+            samples.count,
+            self.domain_of(edge) or None,
+        )
+
+    def snapshot(self) -> TreeSnapshot:
+        """A copy of all frames and robots."""
+        robots = {name: track for name, track in self.robots.items() if track is not None}
+        return TreeSnapshot(self.version, dict(self.frames), robots)
+
+    def resolve_for_insert(self, name: str) -> str:
+        """The frame that a name of an insert means: the one of that name, or a robot's by its bare name."""
+        if name in self.frames:
+            return name
+        candidates = [full for full in self.names.with_bare(name) if full.split("/", 1)[0] in self.robots]
+        if len(candidates) > 1:
+            raise InsertRefused(
+                f"the frame name {name!r} is not unique: {', '.join(candidates)}; name it in full",
+                reason="frame name",
+                edge=(name, name),
+            )
+        return candidates[0] if candidates else name
+
+    def resolve(self, name: str, target: str, source: str) -> str:
+        """The frame that a name of a lookup means. Raises UnknownFrame or AmbiguousFrame."""
+        if name in self.frames:
+            return name
+        candidates = self.names.with_bare(name)
+        if len(candidates) == 1:
+            return candidates[0]
+        if candidates:
+            raise AmbiguousFrame(target, source, name=name, candidates=candidates)
+        near = self.names.near(name)
+        raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=len(self.names))
+
+    def path(self, target: str, source: str) -> TreePath:
+        """The edges between two frames.
+
+        Raises UnknownFrame, AmbiguousFrame, Disconnected or ClockMismatch.
+        """
+        target_frame = self.resolve(target, target, source)
+        source_frame = self.resolve(source, target, source)
+        parts = self._split_at_common_ancestor(target_frame, source_frame)
+        if parts is None:
+            raise self._disconnected(target, source, (self.root(target_frame), self.root(source_frame)))
+        edges = [edge for part in parts for edge in part]
+        names = tuple({target: target_frame, source: source_frame}.items())
+        placed = tuple((edge.child, edge) for edge in edges)
+        dependencies = PathDependencies(names, placed, self._domains(edges))
+        return TreePath(*parts, self._common_domain(target, source, edges), dependencies)
+
+    def _disconnected(self, target: str, source: str, roots: tuple[str, str]) -> Disconnected:
+        failure = Disconnected(target, source, roots=roots)
+        removed = [self._removed[root] for root in roots if root in self._removed]
+        if removed:
+            last = max(removed, key=lambda one: one.at_s)
+            failure.edge, failure.writer = last.edge, last.writer
+            failure.gone_s = time.monotonic() - last.at_s
+        return failure
+
+    def _split_at_common_ancestor(
+        self, target_frame: str, source_frame: str
+    ) -> tuple[list[Edge], list[Edge]] | None:
+        """The edges from the common ancestor down to each frame; None without one."""
+        above_target = list(self.edges_above(target_frame))
+        above_source = list(self.edges_above(source_frame))
+        depth_by_frame = {target_frame: 0} | {edge.parent: n for n, edge in enumerate(above_target, 1)}
+        for count, name in enumerate([source_frame, *(edge.parent for edge in above_source)]):
+            if name in depth_by_frame:
+                return above_target[: depth_by_frame[name]][::-1], above_source[:count][::-1]
+        return None
+
+    def _domains(self, edges: Iterable[Edge]) -> tuple[tuple[Edge, str | None], ...]:
+        moving = {edge.track: edge for edge in edges if edge.track is not None}
+        return tuple((edge, self.domain_of(edge)) for edge in moving.values())
+
+    def _common_domain(self, target: str, source: str, edges: Sequence[Edge]) -> str:
+        """The clock domain of all moving edges; empty if none is known. Raises ClockMismatch for two."""
+        first: Edge | None = None
+        common = ""
+        for edge in edges:
+            if edge.track is not None and (domain := self.domain_of(edge)):
+                if first is None:
+                    first, common = edge, domain
+                elif domain != common:
+                    raise ClockMismatch(
+                        target,
+                        source,
+                        edges=(first.names, edge.names),
+                        robots=(self.robot_of(first), self.robot_of(edge)),
+                        domains=(common, domain),
+                    )
+        return common
+
+    def dependencies(self, target: str, source: str) -> PathDependencies:
+        """The facts that decide the ``path`` between two frames, also if there is none."""
+        frame_by_name = {name: self._find(name) for name in (target, source)}
+        frames = [frame for frame in frame_by_name.values() if frame is not None]
+        if len(frames) < len(frame_by_name):
+            return PathDependencies(
+                tuple((name, frame) for name, frame in frame_by_name.items() if frame is None)
+            )
+        parts = self._split_at_common_ancestor(frames[0], frames[-1])
+        if parts is not None:
+            edges = [edge for part in parts for edge in part]
+            roots = ()
+        else:
+            edges = [edge for frame in frames for edge in self.edges_above(frame)]
+            roots = tuple((self.root(frame), None) for frame in frames)
+        placed = tuple((edge.child, edge) for edge in edges)
+        return PathDependencies(tuple(frame_by_name.items()), placed + roots, self._domains(edges))
+
+    def is_current(self, dependencies: PathDependencies) -> bool:
+        """Whether nothing of it has changed. May be called without the lock."""
+        find, frames, domain_of = self._find, self.frames, self.domain_of
+        return (
+            all(find(name) == frame for name, frame in dependencies.names)
+            and all(frames.get(frame) is edge for frame, edge in dependencies.edges)
+            and all(domain_of(edge) == domain for edge, domain in dependencies.domains)
+        )
+
+    def _find(self, name: str) -> str | None:
+        """The frame that a name of a lookup means; None for no frame, or more than one."""
+        if name in self.frames:
+            return name
+        candidates = self.names.with_bare(name)
+        return candidates[0] if len(candidates) == 1 else None
+
+
+def _by(writer: str | None) -> str:
+    return f" by {writer}" if writer else ""
