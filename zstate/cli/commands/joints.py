@@ -62,7 +62,7 @@ def joints_command(
     zstate joints panda --wire ros2                    # /joint_states, for a robot_state_publisher
     """
     from zstate.cli.clocks import open_clock
-    from zstate.cli.publishing import run
+    from zstate.cli.commands.publish import run_publisher
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
@@ -78,4 +78,4 @@ def joints_command(
         joints = count_text(len(model.joint_names), "joint")
         place = words_of(wire).place(called, ("joint_states",))
         say_fitted(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
-        run(publisher, SineSource(model), rate, seconds)
+        run_publisher(publisher, SineSource(model), rate, seconds)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.console import count_text, fail, note, say_fitted
+from zstate.cli.console import count_text, fail, note, report_text, say_fitted
 from zstate.cli.metrics import of_publishers, served
 from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.publisher import StatePublisher
+    from zstate.sources.source import JointSource
     from zstate.wire.keys import Stream
 
 _RATE_HZ = 100.0
@@ -107,7 +108,6 @@ def publish_command(
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
     from zstate.cli.clocks import open_clock
-    from zstate.cli.publishing import run
     from zstate.publisher import StatePublisher
     from zstate.sources import SineSource
 
@@ -131,7 +131,7 @@ def publish_command(
         if followed:
             _follow(session, followed[0], derived, whole, rate, seconds)
         elif source == "sine":
-            run(whole, SineSource(model), rate or _RATE_HZ, seconds)
+            run_publisher(whole, SineSource(model), rate or _RATE_HZ, seconds)
         else:
             _publish_recording(whole, source, rate or _RATE_HZ, seconds)
 
@@ -162,14 +162,13 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
     seconds: float | None,
 ) -> None:
     from zstate.cli.heard_source import HeardSource
-    from zstate.cli.publishing import run
 
     words, robot = words_of(wire), derived.robot
     place = words.place(robot, ("joint_states",))
     note(f"waiting for {place} ...")
     with HeardSource(session, derived.model, robot, wire, further=whole) as source:
         if rate_hz is not None:
-            run(derived, source, rate_hz, seconds)
+            run_publisher(derived, source, rate_hz, seconds)
         else:
             _publish_every_sample(derived, source, seconds)
         if not source.count:
@@ -177,13 +176,31 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
             fail(f"heard nothing on {place} in {seconds:g} s; {who}")
 
 
+def run_publisher(
+    publisher: StatePublisher, source: JointSource, rate_hz: float, seconds: float | None
+) -> None:
+    """``publisher.run``, and its report at the end, also after a signal.
+
+    A signal interrupts only the calling thread, which waits, so that the loop of the publisher ends in order.
+    """
+    from zstate.cli.worker import Worker
+
+    worker = Worker("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
+    try:
+        report = worker.result()
+    except SystemExit:
+        publisher.close()
+        say_fitted(report_text(worker.result(1.0)))
+        raise
+    say_fitted(report_text(report))
+
+
 def _publish_recording(publisher: StatePublisher, path: str, rate_hz: float, seconds: float | None) -> None:
-    from zstate.cli.publishing import run
     from zstate.sources.recorded import RecordedSource
 
     with RecordedSource(path, None, publisher.model) as source:
         # One tick more than the recording is long, for its last sample.
-        run(publisher, source, rate_hz, seconds or source.duration_s + 1.0 / rate_hz)
+        run_publisher(publisher, source, rate_hz, seconds or source.duration_s + 1.0 / rate_hz)
 
 
 def _publish_every_sample(publisher: StatePublisher, source: HeardSource, seconds: float | None) -> None:

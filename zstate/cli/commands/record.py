@@ -15,7 +15,7 @@ from zstate.cli.options import checked_seconds, metrics_option, session_options,
 from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
-    from zstate.cli.recording import Progress
+    from zstate.cli.output.recording_text import RecordProgress
     from zstate.metrics.address import Address
     from zstate.recorder import Recorder
 
@@ -103,9 +103,9 @@ def record_command(
 
 
 def _run(recorder: Recorder, roster: Roster, robots: tuple[str, ...], duration: float | None) -> None:
-    from zstate.cli.recording import Progress
+    from zstate.cli.output.recording_text import RecordProgress
 
-    progress = Progress(recorder, roster, robots)
+    progress = RecordProgress(recorder, roster, robots)
     try:
         _show(recorder, progress, duration)
     finally:
@@ -115,16 +115,16 @@ def _run(recorder: Recorder, roster: Roster, robots: tuple[str, ...], duration: 
     if recorder.failure is not None:
         raise recorder.failure
     if not recorder.stats.messages:
-        fail(f"nothing was recorded: {progress.silence}")
+        fail(f"nothing was recorded: {progress.no_message_text}")
 
 
-def _show(recorder: Recorder, progress: Progress, duration: float | None) -> None:
+def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) -> None:
     """Until the recording has ended, or for ``duration`` seconds."""
     until = math.inf if duration is None else time.monotonic() + duration
     if not is_terminal():
         while not _is_over(recorder, until, _LINE_S):
-            for news in progress.news():
-                note(news)
+            for change in progress.changes():
+                note(change)
             say_fitted(progress.line())
         return
     from rich.live import Live
@@ -132,11 +132,11 @@ def _show(recorder: Recorder, progress: Progress, duration: float | None) -> Non
 
     with Live(auto_refresh=False, transient=True) as live:
         while not _is_over(recorder, until, _REFRESH_S):
-            for news in progress.news():
-                live.console.print(news, markup=False, highlight=False, soft_wrap=True)
+            for change in progress.changes():
+                live.console.print(change, markup=False, highlight=False, soft_wrap=True)
             live.update(Text(progress.line()), refresh=True)
 
 
 def _is_over(recorder: Recorder, until: float, pause_s: float) -> bool:
-    """Pause, then tell whether that was it."""
+    """Wait ``pause_s``, then return whether the recording has ended."""
     return recorder.wait(min(pause_s, max(0.0, until - time.monotonic()))) or time.monotonic() >= until

@@ -77,7 +77,7 @@ def replay_command(
     zstate replay run.mcap panda --rate 0.5 --start 30 --duration 10 --loop
     zstate replay bag_folder --wire ros2:domain=5
     """
-    from zstate.cli.replaying import introduction, live_writers
+    from zstate.cli.output.recording_text import conflicting_writers, replay_heading
     from zstate.replayer import Replayer
 
     with (
@@ -94,15 +94,15 @@ def replay_command(
             takeover=takeover,
         ) as replayer,
     ):
-        live = live_writers(session, replayer.robots, wires)
+        live = conflicting_writers(session, replayer.robots, wires)
         if live and not takeover:
             fail(f"there is {'; '.join(live)} on the network already; end that first, or use --takeover")
-        say_fitted(introduction(replayer, file))
+        say_fitted(replay_heading(replayer, file))
         _run(replayer)
 
 
 def _run(replayer: Replayer) -> None:
-    from zstate.cli.replaying import report_text
+    from zstate.cli.output.recording_text import replay_summary
     from zstate.cli.worker import Worker
 
     worker = Worker("zstate replay", replayer.run)
@@ -110,27 +110,27 @@ def _run(replayer: Replayer) -> None:
         report = _show(replayer, worker)
     except SystemExit:
         replayer.close()
-        say_fitted(report_text(replayer.report()))
+        say_fitted(replay_summary(replayer.report()))
         raise
-    say_fitted(report_text(report))
+    say_fitted(replay_summary(report))
     if not report.samples:
         fail("no sample was published; `zstate info` shows what the file holds")
 
 
 def _show(replayer: Replayer, worker: Worker[ReplayReport]) -> ReplayReport:
     """Until it has ended."""
-    from zstate.cli.replaying import progress_line
+    from zstate.cli.output.recording_text import replay_line
 
     if not is_terminal():
         while (report := _result(worker, _LINE_S)) is None:
-            note(progress_line(replayer))
+            note(replay_line(replayer))
         return report
     from rich.live import Live
     from rich.text import Text
 
     with Live(auto_refresh=False, transient=True) as live:
         while (report := _result(worker, _REFRESH_S)) is None:
-            live.update(Text(progress_line(replayer)), refresh=True)
+            live.update(Text(replay_line(replayer)), refresh=True)
     return report
 
 

@@ -1,4 +1,4 @@
-"""What the demo shows: a live table for a person, a line a second for a file."""
+"""Output of `zstate demo`: a live table on a terminal, one line per second otherwise."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from zstate.transform import Transform
 
 _REFRESH_S = 0.1
-# The rate shown is that of so many refreshes.
+# The rate is that of this many refreshes.
 _WINDOW = 10
-# So many columns are enough for angles, too.
-_WITH_ANGLES = 72
+# The least terminal width that has room for angles.
+_WIDTH_WITH_ANGLES = 72
 
 
-class Row(NamedTuple):
-    """One transform and how fresh it is [ns]."""
+class _TransformRow(NamedTuple):
+    """One transform and its age [ns]."""
 
     transform: Transform
     age: int
@@ -46,11 +46,11 @@ class DemoTable:
         self._robot = robot
         self._root = root
         self._links = links
-        self._begun = self._meter.mark()
-        self._marks = deque([self._begun], maxlen=_WINDOW + 1)
+        self._start = self._meter.mark()
+        self._marks = deque([self._start], maxlen=_WINDOW + 1)
 
     def show(self, ended: threading.Event, seconds: float | None) -> None:
-        """Until ``ended``, or for ``seconds``."""
+        """Update until ``ended`` is set, or for ``seconds``."""
         from rich.live import Live
 
         until = float("inf") if seconds is None else time.monotonic() + seconds
@@ -65,13 +65,13 @@ class DemoTable:
                 live.update(self.table(), refresh=True)
 
     def summary(self) -> str:
-        """What was received since the beginning."""
+        """Samples, rate and latency since the start."""
         stats, now = self._listener.stats, self._meter.mark()
-        measure = self._meter.measure(self._begun, now)
-        received = count_text(now.count - self._begun.count, "sample")
+        measure = self._meter.measure(self._start, now)
+        received = count_text(now.count - self._start.count, "sample")
         return (
-            # With as many digits as agree: so many samples in so long make that rate.
-            f"{received} received in {now.time_s - self._begun.time_s:.2f} s: {measure.rate_hz:.1f} Hz, "
+            # Enough digits that count, duration and rate agree.
+            f"{received} received in {now.time_s - self._start.time_s:.2f} s: {measure.rate_hz:.1f} Hz, "
             f"{stats.missed + stats.dropped} missed, median latency {_latency(measure)}"
         )
 
@@ -80,24 +80,24 @@ class DemoTable:
         measure = self._meter.measure(self._marks[0], self._marks[-1])
         return f"{measure.rate_hz:.1f} Hz, {_latency(measure)}"
 
-    def rows(self) -> list[Row]:
-        """The transforms now; those that have no answer yet are left out."""
-        rows: list[Row] = []
+    def rows(self) -> list[_TransformRow]:
+        """The transforms now, without those that cannot be looked up yet."""
+        rows: list[_TransformRow] = []
         for link in self._links:
             try:
                 transform = self._buffer.lookup(f"{self._robot}/{self._root}", f"{self._robot}/{link}")
             except LookupFailed:
                 continue
             assert transform.stamp is not None
-            rows.append(Row(transform, time.time_ns() - transform.stamp))
+            rows.append(_TransformRow(transform, time.time_ns() - transform.stamp))
         return rows
 
     def table(self) -> Table:
-        """For a terminal."""
+        """The transforms for a terminal."""
         from rich import box
         from rich.table import Table
 
-        # Narrow enough for 80 columns; what holds for all rows stands below them.
+        # At most 80 columns; figures for all rows are in the caption.
         table = Table(
             box=box.SIMPLE_HEAD,
             pad_edge=False,
@@ -106,7 +106,7 @@ class DemoTable:
             caption_justify="left",
         )
         table.add_column(f"pose in {self._root}", style="bold", overflow="fold")
-        with_angles = terminal_width() >= _WITH_ANGLES
+        with_angles = terminal_width() >= _WIDTH_WITH_ANGLES
         angles = (r"roll   pitch  yaw \[deg]",) if with_angles else ()
         for title in (r"x       y       z \[m]", *angles, "age"):
             table.add_column(title, justify="right", no_wrap=True)
@@ -127,17 +127,17 @@ class DemoTable:
         return text
 
 
-def _link(row: Row) -> str:
+def _link(row: _TransformRow) -> str:
     return row.transform.source.partition("/")[2]
 
 
 def _latency(measure: Measure) -> str:
-    """The median, in words."""
+    """The median latency as text."""
     latency_s = measure.latency_s
     return f"{duration_or_dash(None if latency_s is None else round(latency_s * 1e9))} from stamp to lookup"
 
 
 def _is_over(ended: threading.Event, until: float, pause_s: float) -> bool:
-    """Pause, then tell whether that was it."""
+    """Wait ``pause_s``, then return whether the table has ended."""
     pause_s = min(pause_s, max(0.0, until - time.monotonic()))
     return wait_in_slices(ended, pause_s) or time.monotonic() >= until
