@@ -87,8 +87,8 @@ EVERYWHERE = {"numpy"}
 GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("cli/snapshot.py", "msgspec"),
-    ("cli/up/sections.py", "msgspec"),
-    ("cli/up/tables.py", "msgspec"),
+    ("cli/up/cell.py", "msgspec"),
+    ("cli/up/schema.py", "msgspec"),
 }
 
 PURE = {"model", "buffer", "wire"}

@@ -1,4 +1,4 @@
-"""The tables of a file of `zstate up`, each checked as it is read."""
+"""Schema of the file of `zstate up`: its tables, checked when they are constructed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RouterSection(_Section, frozen=True):
-    """``[router]``: as the options of `zstate router`."""
+    """``[router]``: the options of `zstate router`."""
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class RouterSection(_Section, frozen=True):
 
 
 class NetworkSection(_Section, frozen=True):
-    """``[network]``: the session options of everything that is started."""
+    """``[network]``: the session options of every process."""
 
     mode: Literal["peer", "loopback", "lan", "client", "router"] | None = None
     connect: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ class NetworkSection(_Section, frozen=True):
 
 
 class RobotSection(_Section, frozen=True):
-    """``[[robot]]``: as the options of `zstate publish`."""
+    """``[[robot]]``: the options of `zstate publish`."""
 
     model: str
     xacro_args: dict[str, str | bool | int | float] = {}
@@ -88,8 +88,8 @@ class RobotSection(_Section, frozen=True):
 class ProgramSection(_Section, frozen=True):
     """``[[program]]``: any program, or any other command of zstate.
 
-    It is ready once a line of it has the text ``ready``; without one as soon as it runs, and a command
-    of zstate with its first line, or with its end.
+    It is ready once it prints a line with the text ``ready``. Without that text a program is ready when it
+    runs, and a command of zstate with its first line or its end.
     """
 
     run: Names
@@ -102,10 +102,10 @@ class ProgramSection(_Section, frozen=True):
 
 
 class StaticSection(_Section, frozen=True):
-    """``[[static]]``: as the arguments of `zstate static`; a pose, or the ``file`` of a calibration.
+    """``[[static]]``: the arguments of `zstate static`: a pose, or the ``file`` of a calibration.
 
-    ``robot`` is whose edge it is, a pattern such as "arm*" for several, or their list. ``wires`` are
-    those of the command where it has none.
+    ``robot`` is the robot of the edge, a pattern such as "arm*", or a list. ``wires`` default to those of
+    the command.
     """
 
     target: str | None = None
@@ -127,7 +127,7 @@ class StaticSection(_Section, frozen=True):
             raise InvalidInput(f"the pose is in {self.file!r}; leave out {', '.join(self._pose_parts)}")
 
     def transform(self) -> Transform:
-        """The edge that is written here. Raises InvalidInput unless it is xyz, one rotation, or both."""
+        """The edge of the table. Raises InvalidInput unless it has xyz, one rotation, or both."""
         if self.target is None or self.source is None:
             raise InvalidInput("an edge places source in target; write both, for instance target = 'tool'")
         rotations = 3 - (self.rpy_deg, self.rpy, self.quat_xyzw).count(None)
@@ -154,13 +154,13 @@ class StaticSection(_Section, frozen=True):
     def _angles(self) -> Vector3:
         if self.rpy is not None:
             return self.rpy
-        # Whole turns of degrees are none, and in radians they would be refused.
+        # Multiples of 360 degrees are removed: in radians they would be refused.
         roll, pitch, yaw = (radians(fmod(angle, 360.0)) for angle in self.rpy_deg or (0.0, 0.0, 0.0))
         return roll, pitch, yaw
 
 
-def in_a_list(names: Names) -> tuple[str, ...]:
-    """One name or several."""
+def as_tuple(names: Names) -> tuple[str, ...]:
+    """One or several names as a tuple."""
     return (names,) if isinstance(names, str) else names
 
 
