@@ -11,8 +11,7 @@ from statistics import median
 
 from zstate.clock import Clock, SystemClock
 from zstate.following.bounded import remember
-from zstate.metrics.histogram import Histogram
-from zstate.metrics.measured_buffer import LATENCY_BOUNDS_S, MeasuredBuffer
+from zstate.metrics.buffer import LATENCY_BOUNDS_S, Histogram, InstrumentedBuffer
 
 # Enough for a median, bounded for a demo that runs for days.
 _KEPT = 100_000
@@ -76,8 +75,8 @@ class Meter:
         )
 
 
-class MeteredBuffer(MeasuredBuffer):
-    """A MeasuredBuffer that also notes, robot by robot, when each sample can be looked up."""
+class MeteredBuffer(InstrumentedBuffer):
+    """A InstrumentedBuffer that also notes, robot by robot, when each sample can be looked up."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
@@ -99,10 +98,10 @@ class MeteredBuffer(MeasuredBuffer):
             remember(self._latencies, robot, latency)
         return latency
 
-    def _note_sample(self, robot: str, stamp: int) -> None:
-        super()._note_sample(robot, stamp)
+    def _on_sample(self, robot: str, stamp: int) -> None:
+        super()._on_sample(robot, stamp)
         if self._is_told(robot):
-            self.latency_of(robot).note((self.clock.now() - stamp) * 1e-9)
+            self.latency_of(robot).add((self.clock.now() - stamp) * 1e-9)
         self.meter_of(robot).note(stamp)
 
     def _is_told(self, robot: str) -> bool:

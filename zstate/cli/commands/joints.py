@@ -24,7 +24,7 @@ from zstate.cli.options import (
 from zstate.cli.words import words_of
 
 if TYPE_CHECKING:
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
 
 
 @click.command("joints")
@@ -48,7 +48,7 @@ def joints_command(
     wire: str,
     clock: str,
     takeover: bool,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     network: Network,
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.

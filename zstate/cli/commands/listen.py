@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from zstate.clock import Clock
     from zstate.following.tally import Stats
     from zstate.listener import Follow, TransformListener
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
     from zstate.wire.keys import Stream
 
@@ -47,7 +47,7 @@ def listen_command(
     as_json: bool,
     wire: str,
     clock: str | None,
-    metrics: Address | None,
+    metrics: BindAddress | None,
 ) -> None:
     """Follow ROBOT, or all robots, and say once a second how their samples come in.
 

@@ -27,7 +27,7 @@ from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.cli.heard_source import HeardSource
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.publisher import StatePublisher
@@ -82,7 +82,7 @@ def publish_command(
     seconds: float | None,
     name: str | None,
     takeover: bool,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     network: Network,
 ) -> None:
     """Publish the state of ROBOT: its model, its fixed edges, and transforms.

@@ -16,7 +16,7 @@ from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
     from zstate.cli.output.recording_text import RecordProgress
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.recorder import Recorder
 
 _LINE_S = 1.0
@@ -61,7 +61,7 @@ def record_command(
     split_size: float | None,
     split_seconds: float | None,
     overwrite: bool,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     network: Network,
 ) -> None:
     """Record ROBOTs, or all there are, into the MCAP file FILE, until Ctrl-C.

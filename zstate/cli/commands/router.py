@@ -16,7 +16,7 @@ from zstate.cli.options import config_option, metrics_option
 from zstate.cli.roster import Roster
 
 if TYPE_CHECKING:
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.net.router_config import RouterConfig
     from zstate.net.security import Credentials
     from zstate.net.thinning import Thinning
@@ -69,7 +69,7 @@ def router_command(
     namespace: str,
     ros2: bool,
     config: str | None,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     only_print: bool,
     output: str | None,
     credentials: Credentials | None,
@@ -165,7 +165,7 @@ def _stream_rate(text: str) -> tuple[str, float]:
         raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
 
 
-def _run(network: Network, listen: tuple[str, ...], metrics: Address | None, file: str = "") -> None:
+def _run(network: Network, listen: tuple[str, ...], metrics: BindAddress | None, file: str = "") -> None:
     from zstate.clock import wait_in_slices
     from zstate.net.modes import listening
 

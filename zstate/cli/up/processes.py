@@ -23,7 +23,6 @@ from zstate.cli.up.schema import (
 from zstate.cli.up.static_edges import check_edges
 from zstate.cli.up.template import Located, near_miss
 from zstate.errors import ConfigError, InvalidInput, ModelError
-from zstate.metrics.address import Address
 from zstate.model.catalog import is_path
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import check_robot
@@ -103,7 +102,9 @@ def _robot_spec(table: Located[RobotSection], cell: Cell, first: tuple[str, ...]
             raise table.error(text, "source")
     metrics: tuple[str, ...] = ()
     if robot.metrics is not None:
-        host, port = Address.parse(str(robot.metrics))
+        from zstate.metrics.endpoint import BindAddress  # loads an HTTP server
+
+        host, port = BindAddress.parse(str(robot.metrics))
         # Each robot of a loop has the next port.
         port = port + table.iteration if port else 0
         metrics = ("--metrics", f"{f'[{host}]' if ':' in host else host}:{port}")

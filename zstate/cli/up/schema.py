@@ -8,7 +8,6 @@ from typing import Literal
 import msgspec
 
 from zstate.errors import InvalidInput
-from zstate.metrics.address import Address
 from zstate.net.config import endpoint_list
 from zstate.net.wires import wire_named
 from zstate.rate import check_rate
@@ -173,4 +172,6 @@ def _check_wires(wires: tuple[str, ...]) -> None:
 
 def _check_metrics(metrics: str | int | None) -> None:
     if metrics is not None:
-        Address.parse(str(metrics))
+        from zstate.metrics.endpoint import BindAddress  # loads an HTTP server
+
+        BindAddress.parse(str(metrics))
