@@ -30,7 +30,7 @@ _ONLY_PACKAGES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Missing:
+class MissingFile:
     """A file that a robot names and that cannot be drawn: why, and where it was looked for."""
 
     uri: str
@@ -59,7 +59,7 @@ class MeshPaths:
     def __init__(self, base: Path | None = None) -> None:
         self._base = None if base is None else _absolute(base)
 
-    def find(self, uri: str) -> Path | Missing:
+    def find(self, uri: str) -> Path | MissingFile:
         """The file of that name, or why there is none."""
         scheme, separator, rest = uri.partition("://")
         if not separator:
@@ -68,39 +68,41 @@ class MeshPaths:
             return self._in_package(uri, unquote(rest).lstrip("/"))
         if scheme == "file":
             return self._plain(uri, Path("/" + unquote(urlsplit(uri).path).lstrip("/")))
-        return Missing(uri, f"{scheme}:// is not fetched; name it as package://NAME/PATH or file:///PATH")
+        return MissingFile(uri, f"{scheme}:// is not fetched; name it as package://NAME/PATH or file:///PATH")
 
-    def _plain(self, uri: str, path: Path) -> Path | Missing:
+    def _plain(self, uri: str, path: Path) -> Path | MissingFile:
         if self._base is None:
             return self._on_search_path(uri, path)
         found = self._base / path
-        return found if _is_file(found) else Missing(uri, "there is no such file", (str(found.parent),))
+        return found if _is_file(found) else MissingFile(uri, "there is no such file", (str(found.parent),))
 
-    def _on_search_path(self, uri: str, path: Path) -> Path | Missing:
+    def _on_search_path(self, uri: str, path: Path) -> Path | MissingFile:
         """A path that a received description names: only what it could have named as package://."""
         if not path.is_absolute():
             reason = "a relative path means nothing without the folder of its URDF; write package://NAME/PATH"
-            return Missing(uri, reason)
+            return MissingFile(uri, reason)
         for folder in (*self._shares, *self._forests):
             if folder in path.parents and _is_within(path, folder, path.parts[len(folder.parts)]):
-                return path if _is_file(path) else Missing(uri, "there is no such file", (str(path.parent),))
-        return Missing(uri, _ONLY_PACKAGES)
+                return (
+                    path if _is_file(path) else MissingFile(uri, "there is no such file", (str(path.parent),))
+                )
+        return MissingFile(uri, _ONLY_PACKAGES)
 
-    def _in_package(self, uri: str, path: str) -> Path | Missing:
+    def _in_package(self, uri: str, path: str) -> Path | MissingFile:
         package, _, rest = path.partition("/")
         if package in ("", ".", ".."):
-            return Missing(uri, f"{package!r} is no name of a package")
+            return MissingFile(uri, f"{package!r} is no name of a package")
         folders = list(dict.fromkeys(self._packages(package)))
         allowed = [one for one in folders if self._base or _is_within(one / rest, one, package)]
         for folder in allowed:
             if _is_file(folder / rest):
                 return folder / rest
         if allowed:
-            return Missing(uri, f"the package {package!r} has no such file", tuple(map(str, allowed)))
+            return MissingFile(uri, f"the package {package!r} has no such file", tuple(map(str, allowed)))
         if folders:
-            return Missing(uri, f"it leads out of the package {package!r}", tuple(map(str, folders)))
+            return MissingFile(uri, f"it leads out of the package {package!r}", tuple(map(str, folders)))
         looked = tuple(str(folder) for folder in (*self._around, *self._shares, *self._forests))
-        return Missing(uri, f"there is no package {package!r}; {_HOW}", looked)
+        return MissingFile(uri, f"there is no package {package!r}; {_HOW}", looked)
 
     def _packages(self, name: str) -> Iterator[Path]:
         for folder in self._around:

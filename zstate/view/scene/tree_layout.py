@@ -1,7 +1,7 @@
-"""Apart: trees of frames that nothing joins to the fixed frame, drawn beside it.
+"""Layout of frame trees that are not connected to the fixed frame.
 
-Where they are relative to each other is not known. So they stand in rows, on one floor, as far apart as
-their robots reach, each with a label that says so.
+Their relative poses are unknown. They are placed in rows next to it, on one floor, as far apart as their
+robots reach, with labels that say so.
 """
 
 from __future__ import annotations
@@ -17,74 +17,62 @@ import viser
 from numpy.typing import NDArray
 
 from zstate.view.moment import Moment, Poses, Rows, Tree
-from zstate.view.scene.nodes import Nodes
+from zstate.view.scene.frame_markers import NodeLabels
+from zstate.view.scene.frame_nodes import FrameNodes
 
 _GAP_M = 0.3
-_FLESH_M = 0.12  # what meshes have around the frames
-# A row is longer than the rows are deep: pictures are wider than high.
-_WIDER = 1.6
+_MARGIN_M = 0.12  # of meshes around their frames
+# Width of the layout divided by its depth: pictures are wider than high.
+_ASPECT = 1.6
 
 Offset = tuple[float, float, float]
 
 
 class _Box(NamedTuple):
-    """The room of a tree around its root [m]: its middle and half its size along x, y; its lowest point."""
+    """The space of a tree around its root [m]: centre and half size along x, y; lowest z."""
 
     middle: NDArray[np.float64]
     half: NDArray[np.float64]
     low: float
 
 
-class Apart:
-    """Places trees beside that of the fixed frame, and labels all when there are several.
+class TreeLayout:
+    """Places trees next to that of the fixed frame, and labels all if there are several.
 
-    A tree keeps its place while robots move; places are found again when a tree comes or goes, or more of
-    its frames have a pose. ``version`` grows then. ``frames`` are those that have a label.
+    A tree keeps its place while robots move. The layout is computed again, and ``version`` grows, when a tree
+    appears or disappears, or more of its frames have a pose.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._scene = scene
+        self._node_labels = NodeLabels(scene, "apart", anchor="bottom-center")
         self._tree: Tree | None = None
-        self._found_for: tuple[int, int] | None = None
+        self._laid_out_for: tuple[int, int] | None = None
         self._boxes: dict[str, tuple[tuple[str, ...], int, _Box]] = {}
         self._offsets: dict[int, Offset] = {}
         self._named_offsets: dict[str, Offset] = {}
         self._texts: dict[str, str] = {}
-        self._labels: dict[str, tuple[str, viser.LabelHandle]] = {}
         self.version = 0
 
     @property
     def frames(self) -> frozenset[str]:
-        """The frames on whose nodes a label hangs."""
+        """The frames that carry labels."""
         return frozenset(self._texts)
 
     def placed(self, moment: Moment, fixed: str) -> Poses:
-        """As ``moment.placed(fixed)``, where every tree has a place. Raises UnknownFrame."""
+        """As ``moment.placed(fixed)``, with poses for every tree. Raises UnknownFrame."""
         tree = moment.tree
         root = int(tree.roots[tree.row(fixed)])
-        found_for = root, int(np.count_nonzero(moment.known))
-        if tree is not self._tree or found_for != self._found_for:
-            self._tree, self._found_for = tree, found_for
-            self._find_places(moment, root)
+        laid_out_for = root, int(np.count_nonzero(moment.known))
+        if tree is not self._tree or laid_out_for != self._laid_out_for:
+            self._tree, self._laid_out_for = tree, laid_out_for
+            self._lay_out(moment, root)
         return moment.beside(fixed, self._offsets) if self._offsets else moment.placed(fixed)
 
-    def show(self, nodes: Nodes) -> None:
+    def show(self, nodes: FrameNodes) -> None:
         """Draw the labels."""
-        for frame, (path, label) in list(self._labels.items()):
-            if nodes.paths.get(frame) != path:
-                del self._labels[frame]  # it went with the node that it hung on
-            elif frame not in self._texts:
-                label.remove()
-                del self._labels[frame]
-        for frame, text in self._texts.items():
-            path = nodes.paths[frame]
-            if frame not in self._labels:
-                label = self._scene.add_label(f"{path}/apart", text, anchor="bottom-center")
-                self._labels[frame] = path, label
-            else:
-                self._labels[frame][1].text = text
+        self._node_labels.show(self._texts, nodes)
 
-    def _find_places(self, moment: Moment, first: int) -> None:
+    def _lay_out(self, moment: Moment, first: int) -> None:
         names = moment.tree.names
         members = _members(moment.tree)
         others = sorted((row for row in members if row != first), key=lambda row: _natural(names[row]))
@@ -98,11 +86,11 @@ class Apart:
         self._named_offsets = named
         self._texts = {}
         for row in ordered if others else ():
-            called = _called([names[member] for member in map(int, members[row])])
-            self._texts[names[row]] = called if row == first else f"{called} (place unknown)"
+            title = _title([names[member] for member in map(int, members[row])])
+            self._texts[names[row]] = title if row == first else f"{title} (place unknown)"
 
     def _box(self, moment: Moment, root: int, rows: Rows) -> _Box:
-        """The largest box that was found for the tree: it does not shrink while samples are missing."""
+        """The largest box of the tree so far: it does not shrink while samples are missing."""
         tree = moment.tree
         names = tuple(tree.names[row] for row in map(int, rows))
         tops, poses = moment.tops
@@ -116,7 +104,7 @@ class Apart:
 
 
 def _members(tree: Tree) -> dict[int, Rows]:
-    """The rows of each tree by that of its root, which stands first."""
+    """The rows of each tree by the row of its root, which is the first."""
     order = np.argsort(tree.roots, kind="stable")
     starts = np.flatnonzero(np.diff(tree.roots[order], prepend=-1))
     ends = [*starts[1:].tolist(), len(order)]
@@ -125,7 +113,7 @@ def _members(tree: Tree) -> dict[int, Rows]:
 
 
 def _box_of(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
-    """Robots may turn and reach to every side; other frames count only where there is no robot."""
+    """The box that the robots can reach in all directions; other frames count only without a robot."""
     robots: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         robots.setdefault(name.partition("/")[0] if "/" in name else "", []).append(row)
@@ -133,15 +121,15 @@ def _box_of(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
         robots.pop("", None)
     corners: list[NDArray[np.float64]] = []
     for rows in robots.values():
-        reach = float(np.linalg.norm(points[rows] - points[rows[0]], axis=1).max()) + _FLESH_M
+        reach = float(np.linalg.norm(points[rows] - points[rows[0]], axis=1).max()) + _MARGIN_M
         corners += [points[rows[0], :2] - reach, points[rows[0], :2] + reach]
     low, high = np.min(corners, axis=0), np.max(corners, axis=0)
     return _Box(0.5 * (low + high), 0.5 * (high - low), min(0.0, float(points[:, 2].min())))
 
 
 def _in_rows(boxes: Sequence[_Box]) -> list[Offset]:
-    """How far each box is moved so that all stand in rows along y on one floor, the first unmoved."""
-    columns = math.ceil(math.sqrt(_WIDER * len(boxes)))
+    """The offset of each box in a layout of rows along y on one floor; the first is not moved."""
+    columns = math.ceil(math.sqrt(_ASPECT * len(boxes)))
     widths = [max(float(box.half[1]) for box in boxes[k::columns]) for k in range(min(columns, len(boxes)))]
     starts = range(0, len(boxes), columns)
     depths = [max(float(box.half[0]) for box in boxes[start : start + columns]) for start in starts]
@@ -156,19 +144,19 @@ def _in_rows(boxes: Sequence[_Box]) -> list[Offset]:
 
 
 def _middles(halves: Sequence[float]) -> list[float]:
-    """Where the middles of intervals are that lie side by side, counted from that of the first."""
+    """The centres of adjacent intervals, relative to the first."""
     middles = [0.0]
     for before, half in pairwise(halves):
         middles.append(middles[-1] + before + _GAP_M + half)
     return middles
 
 
-def _called(names: Sequence[str]) -> str:
-    """The robot whose tree it is; the root, where it is that of several or of none."""
+def _title(names: Sequence[str]) -> str:
+    """The robot of the tree; its root if it has several robots or none."""
     robots = {name.partition("/")[0] for name in names if "/" in name}
     return robots.pop() if len(robots) == 1 else names[0]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """A key that puts bot2 before bot10."""
+    """Sort key that puts bot2 before bot10."""
     return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", name[:200])]

@@ -1,4 +1,4 @@
-"""Glb: surfaces as binary glTF 2.0, which browsers draw; and the same in other colours.
+"""Binary glTF 2.0 files of meshes, in their own or in other colours.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Its colours are linear, those of URDF, COLLADA
 and OBJ are sRGB. The points stay as they are, z up.
@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate.model.shapes import Color
-from zstate.view.geometry.surface import Look, Surface
+from zstate.view.mesh_geometry import Material, Mesh
 
 GREY: Color = (0.74, 0.75, 0.77, 1.0)
-"""What has no colour of its own."""
+"""The colour of a mesh without a material."""
 
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -28,39 +28,39 @@ _VERTICES, _INDICES = 34962, 34963
 _ROUGHNESS = 0.65
 
 
-_PLAIN = Look(GREY)
+_PLAIN = Material(GREY)
 Corner = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Paint:
-    """How a surface is coloured: ``missing`` where the file says nothing, or ``over`` everything."""
+class MaterialOverride:
+    """The material of meshes without one (``missing``), or one colour for all (``over``)."""
 
-    missing: Look = _PLAIN
+    missing: Material = _PLAIN
     over: Color | None = None
 
 
 class Glb:
-    """Surfaces packed once, to be painted in several ways; those that look the same are drawn as one."""
+    """Meshes packed once, for files in several colours; meshes with the same material are joined."""
 
-    def __init__(self, surfaces: Sequence[Surface]) -> None:
-        self._looks: list[tuple[Look | None, bool]] = []
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
+        self._materials: list[tuple[Material | None, bool]] = []
         self._primitives: list[dict[str, Any]] = []
         self._accessors: list[dict[str, Any]] = []
         self._views: list[dict[str, Any]] = []
         self._binary = bytearray()
         self._corner_count = 0
-        for surface in _joined(surfaces):
-            self._add(surface)
+        for mesh in _joined(meshes):
+            self._add(mesh)
 
     @property
     def triangle_count(self) -> int:
-        """How many triangles are drawn."""
+        """Number of triangles."""
         return self._corner_count // 3
 
     @property
     def bounds(self) -> tuple[Corner, Corner]:
-        """The lowest and the highest coordinates of its points [m]; there have to be some."""
+        """The lowest and the highest coordinates of its points [m]; needs at least one point."""
         boxes = [one for one in self._accessors if "min" in one]
         low = np.min([one["min"] for one in boxes], axis=0).tolist()
         high = np.max([one["max"] for one in boxes], axis=0).tolist()
@@ -68,14 +68,14 @@ class Glb:
 
     @property
     def byte_count(self) -> int:
-        """How much memory it takes, and what is painted of it at least."""
-        images = {look.image for look, _ in self._looks if look is not None and look.image is not None}
+        """Size in memory [bytes], the least size of a file."""
+        images = {material.image for material, _ in self._materials if material and material.image}
         return len(self._binary) + sum(map(len, images))
 
-    def painted(self, paint: Paint) -> bytes:
-        """The file, ready to be drawn."""
-        looks = [_look(*own, paint) for own in self._looks]
-        images = list(dict.fromkeys(look.image for look in looks if look.image is not None))
+    def to_bytes(self, override: MaterialOverride) -> bytes:
+        """The glTF file."""
+        materials = [_override(*own, override) for own in self._materials]
+        images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
         binary, views = bytearray(self._binary), list(self._views)
         for image in images:
             views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(image)})
@@ -90,7 +90,7 @@ class Glb:
             "accessors": self._accessors,
             "bufferViews": views,
             "buffers": [{"byteLength": len(binary)}],
-            "materials": [_material(look, images) for look in looks],
+            "materials": [_material(material, images) for material in materials],
         }
         if images:
             document["images"] = [
@@ -99,22 +99,22 @@ class Glb:
             document["textures"] = [{"source": k} for k in range(len(images))]
         return _packed(document, bytes(binary))
 
-    def _add(self, surface: Surface) -> None:
+    def _add(self, mesh: Mesh) -> None:
         attributes = {
-            "POSITION": self._array(surface.points, _VERTICES, bounded=True),
-            "NORMAL": self._array(surface.normals(), _VERTICES),
+            "POSITION": self._array(mesh.points, _VERTICES, bounded=True),
+            "NORMAL": self._array(mesh.normals(), _VERTICES),
         }
-        if surface.uv is not None:
+        if mesh.uv is not None:
             # glTF counts from the upper edge of an image.
-            attributes["TEXCOORD_0"] = self._array(surface.uv * (1, -1) + (0, 1), _VERTICES)
-        if surface.colors is not None:
-            attributes["COLOR_0"] = self._array(_linear_colors(surface.colors), _VERTICES)
-        self._corner_count += surface.triangles.size
-        # The largest number of a kind means something else.
-        narrow = np.uint16 if len(surface.points) < 0xFFFF else np.uint32
-        rows = self._array(surface.triangles.reshape(-1, 1).astype(narrow), _INDICES)
-        self._primitives.append({"attributes": attributes, "indices": rows, "material": len(self._looks)})
-        self._looks.append((surface.look, surface.uv is not None))
+            attributes["TEXCOORD_0"] = self._array(mesh.uv * (1, -1) + (0, 1), _VERTICES)
+        if mesh.colors is not None:
+            attributes["COLOR_0"] = self._array(_linear_colors(mesh.colors), _VERTICES)
+        self._corner_count += mesh.triangles.size
+        # The largest index of a type means primitive restart.
+        narrow = np.uint16 if len(mesh.points) < 0xFFFF else np.uint32
+        rows = self._array(mesh.triangles.reshape(-1, 1).astype(narrow), _INDICES)
+        self._primitives.append({"attributes": attributes, "indices": rows, "material": len(self._materials)})
+        self._materials.append((mesh.material, mesh.uv is not None))
 
     def _array(self, array: NDArray[Any], target: Literal[34962, 34963], *, bounded: bool = False) -> int:
         data = array if array.dtype.name in _COMPONENTS else array.astype(np.float32)
@@ -138,60 +138,60 @@ class Glb:
         return len(self._accessors) - 1
 
 
-def _joined(surfaces: Iterable[Surface]) -> list[Surface]:
-    """One surface for each look: a browser draws few large ones faster than many small ones.
+def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
+    """One mesh for each material: a browser draws few large ones faster than many small ones.
 
-    All of them have places in an image, and colours, where one has: viser draws instances of no others.
+    If one has texture coordinates or colours, all get them: viser draws instances of no others.
     """
-    alike: dict[Look | None, list[Surface]] = {}
-    for surface in surfaces:
-        if len(surface.triangles):
-            alike.setdefault(surface.look, []).append(surface)
-    every = [surface for group in alike.values() for surface in group]
+    by_material: dict[Material | None, list[Mesh]] = {}
+    for mesh in meshes:
+        if len(mesh.triangles):
+            by_material.setdefault(mesh.material, []).append(mesh)
+    every = [mesh for group in by_material.values() for mesh in group]
     has_uv = any(one.uv is not None for one in every)
     has_colors = any(one.colors is not None for one in every)
-    return [_join(group, has_uv, has_colors) for group in alike.values()]
+    return [_join(group, has_uv, has_colors) for group in by_material.values()]
 
 
-def _join(group: list[Surface], has_uv: bool, has_colors: bool) -> Surface:
+def _join(group: list[Mesh], has_uv: bool, has_colors: bool) -> Mesh:
     starts = np.cumsum([0, *(len(one.points) for one in group[:-1])])
     rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
-    return Surface(
+    return Mesh(
         np.concatenate([one.points for one in group]),
         np.concatenate(rows).astype(np.uint32),
-        group[0].look,
+        group[0].material,
         np.concatenate([_uv(one) for one in group]) if has_uv else None,
         np.concatenate([_colors(one) for one in group]) if has_colors else None,
     )
 
 
-def _uv(surface: Surface) -> NDArray[np.float32]:
-    return np.zeros((len(surface.points), 2), dtype=np.float32) if surface.uv is None else surface.uv
+def _uv(mesh: Mesh) -> NDArray[np.float32]:
+    return np.zeros((len(mesh.points), 2), dtype=np.float32) if mesh.uv is None else mesh.uv
 
 
-def _colors(surface: Surface) -> NDArray[np.uint8]:
-    white = np.full((len(surface.points), 4), 255, dtype=np.uint8)
-    return white if surface.colors is None else surface.colors
+def _colors(mesh: Mesh) -> NDArray[np.uint8]:
+    white = np.full((len(mesh.points), 4), 255, dtype=np.uint8)
+    return white if mesh.colors is None else mesh.colors
 
 
-def _look(own: Look | None, has_uv: bool, paint: Paint) -> Look:
-    if paint.over is not None:
-        return Look(paint.over)
-    look = paint.missing if own is None else own
-    return look if has_uv else Look(look.color)
+def _override(own: Material | None, has_uv: bool, override: MaterialOverride) -> Material:
+    if override.over is not None:
+        return Material(override.over)
+    material = override.missing if own is None else own
+    return material if has_uv else Material(material.color)
 
 
-def _material(look: Look, images: list[bytes]) -> dict[str, Any]:
-    red, green, blue, opacity = look.color
-    surface: dict[str, Any] = {
+def _material(material: Material, images: list[bytes]) -> dict[str, Any]:
+    red, green, blue, opacity = material.color
+    shading: dict[str, Any] = {
         "baseColorFactor": [*_linear(np.array([red, green, blue])).tolist(), opacity],
         "metallicFactor": 0.0,
         "roughnessFactor": _ROUGHNESS,
     }
-    if look.image is not None:
-        surface["baseColorTexture"] = {"index": images.index(look.image)}
-    material: dict[str, Any] = {"pbrMetallicRoughness": surface, "doubleSided": opacity >= 1.0}
-    return material | ({"alphaMode": "BLEND"} if opacity < 1.0 else {})
+    if material.image is not None:
+        shading["baseColorTexture"] = {"index": images.index(material.image)}
+    entry: dict[str, Any] = {"pbrMetallicRoughness": shading, "doubleSided": opacity >= 1.0}
+    return entry | ({"alphaMode": "BLEND"} if opacity < 1.0 else {})
 
 
 def _linear(channels: NDArray[np.float64]) -> NDArray[np.float64]:
