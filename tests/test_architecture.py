@@ -76,16 +76,16 @@ HOMES = {
     "matplotlib": "cli",  # `zstate plot`
     "rich": "cli",
     "tomli": "cli",  # a part of Python from 3.11 on, as tomllib
+    "tomli_w": "cli",  # `zstate snapshot save`
     "tomllib": "cli",
     "yaml": "cli",
 }
 EVERYWHERE = {"numpy"}
 GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
-    ("cli/snapshot/snapshot.py", "msgspec"),
-    ("cli/snapshot/text.py", "msgspec"),
-    ("cli/up/sections.py", "msgspec"),
-    ("cli/up/tables.py", "msgspec"),
+    ("cli/snapshot.py", "msgspec"),
+    ("cli/up/cell.py", "msgspec"),
+    ("cli/up/schema.py", "msgspec"),
 }
 
 PURE = {"model", "buffer", "wire"}

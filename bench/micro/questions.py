@@ -19,8 +19,8 @@ import numpy as np
 
 from bench.micro.others import free_port, meet_nobody_else, running
 from zstate import TransformListener, connect, load_model
+from zstate.metrics.collectors import ListenerMetrics
 from zstate.metrics.endpoint import MetricsEndpoint
-from zstate.metrics.listening import ListenerMetrics
 from zstate.model.robot import RobotModel
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.session import Session

@@ -46,7 +46,7 @@ from bench.micro.others import meet_nobody_else
 from zstate import SineSource, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import SystemClock
 from zstate.rate import Rate
-from zstate.view.geometry.paths import MeshPaths
+from zstate.view.mesh_paths import MeshPaths
 
 RATE_HZ = 30.0
 SETTLE_S = 5.0

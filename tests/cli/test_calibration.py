@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from looking import Spawn, failure, started
 
-from zstate.cli.up.calibration import read_calibration, renamed
+from zstate.cli.up.static_edges import read_calibration, with_frames
 from zstate.errors import ConfigError
 
 PARAMETERS = (
@@ -62,7 +62,7 @@ def test_json_is_read_as_well_and_may_hold_several(tmp_path: Path):
 
 def test_the_frames_may_be_called_otherwise_here(tmp_path: Path):
     (edge,) = read_calibration(file_of(tmp_path, OURS, "eye.json"))
-    other = renamed(edge, None, "eye")
+    other = with_frames(edge, None, "eye")
     assert (other.target, other.source, other.pose7) == ("tool0", "eye", pytest.approx(edge.pose7))
 
 

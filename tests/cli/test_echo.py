@@ -14,7 +14,7 @@ from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, star
 from support import DEADLINE_S, until
 
 from zstate import connect
-from zstate.cli.document_text import Changes
+from zstate.cli.output.joint_state_text import ChangeFilter
 
 pytestmark = pytest.mark.processes
 
@@ -94,15 +94,15 @@ def test_changed_prints_only_what_is_news(spawn: Spawn):
 
 
 def test_news_is_a_number_that_differs_by_more_than_asked_for():
-    changes = Changes(by=0.1)
+    changes = ChangeFilter(by=0.1)
     states = [
         {"stamp": stamp, "seq": stamp, "positions": {"elbow": elbow}, "velocities": {"elbow": velocity}}
         for stamp, (elbow, velocity) in enumerate([(0.0, 0.0), (0.09, 0.0), (0.11, 0.0), (0.15, 1.0)])
     ]
-    assert [changes.note(state) for state in states] == [True, False, True, True]
-    assert [changes.note(value) for value in (5, 5, nan, nan, 6)] == [True, False, True, False, True]
-    assert changes.note({"elbow": 6.0})
-    assert not changes.note({"elbow": 6.0})
+    assert [changes.accepts(state) for state in states] == [True, False, True, True]
+    assert [changes.accepts(value) for value in (5, 5, nan, nan, 6)] == [True, False, True, False, True]
+    assert changes.accepts({"elbow": 6.0})
+    assert not changes.accepts({"elbow": 6.0})
 
 
 @pytest.mark.parametrize("amount", ["-1", "nan"])

@@ -11,7 +11,7 @@ import pytest
 from looking import RRBOT, failure, standing, zstate
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
-from zstate.cli.plot.curves import joint_curves, path_curves
+from zstate.cli.plot import joint_series, path_series
 from zstate.errors import InvalidInput
 
 SECOND = 1_000_000_000
@@ -39,19 +39,19 @@ def texts(file: Path) -> str:
 
 
 def test_positions_become_curves_in_the_order_of_time_with_the_units_of_their_joints():
-    curves = joint_curves(DOCUMENTS, load_model(MODEL))
+    curves = joint_series(DOCUMENTS, load_model(MODEL))
     assert curves.names == ("slide", "turn", "flight.0", "flight.1")
     assert curves.units == ("m", "rad", "", "")
     assert curves.seconds.tolist() == [0.0, 1.0]
     assert curves.values.tolist() == [[0.5, 3.0, 4.0, 5.0], [0.25, 1.0, 1.0, 2.0]]
-    assert curves.chosen(["turn", "flight"]).names == ("turn", "flight.0", "flight.1")
-    assert curves.of_unit("m").values.tolist() == [[0.5], [0.25]]
+    assert curves.select(["turn", "flight"]).names == ("turn", "flight.0", "flight.1")
+    assert curves.with_unit("m").values.tolist() == [[0.5], [0.25]]
 
 
 def test_a_joint_that_there_is_not_is_refused_with_those_that_there_are():
-    curves = joint_curves(DOCUMENTS, None)
+    curves = joint_series(DOCUMENTS, None)
     with pytest.raises(InvalidInput, match=r"did you mean 'slide'.*joints: slide, turn"):
-        curves.chosen(["slid"])
+        curves.select(["slid"])
 
 
 def circling() -> TransformBuffer:
@@ -65,13 +65,13 @@ def circling() -> TransformBuffer:
 
 
 def test_a_path_is_asked_for_at_even_times_over_all_that_is_known():
-    curves = path_curves(circling(), "map", "car")
+    curves = path_series(circling(), "map", "car")
     assert (curves.stamps[0], curves.stamps[-1]) == (0, 4 * SECOND)
     assert np.hypot(curves.values[:, 0], curves.values[:, 1]) == pytest.approx(2.0, abs=1e-3)
-    part = path_curves(circling(), "map", "car", start_s=1.0, seconds=2.0)
+    part = path_series(circling(), "map", "car", start_s=1.0, seconds=2.0)
     assert (part.stamps[0], part.stamps[-1]) == (SECOND, 3 * SECOND)
     with pytest.raises(InvalidInput, match=r"there are 4\.000 s; nothing is left after the first 9 s"):
-        path_curves(circling(), "map", "car", start_s=9.0)
+        path_series(circling(), "map", "car", start_s=9.0)
 
 
 @pytest.mark.processes

@@ -45,7 +45,7 @@ def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path
 
 def test_it_says_what_it_waits_for_and_when_that_comes(spawn: Spawn, tmp_path: Path):
     command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot")
-    assert command.line().endswith("  nobody yet")
+    assert command.line().endswith("  no robot yet")
     with standing("rrbot"):
         while not command.line().endswith("  rrbot"):
             pass

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from looking import RRBOT, standing, zstate
 
-from zstate.cli.doctor.diagnosis import joined
-from zstate.cli.doctor.next_command import looking_there
+from zstate.cli.doctor.diagnosis import effective_network, with_same_options
 from zstate.cli.network import Network
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import Stream
@@ -125,20 +124,21 @@ def test_where_no_node_publishes_it_says_in_which_domain(ros_router: str):
 
 def test_a_ros_wire_joins_the_router_of_the_host_where_nothing_is_said(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZENOH_CONFIG", raising=False)
-    assert joined(Network(), "ros2") == Network("client", (ROUTER_ENDPOINT,))
-    assert joined(Network(), "native") == Network()
-    assert joined(Network("lan"), "ros2") == Network("lan")
+    assert effective_network(Network(), "ros2") == Network("client", (ROUTER_ENDPOINT,))
+    assert effective_network(Network(), "native") == Network()
+    assert effective_network(Network("lan"), "ros2") == Network("lan")
 
 
 def test_the_next_command_looks_where_doctor_has_looked():
     network = Network(connect=("tcp/a:1", "tcp/b:2"))
     both = "--connect tcp/a:1 --connect tcp/b:2"
     assert (
-        looking_there("zstate hz r1  # how often?", network, "native") == f"zstate hz r1 {both}  # how often?"
+        with_same_options("zstate hz r1  # how often?", network, "native")
+        == f"zstate hz r1 {both}  # how often?"
     )
-    assert looking_there("zstate ls", Network(), "ros2:domain=5") == "zstate ls --wire ros2:domain=5"
+    assert with_same_options("zstate ls", Network(), "ros2:domain=5") == "zstate ls --wire ros2:domain=5"
     for whole in ("zstate check FILE", "ps -p 7", "zstate ls --wire ros2 --connect tcp/c:3"):
-        assert looking_there(whole, network, "ros2") == whole
+        assert with_same_options(whole, network, "ros2") == whole
 
 
 @pytest.mark.processes

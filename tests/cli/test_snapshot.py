@@ -9,11 +9,16 @@ from support import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.cli.network import Network
-from zstate.cli.snapshot.snapshot import Configuration, RobotShot, Snapshot, StaticShot, read_snapshot
-from zstate.cli.snapshot.text import json_text, toml_text
+from zstate.cli.snapshot import (
+    Configuration,
+    RobotSnapshot,
+    Snapshot,
+    StaticTransformSnapshot,
+    read_snapshot,
+)
 
 HERE = Configuration("1.0", "desk", "peer")
-STATIC = StaticShot("arm", "tool.1", "lower", "came ra", (0.1, 0.2, 0.3), (0.0, 0.0, 0.6, 0.8))
+STATIC = StaticTransformSnapshot("arm", "tool.1", "lower", "came ra", (0.1, 0.2, 0.3), (0.0, 0.0, 0.6, 0.8))
 
 
 @pytest.mark.parametrize(
@@ -24,11 +29,11 @@ STATIC = StaticShot("arm", "tool.1", "lower", "came ra", (0.1, 0.2, 0.3), (0.0, 
         "<robot name='a'><!-- '''\n\\ \t\x7f é \U0001f916 --><link name='b'/></robot>",
     ],
 )
-@pytest.mark.parametrize(("text", "suffix"), [(toml_text, "toml"), (json_text, "json")])
+@pytest.mark.parametrize(("text", "suffix"), [(Snapshot.as_toml, "toml"), (Snapshot.as_json, "json")])
 def test_what_is_written_is_read_again_as_it_was(tmp_path: Path, urdf: str, text, suffix: str):
     positions = {"shoulder pan": 0.1, "base": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0), 'a"b': -1e-9}
-    arm = RobotShot(name="arm", urdf=urdf, writers=("tf: driver",), stamp=17, positions=positions)
-    shots = (arm, RobotShot(name="other", urdf=urdf))
+    arm = RobotSnapshot(name="arm", urdf=urdf, writers=("tf: driver",), stamp=17, positions=positions)
+    shots = (arm, RobotSnapshot(name="other", urdf=urdf))
     snapshot = Snapshot(1, "2026-01-02T03:04:05+00:00", HERE, shots, (STATIC,))
     file = tmp_path / f"cell.{suffix}"
     file.write_text(text(snapshot), newline="")
@@ -103,7 +108,7 @@ def test_a_robot_stands_again_as_it_stood(spawn: Spawn, tmp_path: Path, suffix: 
 )
 def test_who_saved_it_can_be_followed_onto_the_network(saved, options: str, network: Network):
     assert saved.options() == options
-    assert saved.is_plain == (not options)
+    assert saved.is_default == (not options)
     assert saved.network(Network()) == network
     elsewhere = saved.network(Network(connect=("tcp/c:1",)))
     assert (elsewhere.connect, elsewhere.listen) == (("tcp/c:1",), network.listen)

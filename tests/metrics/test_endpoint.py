@@ -84,10 +84,11 @@ def test_a_port_that_is_taken_and_a_host_elsewhere_are_told():
 def test_without_the_library_one_is_told_what_to_install():
     code = (
         "import sys; sys.modules['prometheus_client'] = None\n"
-        "import zstate.metrics.measured_buffer\n"
+        "import zstate.metrics.buffer, zstate.metrics.collectors\n"
         "from zstate.errors import LibraryMissing\n"
         "try:\n"
-        "    import zstate.metrics.endpoint\n"
+        "    from zstate.metrics.endpoint import MetricsEndpoint\n"
+        "    MetricsEndpoint([])\n"
         "except LibraryMissing as error:\n"
         "    print(error)"
     )

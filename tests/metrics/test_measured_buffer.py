@@ -6,7 +6,7 @@ import pytest
 from live import RRBOT, SECOND, STAMP, UPRIGHT
 
 from zstate.errors import Disconnected, InFuture, UnknownFrame
-from zstate.metrics.measured_buffer import MeasuredBuffer
+from zstate.metrics.buffer import InstrumentedBuffer
 from zstate.transform import Transform
 
 
@@ -15,7 +15,7 @@ def moving(stamp: int, x: float = 0.0) -> Transform:
 
 
 def test_lookups_are_counted_and_their_failures_by_kind():
-    buffer = MeasuredBuffer()
+    buffer = InstrumentedBuffer()
     buffer.insert(moving(STAMP))
     buffer.insert_static(Transform("cell", "table", (0.0, 0.0, 0.0), UPRIGHT))
     assert buffer.lookup("base", "hand") == buffer.lookup("base", "hand", STAMP)
@@ -31,7 +31,7 @@ def test_lookups_are_counted_and_their_failures_by_kind():
 
 
 def test_options_of_a_lookup_are_handed_on():
-    buffer = MeasuredBuffer()
+    buffer = InstrumentedBuffer()
     track = buffer.add_robot(RRBOT, "r1")
     buffer.insert_joints(track, STAMP, [0.0, 0.0], [1.0, 1.0])
     answer = buffer.lookup("base", "lower", STAMP + SECOND // 100, predict_s=0.02)
@@ -39,7 +39,7 @@ def test_options_of_a_lookup_are_handed_on():
 
 
 def test_latency_is_from_the_stamp_until_a_sample_can_be_looked_up():
-    buffer = MeasuredBuffer()
+    buffer = InstrumentedBuffer()
     track = buffer.add_robot(RRBOT, "r1")
     buffer.insert_joints(track, time.time_ns() - 2 * SECOND, [0.0, 0.0])
     buffer.insert_many([("base", "cup")], time.time_ns() - SECOND // 5, [[0.0, 0.0, 0.0, *UPRIGHT]])

@@ -12,12 +12,16 @@ from prometheus_client.core import CounterMetricFamily
 from support import until
 
 from zstate.errors import InFuture, InvalidInput
+from zstate.metrics.buffer import InstrumentedBuffer
+from zstate.metrics.collectors import (
+    MAX_ROBOTS,
+    ConnectionMetrics,
+    ListenerMetrics,
+    MetricFamilies,
+    PublisherMetrics,
+    WriterMetrics,
+)
 from zstate.metrics.endpoint import MetricsEndpoint
-from zstate.metrics.families import MOST_ROBOTS, Families
-from zstate.metrics.listening import ListenerMetrics
-from zstate.metrics.measured_buffer import MeasuredBuffer
-from zstate.metrics.presence import ConnectionMetrics, WriterMetrics
-from zstate.metrics.publishing import PublisherMetrics
 from zstate.net.connections import connections
 from zstate.net.presence import RobotInfo, discover, writer_here
 from zstate.net.session import connect
@@ -82,7 +86,7 @@ def test_a_listener_tells_its_stats_ages_latency_and_lookups(sessions):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
-        TransformListener(reader, "r1", MeasuredBuffer(), history_on_join=False) as listener,
+        TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener,
         StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as noise,
     ):
         settle(writer, "r1")
@@ -131,7 +135,7 @@ def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
 
 def test_a_writer_that_starts_again_and_again_adds_no_row(sessions):
     writer, reader = sessions
-    with TransformListener(reader, "r1", MeasuredBuffer(), history_on_join=False) as listener:
+    with TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener:
         settle(writer, "r1")
         metrics = ListenerMetrics(lambda: [listener])
         writers = WriterMetrics(lambda: discover(reader))
@@ -149,11 +153,11 @@ def test_robots_beyond_a_limit_are_counted_and_have_no_rows():
     writer = writer_here(1)
     robots = [
         RobotInfo(f"r{number:04}", (("joint_states", replace(writer, session=number)),))
-        for number in range(MOST_ROBOTS + 3)
+        for number in range(MAX_ROBOTS + 3)
     ]
     rows = collected(WriterMetrics(lambda: robots))
-    assert rows[row("zstate_robots")] == MOST_ROBOTS + 3
-    assert len([name for name, _ in rows if name == "zstate_writers"]) == MOST_ROBOTS
+    assert rows[row("zstate_robots")] == MAX_ROBOTS + 3
+    assert len([name for name, _ in rows if name == "zstate_writers"]) == MAX_ROBOTS
 
 
 def test_two_writers_of_a_stream_are_two():
@@ -163,7 +167,7 @@ def test_two_writers_of_a_stream_are_two():
 
 
 def test_rows_of_the_same_labels_add_up_and_counters_end_in_total():
-    families = Families()
+    families = MetricFamilies()
     for value in (2, 3):
         families.count("zstate_things", "Things.", value, robot="r1")
     (family,) = families

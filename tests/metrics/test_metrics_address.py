@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from zstate.errors import InvalidInput
-from zstate.metrics.address import Address
+from zstate.metrics.endpoint import BindAddress
 
 
 @pytest.mark.parametrize(
@@ -17,10 +17,10 @@ from zstate.metrics.address import Address
     ],
 )
 def test_a_port_alone_is_one_of_this_host(text: str, address: tuple[str, int]):
-    assert Address.parse(text) == address
+    assert BindAddress.parse(text) == address
 
 
 @pytest.mark.parametrize("text", ["", "65536", "-1", "host:", "::1:9100", "tcp/1.2.3.4:5", "a b:1", "\u0661"])
 def test_what_is_neither_port_nor_host_and_port_is_refused_with_the_right_form(text: str):
     with pytest.raises(InvalidInput, match=r"for instance 9100, or 0\.0\.0\.0:9100"):
-        Address.parse(text)
+        BindAddress.parse(text)

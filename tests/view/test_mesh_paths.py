@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zstate.view.geometry.paths import MeshPaths, Missing
+from zstate.view.mesh_paths import MeshPaths, MissingFile
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_packages_are_found_around_the_urdf(package):
 def test_a_relative_name_starts_at_the_urdf(package):
     assert MeshPaths(package).find("meshes/a b.stl") == package / "meshes" / "a b.stl"
     missing = MeshPaths().find("meshes/a b.stl")
-    assert isinstance(missing, Missing)
+    assert isinstance(missing, MissingFile)
     assert "means nothing without the folder of its URDF" in missing.reason
 
 
@@ -107,13 +107,13 @@ def test_a_description_that_was_received_gets_no_file_outside_packages_nor_learn
             file,
         ]
         found = [MeshPaths().find(uri) for uri in uris]
-        return [(one.reason, one.looked) if isinstance(one, Missing) else one for one in found]
+        return [(one.reason, one.looked) if isinstance(one, MissingFile) else one for one in found]
 
     present, absent = answers("secret.png"), answers("nothing.png")
     assert [one for one in present if isinstance(one, Path)] == []
     assert present == absent
     linked = MeshPaths().find("package://arm/secret.png")
-    assert isinstance(linked, Missing)
+    assert isinstance(linked, MissingFile)
     assert linked.reason == "it leads out of the package 'arm'"
 
 
@@ -130,9 +130,9 @@ def test_links_to_the_sources_of_the_same_package_are_followed(package, monkeypa
     installed.parent.mkdir(parents=True)
     installed.symlink_to(file)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(installed.parents[3]))
-    assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), Missing)
+    assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), MissingFile)
     (package / "package.xml").write_text("<package><name>leg</name></package>")
-    assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), Missing)
+    assert isinstance(MeshPaths().find("package://arm/meshes/a b.stl"), MissingFile)
     (package / "package.xml").write_text("<package><name> arm </name></package>")
     assert MeshPaths().find("package://arm/meshes/a b.stl") == installed
     assert MeshPaths().find(str(installed)) == installed
@@ -140,16 +140,16 @@ def test_links_to_the_sources_of_the_same_package_are_followed(package, monkeypa
 
 def test_nothing_is_fetched_from_elsewhere():
     missing = MeshPaths().find("https://example.org/arm.stl")
-    assert isinstance(missing, Missing)
+    assert isinstance(missing, MissingFile)
     assert missing.reason.startswith("https:// is not fetched")
 
 
 def test_what_is_missing_says_where_it_was_looked_for(package, monkeypatch):
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
     missing = MeshPaths().find("package://arm/meshes/c.stl")
-    assert isinstance(missing, Missing)
+    assert isinstance(missing, MissingFile)
     assert (missing.reason, missing.looked) == ("the package 'arm' has no such file", (str(package),))
     unknown = MeshPaths().find("package://leg/meshes/c.stl")
-    assert isinstance(unknown, Missing)
+    assert isinstance(unknown, MissingFile)
     assert "there is no package 'leg'; put the folder" in unknown.reason
     assert str(package.parent) in unknown.looked

@@ -16,9 +16,9 @@ trimesh = pytest.importorskip("trimesh")
 from zstate import load_model  # noqa: E402
 from zstate.model.shapes import Box, Cylinder, MeshFile, Shape, Sphere, shapes_of  # noqa: E402
 from zstate.se3 import IDENTITY  # noqa: E402
-from zstate.view.geometry.paths import Missing  # noqa: E402
-from zstate.view.geometry.smoothing import smooth  # noqa: E402
-from zstate.view.meshes import Drawing, Meshes  # noqa: E402
+from zstate.view.mesh_geometry import smooth_normals  # noqa: E402
+from zstate.view.mesh_paths import MissingFile  # noqa: E402
+from zstate.view.meshes import MeshAsset, Meshes  # noqa: E402
 
 HERE = Path(__file__).parent
 """Of a URDF file that the user named: every file that it names is found."""
@@ -49,19 +49,19 @@ def shape(geometry: object, color: tuple[float, ...] | None = None, texture: str
     return Shape("base", "visual", IDENTITY, geometry, color, texture)
 
 
-def drawn(one: Shape, meshes: Meshes | None = None, **options: object) -> Drawing:
-    drawing = (meshes or Meshes()).draw(one, **{"base": HERE, **options})
-    assert isinstance(drawing, Drawing), str(drawing)
+def drawn(one: Shape, meshes: Meshes | None = None, **options: object) -> MeshAsset:
+    drawing = (meshes or Meshes()).load(one, **{"base": HERE, **options})
+    assert isinstance(drawing, MeshAsset), str(drawing)
     return drawing
 
 
-def read(drawing: Drawing):
+def read(drawing: MeshAsset):
     """The meshes of a glTF file, as another program reads them."""
     scene = trimesh.load_scene(io.BytesIO(drawing.glb), file_type="glb", process=False)
     return list(scene.geometry.values())
 
 
-def the_mesh(drawing: Drawing):
+def the_mesh(drawing: MeshAsset):
     (mesh,) = read(drawing)
     return mesh
 
@@ -71,7 +71,7 @@ def linear(channel: float) -> float:
     return channel / 12.92 if channel <= 0.04045 else ((channel + 0.055) / 1.055) ** 2.4
 
 
-def color_of(drawing: Drawing) -> list[int]:
+def color_of(drawing: MeshAsset) -> list[int]:
     return the_mesh(drawing).visual.material.baseColorFactor.tolist()
 
 
@@ -114,14 +114,14 @@ def test_faces_that_bend_little_share_their_points_and_others_do_not():
         """How many points two triangles have that meet in the y axis at that angle."""
         x, z = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         points = np.array([(0, 0, 0), (0, 1, 0), (-1, 0, 0), (x, 0, z)])
-        return len(smooth(points, np.array([(0, 1, 2), (0, 3, 1)])).points)
+        return len(smooth_normals(points, np.array([(0, 1, 2), (0, 3, 1)])).points)
 
     assert (fold(0), fold(30), fold(40), fold(90)) == (4, 4, 6, 6)
 
 
 def test_triangles_without_area_are_left_out():
     points = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (np.nan, 0, 0)])
-    surface = smooth(points, np.array([(0, 1, 2), (0, 1, 1), (0, 1, 3)]))
+    surface = smooth_normals(points, np.array([(0, 1, 2), (0, 1, 1), (0, 1, 3)]))
     assert surface.points[surface.triangles].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
 
 
@@ -224,22 +224,22 @@ def test_equal_shapes_are_one_object_and_each_file_is_read_once(tmp_path):
 def test_a_file_that_is_no_mesh_is_missing_and_not_an_error(tmp_path, ending, content):
     path = tmp_path / f"bad.{ending}"
     path.write_bytes(content)
-    missing = Meshes().draw(shape(MeshFile(str(path))), base=HERE)
-    assert isinstance(missing, Missing)
+    missing = Meshes().load(shape(MeshFile(str(path))), base=HERE)
+    assert isinstance(missing, MissingFile)
     assert missing.reason
 
 
 @pytest.mark.parametrize("geometry", [Box((0, 0, 0)), Cylinder(0, 1), Sphere(0), Box((1e300, 1, 1))])
 def test_a_primitive_that_nobody_can_see_is_missing(geometry):
-    missing = Meshes().draw(shape(geometry))
-    assert isinstance(missing, Missing)
+    missing = Meshes().load(shape(geometry))
+    assert isinstance(missing, MissingFile)
     assert missing.uri.endswith("of link 'base'")
 
 
 def test_a_format_nobody_reads_says_which_are_read(tmp_path):
     (tmp_path / "old.mesh").write_bytes(b"ogre")
-    missing = Meshes().draw(shape(MeshFile(str(tmp_path / "old.mesh"))), base=HERE)
-    assert isinstance(missing, Missing)
+    missing = Meshes().load(shape(MeshFile(str(tmp_path / "old.mesh"))), base=HERE)
+    assert isinstance(missing, MissingFile)
     assert "'.mesh' are not read; .dae, .glb" in missing.reason
 
 
@@ -248,11 +248,11 @@ def test_a_format_nobody_reads_says_which_are_read(tmp_path):
 def test_nothing_of_a_known_robot_is_missing(name):
     meshes = Meshes()
     for one in shapes_of(load_model(name)):
-        assert not isinstance(meshes.draw(one), Missing)
+        assert not isinstance(meshes.load(one), MissingFile)
         assert meshes.missing_texture(one) is None
 
 
-def painted(tmp_path: Path, meshes: Meshes, shade: float) -> Drawing:
+def painted(tmp_path: Path, meshes: Meshes, shade: float) -> MeshAsset:
     """A mesh of some kilobytes in one of many colours."""
     path = tmp_path / "ball.stl"
     if not path.exists():
@@ -269,18 +269,18 @@ def test_colours_that_are_not_drawn_any_more_take_no_memory(tmp_path):
 
 def test_many_colours_of_one_mesh_are_drawn_up_to_a_limit_and_then_in_one(tmp_path):
     size = len(painted(tmp_path, Meshes(), 0.0).glb)
-    meshes = Meshes(drawn_bytes=10 * size)
+    meshes = Meshes(copied_bytes=10 * size)
     drawings = [painted(tmp_path, meshes, k / 100) for k in range(100)]
     copies = {one.copy for one in drawings}
     assert 5 <= len(copies) <= 11
-    lacks = [one.lack for one in drawings if one.lack is not None]
+    lacks = [one.defect for one in drawings if one.defect is not None]
     assert len(lacks) == 100 - len(copies)
     assert "in the colour of another" in lacks[0].reason
     # A mesh that is not drawn yet is drawn all the same, and there is room again when others are gone.
-    assert drawn(shape(Box((1, 1, 1))), meshes).lack is None
+    assert drawn(shape(Box((1, 1, 1))), meshes).defect is None
     del drawings, copies
     gc.collect()
-    assert painted(tmp_path, meshes, 0.995).lack is None
+    assert painted(tmp_path, meshes, 0.995).defect is None
 
 
 def test_geometry_is_kept_up_to_a_limit_the_latest_first(tmp_path):
@@ -288,8 +288,8 @@ def test_geometry_is_kept_up_to_a_limit_the_latest_first(tmp_path):
     meshes = Meshes(kept_bytes=2 * size)
     for k in range(20):
         for solid in (Box((1, 1, k)), Sphere(1.0 + k), Cylinder(1.0 + k, 1.0)):
-            meshes.draw(shape(solid))
+            meshes.load(shape(solid))
         painted(tmp_path, meshes, 0.5)
     assert meshes.kept_byte_count <= 2 * size
     (tmp_path / "ball.stl").write_bytes(b"nothing")
-    assert painted(tmp_path, meshes, 0.7).lack is None
+    assert painted(tmp_path, meshes, 0.7).defect is None

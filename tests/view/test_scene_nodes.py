@@ -1,4 +1,4 @@
-"""Nodes: viser is told of the poses that changed, and of no others."""
+"""FrameNodes: viser is told of the poses that changed, and of no others."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ viser = pytest.importorskip("viser")
 from drawing import at, in_fixed, is_seen, moment, told, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
-from zstate.view.scene.nodes import Nodes  # noqa: E402
+from zstate.view.scene.frame_nodes import FrameNodes  # noqa: E402
 
 ARM = tree({"map": None, "arm/base": "map", "arm/upper": "arm/base", "arm/tool": "arm/upper"})
 ALL = frozenset({*ARM.names, "cup"})
 POSES = {"arm/base": at(1, 2, 0, pi / 2), "arm/upper": at(0, 0, 0.5, 0.3), "arm/tool": at(0.4, 0, 0)}
 
 
-def show(nodes: Nodes, shown, fixed: str, wanted: frozenset[str]) -> None:
-    nodes.show(shown, shown.poses_in(fixed), wanted)
+def show(nodes: FrameNodes, shown, fixed: str, wanted: frozenset[str]) -> None:
+    nodes.show(shown, shown.placed(fixed), wanted)
 
 
-def assert_placed(server, nodes: Nodes, shown, fixed: str) -> None:
+def assert_placed(server, nodes: FrameNodes, shown, fixed: str) -> None:
     """Every frame that has a place is at it, as viser has been told."""
     for name, expected in zip(shown.tree.names, shown.poses_in(fixed), strict=True):
         path = nodes.paths[name]
@@ -38,14 +38,14 @@ def assert_placed(server, nodes: Nodes, shown, fixed: str) -> None:
 
 @pytest.mark.parametrize("fixed", ARM.names)
 def test_every_frame_is_where_it_is_in_the_fixed_one(server, fixed):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     shown = moment(ARM, POSES)
     show(nodes, shown, fixed, ALL)
     assert_placed(server, nodes, shown, fixed)
 
 
 def test_what_stands_still_is_not_sent(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     with told(server) as messages:
         show(nodes, moment(ARM, POSES, stamp=1), "map", ALL)
@@ -53,7 +53,7 @@ def test_what_stands_still_is_not_sent(server):
 
 
 def test_a_joint_that_turns_is_one_message_whatever_hangs_on_it(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     turned = moment(ARM, POSES | {"arm/upper": at(0, 0, 0.5, 0.8)})
     with told(server) as messages:
@@ -63,7 +63,7 @@ def test_a_joint_that_turns_is_one_message_whatever_hangs_on_it(server):
 
 
 def test_another_fixed_frame_moves_the_root_alone(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     shown = moment(ARM, POSES)
     show(nodes, shown, "map", ALL)
     with told(server) as messages:
@@ -73,7 +73,7 @@ def test_another_fixed_frame_moves_the_root_alone(server):
 
 
 def test_noise_that_nobody_sees_is_not_sent_until_it_adds_up(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     with told(server) as messages:
         for k in range(1, 5):
@@ -84,7 +84,7 @@ def test_noise_that_nobody_sees_is_not_sent_until_it_adds_up(server):
 
 
 def test_frames_without_a_place_are_hidden_with_all_below_them(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     shown = moment(ARM, POSES, unknown=["arm/upper"])
     show(nodes, shown, "map", ALL)
     assert_placed(server, nodes, shown, "map")
@@ -95,7 +95,7 @@ def test_frames_without_a_place_are_hidden_with_all_below_them(server):
 
 
 def test_what_is_below_a_missing_pose_is_seen_from_there(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     shown = moment(ARM, POSES, unknown=["arm/upper"])
     show(nodes, shown, "arm/tool", ALL)
     assert [nodes.is_shown(name) for name in ARM.names] == [False, False, True, True]
@@ -103,7 +103,7 @@ def test_what_is_below_a_missing_pose_is_seen_from_there(server):
 
 
 def test_a_frame_that_comes_leaves_the_others_as_they_are(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     before = dict(nodes.paths)
     more = tree(
@@ -118,7 +118,7 @@ def test_a_frame_that_comes_leaves_the_others_as_they_are(server):
 
 
 def test_a_frame_that_changes_its_parent_takes_along_what_hangs_on_it(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     version = nodes.version
     grasped = tree({"map": None, "arm/base": "map", "arm/tool": "arm/base", "arm/upper": "arm/tool"})
@@ -132,7 +132,7 @@ def test_a_frame_that_changes_its_parent_takes_along_what_hangs_on_it(server):
 
 
 def test_a_frame_that_goes_is_removed(server):
-    nodes = Nodes(server.scene)
+    nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     tool = nodes.paths["arm/tool"]
     show(nodes, moment(tree({"map": None, "arm/base": "map"}), POSES), "map", ALL)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from zstate._util.bounded_dict import BoundedDict
 from zstate.clock import Clock
-from zstate.metrics.histogram import Histogram
-from zstate.metrics.measured_buffer import LATENCY_BOUNDS_S, MeasuredBuffer
+from zstate.metrics.buffer import LATENCY_BOUNDS_S, Histogram, InstrumentedBuffer
 from zstate.net.topic_statistics import IntervalStatistics, Received
 
 _WINDOW_NS = 5_000_000_000
@@ -29,8 +28,8 @@ class RobotMeasure:
     age_s: float | None
 
 
-class MeteredBuffer(MeasuredBuffer):
-    """A MeasuredBuffer that also measures, robot by robot, when each sample can be looked up.
+class MeteredBuffer(InstrumentedBuffer):
+    """A InstrumentedBuffer that also measures, robot by robot, when each sample can be looked up.
 
     ``has_samples`` is set at the first one.
     """
@@ -54,11 +53,11 @@ class MeteredBuffer(MeasuredBuffer):
             latency = self._latencies[robot] = Histogram(LATENCY_BOUNDS_S)
         return latency
 
-    def _note_sample(self, robot: str, stamp: int) -> None:
-        super()._note_sample(robot, stamp)
+    def _on_sample(self, robot: str, stamp: int) -> None:
+        super()._on_sample(robot, stamp)
         delay = self.clock.now() - stamp
         if self._is_comparable(robot):
-            self.latency_of(robot).note(delay * 1e-9)
+            self.latency_of(robot).add(delay * 1e-9)
         statistics = self.statistics_of(robot)
         statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
         if statistics.count == 1:

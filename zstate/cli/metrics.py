@@ -11,16 +11,15 @@ from zstate.cli.output.console import print_status
 if TYPE_CHECKING:
     from zstate.bridge import Bridge
     from zstate.cli.robot_directory import RobotDirectory
-    from zstate.metrics.address import Address
-    from zstate.metrics.library import Collector
-    from zstate.metrics.listening import Listened
+    from zstate.metrics.collectors import Listened
+    from zstate.metrics.endpoint import BindAddress, MetricsCollector
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
     from zstate.recording.recorder import Recorder
 
 
 @contextmanager
-def served(address: Address | None, *collectors: Callable[[], Collector]) -> Generator[None]:
+def served(address: BindAddress | None, *collectors: Callable[[], MetricsCollector]) -> Generator[None]:
     """What ``collectors`` make is served at ``address`` meanwhile, and where is said; None serves nothing."""
     if address is None:
         yield
@@ -35,66 +34,66 @@ def served(address: Address | None, *collectors: Callable[[], Collector]) -> Gen
 # Each loads its library when something is served.
 
 
-def of_publishers(*publishers: StatePublisher) -> Callable[[], Collector]:
+def of_publishers(*publishers: StatePublisher) -> Callable[[], MetricsCollector]:
     """What publishers say."""
 
-    def make() -> Collector:
-        from zstate.metrics.publishing import PublisherMetrics
+    def make() -> MetricsCollector:
+        from zstate.metrics.collectors import PublisherMetrics
 
         return PublisherMetrics(publishers)
 
     return make
 
 
-def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], Collector]:
+def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], MetricsCollector]:
     """What the listeners that there are by then hear."""
 
-    def make() -> Collector:
-        from zstate.metrics.listening import ListenerMetrics
+    def make() -> MetricsCollector:
+        from zstate.metrics.collectors import ListenerMetrics
 
         return ListenerMetrics(listeners)
 
     return make
 
 
-def of_writers(roster: RobotDirectory) -> Callable[[], Collector]:
+def of_writers(roster: RobotDirectory) -> Callable[[], MetricsCollector]:
     """Who writes."""
 
-    def make() -> Collector:
-        from zstate.metrics.presence import WriterMetrics
+    def make() -> MetricsCollector:
+        from zstate.metrics.collectors import WriterMetrics
 
         return WriterMetrics(roster.robots)
 
     return make
 
 
-def of_connections(session: Session) -> Callable[[], Collector]:
+def of_connections(session: Session) -> Callable[[], MetricsCollector]:
     """Who is connected to a router."""
 
-    def make() -> Collector:
-        from zstate.metrics.presence import ConnectionMetrics
+    def make() -> MetricsCollector:
+        from zstate.metrics.collectors import ConnectionMetrics
 
         return ConnectionMetrics(session)
 
     return make
 
 
-def of_recorder(recorder: Recorder) -> Callable[[], Collector]:
+def of_recorder(recorder: Recorder) -> Callable[[], MetricsCollector]:
     """What is recorded."""
 
-    def make() -> Collector:
-        from zstate.metrics.carrying import RecorderMetrics
+    def make() -> MetricsCollector:
+        from zstate.metrics.collectors import RecorderMetrics
 
         return RecorderMetrics(recorder)
 
     return make
 
 
-def of_bridge(bridge: Bridge) -> Callable[[], Collector]:
+def of_bridge(bridge: Bridge) -> Callable[[], MetricsCollector]:
     """What is carried."""
 
-    def make() -> Collector:
-        from zstate.metrics.carrying import BridgeMetrics
+    def make() -> MetricsCollector:
+        from zstate.metrics.collectors import BridgeMetrics
 
         return BridgeMetrics(bridge)
 

@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -18,7 +17,7 @@ from zstate.errors import InvalidInput, NoClock
 
 if TYPE_CHECKING:
     from zstate.clock import Clock
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.model.robot import RobotModel
     from zstate.net.security import Credentials
     from zstate.net.session import Session
@@ -236,15 +235,15 @@ wires_option = click.option(
 )
 
 
-def _checked_address(_: click.Context, __: click.Parameter, text: str | None) -> Address | None:
+def _checked_address(_: click.Context, __: click.Parameter, text: str | None) -> BindAddress | None:
     if text is None:
         return None
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress, check_library
 
-    import_module("zstate.metrics.library")  # told before anything runs when it is missing
+    check_library()  # before anything runs
 
     try:
-        return Address.parse(text)
+        return BindAddress.parse(text)
     except InvalidInput as error:
         raise click.BadParameter(str(error)) from None
 

@@ -1,4 +1,4 @@
-"""MetricsEndpoint: answers scrapes over HTTP."""
+"""HTTP endpoint for Prometheus."""
 
 from __future__ import annotations
 
@@ -8,79 +8,110 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from socketserver import ThreadingMixIn
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from zstate import __version__, kernel
-from zstate._util.endpoint import format_host
+from zstate._util.endpoint import format_host, parse_host_port
 from zstate.closing import Closing
-from zstate.errors import InvalidInput, PortBusy
-from zstate.metrics.address import LOCAL
-from zstate.metrics.library import (
-    Collector,
-    CollectorRegistry,
-    InfoMetricFamily,
-    Metric,
-    ProcessCollector,
-    exposition,
-)
+from zstate.errors import InvalidInput, LibraryMissing, PortBusy
 from zstate.metrics.pace import EVERY_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from wsgiref.types import WSGIApplication
 
-# How soon closing is noticed.
-_POLL_S = 0.1
-# Whoever asks and then says no more is not waited for.
-_PATIENCE_S = 5.0
+    from prometheus_client.core import Metric
+    from prometheus_client.registry import Collector
+
+LOCAL = "127.0.0.1"
+_SHUTDOWN_POLL_S = 0.1
+# A client that sends no complete request within this time is disconnected.
+_REQUEST_WITHIN_S = 5.0
+
+
+class BindAddress(NamedTuple):
+    """A host address and a port; port 0 is a free one."""
+
+    host: str
+    port: int
+
+    @classmethod
+    def parse(cls, text: str) -> BindAddress:
+        """Parse "9100" (this host only), "0.0.0.0:9100" or "[::]:9100". Raises InvalidInput."""
+        address = parse_host_port(text if ":" in text else f"{LOCAL}:{text}")
+        if address is None:
+            raise InvalidInput(f"{text!r} is not PORT or HOST:PORT; for instance 9100, or 0.0.0.0:9100")
+        return cls(*address)
+
+
+class MetricsCollector(Protocol):
+    """Yields metrics at each scrape. An optional ``sample()`` is called once a second."""
+
+    def collect(self) -> Iterable[Metric]:
+        """The metrics now."""
+        ...
+
+
+def check_library() -> None:
+    """Raise LibraryMissing without prometheus-client."""
+    try:
+        import prometheus_client  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+    except ImportError as error:
+        raise LibraryMissing(
+            f"metrics need prometheus-client, which cannot be loaded ({error}): pip install 'zstate[metrics]'"
+        ) from None
 
 
 class MetricsEndpoint(Closing):
-    """Serves what ``collectors`` find, each time it is asked, at ``url``; a context manager.
+    """Serves the metrics of ``collectors`` at ``url``; a context manager.
 
-    Beside them CPU, memory and open files of this process, and the version of zstate. ``port`` 0 is a
-    free one. Nothing is counted for it: it reads what is counted anyway. Raises PortBusy, and
-    InvalidInput for a host that is not this one.
+    It also serves CPU, memory and open files of this process, and the version of zstate. ``port`` 0 is a free
+    one. It adds no counting: it reads counters that exist anyway. Raises PortBusy, LibraryMissing without
+    prometheus-client, and InvalidInput if ``host`` is not an address of this host.
     """
 
-    def __init__(self, collectors: Sequence[Collector], host: str = LOCAL, port: int = 0) -> None:
+    def __init__(self, collectors: Sequence[MetricsCollector], host: str = LOCAL, port: int = 0) -> None:
+        check_library()
+        from prometheus_client import CollectorRegistry, ProcessCollector, exposition  # noqa: PLC0415
+
         registry = CollectorRegistry()
         for collector in (*collectors, _Build()):
-            registry.register(collector)
+            registry.register(cast("Collector", collector))
         ProcessCollector(registry=registry)
         self._server = _bound(host, port)
-        self._server.looks = [look for one in collectors if (look := getattr(one, "look", None)) is not None]
-        # Its types leave the arguments of the application out.
+        samplers = [getattr(collector, "sample", None) for collector in collectors]
+        self._server.samplers = [sampler for sampler in samplers if sampler is not None]
+        # The library's types leave out the arguments of the application.
         make = cast("Callable[[CollectorRegistry], WSGIApplication]", exposition.make_wsgi_app)  # pyright: ignore
         self._server.set_app(make(registry))
         self.url = f"http://{format_host(host)}:{self._server.server_port}/metrics"
         self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(_POLL_S,), name="zstate metrics", daemon=True
+            target=self._server.serve_forever, args=(_SHUTDOWN_POLL_S,), name="zstate metrics", daemon=True
         )
         self._thread.start()
 
     def close(self) -> None:
-        """Answer no more. A second call does nothing."""
+        """Stop the server. A second call does nothing."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """Also calls ``looks`` once a second, from the thread that waits for scrapes."""
+    """Also calls ``samplers`` once a second, from the thread that accepts connections."""
 
     daemon_threads = True
-    looks: Sequence[Callable[[], None]] = ()
-    _looked_s = -EVERY_S
+    samplers: Sequence[Callable[[], None]] = ()
+    _sampled_s = -EVERY_S
 
     def service_actions(self) -> None:
         super().service_actions()
         now_s = time.monotonic()
-        if now_s - self._looked_s >= EVERY_S:
-            self._looked_s = now_s
-            for look in self.looks:
-                look()
+        if now_s - self._sampled_s >= EVERY_S:
+            self._sampled_s = now_s
+            for sampler in self.samplers:
+                sampler()
 
 
 class _Server6(_Server):
@@ -88,14 +119,16 @@ class _Server6(_Server):
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = _PATIENCE_S
+    timeout = _REQUEST_WITHIN_S
 
     def log_message(self, format: str, *args: object) -> None:
-        """Nothing: scrapes come all the time."""
+        """Log nothing: scrapes are frequent."""
 
 
-class _Build(Collector):
+class _Build:
     def collect(self) -> Iterable[Metric]:
+        from prometheus_client.core import InfoMetricFamily  # noqa: PLC0415
+
         facts = {"version": __version__, "kernel": str(kernel)}
         yield InfoMetricFamily("zstate_build", "Which zstate this is.", facts)
 

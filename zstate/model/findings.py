@@ -47,7 +47,7 @@ class Findings:
         """Note something doubtful that does not prevent use, and what to write instead."""
         self._found.append(Finding(line, message, "warning", fix))
 
-    def near_miss(self, name: str, candidates: Iterable[str]) -> str | None:
+    def did_you_mean(self, name: str, candidates: Iterable[str]) -> str | None:
         """The candidate that was probably meant by ``name``, if there is one."""
         if not self._suggestions_left or len(name) > _LONGEST_COMPARED:
             return None

@@ -69,7 +69,7 @@ class JointReader:
         if given is None:
             near, message = None, f"{label} has no type; one of {', '.join(POSITION_COUNTS)}"
         else:
-            near = self._findings.near_miss(given, POSITION_COUNTS)
+            near = self._findings.did_you_mean(given, POSITION_COUNTS)
             choice = suggestion_text(near) or _choices(POSITION_COUNTS)
             message = f"{label} has the unknown type {quoted(given)}{choice}"
         self._findings.error(element.line, message, f'type="{near or "revolute"}"')
@@ -88,7 +88,7 @@ class JointReader:
             self._findings.error(ends[0].line, message, f'<{tag} link="{self._some_link}"/>')
             return ""
         if link not in self._links:
-            near = self._findings.near_miss(link, self._links)
+            near = self._findings.did_you_mean(link, self._links)
             message = f"{label}: its {tag} {quoted(link)} is not a link{suggestion_text(near)}"
             fix = (
                 f'<link name="{shortened(link)}"/> in <robot>' if near is None else f'<{tag} link="{near}"/>'

@@ -26,7 +26,7 @@ def _check_master(findings: Findings, joint: Joint, name: str, by_name: Mapping[
     label = f"joint {quoted(joint.name)} mimics"
     master = by_name.get(name)
     if master is None:
-        near = findings.near_miss(name, (other for other in by_name if other != joint.name))
+        near = findings.did_you_mean(name, (other for other in by_name if other != joint.name))
         fix = _FOLLOW if near is None else f'<mimic joint="{near}"/>'
         message = f"{label} {quoted(name)}, which does not exist{suggestion_text(near)}"
         findings.error(joint.line, message, fix)

@@ -140,7 +140,7 @@ class _Reader:
             return self._materials[name]
         if next(_defined(materials[:1]), None) is not None:
             return self._material(materials[0])
-        near = suggestion_text(self.findings.near_miss(name, self._materials))
+        near = suggestion_text(self.findings.did_you_mean(name, self._materials))
         message = f"link {quoted(link)}: the material {quoted(name)} is defined nowhere{near}"
         self.findings.warning(materials[0].line, message, '<color rgba="0.7 0.7 0.7 1"/> inside it')
         return Material()

@@ -1,36 +1,50 @@
-"""Meshes: what the shapes of robots look like, as files that a browser draws."""
+"""Meshes of shapes as binary glTF, from files or primitives. The one module that uses trimesh and Pillow."""
 
 from __future__ import annotations
 
+import io
 from collections import OrderedDict, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from weakref import WeakValueDictionary, finalize
+from xml.etree import ElementTree
 
+import collada  # pyright: ignore[reportMissingTypeStubs]
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from PIL import Image
+from trimesh.resolvers import FilePathResolver
+from trimesh.units import unit_conversion
 
 from zstate.model.shapes import Box, Color, Cylinder, MeshFile, Shape, Sphere
-from zstate.view.geometry.files import UnreadableFile, read_image, read_mesh
-from zstate.view.geometry.glb import GREY, Corner, Glb, Paint
-from zstate.view.geometry.paths import MeshPaths, Missing
-from zstate.view.geometry.primitives import primitive
-from zstate.view.geometry.surface import Look
+from zstate.view.gltf import GREY, Corner, Glb, MaterialOverride
+from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
+from zstate.view.mesh_paths import MeshPaths, MissingFile
 
 _Source = Path | tuple[Box | Cylinder | Sphere, bool]
 
+FORMATS = {".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl"}
+IMAGES = {".bmp", ".gif", ".jpeg", ".jpg", ".png", ".tga", ".tif", ".tiff"}
+MAX_BYTES = 512 * 1024 * 1024
+_WIDEST_IMAGE = 2048
+_load: Any = trimesh.load_scene  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+_INVISIBLE = 0.02  # exporters disagree on whether 0 or 1 is opaque
+_Collada: Any = collada.Collada  # not typed
 
-# A mesh that is drawn again, by another robot or in another colour, is packed from memory, up to here.
+# Geometry kept in memory, for other robots and other colours.
 _KEPT_BYTES = 256 * 1024 * 1024
-# Each colour of a mesh is a copy, here and in every browser: beyond this, copies that are there are shared.
-_DRAWN_BYTES = 512 * 1024 * 1024
+# Each colour of a mesh is a copy, here and in every browser. Beyond this size, existing copies are shared.
+_COPIED_BYTES = 512 * 1024 * 1024
 
 
 @dataclass(frozen=True, eq=False)
 class Copy:
-    """A mesh in one colour, as binary glTF, and between which coordinates [m] it is.
+    """A mesh in one colour, as binary glTF, with its bounds [m].
 
-    It is kept while something that looks so is drawn.
+    It is kept while an asset uses it.
     """
 
     glb: bytes
@@ -39,49 +53,51 @@ class Copy:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
-    """A shape as binary glTF, to be drawn ``scale`` times as large along x, y, z.
+class MeshAsset:
+    """A shape as binary glTF, to be scaled by ``scale`` along x, y, z.
 
-    Shapes that look the same have the same ``copy``. ``lack`` says what is not as the URDF has it.
+    Shapes with the same appearance share a ``copy``. ``defect`` is a difference from the URDF.
     """
 
     copy: Copy
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    lack: Missing | None = None
+    defect: MissingFile | None = None
 
     def corners(self) -> NDArray[np.float64]:
-        """The corners of the box around it, scaled: (8, 3) [m]."""
+        """The corners of its bounding box, scaled: (8, 3) [m]."""
         ends = np.array([self.copy.low, self.copy.high]) * self.scale
         return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
 
     @property
     def glb(self) -> bytes:
-        """What a browser draws."""
+        """The glTF file."""
         return self.copy.glb
 
 
 class Meshes:
-    """Reads each file once, however many robots have it. To be used by one thread.
+    """Loads meshes; each file is read once for all robots. To be used by one thread.
 
-    What is kept is bounded, whatever is published: geometry by ``kept_bytes``, with the latest used; and
-    coloured copies by ``drawn_bytes``, apart from the first copy of each mesh that is drawn.
+    Memory is bounded: geometry by ``kept_bytes``, the most recently used first, and coloured copies by
+    ``copied_bytes``, apart from the first copy of each mesh in use.
     """
 
-    def __init__(self, kept_bytes: int = _KEPT_BYTES, drawn_bytes: int = _DRAWN_BYTES) -> None:
+    def __init__(self, kept_bytes: int = _KEPT_BYTES, copied_bytes: int = _COPIED_BYTES) -> None:
         self._kept_bytes = kept_bytes
-        self._drawn_bytes = drawn_bytes
+        self._max_copied_bytes = copied_bytes
         self._paths: dict[Path | None, MeshPaths] = {}
         self._packed: OrderedDict[_Source, Glb] = OrderedDict()
         self.kept_byte_count = 0
-        """How large the geometry is that is kept to be drawn again."""
-        self._copies: WeakValueDictionary[tuple[_Source, Paint], Copy] = WeakValueDictionary()
+        """Size of the geometry in memory [bytes]."""
+        self._copies: WeakValueDictionary[tuple[_Source, MaterialOverride], Copy] = WeakValueDictionary()
         self._firsts: WeakValueDictionary[_Source, Copy] = WeakValueDictionary()
         self._copied_bytes = 0
-        # Sizes of copies that nothing draws any more, from whichever thread dropped them.
+        # Sizes of copies that are no longer used; appended by any thread.
         self._dropped: deque[int] = deque()
 
-    def draw(self, shape: Shape, over: Color | None = None, base: Path | None = None) -> Drawing | Missing:
-        """The shape in its own colours, or all ``over`` in one; or why it cannot be drawn.
+    def load(
+        self, shape: Shape, over: Color | None = None, base: Path | None = None
+    ) -> MeshAsset | MissingFile:
+        """The shape in its own colours, or all in the colour ``over``; or why it cannot be drawn.
 
         ``base`` is the folder of a URDF file that the user named, see MeshPaths.
         """
@@ -90,44 +106,45 @@ class Meshes:
             source = (geometry, shape.texture is not None)
             name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
             if self._pack(source).triangle_count:
-                return self._painted(source, shape, over, base, name)
-            return Missing(name, "there is nothing to see: it has no size, or one beyond all measure")
+                return self._colored(source, shape, over, base, name)
+            return MissingFile(name, "there is nothing to see: it has no size, or one beyond all measure")
         found = self._finder(base).find(geometry.uri)
-        if isinstance(found, Missing):
+        if isinstance(found, MissingFile):
             return found
         try:
-            return replace(self._painted(found, shape, over, base, geometry.uri), scale=geometry.scale)
+            return replace(self._colored(found, shape, over, base, geometry.uri), scale=geometry.scale)
         except (OSError, UnreadableFile) as error:
-            return Missing(geometry.uri, str(error), (str(found.parent),))
+            return MissingFile(geometry.uri, str(error), (str(found.parent),))
 
-    def missing_texture(self, shape: Shape, base: Path | None = None) -> Missing | None:
-        """Why the image that the URDF lays over the shape cannot be drawn, if so: its colour is then."""
+    def missing_texture(self, shape: Shape, base: Path | None = None) -> MissingFile | None:
+        """Why the texture of the shape cannot be loaded; None if it can, or if there is none."""
         image = None if shape.texture is None else self._image(shape.texture, base)
-        return image if isinstance(image, Missing) else None
+        return image if isinstance(image, MissingFile) else None
 
-    def _painted(
+    def _colored(
         self, source: _Source, shape: Shape, over: Color | None, base: Path | None, name: str
-    ) -> Drawing:
-        paint = Paint(over=over) if over is not None else Paint(self._look(shape, base))
-        done = self._copies.get((source, paint))
+    ) -> MeshAsset:
+        override = (
+            MaterialOverride(over=over) if over is not None else MaterialOverride(self._material(shape, base))
+        )
+        done = self._copies.get((source, override))
         if done is not None:
-            return Drawing(done)
+            return MeshAsset(done)
         packed = self._pack(source)
         another = self._firsts.get(source)
-        if another is not None and self._in_use() + packed.byte_count > self._drawn_bytes:
-            reason = (
-                f"in the colour of another: the meshes drawn take {_megabytes(self._drawn_bytes)} already"
-            )
-            return Drawing(another, lack=Missing(name, reason))
-        done = self._copies[source, paint] = Copy(packed.painted(paint), *packed.bounds)
+        if another is not None and self._in_use() + packed.byte_count > self._max_copied_bytes:
+            limit = f"{self._max_copied_bytes / 1e6:.0f} MB"
+            reason = f"in the colour of another: the meshes drawn take {limit} already"
+            return MeshAsset(another, defect=MissingFile(name, reason))
+        done = self._copies[source, override] = Copy(packed.to_bytes(override), *packed.bounds)
         if another is None:
             self._firsts[source] = done
         self._copied_bytes += len(done.glb)
         finalize(done, self._dropped.append, len(done.glb)).atexit = False
-        return Drawing(done)
+        return MeshAsset(done)
 
     def _in_use(self) -> int:
-        """The bytes of all copies that something draws."""
+        """Size of all copies in use [bytes]."""
         while self._dropped:
             self._copied_bytes -= self._dropped.popleft()
         return self._copied_bytes
@@ -135,30 +152,30 @@ class Meshes:
     def _pack(self, source: _Source) -> Glb:
         done = self._packed.pop(source, None)
         if done is None:
-            surfaces = (
+            meshes = (
                 read_mesh(source) if isinstance(source, Path) else [primitive(source[0], textured=source[1])]
             )
-            done = Glb(surfaces)
+            done = Glb(meshes)
             self.kept_byte_count += done.byte_count
         self._packed[source] = done
         while self.kept_byte_count > self._kept_bytes and len(self._packed) > 1:
             self.kept_byte_count -= self._packed.popitem(last=False)[1].byte_count
         return done
 
-    def _look(self, shape: Shape, base: Path | None) -> Look:
+    def _material(self, shape: Shape, base: Path | None) -> Material:
         image = None if shape.texture is None else self._image(shape.texture, base)
         if isinstance(image, bytes):
-            return Look(shape.color or (1.0, 1.0, 1.0, 1.0), image)
-        return Look(shape.color or GREY)
+            return Material(shape.color or (1.0, 1.0, 1.0, 1.0), image)
+        return Material(shape.color or GREY)
 
-    def _image(self, uri: str, base: Path | None) -> bytes | Missing:
+    def _image(self, uri: str, base: Path | None) -> bytes | MissingFile:
         found = self._finder(base).find(uri)
-        if isinstance(found, Missing):
+        if isinstance(found, MissingFile):
             return found
         try:
             return read_image(found)
         except (OSError, UnreadableFile) as error:
-            return Missing(uri, str(error), (str(found.parent),))
+            return MissingFile(uri, str(error), (str(found.parent),))
 
     def _finder(self, base: Path | None) -> MeshPaths:
         finder = self._paths.get(base)
@@ -167,5 +184,124 @@ class Meshes:
         return finder
 
 
-def _megabytes(count: int) -> str:
-    return f"{count / 1e6:.0f} MB"
+class UnreadableFile(ValueError):
+    """A file without a mesh or an image that can be drawn."""
+
+
+def read_mesh(path: Path) -> tuple[Mesh, ...]:
+    """The meshes of a mesh file in metres, in the axes of the file. Raises UnreadableFile.
+
+    The <unit> of COLLADA is used and its <up_axis> is not, as in rviz.
+    """
+    _check(path, FORMATS)
+    try:
+        meshes = _loaded(path, path)
+        if not meshes and path.suffix.lower() == ".dae":
+            meshes = _loaded(path, strip_missing_materials(path))
+    except Exception as error:  # readers of six formats raise exceptions of any type
+        raise UnreadableFile(f"it cannot be read: {str(error)[:200] or type(error).__name__}") from None
+    if not any(len(mesh.triangles) for mesh in meshes):
+        raise UnreadableFile("there are no triangles in it")
+    return meshes
+
+
+def read_image(path: Path) -> bytes:
+    """An image as JPEG or PNG, at most 2048 wide and high. Raises UnreadableFile."""
+    _check(path, IMAGES)
+    try:
+        with Image.open(path) as image:
+            return _encoded(image)
+    except Exception as error:  # Pillow's readers raise exceptions of any type
+        raise UnreadableFile(f"it is no image: {str(error)[:200]}") from None
+
+
+def _check(path: Path, formats: set[str]) -> None:
+    if path.suffix.lower() not in formats:
+        known = ", ".join(sorted(formats))
+        raise UnreadableFile(f"files of the kind '{path.suffix}' are not read; {known} are")
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise UnreadableFile(f"it has {size} bytes; the limit is {MAX_BYTES}")
+
+
+def _loaded(path: Path, data: Path | io.BytesIO) -> tuple[Mesh, ...]:
+    """The meshes in ``data``, the content of ``path``; images are found relative to it."""
+    kind = path.suffix.lower().removeprefix(".")
+    resolver = FilePathResolver(str(path), allow_anywhere=True)
+    scene: Any = _load(data, file_type=kind, resolver=resolver, process=kind == "stl")
+    return tuple(_meshes_in(scene))
+
+
+def _meshes_in(scene: Any) -> Iterator[Mesh]:
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if len(getattr(mesh, "faces", ())):
+            yield _mesh(mesh, np.asarray(matrix, dtype=np.float64) * _in_metres(mesh))
+
+
+def _in_metres(mesh: Any) -> NDArray[np.float64]:
+    scale = 1.0 if mesh.units is None else unit_conversion(mesh.units, "meters")
+    return np.array([[scale], [scale], [scale], [1.0]])
+
+
+def _mesh(mesh: Any, matrix: NDArray[np.float64]) -> Mesh:
+    points = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    # From the cache: the property would compute normals if the file has none.
+    own: Any = mesh._cache.cache.get("vertex_normals")
+    normals = None if own is None else np.asarray(own, dtype=np.float64) @ np.linalg.inv(matrix[:3, :3])
+    material, uv, colors = _visual(mesh.visual)
+    return smooth_normals(points, np.asarray(mesh.faces), material, normals=normals, uv=uv, colors=colors)
+
+
+def _visual(visual: Any) -> tuple[Material | None, NDArray[np.float64] | None, NDArray[np.uint8] | None]:
+    """Material, texture coordinates and point colours."""
+    if visual.kind in {"vertex", "face"}:
+        return Material((1.0, 1.0, 1.0, 1.0)), None, np.asarray(visual.vertex_colors, dtype=np.uint8)
+    material = getattr(visual, "material", None)
+    if material is None:
+        return None, None, None
+    own = _material(material)
+    # Without a material of its own, the URDF may have a texture for it.
+    is_covered = visual.uv is not None and (own is None or own.image is not None)
+    return own, np.asarray(visual.uv, dtype=np.float64) if is_covered else None, None
+
+
+def _material(material: Any) -> Material | None:
+    if hasattr(material, "baseColorFactor"):
+        factor, image = material.baseColorFactor, material.baseColorTexture
+    elif getattr(material, "_name", None) is None:
+        return None  # trimesh adds a material to an OBJ file with texture coordinates and no material
+    else:
+        factor, image = material.diffuse, material.image
+    given = (1.0,) * 4 if factor is None else (np.asarray(factor, dtype=np.float64) / 255.0).tolist()
+    red, green, blue, opacity = given
+    color = (red, green, blue, opacity if opacity > _INVISIBLE else 1.0)
+    return Material(color, None if image is None else _encoded(image))
+
+
+def _encoded(image: Any) -> bytes:
+    image.thumbnail((_WIDEST_IMAGE, _WIDEST_IMAGE))
+    has_opacity = image.mode in {"RGBA", "LA", "PA"} or "transparency" in image.info
+    buffer = io.BytesIO()
+    if has_opacity:
+        image.convert("RGBA").save(buffer, "PNG", compress_level=3)
+    else:
+        image.convert("RGB").save(buffer, "JPEG", quality=88)
+    return buffer.getvalue()
+
+
+def strip_missing_materials(path: Path) -> io.BytesIO:
+    """A COLLADA file without references to materials that cannot be read.
+
+    pycollada leaves out the whole mesh if a material lacks its effect, or the effect its image.
+    """
+    readable = {f"#{material.id}" for material in _Collada(str(path), ignore=[collada.DaeError]).materials}
+    document = ElementTree.parse(path)
+    for above in document.iter():
+        for one in list(above):
+            if one.tag.endswith("instance_material") and one.get("target") not in readable:
+                above.remove(one)
+    stripped = io.BytesIO()
+    document.write(stripped)
+    stripped.seek(0)
+    return stripped

@@ -16,7 +16,7 @@ from zstate.errors import Unreachable
 
 if TYPE_CHECKING:
     from zstate.bridge import Way
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
 
 # The router of rmw_zenoh, on this host.
@@ -42,7 +42,7 @@ _ROS_ROUTER = "tcp/127.0.0.1:7447"
 @metrics_option
 @session_options
 def bridge_command(
-    *, network: Network, robot: str | None, wire: str, ros: str, metrics: Address | None
+    *, network: Network, robot: str | None, wire: str, ros: str, metrics: BindAddress | None
 ) -> None:
     """Carry ROBOT between zstate's native wire and ROS 2 nodes that run rmw_zenoh, both ways.
 

@@ -1,4 +1,4 @@
-"""zstate config: what commands go by, and who said so."""
+"""zstate config: effective settings and where they come from."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from zstate.cli.output.text_layout import in_columns
 
 
 @click.command("config")
-@click.option("--zenoh", "as_zenoh", is_flag=True, help="What Zenoh is told, beyond its own defaults.")
+@click.option(
+    "--zenoh", "as_zenoh", is_flag=True, help="The Zenoh settings that differ from Zenoh's defaults."
+)
 @json_option("One JSON object.")
 @wire_option
 @reading_clock_option
 @plain_session_options
 @click.pass_context
 def config_command(context: click.Context, /, *, as_zenoh: bool, as_json: bool, **_: object) -> None:
-    """Show what commands go by here, and where each value comes from.
+    """Show the effective settings of commands, and where each value comes from.
 
-    Options come before the environment, that before a Zenoh configuration, and that before the defaults.
-    Give this command the options of another one to see what they come to. Every option of every command
-    can stand in the environment: ZSTATE_COMMAND_OPTION, as in ZSTATE_TF_RATE. Passwords are not shown. Exit
-    code 1 when something is wrong, such as a variable that nothing reads.
+    Precedence: options, environment, Zenoh configuration file, defaults. Pass the options of another command
+    to see their effect. Every option of every command can be set in the environment: ZSTATE_COMMAND_OPTION,
+    as in ZSTATE_TF_RATE. Passwords are not shown. Exit code 1 if there is a problem, such as a variable
+    that nothing reads.
 
     \b
     zstate config
@@ -32,20 +34,18 @@ def config_command(context: click.Context, /, *, as_zenoh: bool, as_json: bool, 
     zstate config --zenoh --mode lan
     zstate config --json
     """
-    from zstate.cli.config.problems import problems
-    from zstate.cli.config.settings import settings, zenoh_settings
+    from zstate.cli.effective_config import problems, settings, zenoh_settings
 
-    wrong = problems(context)
+    found = problems(context)
     if as_zenoh:
-        told = zenoh_settings(context)
-        print_json(told) if as_json else print_result(
-            "\n".join(in_columns([(k, str(v)) for k, v in told.items()]))
-        )
+        differences = zenoh_settings(context)
+        rows = [(path, str(value)) for path, value in differences.items()]
+        print_json(differences) if as_json else print_result("\n".join(in_columns(rows)))
     elif as_json:
-        print_json({"settings": [asdict(one) for one in settings(context)], "problems": wrong})
+        print_json({"settings": [asdict(one) for one in settings(context)], "problems": found})
     else:
         rows = [(one.name, one.text, one.origin) for one in settings(context)]
         print_wrapped("\n".join(in_columns([("setting", "value", "from"), *rows])))
-    for text in wrong:
+    for text in found:
         print_status(f"zstate: {text}", event="problem")
-    raise SystemExit(1 if wrong else 0)
+    raise SystemExit(1 if found else 0)

@@ -104,8 +104,8 @@ def _free_port() -> int:
 def _look(
     endpoint: str, model: RobotModel, robot: str, ended: threading.Event, seconds: float | None
 ) -> None:
-    from zstate.cli.demo_table import DemoTable
     from zstate.cli.metered_buffer import MeteredBuffer
+    from zstate.cli.output.demo_table import DemoTable
     from zstate.cli.telling_links import telling_links
     from zstate.nodes.listener import TransformListener
 

@@ -41,8 +41,7 @@ def doctor_command(
     zstate doctor --json | jq .first_broken.text
     """
     from zstate.cli.doctor.check import first_broken
-    from zstate.cli.doctor.diagnosis import diagnosis
-    from zstate.cli.doctor.report import facts, verdict_text
+    from zstate.cli.doctor.diagnosis import conclusion_text, diagnosis, diagnosis_json
     from zstate.cli.logs import keep_warnings_back
     from zstate.wire.keys import ANY, check_robot
 
@@ -54,16 +53,16 @@ def doctor_command(
     found = diagnosis(network, robot, wire, timeout)
     if as_json:
         checks += found
-        print_json(facts(checks))
+        print_json(diagnosis_json(checks))
     else:
         checks += _said(found, in_full=in_full or robot != ANY)
-        print_result(verdict_text(checks))
+        print_result(conclusion_text(checks))
     raise SystemExit(1 if first_broken(checks) else 0)
 
 
 def _said(found: Iterable[Check], *, in_full: bool) -> list[Check]:
     """Say each link as soon as it is known, or all of one robot as soon as they are."""
-    from zstate.cli.doctor.report import check_text, robot_lines
+    from zstate.cli.doctor.diagnosis import check_text, robot_lines
 
     said: list[Check] = []
     for robot, checks in groupby(found, key=lambda check: check.robot):

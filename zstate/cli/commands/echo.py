@@ -14,7 +14,7 @@ from zstate.cli.options import named_robot, refuse_topic, session_options, timeo
 from zstate.cli.output.console import print_json, print_result
 
 if TYPE_CHECKING:
-    from zstate.cli.document_text import Changes
+    from zstate.cli.output.joint_state_text import ChangeFilter
 
 
 def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> float:
@@ -65,43 +65,45 @@ def echo_command(
     zstate echo --wire ros2 --once                     # /joint_states
     zstate echo --wire ros2:namespace=r1               # /r1/joint_states
     """
-    from zstate.cli.document_text import Changes
-    from zstate.cli.named_joints import Named
+    from zstate.cli.output.joint_state_text import ChangeFilter, DescribedJointStates
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
+    from zstate.wire.messages import JointState
 
     refuse_topic(robot, wire)
     with ExitStack() as opened:
         session = opened.enter_context(open_session(network, (wire,)))
-        name = named_robot(session, robot, wire)
-        named = opened.enter_context(Named(session, name, wire))
-        reader = opened.enter_context(StreamReader(session, name, "joint_states", wire))
-        show = _printer(form, field, Changes(by) if changed or by else None)
-        sample = reader.first(timeout if once else None)
-        show(named.document(sample))
-        while not once:
-            sample = reader.next(LONGEST_WAIT_S)
-            if sample is not None:
-                show(named.document(sample))
+        selected = named_robot(session, robot, wire)
+        states = opened.enter_context(DescribedJointStates(session, selected, wire))
+        tap = opened.enter_context(StreamReader(session, selected, "joint_states", wire))
+        show = _printer(form, field, ChangeFilter(by) if changed or by else None)
+        tapped = tap.first(timeout if once else None)
+        while True:
+            if tapped is not None:
+                assert isinstance(tapped.sample, JointState)
+                show(states.document(tapped.sample))
+            if once:
+                return
+            tapped = tap.next(LONGEST_WAIT_S)
 
 
 def _with_nulls(value: Any) -> Any:
-    """JSON has no NaN, by which ROS drivers say that they do not measure something."""
+    """NaN as null, which JSON has. ROS drivers send NaN for a quantity they do not measure."""
     if isinstance(value, dict):
         return {name: _with_nulls(inner) for name, inner in cast("dict[str, Any]", value).items()}
     if isinstance(value, list):
         return [_with_nulls(inner) for inner in cast("list[Any]", value)]
-    return None if value != value else value  # noqa: PLR0124 - what NaN is known by
+    return None if value != value else value  # noqa: PLR0124 - true of NaN only
 
 
-def _printer(form: str | None, field: str | None, changes: Changes | None) -> Callable[[Any], None]:
-    from zstate.cli.document_text import Columns, field_of, yaml_text
+def _printer(form: str | None, field: str | None, changes: ChangeFilter | None) -> Callable[[Any], None]:
+    from zstate.cli.output.joint_state_text import CsvFormatter, field_of, yaml_text
 
-    table = Columns()
+    table = CsvFormatter()
 
     def show(document: Any) -> None:
         value = document if field is None else field_of(document, field)
-        if changes is not None and not changes.note(value):
+        if changes is not None and not changes.accepts(value):
             return
         if form == "json":
             print_json(_with_nulls(value))

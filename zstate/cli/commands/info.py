@@ -43,7 +43,7 @@ def info_command(file: str, as_json: bool) -> None:
 
 
 def _head(info: RecordingInfo) -> Iterator[str]:
-    from zstate.cli.recording import files_text, size_text
+    from zstate.cli.output.recording_text import files_text, size_text
 
     libraries = f" by {', '.join(info.libraries)}" if info.libraries else ""
     storage = ", ".join((*info.formats, *info.compressions))

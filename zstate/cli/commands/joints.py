@@ -13,7 +13,6 @@ from zstate.cli.options import (
     load_robot,
     metrics_option,
     name_option,
-    open_clock,
     rate_option,
     seconds_option,
     session_options,
@@ -25,7 +24,7 @@ from zstate.cli.output.console import count_text, print_wrapped
 from zstate.cli.words import words_of
 
 if TYPE_CHECKING:
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
 
 
 @click.command("joints")
@@ -49,7 +48,7 @@ def joints_command(
     wire: str,
     clock: str,
     takeover: bool,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     network: Network,
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
@@ -62,7 +61,8 @@ def joints_command(
     zstate joints arm.urdf --rate 500 --seconds 10
     zstate joints panda --wire ros2                    # /joint_states, for a robot_state_publisher
     """
-    from zstate.cli.publishing import run
+    from zstate.cli.commands.publish import run_publisher
+    from zstate.cli.options import open_clock
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
 
@@ -78,4 +78,4 @@ def joints_command(
         joints = count_text(len(model.joint_names), "joint")
         place = words_of(wire).place(called, ("joint_states",))
         print_wrapped(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
-        run(publisher, SineSource(model), rate, seconds)
+        run_publisher(publisher, SineSource(model), rate, seconds)

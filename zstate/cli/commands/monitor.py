@@ -28,7 +28,7 @@ from zstate.cli.words import followed
 if TYPE_CHECKING:
     from zstate.cli.monitor.monitored import Monitored
     from zstate.cli.robot_monitor import RobotMonitor
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
 
 _FIRST_AFTER_S = 1.0
 # Meeting everybody takes less.
@@ -58,7 +58,7 @@ def monitor_command(
     robot: str,
     wire: str,
     clock: str | None,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     as_json: bool,
 ) -> None:
     """Watch each edge between the frames A and B, or all that are heard, until Ctrl-C.

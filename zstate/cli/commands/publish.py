@@ -16,22 +16,23 @@ from zstate.cli.options import (
     load_robot,
     metrics_option,
     name_option,
-    open_clock,
     seconds_option,
     session_options,
     takeover_option,
     wires_option,
     xacro_arguments,
 )
-from zstate.cli.output.console import count_text, fail, print_status, print_wrapped
+from zstate.cli.output.console import count_text, fail, print_status, print_wrapped, report_text
+from zstate.cli.processes import BackgroundCall
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
     from zstate.cli.heard_source import HeardSource
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
+    from zstate.sources.source import JointSource
     from zstate.wire.keys import Stream
 
 _RATE_HZ = 100.0
@@ -82,7 +83,7 @@ def publish_command(
     seconds: float | None,
     name: str | None,
     takeover: bool,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     network: Network,
 ) -> None:
     """Publish the state of ROBOT: its model, its fixed edges, and transforms.
@@ -107,7 +108,7 @@ def publish_command(
     zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
-    from zstate.cli.publishing import run
+    from zstate.cli.options import open_clock
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
 
@@ -131,7 +132,7 @@ def publish_command(
         if followed:
             _follow(session, followed[0], derived, whole, rate, seconds)
         elif source == "sine":
-            run(whole, SineSource(model), rate or _RATE_HZ, seconds)
+            run_publisher(whole, SineSource(model), rate or _RATE_HZ, seconds)
         else:
             _publish_recording(whole, source, rate or _RATE_HZ, seconds)
 
@@ -164,14 +165,13 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
     seconds: float | None,
 ) -> None:
     from zstate.cli.heard_source import HeardSource
-    from zstate.cli.publishing import run
 
     words, robot = words_of(wire), derived.robot
     place = words.place(robot, ("joint_states",))
     print_status(f"waiting for {place} ...")
     with HeardSource(session, derived.model, robot, wire, further=whole) as source:
         if rate_hz is not None:
-            run(derived, source, rate_hz, seconds)
+            run_publisher(derived, source, rate_hz, seconds)
         else:
             _publish_every_sample(derived, source, seconds)
         if not source.count:
@@ -179,13 +179,30 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
             fail(f"heard nothing on {place} in {seconds:g} s; {who}")
 
 
+def run_publisher(
+    publisher: StatePublisher, source: JointSource, rate_hz: float, seconds: float | None
+) -> None:
+    """``publisher.run``, and its report at the end, also after a signal.
+
+    A signal interrupts only the calling thread, which waits, so that the loop of the publisher ends in order.
+    """
+
+    worker = BackgroundCall("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
+    try:
+        report = worker.result()
+    except SystemExit:
+        publisher.close()
+        print_wrapped(report_text(worker.result(1.0)))
+        raise
+    print_wrapped(report_text(report))
+
+
 def _publish_recording(publisher: StatePublisher, path: str, rate_hz: float, seconds: float | None) -> None:
-    from zstate.cli.publishing import run
     from zstate.recording.source import RecordedSource
 
     with RecordedSource(path, None, publisher.model) as source:
         # One tick more than the recording is long, for its last sample.
-        run(publisher, source, rate_hz, seconds or source.duration_s + 1.0 / rate_hz)
+        run_publisher(publisher, source, rate_hz, seconds or source.duration_s + 1.0 / rate_hz)
 
 
 def _publish_every_sample(publisher: StatePublisher, source: HeardSource, seconds: float | None) -> None:

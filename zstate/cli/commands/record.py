@@ -15,8 +15,8 @@ from zstate.cli.output.console import fail, is_terminal, print_status, print_wra
 from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
-    from zstate.cli.recording import Progress
-    from zstate.metrics.address import Address
+    from zstate.cli.output.recording_text import RecordProgress
+    from zstate.metrics.endpoint import BindAddress
     from zstate.recording.recorder import Recorder
 
 _LINE_S = 1.0
@@ -61,7 +61,7 @@ def record_command(
     split_size: float | None,
     split_seconds: float | None,
     overwrite: bool,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     network: Network,
 ) -> None:
     """Record ROBOTs, or all there are, into the MCAP file FILE, until Ctrl-C.
@@ -103,9 +103,9 @@ def record_command(
 
 
 def _run(recorder: Recorder, roster: RobotDirectory, robots: tuple[str, ...], duration: float | None) -> None:
-    from zstate.cli.recording import Progress
+    from zstate.cli.output.recording_text import RecordProgress
 
-    progress = Progress(recorder, roster, robots)
+    progress = RecordProgress(recorder, roster, robots)
     try:
         _show(recorder, progress, duration)
     finally:
@@ -115,16 +115,16 @@ def _run(recorder: Recorder, roster: RobotDirectory, robots: tuple[str, ...], du
     if recorder.failure is not None:
         raise recorder.failure
     if not recorder.stats.messages:
-        fail(f"nothing was recorded: {progress.silence}")
+        fail(f"nothing was recorded: {progress.no_message_text}")
 
 
-def _show(recorder: Recorder, progress: Progress, duration: float | None) -> None:
+def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) -> None:
     """Until the recording has ended, or for ``duration`` seconds."""
     until = math.inf if duration is None else time.monotonic() + duration
     if not is_terminal():
         while not _is_over(recorder, until, _LINE_S):
-            for news in progress.news():
-                print_status(news)
+            for change in progress.changes():
+                print_status(change)
             print_wrapped(progress.line())
         return
     from rich.live import Live
@@ -132,11 +132,11 @@ def _show(recorder: Recorder, progress: Progress, duration: float | None) -> Non
 
     with Live(auto_refresh=False, transient=True) as live:
         while not _is_over(recorder, until, _REFRESH_S):
-            for news in progress.news():
-                live.console.print(news, markup=False, highlight=False, soft_wrap=True)
+            for change in progress.changes():
+                live.console.print(change, markup=False, highlight=False, soft_wrap=True)
             live.update(Text(progress.line()), refresh=True)
 
 
 def _is_over(recorder: Recorder, until: float, pause_s: float) -> bool:
-    """Pause, then tell whether that was it."""
+    """Wait ``pause_s``, then return whether the recording has ended."""
     return recorder.wait(min(pause_s, max(0.0, until - time.monotonic()))) or time.monotonic() >= until

@@ -77,7 +77,7 @@ def replay_command(
     zstate replay run.mcap panda --rate 0.5 --start 30 --duration 10 --loop
     zstate replay bag_folder --wire ros2:domain=5
     """
-    from zstate.cli.replaying import introduction, live_writers
+    from zstate.cli.output.recording_text import conflicting_writers, replay_heading
     from zstate.recording.player import Player
 
     with (
@@ -94,42 +94,42 @@ def replay_command(
             takeover=takeover,
         ) as replayer,
     ):
-        live = live_writers(session, replayer.robots, wires)
+        live = conflicting_writers(session, replayer.robots, wires)
         if live and not takeover:
             fail(f"there is {'; '.join(live)} on the network already; end that first, or use --takeover")
-        print_wrapped(introduction(replayer, file))
+        print_wrapped(replay_heading(replayer, file))
         _run(replayer)
 
 
 def _run(replayer: Player) -> None:
-    from zstate.cli.replaying import report_text
+    from zstate.cli.output.recording_text import replay_summary
 
     worker = BackgroundCall("zstate replay", replayer.run)
     try:
         report = _show(replayer, worker)
     except SystemExit:
         replayer.close()
-        print_wrapped(report_text(replayer.report()))
+        print_wrapped(replay_summary(replayer.report()))
         raise
-    print_wrapped(report_text(report))
+    print_wrapped(replay_summary(report))
     if not report.samples:
         fail("no sample was published; `zstate info` shows what the file holds")
 
 
 def _show(replayer: Player, worker: BackgroundCall[PlayerReport]) -> PlayerReport:
     """Until it has ended."""
-    from zstate.cli.replaying import progress_line
+    from zstate.cli.output.recording_text import replay_line
 
     if not is_terminal():
         while (report := _result(worker, _LINE_S)) is None:
-            print_status(progress_line(replayer))
+            print_status(replay_line(replayer))
         return report
     from rich.live import Live
     from rich.text import Text
 
     with Live(auto_refresh=False, transient=True) as live:
         while (report := _result(worker, _REFRESH_S)) is None:
-            live.update(Text(progress_line(replayer)), refresh=True)
+            live.update(Text(replay_line(replayer)), refresh=True)
     return report
 
 

@@ -15,7 +15,7 @@ from zstate.cli.output.console import fail, print_result, print_status, print_wr
 from zstate.cli.robot_directory import RobotDirectory
 
 if TYPE_CHECKING:
-    from zstate.metrics.address import Address
+    from zstate.metrics.endpoint import BindAddress
     from zstate.net.router_config import RouterConfig
     from zstate.net.security import Credentials
     from zstate.net.thinning import Thinning
@@ -68,7 +68,7 @@ def router_command(
     namespace: str,
     ros2: bool,
     config: str | None,
-    metrics: Address | None,
+    metrics: BindAddress | None,
     only_print: bool,
     output: str | None,
     credentials: Credentials | None,
@@ -164,7 +164,7 @@ def _stream_rate(text: str) -> tuple[str, float]:
         raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
 
 
-def _run(network: Network, listen: tuple[str, ...], metrics: Address | None, file: str = "") -> None:
+def _run(network: Network, listen: tuple[str, ...], metrics: BindAddress | None, file: str = "") -> None:
     from zstate.clock import wait_in_slices
     from zstate.net.modes import listening
 

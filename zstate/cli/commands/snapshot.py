@@ -1,4 +1,4 @@
-"""zstate snapshot: robots as they are, into a file and out of it again."""
+"""zstate snapshot: saves robots to a file, and publishes them from it."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from zstate.cli.options import (
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 
 if TYPE_CHECKING:
-    from zstate.cli.snapshot.snapshot import Configuration
+    from zstate.cli.snapshot import Configuration
 
 _RATE_HZ = 10.0
 
 
 @click.group("snapshot")
 def snapshot_command() -> None:
-    """Save robots as they are now, and say it again: models, static edges, joints, configuration.
+    """Save the current state of robots and publish it again: models, static edges, joints, configuration.
 
     \b
     zstate snapshot save cell.toml                     # all robots; or cell.json
@@ -42,7 +42,7 @@ def snapshot_command() -> None:
 @snapshot_command.command("save")
 @click.argument("file", metavar="FILE")
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
-@click.option("--force", is_flag=True, help="Also where there is such a file already.")
+@click.option("--force", is_flag=True, help="Replace an existing FILE.")
 @timeout_option("How long to wait for what is announced.", 3.0)
 @wire_option
 @session_options
@@ -51,22 +51,21 @@ def save_command(
 ) -> None:
     """Write the announced robots, or the named ones, to FILE: TOML, or JSON for a name in .json.
 
-    That is the model of each, its static edges by their writers, where its joints are now, who writes for
-    it, and how this command joined the network. FILE may be "-" for standard output.
+    Saves the model of each, its static edges by writer, its joint positions, its publishers, and the session
+    options of this command. FILE may be "-" for standard output.
 
     \b
     zstate snapshot save cell.toml
     zstate snapshot save - panda | less
     """
-    from zstate.cli.snapshot.taking import taken
-    from zstate.cli.snapshot.text import json_text, toml_text
+    from zstate.cli.snapshot import capture
 
     path = Path(file)
     if file != "-" and path.exists() and not force:
         fail(f"{file!r} exists; --force replaces it")
     with open_session(network, (wire,)) as session:
-        snapshot = taken(session, network, robots, wire, timeout)
-    text = json_text(snapshot) if path.suffix == ".json" else toml_text(snapshot)
+        snapshot = capture(session, network, robots, wire, timeout)
+    text = snapshot.as_json() if path.suffix == ".json" else snapshot.as_toml()
     if file == "-":
         print_result(text.rstrip("\n"))
         return
@@ -75,7 +74,7 @@ def save_command(
     except OSError as error:
         fail(f"{file!r} cannot be written: {error.strerror}")
     size = f"{count_text(len(snapshot.robot), 'robot')}, {count_text(len(snapshot.static), 'static edge')}"
-    print_status(f"wrote {file} ({size}); `zstate snapshot load {shlex.quote(file)}` says it again")
+    print_status(f"wrote {file} ({size}); `zstate snapshot load {shlex.quote(file)}` publishes it again")
 
 
 @snapshot_command.command("load")
@@ -88,12 +87,12 @@ def save_command(
     default=_RATE_HZ,
     show_default=True,
     metavar="HZ",
-    help="How often the joints are said.",
+    help="Rate of the joint states.",
 )
 @click.option(
     "--as-saved",
     is_flag=True,
-    help="Join the network, and speak the wire, as whoever saved FILE; the options below come first.",
+    help="Use the session options and the wire with which FILE was saved; options below take precedence.",
 )
 @seconds_option
 @takeover_option
@@ -110,41 +109,40 @@ def load_command(
     wires: tuple[str, ...],
     network: Network,
 ) -> None:
-    """Publish the robots of FILE, or the named ones, until Ctrl-C: they stand as they stood.
+    """Publish the robots of FILE, or the named ones, until Ctrl-C, with the saved joint positions.
 
-    Their joints are stamped with the time it is now. Nothing leaves this host, wherever the robots of FILE
-    were, unless options or --as-saved say so. Passwords and certificates are not in FILE.
+    Joint states are stamped with the current time. Nothing leaves this host, wherever FILE was saved, unless
+    you pass options or --as-saved. Passwords and certificates are not in FILE.
 
     \b
     zstate snapshot load cell.toml
     zstate snapshot load cell.toml --as-saved          # back to where it was taken
     zstate snapshot load cell.toml panda --wire ros2
     """
-    from zstate.cli.snapshot.loading import Standing, chosen
-    from zstate.cli.snapshot.snapshot import read_snapshot
+    from zstate.cli.snapshot import SnapshotPublisher, read_snapshot
 
     snapshot = read_snapshot(Path(file))
-    shots, statics = chosen(snapshot, robots)
-    if not shots and not statics:
+    selected, edges = snapshot.select(robots)
+    if not selected and not edges:
         fail(f"{file!r} has no robot in it")
     network, wires = _joining(snapshot.configuration, network, wires, as_saved=as_saved)
     with (
         open_session(network, wires) as session,
-        Standing(session, shots, statics, wires, takeover=takeover) as standing,
+        SnapshotPublisher(session, selected, edges, wires, takeover=takeover) as publisher,
     ):
-        standing.run(rate, seconds)
+        publisher.run(rate, seconds)
 
 
 def _joining(
     saved: Configuration, network: Network, wires: tuple[str, ...], *, as_saved: bool
 ) -> tuple[Network, tuple[str, ...]]:
-    """How to join the network, and what to speak; says where that is not as it was saved, or is as saved."""
-    is_wire_said = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
+    """The session options and wires to use. Logs a note if they differ from the saved ones or repeat them."""
+    is_wire_given = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
     if as_saved:
-        if not saved.is_plain:
+        if not saved.is_default:
             print_status(f"as saved on {saved.host!r}: {saved.options()}")
-        return saved.network(network), wires if is_wire_said else (saved.wire,)
-    if not (saved.is_plain or network.is_given or is_wire_said):
+        return saved.network(network), wires if is_wire_given else (saved.wire,)
+    if not (saved.is_default or network.is_given or is_wire_given):
         print_status(f"it was saved on {saved.host!r} with {saved.options()}; --as-saved does the same here")
     return network, wires
 

@@ -16,8 +16,8 @@ from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.words import is_ros, words_of
 
 if TYPE_CHECKING:
-    from zstate.cli.up.edges import OwnedEdge
-    from zstate.cli.up.sections import Quaternion, Vector3
+    from zstate.cli.up.schema import Quaternion, Vector3
+    from zstate.cli.up.static_edges import OwnedEdge
     from zstate.net.session import Session
     from zstate.nodes.static_publisher import StaticPublisher
     from zstate.transform import Transform
@@ -98,8 +98,8 @@ def static_command(
     elif target is None or source is None or (xyz, rpy_deg, rpy, quat_xyzw) == (None,) * 4:
         raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
-        from zstate.cli.up.edges import OwnedEdge
-        from zstate.cli.up.sections import StaticSection
+        from zstate.cli.up.schema import StaticSection
+        from zstate.cli.up.static_edges import OwnedEdge
 
         edge = StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform()
         edges = [OwnedEdge(edge, robot)]
@@ -124,11 +124,10 @@ def static_command(
 def _edges_of_file(
     file: str, settings: tuple[str, ...], target: str | None, source: str | None
 ) -> list[OwnedEdge]:
-    from zstate.cli.up.calibration import read_calibration, renamed
     from zstate.cli.up.cell import read_cell
-    from zstate.cli.up.edges import OwnedEdge, owned_edges
-    from zstate.cli.up.parameters import parsed_settings
-    from zstate.cli.up.starts import robot_names
+    from zstate.cli.up.processes import robot_names
+    from zstate.cli.up.static_edges import OwnedEdge, owned_edges, read_calibration, with_frames
+    from zstate.cli.up.template import parse_settings
 
     if not file.endswith(".toml"):
         if settings:
@@ -136,10 +135,10 @@ def _edges_of_file(
         edges = read_calibration(Path(file))
         if target is not None and len(edges) > 1:
             raise click.UsageError(f"{file!r} has {len(edges)} transforms; leave out TARGET and SOURCE")
-        return [OwnedEdge(renamed(edge, target, source)) for edge in edges]
+        return [OwnedEdge(with_frames(edge, target, source)) for edge in edges]
     if target is not None:
         raise click.UsageError("give TARGET and SOURCE, or a .toml file, not both")
-    cell = read_cell(file, parsed_settings(settings))
+    cell = read_cell(file, parse_settings(settings))
     if not cell.static:
         fail(f"{file!r} has no [[static]]")
     return owned_edges(cell, robot_names(cell))

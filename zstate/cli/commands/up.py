@@ -1,4 +1,4 @@
-"""zstate up: several commands from one file, which live and end together."""
+"""zstate up: starts and supervises the processes of one file."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import click
 
 from zstate.cli import logs
 from zstate.cli.output.console import fail, print_result
+from zstate.cli.output.text_layout import in_columns
 
 if TYPE_CHECKING:
-    from zstate.cli.up.starts import Start
+    from zstate.cli.up.processes import ProcessSpec
 
 _COLORS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
 
@@ -22,11 +23,11 @@ _COLORS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_
 @click.command("up")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False))
 @click.argument("parameters", nargs=-1, metavar="[KEY=VALUE]...")
-@click.option("--check", "only_check", is_flag=True, help="Say what would start, and start nothing.")
+@click.option("--check", "only_check", is_flag=True, help="Print what would start, and start nothing.")
 def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None:
-    """Start what FILE says, and end all of it with Ctrl-C, or when one part fails.
+    """Start the processes of FILE, and end all of them with Ctrl-C, or when one fails.
 
-    Each part is a process, its lines begin with its name. `zstate init panda` writes a file to begin with.
+    The lines of each process begin with its name. `zstate init panda` writes a file to begin with.
     KEY=VALUE changes one of its [parameters].
 
     \b
@@ -81,33 +82,22 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     ready = "driver runs"             # what it says when it is ready itself
     """
     from zstate.cli.up.cell import read_cell
-    from zstate.cli.up.parameters import parsed_settings
-    from zstate.cli.up.starts import planned
-
-    settings = parsed_settings(parameters)
-    starts = planned(read_cell(file, settings), Path(file), settings)
-    if only_check:
-        print_result(_plan_text(starts))
-    else:
-        _run(starts)
-
-
-def _plan_text(starts: Sequence[Start]) -> str:
-    from zstate.cli.output.text_layout import in_columns
-
-    rows = [
-        (start.name, shlex.join(start.arguments if start.is_program else ("zstate", *start.arguments)))
-        for start in starts
-    ]
-    return "\n".join(in_columns(rows))
-
-
-def _run(starts: Sequence[Start]) -> None:
+    from zstate.cli.up.processes import plan_processes
     from zstate.cli.up.supervisor import Supervisor
+    from zstate.cli.up.template import parse_settings
 
-    failure = Supervisor(starts, _line_printer([start.name for start in starts])).run()
-    if failure:
-        fail(failure)
+    settings = parse_settings(parameters)
+    specs = plan_processes(read_cell(file, settings), Path(file), settings)
+    if only_check:
+        print_result("\n".join(in_columns([(spec.name, _command_line(spec)) for spec in specs])))
+    else:
+        failure = Supervisor(specs, _line_printer([spec.name for spec in specs])).run()
+        if failure:
+            fail(failure)
+
+
+def _command_line(spec: ProcessSpec) -> str:
+    return shlex.join(spec.arguments if spec.is_program else ("zstate", *spec.arguments))
 
 
 def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:

@@ -1,17 +1,21 @@
-"""Diagnosis: the links of the chain in their order, each as soon as it is known."""
+"""Diagnosis: the checks of `zstate doctor` in order, each reported as soon as it is done, and their text."""
 
 from __future__ import annotations
 
+import shlex
+import shutil
+import textwrap
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.doctor.check import Check, broken, ok, warning
+from zstate.cli.doctor.check import Check, broken, first_broken, ok, warning
 from zstate.cli.doctor.network_checks import (
     access_check,
     elsewhere,
@@ -20,8 +24,8 @@ from zstate.cli.doctor.network_checks import (
     refused_check,
     with_options,
 )
-from zstate.cli.doctor.next_command import looking_there
 from zstate.cli.network import Network, open_session
+from zstate.cli.output.console import colored, count_text, is_terminal
 from zstate.cli.waiting import ConditionWaiter
 from zstate.cli.words import RosWords, is_ros, words_of, writing
 from zstate.errors import ZStateError
@@ -41,6 +45,10 @@ _TIMEOUTS = 5
 each group of them."""
 
 
+_COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
+_STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
+
+
 def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
     """The links to ``robot``, or to every robot for "*".
 
@@ -58,19 +66,21 @@ def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iter
         except click.ClickException as error:
             yield broken("network", error.format_message(), "zstate router --ros2")
             return
-        yield from _behind(session, network, robot, wire, timeout_s)
+        yield from _after_connecting(session, network, robot, wire, timeout_s)
 
 
-def joined(network: Network, wire: str) -> Network:
-    """How ``open_session`` joins, where ``network`` may say nothing."""
+def effective_network(network: Network, wire: str) -> Network:
+    """The options that ``open_session`` uses, with its default on a ROS wire."""
     return Network("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_given else network
 
 
-def _behind(session: Session, network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
+def _after_connecting(
+    session: Session, network: Network, robot: str, wire: str, timeout_s: float
+) -> Iterator[Check]:
     from zstate.net.presence import discover
 
     robots = discover(session, wire=wire)
-    check = network_check(session, joined(network, wire))  # later than the others, whom it counts
+    check = network_check(session, effective_network(network, wire))  # later than the others, whom it counts
     yield check
     if check.state == "broken":
         return
@@ -86,7 +96,7 @@ def _behind(session: Session, network: Network, robot: str, wire: str, timeout_s
     names = ", ".join(repr(info.name) for info in robots)
     yield ok("robots", words_of(wire).announced(robots) if is_ros(wire) else f"{names} announced")
     for found in _of_robots(session, wanted, robots, wire, timeout_s, called=robot):
-        yield replace(found, next=looking_there(found.next, network, wire)) if found.next else found
+        yield replace(found, next=with_same_options(found.next, network, wire)) if found.next else found
 
 
 def _of_robots(
@@ -156,7 +166,7 @@ def _absent_check(
     if names:
         text = f"{what}; announced: {', '.join(map(repr, names))}"
         then = f"zstate doctor {(near or names)[0]}"
-        return broken("robots", text, looking_there(then, network, wire))
+        return broken("robots", text, with_same_options(then, network, wire))
     for options, others in elsewhere(network) if wire == "native" else ():
         found = next((name for name in others if name == robot), others[0])
         text = f"{what} here; {with_options(options)}: {', '.join(map(repr, others))}"
@@ -188,3 +198,63 @@ def _start(robot: str) -> str:
 
 def _connecting(network: Network) -> str:
     return "".join(f" --connect {endpoint}" for endpoint in network.connect)
+
+
+def with_same_options(command: str, network: Network, wire: str) -> str:
+    """``command`` with the wire and endpoints of doctor, if it accepts them and sets none of its own."""
+    text, mark, comment = command.partition("  #")
+    program, *words = text.split()
+    if program != "zstate":
+        return command
+    parameters = getattr(import_module(f"zstate.cli.commands.{words[0]}"), f"{words[0]}_command").params
+    accepted = {option for parameter in parameters for option in parameter.opts}
+    wires = ("--wire", wire) if wire != "native" else ()
+    endpoints = tuple(word for endpoint in network.connect for word in ("--connect", endpoint))
+    for group in (wires, endpoints):
+        if group and group[0] in accepted and group[0] not in words:
+            text += f" {shlex.join(group)}"
+    return text + mark + comment
+
+
+def check_text(check: Check) -> str:
+    """One check, wrapped at the width of the terminal; on one line if there is no terminal."""
+    indent = "  " if check.robot else ""
+    state, name = f"{check.state:<{_STATE}}", f"{check.name:<{_NAME}}"
+    head = f"{indent}{colored(state, _COLORS[check.state])}  {name}  "
+    text = " ".join(check.text.split())
+    if not is_terminal():
+        return head + text
+    column = len(f"{indent}{state}  {name}  ")
+    width = max(shutil.get_terminal_size().columns - column, _MIN_TEXT)
+    return head + f"\n{' ' * column}".join(textwrap.wrap(text, width, break_on_hyphens=False))
+
+
+def robot_lines(robot: str, checks: Sequence[Check], *, in_full: bool) -> Iterator[str]:
+    """The checks of ``robot``; unless ``in_full`` only those that fail, or one line if all are ok."""
+    shown = [check for check in checks if in_full or check.state in ("warning", "broken")]
+    if shown:
+        yield robot
+        yield from map(check_text, shown)
+    else:
+        moves = [check.text for check in checks if check.name in ("joint_states", "tf")]
+        yield check_text(Check(robot, "ok", moves[0] if moves else "sound"))
+
+
+def conclusion_text(checks: Sequence[Check]) -> str:
+    """The first broken check, or the first warning, and the next command."""
+    check, text = first_broken(checks), "all is sound"
+    if check is not None:
+        text = f"first broken link: {check.name}{f' of {check.robot!r}' if check.robot else ''}"
+    elif warnings := [one for one in checks if one.state == "warning"]:
+        check, text = warnings[0], f"sound, with {count_text(len(warnings), 'warning')}"
+    return text + (f"\nnext: {check.next}" if check is not None and check.next else "")
+
+
+def diagnosis_json(checks: Sequence[Check]) -> dict[str, Any]:
+    """All checks as one JSON object."""
+    first = first_broken(checks)
+    return {
+        "sound": first is None,
+        "first_broken": None if first is None else asdict(first),
+        "checks": [asdict(check) for check in checks],
+    }

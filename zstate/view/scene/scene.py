@@ -1,9 +1,11 @@
-"""Scene: what is drawn in the page, apart from its panels."""
+"""The scene of the page: robots, frames, trails and labels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import viser
@@ -13,25 +15,28 @@ from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
 from zstate.model.findings import Finding
 from zstate.model.robot import RobotModel
 from zstate.model.shapes import Shape, read_shapes
+from zstate.view.mesh_loader import MeshLoader
+from zstate.view.mesh_paths import MissingFile
 from zstate.view.meshes import Meshes
-from zstate.view.scene.apart import Apart
-from zstate.view.scene.axes import Axes
-from zstate.view.scene.dress import Dress
-from zstate.view.scene.lines import Lines
-from zstate.view.scene.names import Names
-from zstate.view.scene.nodes import Nodes, in_frame
-from zstate.view.scene.robots import Robots
-from zstate.view.scene.silences import Silences
+from zstate.view.scene.frame_markers import Axes, FrameLabels, ParentLines, StaleLabels
+from zstate.view.scene.frame_nodes import FrameNodes, in_frame
+from zstate.view.scene.instanced_meshes import InstancedMeshes
+from zstate.view.scene.robot_meshes import RenderStyle, RobotMeshes
 from zstate.view.scene.trails import Trails
-from zstate.view.scene.workshop import Workshop
+from zstate.view.scene.tree_layout import TreeLayout
+
+# Identical robots have the same shapes, and the same folder of the URDF file if the user named one.
+_Kind: TypeAlias = tuple[tuple[Shape, ...], Path | None]
+
+_MIN_INSTANCES = 4  # identical robots that are drawn by instances
 
 
 class Scene:
-    """Robots, and frames, as they are at the moments that are shown.
+    """Draws robots and frames at one instant after the other.
 
-    The attributes say what is drawn from the next ``show`` on: ``visuals`` and ``collisions`` of robots
-    (the latter see-through), and ``axes``, ``names`` and ``parent_lines`` of frames. Files are read beside
-    the drawing; ``busy`` while some of what is to be drawn is not there yet. To be used by one thread.
+    Attributes, used by the next ``show``: ``visuals`` and ``collisions`` of robots (the latter translucent),
+    and ``axes``, ``names`` and ``parent_lines`` of frames. Meshes are loaded in the background; the scene is
+    ``busy`` until all are drawn. To be used by one thread.
     """
 
     def __init__(self, server: viser.ViserServer, meshes: Meshes | None = None) -> None:
@@ -41,26 +46,26 @@ class Scene:
         self.names = False
         self.parent_lines = False
         self._scene = server.scene
-        self._workshop = Workshop(meshes or Meshes())
-        self._robots = Robots(server.scene, self._workshop)
+        self._loader = MeshLoader(meshes or Meshes())
+        self._robots = _Robots(server.scene, self._loader)
         self._faults: dict[str, tuple[tuple[str, str], ...]] = {}
-        self._nodes = Nodes(server.scene)
+        self._nodes = FrameNodes(server.scene)
         self._axes = Axes(server.scene)
-        self._names = Names(server.scene)
-        self._lines = Lines(server.scene)
+        self._names = FrameLabels(server.scene)
+        self._lines = ParentLines(server.scene)
         self._trails = Trails(server.scene)
-        self._silences = Silences(server.scene)
-        self._apart = Apart(server.scene)
+        self._stale_labels = StaleLabels(server.scene)
+        self._layout = TreeLayout(server.scene)
 
     @property
     def busy(self) -> bool:
-        """Whether files are still being read for what is to be drawn."""
-        return self._workshop.busy
+        """Whether meshes are still being loaded."""
+        return self._loader.busy
 
     @property
     def arrangement(self) -> int:
-        """A number that changes when trees that nothing joins to the fixed frame are placed elsewhere."""
-        return self._apart.version
+        """A number that changes when trees that are not connected to the fixed frame get other places."""
+        return self._layout.version
 
     def set_robot(
         self,
@@ -69,10 +74,10 @@ class Scene:
         shapes: Sequence[Shape] | None = None,
         base: Path | None = None,
     ) -> None:
-        """Draw a robot, in place of an earlier one of that name; its links are the frames ``name/link``.
+        """Add or replace a robot; its links are the frames ``name/link``.
 
-        ``shapes`` are those of its model when they are not given. ``base`` is the folder of its URDF file,
-        if the user named that: then every file that it names can be drawn, otherwise those in packages.
+        ``shapes`` default to those of its model. ``base`` is the folder of its URDF file, if the user named
+        one: then every file in it can be loaded, otherwise only those in packages.
         """
         faults: tuple[Finding, ...] = ()
         if shapes is None:
@@ -81,44 +86,44 @@ class Scene:
         self._robots.set(name, tuple(shapes), self._nodes, base)
 
     def remove_robot(self, name: str) -> None:
-        """Draw a robot no more; without one of that name, do nothing."""
+        """Remove a robot, if it exists."""
         self._robots.remove(name, self._nodes)
         self._faults.pop(name, None)
-        self._silences.set(name, None)
+        self._stale_labels.set(name, None)
 
     def grey(self, robot: str, since: str | None) -> None:
-        """Draw a robot in see-through grey, with the text ``since`` at its root; None: as it is again."""
-        self._silences.set(robot, since)
+        """Draw a stale robot in translucent grey, with the text ``since`` at its root; None: as usual."""
+        self._stale_labels.set(robot, since)
 
     def trail(self, frame: str, on: bool) -> None:
-        """Draw where a frame has been from now on, or draw that no more."""
+        """Start or remove the trail of a frame."""
         self._trails.switch(frame, on)
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
-        """What cannot be drawn of a robot: the name of each file in the URDF, and why it cannot."""
+        """Files of a robot that cannot be drawn: the name in the URDF, and the reason."""
         missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
         return self._faults.get(robot, ()) + missing
 
     def show(self, moment: FramePoses, fixed: str) -> Poses:
-        """Draw everything as it was at a moment, seen from the frame ``fixed``.
+        """Draw everything at one instant, relative to the frame ``fixed``.
 
-        Returns the place of each frame, as ``moment.poses_in(fixed)``, and of trees that nothing joins to the
-        fixed frame as they are drawn beside it. Raises UnknownFrame.
+        Returns the pose of each frame, as ``moment.poses_in(fixed)``; trees that are not connected to the
+        fixed frame have the poses at which they are drawn. Raises UnknownFrame.
         """
-        placed = self._apart.placed(moment, fixed)
+        placed = self._layout.placed(moment, fixed)
         self._nodes.show(moment, placed, self._wanted(moment.tree))
         shown = self._nodes.shown
-        self._robots.show(self._nodes, moment.tree, placed, self._dresses)
+        self._robots.show(self._nodes, moment.tree, placed, self._styles)
         self._axes.show(self.axes, placed, shown)
         self._lines.show(self.parent_lines, placed, shown, moment.tree.parents)
         self._names.show(self.names, moment, self._nodes)
         self._trails.show(moment, fixed, placed)
-        self._silences.show(self._nodes)
-        self._apart.show(self._nodes)
+        self._stale_labels.show(self._nodes)
+        self._layout.show(self._nodes)
         return placed
 
     def corners(self, tree: FrameTable, placed: Poses) -> NDArray[np.float64]:
-        """The corners of the boxes around all visuals that are there and have a place: (N, 3) [m]."""
+        """The corners of the bounding boxes of all loaded visuals with a known pose: (N, 3) [m]."""
         boxes = [np.empty((0, 3))]
         for frame, corners in self._robots.corners():
             row = tree.index.get(frame)
@@ -127,13 +132,88 @@ class Scene:
         return np.concatenate(boxes)
 
     def _wanted(self, tree: FrameTable) -> frozenset[str]:
-        """The frames on which something hangs."""
+        """The frames that carry something."""
         if self.names:
             return frozenset(tree.names)
-        return self._robots.frames | self._silences.frames(tree) | self._apart.frames
+        return self._robots.frames | self._stale_labels.frames(tree) | self._layout.frames
 
-    def _dresses(self, robot: str) -> set[Dress]:
-        dresses: set[Dress] = {"collision"} if self.collisions else set()
+    def _styles(self, robot: str) -> set[RenderStyle]:
+        styles: set[RenderStyle] = {"collision"} if self.collisions else set()
         if self.visuals:
-            dresses.add("grey" if self._silences.is_silent(robot) else "visual")
-        return dresses
+            styles.add("stale" if self._stale_labels.is_stale(robot) else "visual")
+        return styles
+
+
+class _Robots:
+    """The meshes of all robots. ``frames`` are those whose nodes carry some."""
+
+    def __init__(self, scene: viser.SceneApi, loader: MeshLoader) -> None:
+        self._scene = scene
+        self._loader = loader
+        self._single: dict[str, RobotMeshes] = {}
+        self._instanced: dict[_Kind, InstancedMeshes] = {}
+        self._instanced_count = 0
+        self.frames: frozenset[str] = frozenset()
+
+    def set(self, name: str, shapes: tuple[Shape, ...], nodes: FrameNodes, base: Path | None = None) -> None:
+        """Add or replace a robot; ``base`` as for RobotMeshes."""
+        self.remove(name, nodes)
+        kind = shapes, base
+        alike = [robot for robot, meshes in self._single.items() if (meshes.shapes, meshes.base) == kind]
+        if kind in self._instanced or len(alike) + 1 >= _MIN_INSTANCES:
+            for robot in alike:
+                self._single.pop(robot).remove(nodes)
+            self._group(kind).robots |= dict.fromkeys([*alike, name])
+        else:
+            self._single[name] = RobotMeshes(self._scene, self._loader, name, shapes, base)
+        self._find_frames()
+
+    def remove(self, name: str, nodes: FrameNodes) -> None:
+        """Remove a robot, if it exists."""
+        meshes = self._single.pop(name, None)
+        if meshes is not None:
+            meshes.remove(nodes)
+        for kind, group in list(self._instanced.items()):
+            group.robots.pop(name, None)
+            if not group.robots:
+                group.remove()
+                del self._instanced[kind]
+        self._find_frames()
+
+    def missing(self, name: str) -> Sequence[MissingFile]:
+        """Files of a robot that cannot be drawn."""
+        if name in self._single:
+            return self._single[name].meshes.missing
+        groups = [group for group in self._instanced.values() if name in group.robots]
+        return groups[0].meshes.missing if groups else ()
+
+    def show(
+        self, nodes: FrameNodes, tree: FrameTable, placed: Poses, styles: Callable[[str], set[RenderStyle]]
+    ) -> None:
+        """Draw each robot in its styles, with the meshes loaded since."""
+        for loaded in self._loader.fetch():
+            any(one.meshes.receive(loaded) for one in chain(self._single.values(), self._instanced.values()))
+        for name, meshes in self._single.items():
+            meshes.show(nodes, styles(name))
+        for group in self._instanced.values():
+            group.show(tree, placed, {name: styles(name) for name in group.robots})
+
+    def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
+        """The frame of each loaded visual, with the corners of its bounding box in it (8, 3) [m]."""
+        return chain.from_iterable(
+            one.corners() for one in (*self._single.values(), *self._instanced.values())
+        )
+
+    def _group(self, kind: _Kind) -> InstancedMeshes:
+        group = self._instanced.get(kind)
+        if group is None:
+            self._instanced_count += 1
+            shapes, base = kind
+            group = InstancedMeshes(
+                self._scene, self._loader, shapes, f"/instanced/{self._instanced_count}", base
+            )
+            self._instanced[kind] = group
+        return group
+
+    def _find_frames(self) -> None:
+        self.frames = frozenset(chain.from_iterable(meshes.frames for meshes in self._single.values()))

@@ -1,4 +1,4 @@
-"""Trails: where frames have been, as lines that fade."""
+"""Trails: the recent positions of frames, as fading lines."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ _COLORS = ((214, 39, 120), (31, 119, 180), (44, 140, 60), (230, 120, 20), (120, 
 
 
 class Trail:
-    """The last places of one frame, as many segments as fit; they begin all in one point."""
+    """The last positions of one frame, as a fixed number of segments that start at one point."""
 
-    def __init__(self, handle: viser.LineSegmentsHandle, place: NDArray[np.float64], stamp: int) -> None:
+    def __init__(self, handle: viser.LineSegmentsHandle, position: NDArray[np.float64], stamp: int) -> None:
         self.handle = handle
-        self._points = np.broadcast_to(place, (_SEGMENTS, 2, 3)).astype(np.float32)
+        self._points = np.broadcast_to(position, (_SEGMENTS, 2, 3)).astype(np.float32)
         self._stamp = stamp
 
-    def goes_on(self, stamp: int) -> bool:
-        """Whether a place at that stamp belongs to the same trail: time has not jumped."""
+    def continues_at(self, stamp: int) -> bool:
+        """Whether a position at that stamp continues the trail: time has not jumped."""
         return 0 <= stamp - self._stamp < _LONGEST_GAP_NS
 
-    def add(self, place: NDArray[np.float64], stamp: int) -> None:
-        """Go on to a place, unless that is too soon or too near to be seen."""
+    def add(self, position: NDArray[np.float64], stamp: int) -> None:
+        """Append a position, unless it is too soon or too near."""
         last = self._points[-1, 1]
-        near = float(np.linalg.norm(place - last)) < _SHORTEST_M
+        near = float(np.linalg.norm(position - last)) < _SHORTEST_M
         if near or stamp - self._stamp < _PERIOD_NS:
             self._stamp = stamp if near else self._stamp
             return
         self._points = np.roll(self._points, -1, axis=0)
-        self._points[-1] = (last, place)
+        self._points[-1] = (last, position)
         self._stamp = stamp
         self.handle.points = self._points
 
 
 class Trails:
-    """Draws those that are on. A trail begins anew when time jumps, or the fixed frame is another."""
+    """Draws the enabled trails. A trail restarts when time jumps or the fixed frame changes."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
@@ -52,44 +52,44 @@ class Trails:
         self._fixed = ""
 
     def switch(self, frame: str, on: bool) -> None:
-        """Draw the trail of a frame from now on, or draw it no more."""
+        """Start or remove the trail of a frame."""
         if on:
             self._trails.setdefault(frame, None)
         elif frame in self._trails:
-            self._forget(frame)
+            self._clear(frame)
             del self._trails[frame]
 
     def show(self, moment: FramePoses, fixed: str, placed: Poses) -> None:
-        """Go on to where the frames are."""
+        """Append the current positions."""
         if fixed != self._fixed:
             self._fixed = fixed
             for frame in self._trails:
-                self._forget(frame)
+                self._clear(frame)
         for frame in self._trails:
             row = moment.tree.index.get(frame)
             if row is not None and moment.stamp is not None and np.isfinite(placed[row, 0]):
                 self._add(frame, placed[row, :3], moment.stamp)
 
-    def _add(self, frame: str, place: NDArray[np.float64], stamp: int) -> None:
+    def _add(self, frame: str, position: NDArray[np.float64], stamp: int) -> None:
         trail = self._trails[frame]
-        if trail is not None and trail.goes_on(stamp):
-            trail.add(place, stamp)
+        if trail is not None and trail.continues_at(stamp):
+            trail.add(position, stamp)
             return
-        self._trails[frame] = Trail(self._line(frame, place), place, stamp)
+        self._trails[frame] = Trail(self._line(frame, position), position, stamp)
 
-    def _line(self, frame: str, place: NDArray[np.float64]) -> viser.LineSegmentsHandle:
+    def _line(self, frame: str, position: NDArray[np.float64]) -> viser.LineSegmentsHandle:
         number = self._colors.setdefault(frame, len(self._colors))
         fade = np.linspace(0.0, 1.0, 2 * _SEGMENTS)[:, None] ** 0.5
         colors = (1.0 - fade) * _PAPER + fade * np.array(_COLORS[number % len(_COLORS)])
         return self._scene.add_line_segments(
             f"/trails/{number}",
-            np.broadcast_to(place, (_SEGMENTS, 2, 3)).astype(np.float32),
+            np.broadcast_to(position, (_SEGMENTS, 2, 3)).astype(np.float32),
             colors.reshape(_SEGMENTS, 2, 3).astype(np.uint8),
             thickness=_WIDTH_PX,
             thickness_units="screen",
         )
 
-    def _forget(self, frame: str) -> None:
+    def _clear(self, frame: str) -> None:
         trail = self._trails[frame]
         if trail is not None:
             trail.handle.remove()

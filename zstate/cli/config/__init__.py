@@ -1,1 +1,0 @@
-"""What a command is told from outside: options, the environment, files."""

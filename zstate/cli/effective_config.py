@@ -1,0 +1,225 @@
+"""Effective configuration: the settings of a command, where each comes from, and what is wrong with them.
+
+Precedence: options, environment variables, a Zenoh configuration file, defaults.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, cast
+
+import click
+from click.core import ParameterSource
+
+from zstate._util.suggestions import did_you_mean
+from zstate.cli.logs import FORMAT_VARIABLE, FORMATS
+from zstate.cli.network import Network
+from zstate.cli.options import PASSWORD_VARIABLE, credentials_of
+from zstate.cli.words import is_ros
+from zstate.errors import InvalidInput, ZStateError
+from zstate.extension import VARIABLE as KERNEL_VARIABLE
+from zstate.extension import kernel
+from zstate.net.config import CONFIG_VARIABLE, endpoint_list, given_config, our_config
+from zstate.net.modes import check_mode, listening
+from zstate.net.rendezvous import RENDEZVOUS, RENDEZVOUS_VARIABLE, rendezvous_addresses
+from zstate.net.security import Credentials
+from zstate.net.wires import DOMAIN_VARIABLE, wire_named
+
+_PREFIX = "ZSTATE_"
+_VARIABLES = (RENDEZVOUS_VARIABLE, PASSWORD_VARIABLE, KERNEL_VARIABLE, FORMAT_VARIABLE, "ZSTATE_USERS")
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting. ``value`` is None if unset; ``origin`` names its option, variable or file."""
+
+    name: str
+    value: Any
+    origin: str
+
+    @property
+    def text(self) -> str:
+        """The value as displayed: "-" for none, a list separated by blanks."""
+        value: object = self.value
+        if isinstance(value, list):
+            return " ".join(map(str, cast("list[object]", value))) or "-"
+        return "-" if value is None else str(value)
+
+
+def settings(context: click.Context) -> Iterator[Setting]:
+    """Every setting of the running command. Raises ConfigError if a configuration file cannot be used."""
+    yield from _file_settings(context) if _config_file(context).value else _option_settings(context)
+    yield _config_file(context)
+    for name in ("certs", "identity", "user"):
+        yield _option(context, name)
+    file, password = _option(context, "password_file"), _variable("password", PASSWORD_VARIABLE, None)
+    # Passwords are never displayed.
+    hidden = Setting("password", "set" if password.value else None, password.origin)
+    yield Setting("password", "set", f"file {file.value}, by {file.origin}") if file.value else hidden
+    wire = _option(context, "wire")
+    yield wire
+    if is_ros(wire.value):
+        yield _ros_domain(wire)
+    yield _option(context, "clock")
+    yield _variable("log format", FORMAT_VARIABLE, "text")
+    selected = _variable("kernel", KERNEL_VARIABLE, None)
+    yield Setting(
+        "kernel", str(kernel), selected.origin if selected.value or kernel == "c" else kernel.reason
+    )
+
+
+def zenoh_settings(context: click.Context) -> dict[str, Any]:
+    """Zenoh settings that differ from Zenoh's defaults, by their path in its configuration."""
+    network = _network(context)
+    mode = check_mode(network.joins_as)
+    if network.config:
+        config = given_config(network.config, mode, network.connect, network.listen, network.credentials)
+    else:
+        endpoints = listening(mode, network.listen, network.credentials)
+        config = our_config(mode, network.connect, endpoints, None, network.credentials)
+    default = given_config({}, "peer", (), ())
+    return dict(_differences("", json.loads(str(config)), json.loads(str(default))))
+
+
+def problems(context: click.Context) -> list[str]:
+    """Contradictory, invalid and unused settings, each in one sentence."""
+    params = context.params
+    checks: tuple[Callable[[], object], ...] = (
+        lambda: endpoint_list((*params["connect"], *params["listen"])),
+        rendezvous_addresses,
+        lambda: _network(context),
+    )
+    invalid = [text for check in checks if (text := _error_of(check))]
+    return [*invalid, *_contradictions(params), *_unused_variables(context)]
+
+
+def _option(context: click.Context, name: str) -> Setting:
+    value: Any = context.params[name]
+    option = next(one for one in context.command.params if one.name == name)
+    source = context.get_parameter_source(name)
+    origin = "default"
+    if source == ParameterSource.COMMANDLINE:
+        origin = f"option {option.opts[0]}"
+    elif source == ParameterSource.ENVIRONMENT:
+        # The variable of the option itself takes precedence over ZSTATE_COMMAND_OPTION.
+        variable = option.envvar
+        is_set = isinstance(variable, str) and os.environ.get(variable)
+        origin = f"environment {variable if is_set else f'{context.auto_envvar_prefix}_{name.upper()}'}"
+    if isinstance(value, tuple):
+        value = list(cast("tuple[Any, ...]", value))
+    return Setting(option.opts[0].lstrip("-"), value, origin)
+
+
+def _variable(name: str, variable: str, default: Any) -> Setting:
+    value = os.environ.get(variable)
+    return Setting(name, value, f"environment {variable}") if value else Setting(name, default, "default")
+
+
+def _config_file(context: click.Context) -> Setting:
+    option = _option(context, "config")
+    return option if option.value else _variable("config", CONFIG_VARIABLE, None)
+
+
+def _credentials(context: click.Context) -> Credentials | None:
+    params = context.params
+    return credentials_of(params["certs"], params["identity"], params["user"], params["password_file"], None)
+
+
+def _network(context: click.Context) -> Network:
+    """The session options in effect. Raises ConfigError, and UsageError for incomplete credentials."""
+    params, config = context.params, _config_file(context).value
+    return Network(params["mode"], params["connect"], params["listen"], config, _credentials(context))
+
+
+def _option_settings(context: click.Context) -> Iterator[Setting]:
+    """Mode and endpoints without a Zenoh configuration file."""
+    params = context.params
+    mode, connect, listen = (_option(context, name) for name in ("mode", "connect", "listen"))
+    effective = check_mode(Network(params["mode"], params["connect"], params["listen"]).joins_as)
+    credentials = None
+    with suppress(InvalidInput, click.UsageError):  # listed by problems()
+        credentials = _credentials(context)
+    implied = f"{connect.origin}, which alone means a router" if connect.value else "default"
+    yield mode if mode.value else Setting("mode", effective, implied)
+    yield connect
+    endpoints = listening(effective, params["listen"], credentials)
+    yield listen if listen.value else Setting("listen", list(endpoints), "default")
+    if effective in ("peer", "loopback") and not (connect.value or listen.value):
+        yield _variable("rendezvous", RENDEZVOUS_VARIABLE, RENDEZVOUS)
+
+
+def _file_settings(context: click.Context) -> Iterator[Setting]:
+    """Mode and endpoints with a Zenoh configuration file."""
+    params, file = context.params, _config_file(context).value
+    network = Network(params["mode"], params["connect"], params["listen"], file)
+    config = given_config(file, check_mode(network.joins_as), network.connect, network.listen)
+    default = given_config({}, "peer", (), ())
+    mode = json.loads(config.get_json("mode"))
+    for name, path in (("mode", "mode"), ("connect", "connect/endpoints"), ("listen", "listen/endpoints")):
+        option, text = _option(context, name), config.get_json(path)
+        from_file = "default of Zenoh" if text == default.get_json(path) else f"file {file}"
+        is_used = option.value and option.value != "peer"  # peer keeps the mode of the file
+        value = json.loads(text)
+        if isinstance(value, dict):  # one value for each mode
+            value = cast("dict[str, Any]", value).get(mode)
+        yield Setting(option.name, value, option.origin if is_used else from_file)
+
+
+def _ros_domain(wire: Setting) -> Setting:
+    from zstate.wire.ros2.wire import Ros2Wire
+
+    ros_wire = wire_named(wire.value)
+    assert isinstance(ros_wire, Ros2Wire)
+    variable = _variable("ros domain", DOMAIN_VARIABLE, 0)
+    origin = wire.origin if re.search(r"\bdomain\s*=", wire.value) else variable.origin
+    return Setting("ros domain", ros_wire.options.domain, origin)
+
+
+def _differences(path: str, config: Any, default: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(config, dict) and isinstance(default, dict):
+        defaults = cast("dict[str, Any]", default)
+        for name, value in cast("dict[str, Any]", config).items():
+            yield from _differences(f"{path}/{name}".lstrip("/"), value, defaults.get(name))
+    elif config != default:
+        yield path, "set" if path.endswith("password") else config
+
+
+def _error_of(check: Callable[[], object]) -> str:
+    try:
+        check()
+    except ZStateError as error:
+        return str(error)
+    except click.ClickException as error:
+        return error.format_message()
+    return ""
+
+
+def _contradictions(params: dict[str, Any]) -> Iterator[str]:
+    file = params["config"] or os.environ.get(CONFIG_VARIABLE)
+    if params["config"] and os.environ.get(CONFIG_VARIABLE):
+        yield f"{CONFIG_VARIABLE} also names a file; --config takes precedence"
+    if params["mode"] == "loopback" and file:
+        yield f"mode 'loopback' stays on this host, but the configuration {file!r} could leave it: choose one"
+    if params["mode"] == "client" and not params["connect"] and not file:
+        yield "mode 'client' needs --connect, for instance tcp/192.168.1.10:7447"
+    log_format = os.environ.get(FORMAT_VARIABLE)
+    if log_format and log_format not in FORMATS:
+        yield f"{FORMAT_VARIABLE} is {log_format!r}; valid values: {' or '.join(FORMATS)}"
+
+
+def _unused_variables(context: click.Context) -> Iterator[str]:
+    group = context.find_root().command
+    assert isinstance(group, click.Group)
+    known = {*_VARIABLES, *(str(one.envvar) for one in context.command.params if one.envvar)}
+    for variable in sorted(os.environ):
+        # An option of another command, ZSTATE_COMMAND_OPTION: every option of every command has one.
+        name, _, option = variable.removeprefix(_PREFIX).partition("_")
+        command = group.get_command(context, name.lower())
+        is_option = command and option in {(one.name or "").upper() for one in command.params}
+        if variable.startswith(_PREFIX) and variable not in known and not is_option:
+            yield f"nothing reads {variable}{did_you_mean(variable, known)}"

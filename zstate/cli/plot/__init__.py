@@ -1,1 +1,0 @@
-"""zstate plot: numbers over time, as a picture."""

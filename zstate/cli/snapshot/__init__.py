@@ -1,1 +1,0 @@
-"""`zstate snapshot`: robots as they are now in a file, and out of it again."""

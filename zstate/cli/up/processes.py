@@ -1,0 +1,272 @@
+"""The processes of a file of `zstate up`: their command lines, their order, and how they join the network."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from zstate._util.endpoint import format_host
+from zstate._util.suggestions import did_you_mean
+from zstate.cli.options import load_robot, parsed_xacro_args
+from zstate.cli.up.cell import Cell
+from zstate.cli.up.schema import (
+    NetworkSection,
+    ProgramSection,
+    Restart,
+    RobotSection,
+    RouterSection,
+    as_tuple,
+)
+from zstate.cli.up.static_edges import check_edges
+from zstate.cli.up.template import Located
+from zstate.errors import ConfigError, InvalidInput, ModelError
+from zstate.model.catalog import is_path
+from zstate.net.config import ROUTER_ENDPOINT
+from zstate.wire.keys import check_robot
+
+# The keys of [network] with one value, and with several. Options and variables are named after them.
+_SINGLE = ("mode", "config", "certs", "identity", "user", "password_file")
+_REPEATED = ("connect", "listen")
+_NETWORK_PATHS = ("config", "certs", "password_file")
+_ROUTER_PATHS = ("acl", "certs", "password_file", "users")
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessSpec:
+    """One process to start.
+
+    ``arguments`` are those of zstate, or with ``is_program`` the command line of another program, which runs
+    in ``folder`` with the variables of ``environment``. The process starts once those in ``after`` are ready,
+    and is ready once it prints a line with the text ``ready``, or at once if that is None.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    after: tuple[str, ...] = ()
+    restart: Restart = "never"
+    ready: str | None = ""
+    is_program: bool = False
+    folder: str | None = None
+    environment: Mapping[str, str] = field(default_factory=dict[str, str])
+
+
+def plan_processes(cell: Cell, file: Path, settings: Mapping[str, str]) -> list[ProcessSpec]:
+    """The processes in order of the file. Raises ConfigError for values that no command would accept."""
+    specs: dict[str, ProcessSpec] = {}
+    tables: dict[str, Located[Any]] = {}
+    for spec, table in _specs(cell, file, settings):
+        if spec.name in specs:
+            other = tables[spec.name].place
+            raise table.error(f"{other} is called {spec.name!r} already; give one of them another name")
+        specs[spec.name], tables[spec.name] = spec, table
+    if not specs:
+        raise ConfigError(f"{file} starts nothing; it has no [router], [[robot]], [[static]] or [[program]]")
+    for name in specs:
+        _check_order(name, specs, tables[name])
+    return list(specs.values())
+
+
+def robot_names(cell: Cell) -> tuple[str, ...]:
+    """The names of the robots of the file."""
+    return tuple(_model_and_name(table)[1] for table in cell.robot)
+
+
+def _specs(cell: Cell, file: Path, settings: Mapping[str, str]) -> Iterator[tuple[ProcessSpec, Located[Any]]]:
+    router = cell.router
+    first = () if router is None else ("router",)
+    if router is not None:
+        arguments = ("router", *_router_options(router))
+        yield ProcessSpec("router", arguments, restart=router.section.restart), router
+    for robot in cell.robot:
+        yield _robot_spec(robot, cell, first), robot
+    if cell.static:
+        check_edges(cell, robot_names(cell))
+        sets = _repeated("--set", tuple(f"{key}={value}" for key, value in settings.items()))
+        arguments = ("static", "--file", str(file), *sets, *_session_options(cell))
+        yield ProcessSpec("static", arguments, first), cell.static[0]
+    for program in cell.program:
+        yield _program_spec(program, cell, first), program
+
+
+def _robot_spec(table: Located[RobotSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
+    robot = table.section
+    model, name = _model_and_name(table)
+    source = robot.source
+    if source not in ("joints", "sine"):
+        source = table.resolve(source)
+        if not Path(source).exists():
+            text = f"{robot.source!r} is neither 'joints' nor 'sine' nor a recording that exists"
+            raise table.error(text, "source")
+    metrics: tuple[str, ...] = ()
+    if robot.metrics is not None:
+        from zstate.metrics.endpoint import BindAddress  # loads an HTTP server
+
+        host, port = BindAddress.parse(str(robot.metrics))
+        # Each robot of a loop has the next port.
+        port = port + table.iteration if port else 0
+        metrics = ("--metrics", f"{format_host(host)}:{port}")
+    _check_identity(table, cell)
+    arguments = (
+        *("publish", model, *_xacro_words(robot), "--name", name, "--source", source),
+        *(() if robot.rate is None else ("--rate", repr(robot.rate))),
+        *_repeated("--wire", robot.wires),
+        *(() if robot.clock == "system" else ("--clock", robot.clock)),
+        *(("--takeover",) if robot.takeover else ()),
+        *metrics,
+        *_session_options(cell, robot.identity),
+    )
+    return ProcessSpec(name, arguments, (*first, *as_tuple(robot.after)), robot.restart)
+
+
+def _model_and_name(table: Located[RobotSection]) -> tuple[str, str]:
+    """The model as the child process finds it, and the name of the robot."""
+    model, path = table.section.model, table.resolve(table.section.model)
+    if is_path(model) or Path(path).is_file():
+        model = path
+    try:
+        default = _default_name(model, table.section.name, _xacro_words(table.section))
+        return model, check_robot(table.section.name or default)
+    except (ModelError, InvalidInput) as error:
+        raise table.error(str(error)) from None
+
+
+@lru_cache(maxsize=256)
+def _default_name(model: str, name: str | None, xacro_words: tuple[str, ...]) -> str:
+    return load_robot(model, name, parsed_xacro_args(xacro_words))[1]
+
+
+def _xacro_words(robot: RobotSection) -> tuple[str, ...]:
+    """Xacro arguments as on a command line; truth values of xacro are those of Python in lower case."""
+    return tuple(
+        f"{name}:={str(value).lower() if isinstance(value, bool) else value}"
+        for name, value in robot.xacro_args.items()
+    )
+
+
+def _program_spec(table: Located[ProgramSection], cell: Cell, first: tuple[str, ...]) -> ProcessSpec:
+    program = table.section
+    try:
+        command = tuple(shlex.split(program.run) if isinstance(program.run, str) else program.run)
+    except ValueError as error:
+        advice = "an argument with a quote needs a list: run = ['python', 'driver.py', '...']"
+        raise table.error(f"{program.run!r} is not a command line ({error}); {advice}", "run") from None
+    if not command:
+        raise table.error("is empty; write for instance run = 'python driver.py'", "run")
+    is_zstate = command[0] == "zstate"
+    if command[0] in ("python", "python3"):
+        command = (sys.executable, *command[1:])
+    _check_identity(table, cell)
+    script = next((word for word in command if word.endswith(".py")), command[0])
+    default = next(iter(command[1:]), "zstate") if is_zstate else Path(script).stem
+    variables = {key: str(value) for key, value in program.environment.items()}
+    return ProcessSpec(
+        program.name or default,
+        command[1:] if is_zstate else command,
+        (*first, *as_tuple(program.after)),
+        program.restart,
+        program.ready or "" if is_zstate else program.ready,
+        is_program=not is_zstate,
+        folder=str(table.file.folder.resolve()),
+        environment={**_session_variables(cell, program.identity), **variables},
+    )
+
+
+def _check_identity(table: Located[RobotSection] | Located[ProgramSection], cell: Cell) -> None:
+    network = NetworkSection() if cell.network is None else cell.network.section
+    identity = table.section.identity
+    if network.certs is not None and not (identity or network.identity):
+        raise table.error("the certs of [network] are of no use without identity, here or there")
+    if identity and network.certs is None:
+        raise table.error("is of no use without certs = in [network]", "identity")
+
+
+def _check_order(name: str, specs: Mapping[str, ProcessSpec], table: Located[Any]) -> None:
+    """Raise ConfigError if ``after`` names an unknown process, or leads back to this one."""
+    seen, new = set[str](), [name]
+    while new:
+        for other in specs[new.pop()].after:
+            if other not in specs:
+                known = did_you_mean(other, specs) or f"; there are {', '.join(specs)}"
+                raise table.error(f"nothing here is called {other!r}{known}", "after")
+            if other == name:
+                raise table.error(f"{other!r} would wait for itself", "after")
+            if other not in seen:
+                seen.add(other)
+                new.append(other)
+
+
+def _session_values(cell: Cell, identity: str | None) -> dict[str, tuple[str, ...]]:
+    """The values of [network] by key, with ``identity`` if that is given.
+
+    Without an endpoint or a mode, the processes connect to the router of the file.
+    """
+    network = NetworkSection() if cell.network is None else cell.network.section
+    values: dict[str, tuple[str, ...]] = {
+        key: (str(value),) for key in _SINGLE if (value := getattr(network, key)) is not None
+    }
+    if cell.network is not None:
+        values |= {key: (cell.network.resolve(values[key][0]),) for key in _NETWORK_PATHS if key in values}
+    if identity is not None:
+        values["identity"] = (identity,)
+    if "certs" not in values:
+        values.pop("identity", None)
+    values |= {key: tuple(getattr(network, key)) for key in _REPEATED}
+    has_place = network.mode or network.connect or network.listen or network.config
+    if cell.router is not None and not has_place:
+        endpoint = _router_endpoints(cell.router.section)[0]
+        # A client on this host cannot connect to a wildcard address.
+        endpoint = endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+        values |= {"mode": ("client",), "connect": (endpoint,)}
+    return values
+
+
+def _session_options(cell: Cell, identity: str | None = None) -> tuple[str, ...]:
+    """[network] as session options."""
+    values = _session_values(cell, identity)
+    return tuple(word for key in values for word in _repeated(_option(key), values[key]))
+
+
+def _session_variables(cell: Cell, identity: str | None = None) -> dict[str, str]:
+    """[network] as environment variables, for programs and the commands of zstate in them."""
+    values = _session_values(cell, identity)
+    return {f"ZSTATE_{key.upper()}": " ".join(values[key]) for key in values if values[key]}
+
+
+def _router_options(router: Located[RouterSection]) -> tuple[str, ...]:
+    """[router] as options of `zstate router`."""
+    section = router.section
+    return (
+        *(("--ros2",) if section.ros2 else ()),
+        *_repeated("--listen", _router_endpoints(section)),
+        *_repeated("--connect", section.connect),
+        *(
+            word
+            for key in _ROUTER_PATHS
+            if (path := getattr(section, key))
+            for word in (_option(key), router.resolve(path))
+        ),
+        *(
+            word
+            for key in ("identity", "user", "metrics")
+            if (value := getattr(section, key)) is not None
+            for word in (_option(key), str(value))
+        ),
+    )
+
+
+def _router_endpoints(router: RouterSection) -> tuple[str, ...]:
+    default = ROUTER_ENDPOINT if router.certs is None else ROUTER_ENDPOINT.replace("tcp/", "tls/", 1)
+    return router.listen or (default,)
+
+
+def _repeated(option: str, values: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(word for value in values for word in (option, value))
+
+
+def _option(key: str) -> str:
+    return f"--{key.replace('_', '-')}"

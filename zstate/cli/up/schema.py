@@ -1,0 +1,177 @@
+"""Schema of the file of `zstate up`: its tables, checked when they are constructed."""
+
+from __future__ import annotations
+
+from math import fmod, radians
+from typing import Literal
+
+import msgspec
+
+from zstate.errors import InvalidInput
+from zstate.net.config import endpoint_list
+from zstate.net.wires import wire_named
+from zstate.rate import check_rate
+from zstate.transform import Transform
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Restart = Literal["never", "on-failure", "always"]
+Names = str | tuple[str, ...]
+
+
+class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class RouterSection(_Section, frozen=True):
+    """``[router]``: the options of `zstate router`."""
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    ros2: bool = False
+    acl: str | None = None
+    certs: str | None = None
+    identity: str | None = None
+    user: str | None = None
+    password_file: str | None = None
+    users: str | None = None
+    metrics: str | int | None = None
+    restart: Restart = "never"
+
+    def __post_init__(self) -> None:
+        endpoint_list((*self.connect, *self.listen))
+        _check_metrics(self.metrics)
+
+
+class NetworkSection(_Section, frozen=True):
+    """``[network]``: the session options of every process."""
+
+    mode: Literal["peer", "loopback", "lan", "client", "router"] | None = None
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    config: str | None = None
+    certs: str | None = None
+    identity: str | None = None
+    user: str | None = None
+    password_file: str | None = None
+
+    def __post_init__(self) -> None:
+        endpoint_list((*self.connect, *self.listen))
+        if self.mode == "client" and not self.connect and not self.config:
+            raise InvalidInput("mode 'client' needs connect, for instance ['tcp/192.168.1.10:7447']")
+
+
+class RobotSection(_Section, frozen=True):
+    """``[[robot]]``: the options of `zstate publish`."""
+
+    model: str
+    xacro_args: dict[str, str | bool | int | float] = {}
+    name: str | None = None
+    source: str = "joints"
+    rate: float | None = None
+    wires: tuple[str, ...] = ("native",)
+    clock: Literal["system", "sim"] = "system"
+    takeover: bool = False
+    metrics: str | int | None = None
+    identity: str | None = None
+    after: Names = ()
+    restart: Restart = "never"
+
+    def __post_init__(self) -> None:
+        if self.rate is not None:
+            check_rate(self.rate)
+        _check_wires(self.wires)
+        _check_metrics(self.metrics)
+
+
+class ProgramSection(_Section, frozen=True):
+    """``[[program]]``: any program, or any other command of zstate.
+
+    It is ready once it prints a line with the text ``ready``. Without that text a program is ready when it
+    runs, and a command of zstate with its first line or its end.
+    """
+
+    run: Names
+    name: str | None = None
+    ready: str | None = None
+    environment: dict[str, str | int | float] = {}
+    identity: str | None = None
+    after: Names = ()
+    restart: Restart = "never"
+
+
+class StaticSection(_Section, frozen=True):
+    """``[[static]]``: the arguments of `zstate static`: a pose, or the ``file`` of a calibration.
+
+    ``robot`` is the robot of the edge, a pattern such as "arm*", or a list. ``wires`` default to those of
+    the command.
+    """
+
+    target: str | None = None
+    source: str | None = None
+    xyz: Vector3 | None = None
+    rpy_deg: Vector3 | None = None
+    rpy: Vector3 | None = None
+    quat_xyzw: Quaternion | None = None
+    file: str | None = None
+    robot: Names = ()
+    wires: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.wires is not None:
+            _check_wires(self.wires)
+        if self.file is None:
+            self.transform()
+        elif self._pose_parts:
+            raise InvalidInput(f"the pose is in {self.file!r}; leave out {', '.join(self._pose_parts)}")
+
+    def transform(self) -> Transform:
+        """The edge of the table. Raises InvalidInput unless it has xyz, one rotation, or both."""
+        if self.target is None or self.source is None:
+            raise InvalidInput("an edge places source in target; write both, for instance target = 'tool'")
+        rotations = 3 - (self.rpy_deg, self.rpy, self.quat_xyzw).count(None)
+        if rotations > 1 or (rotations == 0 and self.xyz is None):
+            raise InvalidInput(
+                f"the pose of {self.source!r} in {self.target!r} has {rotations} rotations"
+                f"{'' if rotations else ' and no xyz'}; give xyz, one of rpy_deg, rpy and quat_xyzw, or both"
+            )
+        xyz = self.xyz or (0.0, 0.0, 0.0)
+        if self.quat_xyzw is not None:
+            return Transform(self.target, self.source, xyz, self.quat_xyzw)
+        try:
+            return Transform.from_rpy(self.target, self.source, xyz, self._angles())
+        except InvalidInput as error:
+            given = " ".join(f"{angle:g}" for angle in self.rpy or ())
+            degrees = f"; to give degrees use --rpy-deg {given} (in a file: rpy_deg)" if given else ""
+            raise InvalidInput(f"{error}{degrees}") from None
+
+    @property
+    def _pose_parts(self) -> list[str]:
+        parts = ("xyz", "rpy_deg", "rpy", "quat_xyzw")
+        return [name for name in parts if getattr(self, name) is not None]
+
+    def _angles(self) -> Vector3:
+        if self.rpy is not None:
+            return self.rpy
+        # Multiples of 360 degrees are removed: in radians they would be refused.
+        roll, pitch, yaw = (radians(fmod(angle, 360.0)) for angle in self.rpy_deg or (0.0, 0.0, 0.0))
+        return roll, pitch, yaw
+
+
+def as_tuple(names: Names) -> tuple[str, ...]:
+    """One or several names as a tuple."""
+    return (names,) if isinstance(names, str) else names
+
+
+def _check_wires(wires: tuple[str, ...]) -> None:
+    if not wires:
+        raise InvalidInput("wires is empty; write for instance ['native', 'ros2']")
+    for wire in wires:
+        wire_named(wire)
+
+
+def _check_metrics(metrics: str | int | None) -> None:
+    if metrics is not None:
+        from zstate.metrics.endpoint import BindAddress  # loads an HTTP server
+
+        BindAddress.parse(str(metrics))

@@ -1,0 +1,272 @@
+"""Template features of the file of `zstate up`, expanded in one pass before its tables are checked.
+
+These are ``include``, ``[parameters]``, ``${NAME}``, the loops ``names`` and ``count``, and ``when``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
+
+from zstate._util.suggestions import did_you_mean
+from zstate.cli.up.toml_file import TomlFile
+from zstate.errors import ConfigError, InvalidInput
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SINGLE = ("router", "network")
+LISTS = ("robot", "static", "program")
+_TABLES = (*LISTS, *SINGLE, "parameters", "include")
+_LOOPS = ("robot", "program")
+_LOOP_KEYS = ("names", "count", "when")
+
+_REFERENCE = re.compile(r"\$?\$\{(?P<name>[^{}:]*)(?::-(?P<default>[^{}]*))?\}")
+_TRUE = ("true", "yes", "on", "1")
+_FALSE = ("false", "no", "off", "0", "")
+
+Section = TypeVar("Section")
+
+
+@dataclass(frozen=True, slots=True)
+class Located(Generic[Section]):
+    """A table and its position in a file; ``iteration`` counts the iterations of its loop from 0."""
+
+    section: Section
+    file: TomlFile
+    place: str
+    iteration: int = 0
+
+    def error(self, text: str, key: str = "") -> ConfigError:
+        """An error of the table, or of its ``key``."""
+        return self.file.error(f"{self.place}.{key}" if key else self.place, text)
+
+    def resolve(self, path: str) -> str:
+        """A path relative to the file."""
+        return str(self.file.folder.resolve() / Path(path).expanduser())
+
+
+class Variables:
+    """The values of ``${NAME}``: ``values``, then the environment."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.values = dict(values)
+
+    def extended(self, values: Mapping[str, Any]) -> Variables:
+        """These variables and ``values``, which take precedence."""
+        return Variables({**self.values, **values})
+
+    def substitute(self, value: Any) -> Any:
+        """Replace the references in ``value``; a text that is only a reference takes the type of its value.
+
+        ``${NAME:-DEFAULT}`` is DEFAULT if NAME is unset or empty, ``$${`` is ``${``. Raises InvalidInput if a
+        name is unknown.
+        """
+        if isinstance(value, dict):
+            return {key: self.substitute(inner) for key, inner in cast("dict[str, Any]", value).items()}
+        if isinstance(value, list):
+            return [self.substitute(inner) for inner in cast("list[Any]", value)]
+        if not isinstance(value, str):
+            return value
+        reference = _REFERENCE.fullmatch(value)
+        if reference is not None and not value.startswith("$$"):
+            return self._value(reference)
+        return _REFERENCE.sub(self._text, value)
+
+    def _text(self, reference: re.Match[str]) -> str:
+        if reference[0].startswith("$$"):
+            return reference[0][1:]
+        value = self._value(reference)
+        if not isinstance(value, str | int | float):
+            raise InvalidInput(f"${{{reference['name']}}} is {value!r}, which cannot be a part of a text")
+        return str(value).lower() if isinstance(value, bool) else str(value)
+
+    def _value(self, reference: re.Match[str]) -> Any:
+        name, default = reference["name"].strip(), reference["default"]
+        value = self.values.get(name, os.environ.get(name))
+        if default is not None and value in (None, ""):
+            return default
+        if value is None:
+            raise InvalidInput(
+                f"${{{name}}} is neither a parameter nor set in the environment"
+                f"{did_you_mean(name, self.values)}; ${{{name}:-DEFAULT}} would have a default"
+            )
+        return value
+
+
+def expand(path: Path, settings: Mapping[str, str]) -> Iterator[tuple[str, Located[dict[str, Any]]]]:
+    """The kind and the plain values of every table of a file and of those it includes.
+
+    Included files come first; ``settings`` override parameters. Raises ConfigError with the position.
+    """
+    files = list(_with_includes(TomlFile(path), (), set()))
+    for file in files:
+        _check_tables(file)
+    variables = _parameters(files, settings)
+    for file in files:
+        for kind in SINGLE:
+            if kind in file.tables:
+                yield from _iterations(kind, Located(file.tables[kind], file, kind), variables)
+        for kind in LISTS:
+            for number, table in enumerate(file.tables.get(kind, [])):
+                yield from _iterations(kind, Located(table, file, f"{kind}[{number}]"), variables)
+
+
+def parse_settings(texts: Sequence[str]) -> dict[str, str]:
+    """Parameters given as ``KEY=VALUE`` on a command line. Raises InvalidInput."""
+    settings: dict[str, str] = {}
+    for text in texts:
+        key, sign, value = text.partition("=")
+        if not sign or not key.strip():
+            raise InvalidInput(f"{text!r} is not a parameter; write KEY=VALUE, such as speed=2")
+        if key.endswith(":"):
+            raise InvalidInput(f"{text!r} is written as for ROS; here it is {key[:-1]}={value}")
+        settings[key.strip()] = value
+    return settings
+
+
+def known_keys(kind: str, section: Sequence[str]) -> tuple[str, ...]:
+    """The keys of a table: those of its ``section``, and those of its loop and condition."""
+    return (*section, *(_LOOP_KEYS if kind in _LOOPS else ("when",)))
+
+
+def evaluate_condition(condition: object) -> bool:
+    """The value of ``when``: true, false, or ``A == B`` or ``A != B`` of texts. Raises InvalidInput."""
+    if isinstance(condition, bool):
+        return condition
+    text = str(condition).strip()
+    for sign, is_equality in (("==", True), ("!=", False)):
+        left, found, right = (part.strip().strip("'\"") for part in text.partition(sign))
+        if found:
+            return (left == right) is is_equality
+    if text.lower() not in _TRUE + _FALSE:
+        raise InvalidInput(f"{text!r} is neither true nor false; write one of these, 'A == B' or 'A != B'")
+    return text.lower() in _TRUE
+
+
+def _with_includes(file: TomlFile, above: tuple[Path, ...], read: set[Path]) -> Iterator[TomlFile]:
+    """``file`` after the files that it includes, each once; ``read`` holds the paths of those read so far."""
+    chain = (*above, file.path.resolve())
+    includes = file.tables.get("include", [])
+    for name in [includes] if isinstance(includes, str) else includes:
+        with _error_at(file, "include"):
+            path = file.folder / Path(str(Variables({}).substitute(name))).expanduser()
+        if path.resolve() in chain:
+            raise file.error("include", f"{name!r} includes this file again")
+        if not path.is_file():
+            raise file.error("include", f"there is no file {str(path)!r}")
+        if path.resolve() not in read:
+            read.add(path.resolve())
+            yield from _with_includes(TomlFile(path), chain, read)
+    yield file
+
+
+def _check_tables(file: TomlFile) -> None:
+    for name, value in file.tables.items():
+        if name not in _TABLES:
+            raise file.error(name, f"there is no such table{did_you_mean(name, _TABLES)}")
+        tables = cast("list[Any]", value if isinstance(value, list) else [value])
+        is_right = isinstance(value, list) == (name in LISTS) and all(isinstance(one, dict) for one in tables)
+        if name != "include" and not is_right:
+            brackets = f"[[{name}]]" if name in LISTS else f"[{name}]"
+            raise file.error(name, f"write {brackets}, and below it key = value")
+
+
+def _parameters(files: Sequence[TomlFile], settings: Mapping[str, str]) -> Variables:
+    """The parameters of all files, later ones first; a setting needs the type of its parameter."""
+    declared: dict[str, tuple[TomlFile, Any]] = {
+        name: (file, value) for file in files for name, value in file.tables.get("parameters", {}).items()
+    }
+    for name in settings:
+        if name not in declared:
+            known = ", ".join(declared) or "none"
+            text = f"has no parameter {name!r}{did_you_mean(name, declared)}; its [parameters]: {known}"
+            raise ConfigError(f"{files[-1].shown} {text}", path=f"parameters.{name}")
+    variables = Variables({})
+    for name, (file, value) in declared.items():
+        with _error_at(file, f"parameters.{name}"):
+            is_set = name in settings
+            meant = _parsed_like(value, settings[name]) if is_set else variables.substitute(value)
+        variables = variables.extended({name: meant})
+    return variables
+
+
+def _parsed_like(value: object, text: str) -> Any:
+    """``text`` as a value of the type of ``value``."""
+    if isinstance(value, str):
+        return text
+    try:
+        parsed = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = None
+    types = (int, float) if type(value) in (int, float) else (type(value),)
+    if type(parsed) not in types:
+        raise InvalidInput(f"it is {value!r} in the file, and {text!r} is nothing of that kind")
+    return parsed
+
+
+def _iterations(
+    kind: str, table: Located[dict[str, Any]], variables: Variables
+) -> Iterator[tuple[str, Located[dict[str, Any]]]]:
+    """The table with plain values, once for each iteration of its loop whose condition holds."""
+    keys, file, place = table.section, table.file, table.place
+    for iteration, loop_variables in enumerate(_loop_variables(kind, table, variables)):
+        inner = variables.extended(loop_variables)
+        if "name" in keys:
+            with _error_at(file, f"{place}.name"):
+                inner = inner.extended({"name": inner.substitute(keys["name"])})
+        with _error_at(file, f"{place}.when"):
+            is_wanted = evaluate_condition(inner.substitute(keys.get("when", True)))
+        if is_wanted:
+            rest = {key: value for key, value in keys.items() if key not in (*_LOOP_KEYS, "name")}
+            values = _substituted(table, rest, inner)
+            if "name" in keys or "names" in keys:
+                values["name"] = inner.values["name"]
+            yield kind, Located(values, file, place, iteration)
+
+
+def _loop_variables(kind: str, table: Located[dict[str, Any]], variables: Variables) -> list[dict[str, Any]]:
+    """The variables of each iteration: ``name`` from ``names``, or ``number`` from ``count``."""
+    loop = {key: table.section[key] for key in ("names", "count") if key in table.section}
+    if not loop:
+        return [{}]
+    if kind not in _LOOPS:
+        raise table.error(f"only {' and '.join(_LOOPS)} can be a loop of names or count")
+    loop = _substituted(table, loop, variables)
+    if len(loop) > 1 or ("name" in table.section) is not ("count" in loop):
+        raise table.error("a loop is names = ['left', 'right'], or count = 3 and name = 'arm${number}'")
+    if "names" in loop:
+        names = loop["names"]
+        return [
+            {"name": name} for name in (re.findall(r"[^\s,]+", names) if isinstance(names, str) else names)
+        ]
+    if not str(loop["count"]).isdecimal():
+        raise table.error(f"{loop['count']!r} is not how often", "count")
+    return [{"number": number} for number in range(1, int(loop["count"]) + 1)]
+
+
+def _substituted(
+    table: Located[dict[str, Any]], values: Mapping[str, Any], variables: Variables
+) -> dict[str, Any]:
+    substituted: dict[str, Any] = {}
+    for key, value in values.items():
+        with _error_at(table.file, f"{table.place}.{key}"):
+            substituted[key] = variables.substitute(value)
+    return substituted
+
+
+@contextmanager
+def _error_at(file: TomlFile, place: str) -> Generator[None]:
+    """Adds the position to an InvalidInput."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise file.error(place, str(error)) from None

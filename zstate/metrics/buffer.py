@@ -1,0 +1,117 @@
+"""Transform buffer that counts its lookups and measures the latency of its samples."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Sequence
+from itertools import accumulate
+
+from numpy.typing import ArrayLike
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.tracks import JointTrack
+from zstate.clock import Clock
+from zstate.errors import LookupFailed, WaitTimeout
+from zstate.locks import new_lock
+from zstate.transform import Transform
+
+LATENCY_BOUNDS_S = (
+    *(0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05),
+    *(0.1, 0.25, 0.5, 1.0, 2.5, 5.0),
+)
+
+
+class Histogram:
+    """Counts of values up to each of ``bounds`` (ascending), and above. Safe from any thread."""
+
+    def __init__(self, bounds: Sequence[float]) -> None:
+        self._bounds = tuple(bounds)
+        self._counts = [0] * (len(self._bounds) + 1)
+        self._total = 0.0
+        self._lock = new_lock()
+
+    def add(self, value: float) -> None:
+        """Count a value."""
+        with self._lock:
+            self._counts[bisect_left(self._bounds, value)] += 1
+            self._total += value
+
+    def read(self) -> tuple[list[tuple[str, float]], float]:
+        """(bound, number of values up to it), the last bound being "+Inf"; and the sum of all values."""
+        with self._lock:
+            counts, total = self._counts.copy(), self._total
+        bounds = (*(f"{bound:g}" for bound in self._bounds), "+Inf")
+        return list(zip(bounds, map(float, accumulate(counts)), strict=True)), total
+
+
+class InstrumentedBuffer(TransformBuffer):
+    """Counts ``lookup`` calls and their failures by kind, and measures the latency of each sample.
+
+    ``latency`` [s] is the time from a sample's stamp until it can be looked up, by the clocks of both
+    machines. Counting makes each ``lookup`` two to three times as slow, so this buffer is optional. Lookups
+    by a plan or by ``lookup_many`` are not counted.
+    """
+
+    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+        super().__init__(history_s, clock)
+        self.latency = Histogram(LATENCY_BOUNDS_S)
+        self._counting = new_lock()
+        self._lookups = 0
+        self._failures: Counter[str] = Counter()
+
+    def latency_of(self, robot: str) -> Histogram:
+        """The latency of one robot; here that of all robots."""
+        return self.latency
+
+    @property
+    def lookups(self) -> int:
+        """Number of calls of ``lookup``."""
+        return self._lookups
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """Number of failed lookups by error class: "InFuture", ..., also after a wait."""
+        with self._counting:
+            return dict(self._failures)
+
+    def lookup(
+        self,
+        target: str,
+        source: str,
+        at: int | None = None,
+        *,
+        timeout_s: float = 0.0,
+        max_age_s: float | None = None,
+        predict_s: float = 0.0,
+    ) -> Transform:
+        with self._counting:
+            self._lookups += 1
+        try:
+            return super().lookup(
+                target, source, at, timeout_s=timeout_s, max_age_s=max_age_s, predict_s=predict_s
+            )
+        except LookupFailed as error:
+            kind = error.reason if isinstance(error, WaitTimeout) else type(error)
+            with self._counting:
+                self._failures[kind.__name__] += 1
+            raise
+
+    def insert_joints(
+        self, track: JointTrack, stamp: int, positions: ArrayLike, velocities: ArrayLike | None = None
+    ) -> bool:
+        inserted = super().insert_joints(track, stamp, positions, velocities)
+        self._on_sample(track.prefix, stamp)
+        return inserted
+
+    def insert_many(
+        self, edges: Sequence[tuple[str, str]], stamp: int, poses: ArrayLike, *, writer: str | None = None
+    ) -> bool:
+        inserted = super().insert_many(edges, stamp, poses, writer=writer)
+        self._on_sample(self.domain.robot_placing(edges[0][1]), stamp)
+        return inserted
+
+    def _on_sample(self, robot: str, stamp: int) -> None:
+        """Called when a sample of ``robot`` with this stamp [ns] can be looked up."""
+        if (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain:
+            self.latency.add((self.clock.now() - stamp) * 1e-9)

@@ -1,0 +1,273 @@
+"""Collectors of metrics: publishers, listeners, writers, connections, recorders and bridges.
+
+Each reads counters that exist anyway, at each scrape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Protocol
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.ingest.counters import ListenerStats
+from zstate.metrics.buffer import Histogram, InstrumentedBuffer
+from zstate.metrics.pace import Paces
+from zstate.net.connections import connections
+from zstate.wire.keys import ANY
+
+if TYPE_CHECKING:
+    from prometheus_client.core import Metric
+
+    from zstate.bridge import Bridge
+    from zstate.net.presence import RobotInfo
+    from zstate.net.session import Session
+    from zstate.nodes.publisher import StatePublisher
+    from zstate.recording.recorder import Recorder
+
+MAX_ROBOTS = 500
+"""Robots with rows of their own. Names come from the network, so further robots are only counted."""
+_MAX_STREAMS = 5 * MAX_ROBOTS
+
+
+class MetricFamilies:
+    """Metric rows grouped by name. Rows with the same name and labels are added."""
+
+    def __init__(self) -> None:
+        self._rows: dict[tuple[str, str, str], dict[tuple[tuple[str, str], ...], float]] = {}
+        self._histograms: dict[tuple[str, str], dict[tuple[tuple[str, str], ...], Histogram]] = {}
+
+    def count(self, name: str, text: str, value: float, **labels: str) -> None:
+        """A counter; ``_total`` is appended to its name."""
+        self._add("counter", name, text, value, labels)
+
+    def gauge(self, name: str, text: str, value: float, **labels: str) -> None:
+        """A value that rises and falls."""
+        self._add("gauge", name, text, value, labels)
+
+    def histogram(self, name: str, text: str, histogram: Histogram, **labels: str) -> None:
+        """A distribution of values."""
+        self._histograms.setdefault((name, text), {})[tuple(labels.items())] = histogram
+
+    def _add(self, kind: str, name: str, text: str, value: float, labels: dict[str, str]) -> None:
+        rows = self._rows.setdefault((kind, name, text), {})
+        row = tuple(labels.items())
+        rows[row] = rows.get(row, 0.0) + value
+
+    def __iter__(self) -> Iterator[Metric]:
+        from prometheus_client.core import (  # noqa: PLC0415
+            CounterMetricFamily,
+            GaugeMetricFamily,
+            HistogramMetricFamily,
+        )
+
+        for (kind, name, text), rows in self._rows.items():
+            named = [label for label, _ in next(iter(rows))]
+            family_type = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
+            family = family_type(name, text, labels=named)
+            for row, value in rows.items():
+                family.add_metric([label for _, label in row], value)
+            yield family
+        for (name, text), histograms in self._histograms.items():
+            family = HistogramMetricFamily(name, text, labels=[label for label, _ in next(iter(histograms))])
+            for row, histogram in histograms.items():
+                buckets, total = histogram.read()
+                family.add_metric([label for _, label in row], buckets, total)
+            yield family
+
+
+class PublisherMetrics:
+    """Metrics of publishers."""
+
+    def __init__(self, publishers: Sequence[StatePublisher]) -> None:
+        self._publishers = publishers
+        self._paces = Paces()
+        self.sample()
+
+    def sample(self) -> None:
+        """Read the counters, from which rates are computed; called once a second."""
+        for publisher in self._publishers:
+            for (wire, stream), counts in publisher.stats.streams.items():
+                self._paces.note((id(publisher), wire, stream), counts.samples)
+
+    def collect(self) -> Iterable[Metric]:
+        families = MetricFamilies()
+        for publisher in self._publishers:
+            if publisher.stats.streams:
+                self._add(families, publisher)
+        yield from families
+
+    def _add(self, families: MetricFamilies, publisher: StatePublisher) -> None:
+        robot, stats = publisher.robot, publisher.stats
+        count, gauge = families.count, families.gauge
+        for (wire, stream), counts in stats.streams.items():
+            labels = {"robot": robot, "wire": wire, "stream": stream}
+            count("zstate_publisher_samples", "Samples put on the network.", counts.samples, **labels)
+            count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
+            text = "Samples not said, since nobody reads the stream."
+            count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
+            key: Hashable = id(publisher), wire, stream
+            rate_hz = self._paces.rate_hz(key, counts.samples)
+            gauge("zstate_publisher_rate_hertz", "Samples put a second.", rate_hz, **labels)
+        count("zstate_publisher_refused", "Samples that could not be published.", stats.refused, robot=robot)
+        if stats.rate is not None:
+            rate = stats.rate
+            text = "The rate that the publisher is to keep."
+            gauge("zstate_publisher_commanded_hertz", text, rate.commanded_hz, robot=robot)
+            count("zstate_publisher_ticks", "Ticks of that rate.", rate.ticks, robot=robot)
+            text = "Ticks more than a period late."
+            count("zstate_publisher_late_ticks", text, rate.late, robot=robot)
+            text = "Ticks given up after a long delay."
+            count("zstate_publisher_skipped_ticks", text, rate.skipped, robot=robot)
+
+
+class Listened(Protocol):
+    """A TransformListener, or the part of one for a single robot."""
+
+    @property
+    def robot(self) -> str: ...
+    @property
+    def stats(self) -> ListenerStats: ...
+    @property
+    def buffer(self) -> TransformBuffer: ...
+
+
+class ListenerMetrics:
+    """Metrics of the listeners that ``listeners()`` returns at a scrape.
+
+    Counts are those of each listener: for one of all robots they are totals with the robot "*". Latency and
+    lookups need an InstrumentedBuffer.
+    """
+
+    def __init__(self, listeners: Callable[[], Sequence[Listened]]) -> None:
+        self._listeners = listeners
+        self._paces = Paces()
+        self.sample()
+
+    def sample(self) -> None:
+        """Read the counters, from which rates are computed; called once a second."""
+        for listener in self._listeners():
+            self._paces.note(id(listener), listener.stats.received)
+
+    def collect(self) -> Iterable[Metric]:
+        families = MetricFamilies()
+        listeners = sorted(self._listeners(), key=lambda listener: listener.robot)
+        for listener in listeners[:MAX_ROBOTS]:
+            self._add_counts(families, listener)
+            _add_ages(families, listener)
+            if isinstance(listener.buffer, InstrumentedBuffer):
+                _add_lookups(families, listener.robot, listener.buffer)
+        left_out = max(0, len(listeners) - MAX_ROBOTS)
+        families.gauge("zstate_listener_robots_left_out", "Robots without rows of their own.", left_out)
+        yield from families
+
+    def _add_counts(self, families: MetricFamilies, listener: Listened) -> None:
+        robot, counts = listener.robot, asdict(listener.stats)
+        for reason, count in counts.pop("refused").items():
+            text = "Messages that could not be used."
+            families.count("zstate_listener_refused", text, count, robot=robot, reason=reason)
+        for name, count in counts.items():
+            text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
+            families.count(f"zstate_listener_{name}", text, count, robot=robot)
+        rate_hz = self._paces.rate_hz(id(listener), counts["received"])
+        families.gauge("zstate_listener_rate_hertz", "Samples received a second.", rate_hz, robot=robot)
+
+
+def _add_ages(families: MetricFamilies, listener: Listened) -> None:
+    text = "How old the newest sample of a robot is, by the clocks of both machines."
+    buffer = listener.buffer
+    for robot, stamp in sorted(_newest_stamps(listener).items())[:MAX_ROBOTS]:
+        age_s = (buffer.clock.now() - stamp) * 1e-9
+        families.gauge("zstate_listener_age_seconds", text, age_s, robot=robot)
+
+
+def _newest_stamps(listener: Listened) -> dict[str, int]:
+    newest: dict[str, int] = {}
+    for frame in listener.buffer.frames():
+        robot = frame.name.partition("/")[0]
+        stamp = frame.newest_in(listener.buffer.clock.domain)
+        if stamp is not None and listener.robot in (ANY, robot):
+            newest[robot] = max(newest.get(robot, stamp), stamp)
+    return newest
+
+
+def _add_lookups(families: MetricFamilies, robot: str, buffer: InstrumentedBuffer) -> None:
+    text = "From a sample's stamp until it could be looked up."
+    families.histogram("zstate_listener_latency_seconds", text, buffer.latency_of(robot), robot=robot)
+    families.count("zstate_listener_lookups", "Lookups in the buffer.", buffer.lookups, robot=robot)
+    for kind, count in buffer.failures.items():
+        text = "Lookups without an answer, by the kind of the error."
+        families.count("zstate_listener_lookup_errors", text, count, robot=robot, kind=kind)
+
+
+class WriterMetrics:
+    """Number of writers of each stream, for the robots that ``robots()`` returns at a scrape."""
+
+    def __init__(self, robots: Callable[[], Sequence[RobotInfo]]) -> None:
+        self._robots = robots
+
+    def collect(self) -> Iterable[Metric]:
+        families, robots = MetricFamilies(), self._robots()
+        families.gauge("zstate_robots", "Robots that somebody writes for.", len(robots))
+        for robot in robots[:MAX_ROBOTS]:
+            for stream, _ in robot.writers:
+                text = "Writers that are alive."
+                families.gauge("zstate_writers", text, 1, robot=robot.name, stream=stream)
+        yield from families
+
+
+class ConnectionMetrics:
+    """Number of connections of a session: for a router its clients, peers and other routers."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def collect(self) -> Iterable[Metric]:
+        families, known = MetricFamilies(), connections(self._session)
+        for mode, count in known.sessions.items():
+            families.gauge("zstate_router_sessions", "Connected sessions.", count, mode=mode)
+        for protocol, count in known.links.items():
+            families.gauge("zstate_router_links", "Links to them.", count, protocol=protocol)
+        yield from families
+
+
+class RecorderMetrics:
+    """Metrics of a recorder."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+
+    def collect(self) -> Iterable[Metric]:
+        families, stats = MetricFamilies(), self._recorder.stats
+        for (robot, stream), count in sorted(stats.messages.items())[:_MAX_STREAMS]:
+            text = "Messages written."
+            families.count("zstate_recorder_messages", text, count, robot=robot, stream=stream)
+        families.gauge("zstate_recorder_size_bytes", "Size of all files.", stats.bytes)
+        families.gauge("zstate_recorder_files", "Files of the recording.", len(stats.files))
+        for name in ("dropped", "missed", "unwritten"):
+            text = f"Samples {name}, as Recorder.stats counts them."
+            families.count(f"zstate_recorder_{name}", text, getattr(stats, name))
+        for reason, count in stats.refused.items():
+            families.count(
+                "zstate_recorder_refused", "Messages that cannot be written.", count, reason=reason
+            )
+        yield from families
+
+
+class BridgeMetrics:
+    """Metrics of a bridge."""
+
+    def __init__(self, bridge: Bridge) -> None:
+        self._bridge = bridge
+
+    def collect(self) -> Iterable[Metric]:
+        families = MetricFamilies()
+        for carrier in sorted(self._bridge.carriers, key=lambda carrier: carrier.robot)[:MAX_ROBOTS]:
+            text = "Robots that are carried, by way."
+            families.gauge(
+                "zstate_bridge_carried", text, carrier.has_begun, robot=carrier.robot, way=carrier.source.way
+            )
+            for reason, count in carrier.refused.items():
+                text = "What could not be carried."
+                families.count("zstate_bridge_refused", text, count, robot=carrier.robot, reason=reason)
+        yield from families

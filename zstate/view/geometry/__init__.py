@@ -1,1 +1,0 @@
-"""What is drawn, made ready for a browser: surfaces of files and primitives, as binary glTF."""

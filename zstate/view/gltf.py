@@ -1,0 +1,216 @@
+"""Binary glTF 2.0 files of meshes, in their own or in other colours.
+
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Its colours are linear, those of URDF, COLLADA
+and OBJ are sRGB. The points stay as they are, z up.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.model.shapes import Color
+from zstate.view.mesh_geometry import Material, Mesh
+
+GREY: Color = (0.74, 0.75, 0.77, 1.0)
+"""The colour of a mesh without a material."""
+
+_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123}
+_VERTICES, _INDICES = 34962, 34963
+_ROUGHNESS = 0.65
+
+
+_PLAIN = Material(GREY)
+Corner = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class MaterialOverride:
+    """The material of meshes without one (``missing``), or one colour for all (``over``)."""
+
+    missing: Material = _PLAIN
+    over: Color | None = None
+
+
+class Glb:
+    """Meshes packed once, for files in several colours; meshes with the same material are joined."""
+
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
+        self._materials: list[tuple[Material | None, bool]] = []
+        self._primitives: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._views: list[dict[str, Any]] = []
+        self._binary = bytearray()
+        self._corner_count = 0
+        for mesh in _joined(meshes):
+            self._add(mesh)
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles."""
+        return self._corner_count // 3
+
+    @property
+    def bounds(self) -> tuple[Corner, Corner]:
+        """The lowest and the highest coordinates of its points [m]; needs at least one point."""
+        boxes = [one for one in self._accessors if "min" in one]
+        low = np.min([one["min"] for one in boxes], axis=0).tolist()
+        high = np.max([one["max"] for one in boxes], axis=0).tolist()
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+    @property
+    def byte_count(self) -> int:
+        """Size in memory [bytes], the least size of a file."""
+        images = {material.image for material, _ in self._materials if material and material.image}
+        return len(self._binary) + sum(map(len, images))
+
+    def to_bytes(self, override: MaterialOverride) -> bytes:
+        """The glTF file."""
+        materials = [_override(*own, override) for own in self._materials]
+        images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
+        binary, views = bytearray(self._binary), list(self._views)
+        for image in images:
+            views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(image)})
+            binary += image + bytes(-len(image) % 4)
+        first = len(self._views)
+        document: dict[str, Any] = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": self._primitives}],
+            "accessors": self._accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": len(binary)}],
+            "materials": [_material(material, images) for material in materials],
+        }
+        if images:
+            document["images"] = [
+                {"bufferView": first + k, "mimeType": _mime_type(image)} for k, image in enumerate(images)
+            ]
+            document["textures"] = [{"source": k} for k in range(len(images))]
+        return _packed(document, bytes(binary))
+
+    def _add(self, mesh: Mesh) -> None:
+        attributes = {
+            "POSITION": self._array(mesh.points, _VERTICES, bounded=True),
+            "NORMAL": self._array(mesh.normals(), _VERTICES),
+        }
+        if mesh.uv is not None:
+            # glTF counts from the upper edge of an image.
+            attributes["TEXCOORD_0"] = self._array(mesh.uv * (1, -1) + (0, 1), _VERTICES)
+        if mesh.colors is not None:
+            attributes["COLOR_0"] = self._array(_linear_colors(mesh.colors), _VERTICES)
+        self._corner_count += mesh.triangles.size
+        # The largest index of a type means primitive restart.
+        narrow = np.uint16 if len(mesh.points) < 0xFFFF else np.uint32
+        rows = self._array(mesh.triangles.reshape(-1, 1).astype(narrow), _INDICES)
+        self._primitives.append({"attributes": attributes, "indices": rows, "material": len(self._materials)})
+        self._materials.append((mesh.material, mesh.uv is not None))
+
+    def _array(self, array: NDArray[Any], target: Literal[34962, 34963], *, bounded: bool = False) -> int:
+        data = array if array.dtype.name in _COMPONENTS else array.astype(np.float32)
+        view = {
+            "buffer": 0,
+            "byteOffset": len(self._binary),
+            "byteLength": data.nbytes,
+            "target": target,
+        }
+        accessor: dict[str, Any] = {
+            "bufferView": len(self._views),
+            "componentType": _COMPONENTS[data.dtype.name],
+            "count": len(data),
+            "type": _TYPES[data.shape[1]],
+        }
+        if bounded:
+            accessor |= {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
+        self._binary += data.tobytes() + bytes(-data.nbytes % 4)
+        self._views.append(view)
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+
+def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
+    """One mesh for each material: a browser draws few large ones faster than many small ones.
+
+    If one has texture coordinates or colours, all get them: viser draws instances of no others.
+    """
+    by_material: dict[Material | None, list[Mesh]] = {}
+    for mesh in meshes:
+        if len(mesh.triangles):
+            by_material.setdefault(mesh.material, []).append(mesh)
+    every = [mesh for group in by_material.values() for mesh in group]
+    has_uv = any(one.uv is not None for one in every)
+    has_colors = any(one.colors is not None for one in every)
+    return [_join(group, has_uv, has_colors) for group in by_material.values()]
+
+
+def _join(group: list[Mesh], has_uv: bool, has_colors: bool) -> Mesh:
+    starts = np.cumsum([0, *(len(one.points) for one in group[:-1])])
+    rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
+    return Mesh(
+        np.concatenate([one.points for one in group]),
+        np.concatenate(rows).astype(np.uint32),
+        group[0].material,
+        np.concatenate([_uv(one) for one in group]) if has_uv else None,
+        np.concatenate([_colors(one) for one in group]) if has_colors else None,
+    )
+
+
+def _uv(mesh: Mesh) -> NDArray[np.float32]:
+    return np.zeros((len(mesh.points), 2), dtype=np.float32) if mesh.uv is None else mesh.uv
+
+
+def _colors(mesh: Mesh) -> NDArray[np.uint8]:
+    white = np.full((len(mesh.points), 4), 255, dtype=np.uint8)
+    return white if mesh.colors is None else mesh.colors
+
+
+def _override(own: Material | None, has_uv: bool, override: MaterialOverride) -> Material:
+    if override.over is not None:
+        return Material(override.over)
+    material = override.missing if own is None else own
+    return material if has_uv else Material(material.color)
+
+
+def _material(material: Material, images: list[bytes]) -> dict[str, Any]:
+    red, green, blue, opacity = material.color
+    shading: dict[str, Any] = {
+        "baseColorFactor": [*_linear(np.array([red, green, blue])).tolist(), opacity],
+        "metallicFactor": 0.0,
+        "roughnessFactor": _ROUGHNESS,
+    }
+    if material.image is not None:
+        shading["baseColorTexture"] = {"index": images.index(material.image)}
+    entry: dict[str, Any] = {"pbrMetallicRoughness": shading, "doubleSided": opacity >= 1.0}
+    return entry | ({"alphaMode": "BLEND"} if opacity < 1.0 else {})
+
+
+def _linear(channels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """sRGB to linear light (IEC 61966-2-1)."""
+    return np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+
+
+def _linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    scaled = colors / 255.0
+    return np.concatenate([_linear(scaled[:, :3]), scaled[:, 3:]], axis=1).astype(np.float32)
+
+
+def _mime_type(image: bytes) -> str:
+    return "image/png" if image.startswith(b"\x89PNG") else "image/jpeg"
+
+
+def _packed(document: dict[str, Any], binary: bytes) -> bytes:
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(binary)
+    head = struct.pack("<III", _MAGIC, 2, size) + struct.pack("<II", len(text), _JSON)
+    return head + text + struct.pack("<II", len(binary), _BINARY) + binary

@@ -1,0 +1,170 @@
+"""The frame tree as viser nodes, so that only poses that change are sent.
+
+A moving joint is one message, whatever its link carries; another fixed frame moves only the root.
+
+The setters here bypass those of viser, which compare each pose with numpy's ``allclose`` and check the types
+of arrays: that costs more than the rest of sending, and our callers have compared already. For talos at 30 Hz
+it is a third of the drawing.
+"""
+
+# pyright: reportPrivateUsage=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser import _messages as messages
+
+from zstate.buffer.snapshot import FramePoses, FrameTable, Mask, Poses, Rows
+from zstate.se3 import IDENTITY, to_matrix
+
+_Float = TypeVar("_Float", np.float32, np.float64)
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+_TOP = "/frames"
+# Smaller changes are rounding errors of products of poses, and are not sent [m, and parts of a quaternion].
+_INVISIBLE = 1e-6
+
+
+class FrameNodes:
+    """A node for each frame that carries something, and for its ancestors.
+
+    ``paths`` are their names in viser. ``shown`` has a flag for each row of ``tree``: whether the pose in the
+    fixed frame is known. ``version`` grows when the path of a frame or its flag changes.
+    """
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        scene.add_frame(_TOP, show_axes=False)
+        self._ids: dict[str, int] = {}
+        self._handles: dict[str, viser.FrameHandle] = {}
+        self._rows: Rows = np.empty(0, dtype=np.intp)
+        self._node_handles: list[viser.FrameHandle] = []
+        self._wanted: frozenset[str] = frozenset()
+        self._poses: Poses = np.empty((0, 7))
+        self.tree: FrameTable | None = None
+        self.paths: dict[str, str] = {}
+        self.shown: Mask = np.empty(0, dtype=np.bool_)
+        self.version = 0
+
+    def show(self, moment: FramePoses, placed: Poses, wanted: frozenset[str]) -> None:
+        """Move every frame to its pose in the fixed one (N, 7); frames in ``wanted`` get nodes."""
+        if moment.tree is not self.tree or wanted != self._wanted:
+            self._wanted = wanted
+            self._rebuild(moment.tree)
+        shown = np.isfinite(placed[:, 0])
+        if not np.array_equal(shown, self.shown):
+            self._set_visible(moment.tree, shown)
+        self._move(_on_parents(moment, placed, shown)[self._rows])
+
+    def is_shown(self, frame: str) -> bool:
+        """Whether the pose of the frame in the fixed one is known."""
+        return self.tree is not None and frame in self.paths and bool(self.shown[self.tree.row(frame)])
+
+    def _rebuild(self, tree: FrameTable) -> None:
+        paths = self._paths(tree)
+        for path in self._outermost_without(set(paths.values())):
+            self._handles[path].remove()
+            for below in [one for one in self._handles if one == path or one.startswith(f"{path}/")]:
+                del self._handles[below]
+        for path in paths.values():
+            if path not in self._handles:
+                self._handles[path] = self._scene.add_frame(path, show_axes=False)
+        self._rows = np.array([tree.row(name) for name in paths], dtype=np.intp)
+        self._node_handles = [self._handles[path] for path in paths.values()]
+        self._poses = np.full((len(paths), 7), np.nan)
+        self.shown = np.zeros(0, dtype=np.bool_)
+        self.tree, self.paths = tree, paths
+        self.version += 1
+
+    def _paths(self, tree: FrameTable) -> dict[str, str]:
+        """Short names, because every message contains one; the number of a frame never changes."""
+        kept = np.array([name in self._wanted for name in tree.names], dtype=np.bool_)
+        for row in range(len(kept) - 1, -1, -1):
+            kept[tree.parents[row]] |= kept[row] and tree.parents[row] >= 0
+        paths: dict[str, str] = {}
+        for row in np.flatnonzero(kept).tolist():
+            name, parent = tree.names[row], int(tree.parents[row])
+            above = _TOP if parent < 0 else paths[tree.names[parent]]
+            paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
+        return paths
+
+    def _outermost_without(self, kept: set[str]) -> Iterator[str]:
+        """The topmost nodes to remove; their descendants are removed with them."""
+        gone = self._handles.keys() - kept
+        return (path for path in gone if path.rpartition("/")[0] not in gone)
+
+    def _set_visible(self, tree: FrameTable, shown: Mask) -> None:
+        """Hide nodes without a pose, unless a descendant has one."""
+        passed = shown.copy()
+        for row in range(len(shown) - 1, -1, -1):
+            parent = int(tree.parents[row])
+            if passed[row] and parent >= 0:
+                passed[parent] = True
+        for handle, visible in zip(self._node_handles, passed[self._rows].tolist(), strict=True):
+            handle.visible = visible
+        self.shown = shown
+        self.version += 1
+
+    def _move(self, poses: Poses) -> None:
+        with np.errstate(invalid="ignore"):
+            changed = ~(np.abs(poses - self._poses) <= _INVISIBLE)
+        moved, turned = changed[:, :3].any(axis=1), changed[:, 3:].any(axis=1)
+        for row in np.flatnonzero(moved).tolist():
+            x, y, z = poses[row, :3].tolist()
+            set_position(self._node_handles[row], (x, y, z))
+        for row in np.flatnonzero(turned).tolist():
+            qx, qy, qz, qw = poses[row, 3:].tolist()
+            set_rotation(self._node_handles[row], (qw, qx, qy, qz))
+        self._poses[moved, :3] = poses[moved, :3]
+        self._poses[turned, 3:] = poses[turned, 3:]
+
+
+def wxyzs(poses: NDArray[_Float]) -> NDArray[_Float]:
+    """The quaternions of poses (..., 7) in the order of viser (..., 4)."""
+    return poses[..., [6, 3, 4, 5]]
+
+
+def in_frame(pose: Sequence[float], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Transform ``points`` (N, 3) by a pose."""
+    matrix = to_matrix(pose)
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _on_parents(moment: FramePoses, placed: Poses, shown: Mask) -> Poses:
+    """The pose of each frame in the node of its parent, which is at the fixed frame if its own is unknown."""
+    parents = moment.tree.parents
+    on_shown = (parents >= 0) & shown[parents]
+    on_top = np.where(shown[:, None], placed, IDENTITY)
+    return np.where((shown & on_shown)[:, None], moment.poses, on_top)
+
+
+def set_position(handle: viser.SceneNodeHandle, position: Vector) -> None:
+    """Set the position of a node in its parent [m]."""
+    node = handle._impl
+    node.position[:] = position
+    node.api._queue_scene_message(messages.SetPositionMessage(node.name, position))
+
+
+def set_rotation(handle: viser.SceneNodeHandle, wxyz: Quaternion) -> None:
+    """Set the rotation of a node in its parent."""
+    node = handle._impl
+    node.wxyz[:] = wxyz
+    node.api._queue_scene_message(messages.SetOrientationMessage(node.name, wxyz))
+
+
+def set_instances(
+    handle: viser.BatchedAxesHandle | viser.BatchedGlbHandle,
+    positions: NDArray[np.float32],
+    wxyzs: NDArray[np.float32],
+) -> None:
+    """Set positions (N, 3) [m] and rotations (N, 4) of the instances of a node; viser keeps the arrays."""
+    node = handle._impl
+    node.props.batched_positions, node.props.batched_wxyzs = positions, wxyzs
+    moved = {"batched_positions": positions, "batched_wxyzs": wxyzs}
+    node.api._queue_scene_message(messages.SceneNodeUpdateMessage(node.name, moved))

@@ -1,0 +1,162 @@
+"""Layout of frame trees that are not connected to the fixed frame.
+
+Their relative poses are unknown. They are placed in rows next to it, on one floor, as far apart as their
+robots reach, with labels that say so.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from zstate.buffer.snapshot import FramePoses, FrameTable, Poses, Rows
+from zstate.view.scene.frame_markers import NodeLabels
+from zstate.view.scene.frame_nodes import FrameNodes
+
+_GAP_M = 0.3
+_MARGIN_M = 0.12  # of meshes around their frames
+# Width of the layout divided by its depth: pictures are wider than high.
+_ASPECT = 1.6
+
+Offset = tuple[float, float, float]
+
+
+class _Box(NamedTuple):
+    """The space of a tree around its root [m]: centre and half size along x, y; lowest z."""
+
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    low: float
+
+
+class TreeLayout:
+    """Places trees next to that of the fixed frame, and labels all if there are several.
+
+    A tree keeps its place while robots move. The layout is computed again, and ``version`` grows, when a tree
+    appears or disappears, or more of its frames have a pose.
+    """
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._node_labels = NodeLabels(scene, "apart", anchor="bottom-center")
+        self._tree: FrameTable | None = None
+        self._laid_out_for: tuple[int, int] | None = None
+        self._boxes: dict[str, tuple[tuple[str, ...], int, _Box]] = {}
+        self._offsets: dict[int, Offset] = {}
+        self._named_offsets: dict[str, Offset] = {}
+        self._texts: dict[str, str] = {}
+        self.version = 0
+
+    @property
+    def frames(self) -> frozenset[str]:
+        """The frames that carry labels."""
+        return frozenset(self._texts)
+
+    def placed(self, moment: FramePoses, fixed: str) -> Poses:
+        """As ``moment.poses_in(fixed)``, with poses for every tree. Raises UnknownFrame."""
+        tree = moment.tree
+        root = int(tree.roots[tree.row(fixed)])
+        laid_out_for = root, int(np.count_nonzero(moment.known))
+        if tree is not self._tree or laid_out_for != self._laid_out_for:
+            self._tree, self._laid_out_for = tree, laid_out_for
+            self._lay_out(moment, root)
+        return moment.poses_side_by_side(fixed, self._offsets) if self._offsets else moment.poses_in(fixed)
+
+    def show(self, nodes: FrameNodes) -> None:
+        """Draw the labels."""
+        self._node_labels.show(self._texts, nodes)
+
+    def _lay_out(self, moment: FramePoses, first: int) -> None:
+        names = moment.tree.names
+        members = _members(moment.tree)
+        others = sorted((row for row in members if row != first), key=lambda row: _natural(names[row]))
+        ordered = [first, *others]
+        boxes = [self._box(moment, row, members[row]) for row in ordered]
+        self._boxes = {name: self._boxes[name] for name in (names[row] for row in ordered)}
+        offsets = _in_rows(boxes)
+        self._offsets = {row: offset for row, offset in zip(ordered, offsets, strict=True) if row != first}
+        named = {names[row]: offset for row, offset in self._offsets.items()}
+        self.version += named != self._named_offsets
+        self._named_offsets = named
+        self._texts = {}
+        for row in ordered if others else ():
+            title = _title([names[member] for member in map(int, members[row])])
+            self._texts[names[row]] = title if row == first else f"{title} (place unknown)"
+
+    def _box(self, moment: FramePoses, root: int, rows: Rows) -> _Box:
+        """The largest box of the tree so far: it does not shrink while samples are missing."""
+        tree = moment.tree
+        names = tuple(tree.names[row] for row in map(int, rows))
+        tops, poses = moment.tops
+        known = rows[tops[rows] == root]
+        before = self._boxes.get(names[0])
+        if before is not None and before[0] == names and before[1] >= len(known):
+            return before[2]
+        box = _box_of([tree.names[row] for row in map(int, known)], poses[known, :3])
+        self._boxes[names[0]] = names, len(known), box
+        return box
+
+
+def _members(tree: FrameTable) -> dict[int, Rows]:
+    """The rows of each tree by the row of its root, which is the first."""
+    order = np.argsort(tree.roots, kind="stable")
+    starts = np.flatnonzero(np.diff(tree.roots[order], prepend=-1))
+    ends = [*starts[1:].tolist(), len(order)]
+    groups = [order[start:end] for start, end in zip(starts.tolist(), ends, strict=True)]
+    return {int(tree.roots[group[0]]): group for group in groups}
+
+
+def _box_of(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
+    """The box that the robots can reach in all directions; other frames count only without a robot."""
+    robots: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        robots.setdefault(name.partition("/")[0] if "/" in name else "", []).append(row)
+    if len(robots) > 1:
+        robots.pop("", None)
+    corners: list[NDArray[np.float64]] = []
+    for rows in robots.values():
+        reach = float(np.linalg.norm(points[rows] - points[rows[0]], axis=1).max()) + _MARGIN_M
+        corners += [points[rows[0], :2] - reach, points[rows[0], :2] + reach]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    return _Box(0.5 * (low + high), 0.5 * (high - low), min(0.0, float(points[:, 2].min())))
+
+
+def _in_rows(boxes: Sequence[_Box]) -> list[Offset]:
+    """The offset of each box in a layout of rows along y on one floor; the first is not moved."""
+    columns = math.ceil(math.sqrt(_ASPECT * len(boxes)))
+    widths = [max(float(box.half[1]) for box in boxes[k::columns]) for k in range(min(columns, len(boxes)))]
+    starts = range(0, len(boxes), columns)
+    depths = [max(float(box.half[0]) for box in boxes[start : start + columns]) for start in starts]
+    across, behind = _middles(widths), _middles(depths)
+    first = boxes[0]
+    offsets: list[Offset] = []
+    for k, box in enumerate(boxes):
+        x = first.middle[0] - behind[k // columns] - box.middle[0]
+        y = first.middle[1] + across[k % columns] - box.middle[1]
+        offsets.append((float(x), float(y), first.low - box.low))
+    return offsets
+
+
+def _middles(halves: Sequence[float]) -> list[float]:
+    """The centres of adjacent intervals, relative to the first."""
+    middles = [0.0]
+    for before, half in pairwise(halves):
+        middles.append(middles[-1] + before + _GAP_M + half)
+    return middles
+
+
+def _title(names: Sequence[str]) -> str:
+    """The robot of the tree; its root if it has several robots or none."""
+    robots = {name.partition("/")[0] for name in names if "/" in name}
+    return robots.pop() if len(robots) == 1 else names[0]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort key that puts bot2 before bot10."""
+    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", name[:200])]
