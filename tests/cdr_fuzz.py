@@ -22,7 +22,7 @@ from wire.ros2 import by_hand
 
 from zstate.errors import MessageError
 from zstate.wire.ros2.joint_state import JointStateDecoder
-from zstate.wire.ros2.plain import decode_clock, decode_string
+from zstate.wire.ros2.simple_messages import decode_clock, decode_string
 from zstate.wire.ros2.tf_message import TfMessageDecoder
 
 REASONS = {"truncated", "malformed", "no positions"}

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from support import until
 
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber

@@ -24,7 +24,8 @@ PACKAGE = Path(__file__).parent.parent / "zstate"
 
 # From the ground up. Rooms of one floor do not know each other, but for the neighbours below.
 FLOORS = (
-    {"_util", "closing", "errors", "locks", "_kernel"},
+    {"_util", "_kernel"},
+    {"errors"},
     {"checks", "extension"},
     {"clock"},
     {"se3", "rate"},
@@ -34,7 +35,7 @@ FLOORS = (
     {"net"},
     {"sources"},
     {"nodes"},
-    {"ros1", "bridge", "recording"},
+    {"bridges", "recording"},
     {"zstate"},
     {"metrics"},
     {"view", "cli"},
@@ -59,12 +60,12 @@ HOMES = {
     "mcap": "recording",
     "lz4": "recording",
     "zstandard": "recording",
-    "rospy": "ros1",
-    "geometry_msgs": "ros1",
-    "rosgraph_msgs": "ros1",
-    "sensor_msgs": "ros1",
-    "std_msgs": "ros1",
-    "tf2_msgs": "ros1",
+    "rospy": "bridges",
+    "geometry_msgs": "bridges",
+    "rosgraph_msgs": "bridges",
+    "sensor_msgs": "bridges",
+    "std_msgs": "bridges",
+    "tf2_msgs": "bridges",
     "prometheus_client": "metrics",
     "viser": "view",
     "websockets": "view",  # what viser's server is made of
@@ -90,7 +91,7 @@ GUESTS = {
 
 PURE = {"model", "buffer", "wire"}
 # The catalog and the expander are where a model comes from: they look for files and read them.
-READS_FILES = {"model/catalog.py", "model/known.py", "model/xacro.py"}
+READS_FILES = {"model/load.py", "model/catalog.py", "model/xacro.py"}
 IMPURE_MODULES = {
     "io",
     "logging",

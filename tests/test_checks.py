@@ -14,8 +14,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import real_numbers
 from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.nodes.robot_encoder import RobotEncoder
 from zstate.transform import Transform
 

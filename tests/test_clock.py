@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from zstate.clock import ManualClock, SystemClock, check_stamp, stamp_text, wait_in_slices
+from zstate.clock import ManualClock, SystemClock, check_stamp, format_stamp, wait_interruptible
 from zstate.errors import InvalidInput
 
 
@@ -35,7 +35,7 @@ def test_what_is_no_64_bit_integer_is_refused_with_the_way_out(stamp: object) ->
     [(0, "0.000000000"), (1, "0.000000001"), (1_500_000_000, "1.500000000"), (-1, "-0.000000001")],
 )
 def test_a_stamp_reads_as_seconds_with_all_nine_digits(stamp: int, text: str) -> None:
-    assert stamp_text(stamp) == text
+    assert format_stamp(stamp) == text
 
 
 def test_the_system_clock_tells_the_time_of_the_system() -> None:
@@ -85,8 +85,8 @@ def test_whoever_waits_for_a_manual_clock_wakes_when_it_gets_there() -> None:
 
 def test_waiting_in_slices_ends_when_the_event_is_set_or_the_time_is_up() -> None:
     event = threading.Event()
-    assert not wait_in_slices(event, 0.0)
-    assert not wait_in_slices(event, 0.01)
+    assert not wait_interruptible(event, 0.0)
+    assert not wait_interruptible(event, 0.01)
     threading.Timer(0.01, event.set).start()
-    assert wait_in_slices(event)
-    assert wait_in_slices(event, -1.0)
+    assert wait_interruptible(event)
+    assert wait_interruptible(event, -1.0)

@@ -7,9 +7,9 @@ from live import Tap, await_reader
 
 from zstate.errors import Closed, InvalidInput
 from zstate.nodes.clock import ClockPublisher
-from zstate.wire.messages import Clock
+from zstate.wire.messages import ClockMessage
 from zstate.wire.native import ENCODINGS, decode
-from zstate.wire.ros2.plain import decode_clock
+from zstate.wire.ros2.simple_messages import decode_clock
 
 ROS = "ros2:domain=7,namespace=*,frame_prefix=*/"
 
@@ -22,7 +22,7 @@ def test_the_time_is_said_on_both_wires(sessions):
         await_reader(writer, "7/clock/x/y")
         for stamp in (0, 5, 1_700_000_000_000_000_001):
             clock.publish(stamp)
-        told = [decode(payload, ENCODINGS[Clock], Clock) for payload in native.payloads(3)]
+        told = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in native.payloads(3)]
         assert [clock.stamp for clock in told] == [0, 5, 1_700_000_000_000_000_001]
         assert [clock.seq for clock in told] == [0, 1, 2]
         assert len({clock.session for clock in told}) == 1
@@ -36,7 +36,7 @@ def test_a_new_publisher_is_a_new_start(sessions):
     for _ in range(2):
         with ClockPublisher(writer) as clock:
             clock.publish(1)
-    told = [decode(payload, ENCODINGS[Clock], Clock) for payload in tap.payloads(2)]
+    told = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(2)]
     assert told[0].session != told[1].session
 
 
@@ -49,7 +49,7 @@ def test_what_cannot_be_said_is_refused_and_counts_for_nothing(sessions):
             with pytest.raises(InvalidInput):
                 clock.publish(wrong)
         clock.publish(3)
-        (told,) = (decode(payload, ENCODINGS[Clock], Clock) for payload in tap.payloads(1))
+        (told,) = (decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(1))
         assert (told.stamp, told.seq) == (3, 0)
 
 

@@ -19,8 +19,8 @@ from zstate.errors import (
     UnknownFrame,
     WaitTimeout,
     ZStateError,
-    duration_text,
-    timed_out,
+    as_timeout,
+    format_duration,
 )
 
 S = 1_000_000_000
@@ -51,7 +51,7 @@ def test_bad_input_is_a_value_error_and_a_failed_question_is_not() -> None:
     ],
 )
 def test_durations_read_as_a_person_says_them(nanoseconds: int, text: str) -> None:
-    assert duration_text(nanoseconds) == text
+    assert format_duration(nanoseconds) == text
 
 
 def in_future() -> InFuture:
@@ -102,7 +102,7 @@ def test_wall_clock_time_asked_of_a_simulation_is_told_in_words() -> None:
     )
     assert error.is_of_another_time
     assert "wait for it" not in str(error)
-    again = pickle.loads(pickle.dumps(timed_out(error, 1.0)))
+    again = pickle.loads(pickle.dumps(as_timeout(error, 1.0)))
     assert str(again).endswith(str(error))
 
 
@@ -164,7 +164,7 @@ def test_a_note_stands_behind_the_sentence() -> None:
 
 
 def test_a_wait_that_ran_out_keeps_its_reasons_class_and_facts_and_is_a_timeout() -> None:
-    error = timed_out(in_future(), 0.25)
+    error = as_timeout(in_future(), 0.25)
     assert isinstance(error, InFuture)
     assert isinstance(error, TimeoutError)
     assert isinstance(error, WaitTimeout)
@@ -174,7 +174,7 @@ def test_a_wait_that_ran_out_keeps_its_reasons_class_and_facts_and_is_a_timeout(
 
 
 def test_each_reason_has_one_class_of_timeouts() -> None:
-    assert type(timed_out(in_future(), 1.0)) is type(timed_out(in_future(), 2.0))
+    assert type(as_timeout(in_future(), 1.0)) is type(as_timeout(in_future(), 2.0))
 
 
 def one_of_each() -> list[errors.ZStateError]:
@@ -195,7 +195,7 @@ def one_of_each() -> list[errors.ZStateError]:
         errors.UnknownFrame("a", "b", name="b", near_misses=("bb",)),
         errors.Stale("a", "b", age_s=2.0, max_age_s=1.0, edge=("a", "b")),
         late,
-        errors.timed_out(late, 0.5),
+        errors.as_timeout(late, 0.5),
     ]
 
 
@@ -222,10 +222,10 @@ def test_the_writers_clock_is_named_where_it_may_be_the_cause(
     error = InFuture(
         "map", "hand", edge=("map", "base"), requested=5 * S, newest=4 * S, writer="driver@jetson"
     )
-    without = error.explanation()
+    without = error.message()
     error.clock_offset_ns, error.clock_uncertainty_ns = offset_ns, uncertainty_ns
-    assert error.explanation() == without + text
-    again = pickle.loads(pickle.dumps(timed_out(error, 1.0)))
+    assert error.message() == without + text
+    again = pickle.loads(pickle.dumps(as_timeout(error, 1.0)))
     assert (again.clock_offset_ns, again.clock_uncertainty_ns) == (offset_ns, uncertainty_ns)
 
 
@@ -257,7 +257,7 @@ def one_of_each() -> list[ZStateError]:
         Stale("a", "b", age_s=2.0, max_age_s=1.0, **where),
         Stale("a", "b", age_s=9.0, other=("hand", "tip"), other_newest=11 * S, **where),
         errors.NotFinite("a", "b", **where),
-        timed_out(InFuture("a", "b", **where), 0.5),
+        as_timeout(InFuture("a", "b", **where), 0.5),
     ]
 
 

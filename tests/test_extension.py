@@ -10,7 +10,7 @@ import pytest
 
 import zstate
 from zstate.errors import InvalidInput
-from zstate.extension import VARIABLE, choose, kernel
+from zstate.extension import VARIABLE, kernel, select_kernel
 
 SHADOW = "import sys; sys.modules['zstate._kernel'] = None; "
 STALE = "import sys, types; sys.modules['zstate._kernel'] = types.SimpleNamespace(REVISION=-1); "
@@ -60,4 +60,4 @@ def test_a_wish_for_the_extension_is_not_silently_unmet() -> None:
 
 def test_another_wish_is_refused() -> None:
     with pytest.raises(InvalidInput, match="'c', 'reference' or not set; got 'fast'"):
-        choose("fast")
+        select_kernel("fast")

@@ -15,9 +15,9 @@ from support import DEADLINE_S, Child, until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InPast, InvalidInput
-from zstate.model.catalog import load_model
-from zstate.net.history import Memory, PastReader, answer_past
+from zstate.model.load import load_model
 from zstate.net.presence import announce
+from zstate.net.sample_history import HistoryReader, SampleCache, serve_history
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.lookup_service import RecentBuffer
@@ -25,10 +25,10 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.writer import Announced, Writer
 
 MS = 1_000_000
 PERIOD = 10 * MS
@@ -339,7 +339,7 @@ def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Sessi
         assert publisher.cache is not None
         said = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
-        with PastReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
+        with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
             past.ask(JOINTS, publisher.cache.since(0)[0].session)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == said
@@ -367,13 +367,13 @@ def test_statics_and_the_past_answer_together_at_an_instant_before_joining(
 
 def test_a_past_of_another_session_than_was_asked_is_refused(sessions):
     writer, reader = sessions
-    memory = Memory(10.0, 2, 8)
+    memory = SampleCache(10.0, 2, 8)
     order = order_digest(RRBOT.joint_names)
     memory.append(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
-    said = Announced("r1", "joint_states", Writer("driver", "nuc", 1, 2, 8))
+    said = Announcement("r1", "joint_states", WriterId("driver", "nuc", 1, 2, 8))
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
-        answer_past(writer, "r1", "joint_states", memory, encode),
+        serve_history(writer, "r1", "joint_states", memory, encode),
         announce(writer, f"zstate/r1/@writer/joint_states/{said.identity}"),
         TransformListener(reader, "r1") as listener,
     ):

@@ -12,7 +12,7 @@ from support import SOON_S, Child, until
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
 from zstate.errors import AmbiguousFrame, InvalidInput
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.clock_offset import measure_offsets
 from zstate.net.presence import discover
 from zstate.net.streams import StreamPublisher

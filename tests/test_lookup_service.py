@@ -11,13 +11,13 @@ from support import Child, until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, UnknownFrame, Unreachable
-from zstate.net.service import ask_lookup
+from zstate.net.queryable import query_lookup
 from zstate.net.session import Session, connect
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher import StatePublisher
 from zstate.transform import Transform
-from zstate.wire.json import to_json
 from zstate.wire.keys import Stream
+from zstate.wire.lookup_request import to_json
 
 PERIOD = 10_000_000
 KEY = "zstate/r1/lookup"
@@ -62,7 +62,7 @@ def test_an_answer_that_does_not_come_on_the_robots_key_is_none(sessions: tuple[
     forged = sessions[0].zenoh.declare_queryable(wide, lambda query: query.reply(wide, pose))
     until(lambda: [reply.ok for reply in sessions[1].zenoh.get(KEY, timeout=5.0)])
     with pytest.raises(Unreachable):
-        ask_lookup(sessions[1], "r1", "world", "tool")
+        query_lookup(sessions[1], "r1", "world", "tool")
     forged.undeclare()
 
 
@@ -75,7 +75,7 @@ def test_each_answer_is_that_of_the_buffer(sessions: tuple[Session, Session]):
         await_answers(sessions[1])
         for at in (None, STAMP, STAMP + 1, STAMP + PERIOD):
             answer, expected = (
-                ask_lookup(sessions[1], "r1", "world", "tool", at),
+                query_lookup(sessions[1], "r1", "world", "tool", at),
                 buffer.lookup("world", "tool", at),
             )
             assert_pose(answer, expected.matrix)
@@ -106,7 +106,7 @@ def test_what_the_buffer_refuses_is_raised_where_it_was_asked(sessions, asked, e
         with pytest.raises(error) as here:
             buffer.lookup(*asked)
         with pytest.raises(error) as there:
-            ask_lookup(sessions[1], "r1", *asked)
+            query_lookup(sessions[1], "r1", *asked)
     assert str(there.value) == str(here.value)
     assert there.value.facts() == here.value.facts()
 
@@ -116,16 +116,16 @@ def test_a_bare_name_is_the_robots_own_where_several_have_it(sessions: tuple[Ses
     with LookupService(sessions[0], buffer, "r1"), LookupService(sessions[0], buffer, "r2"):
         for robot, height in (("r1", 1.0), ("r2", 2.0)):
             await_answers(sessions[1], robot)
-            assert ask_lookup(sessions[1], robot, "base", "tool").translation[2] == height
-        assert ask_lookup(sessions[1], "r1", "r2/base", "r2/tool").translation[2] == 2.0
+            assert query_lookup(sessions[1], robot, "base", "tool").translation[2] == height
+        assert query_lookup(sessions[1], "r1", "r2/base", "r2/tool").translation[2] == 2.0
 
 
 def test_where_nobody_answers_it_is_said_what_to_run(sessions: tuple[Session, Session]):
     with pytest.raises(Unreachable, match=r"zstate/r1/lookup.*zstate publish r1") as caught:
-        ask_lookup(sessions[1], "r1", "world", "tool")
+        query_lookup(sessions[1], "r1", "world", "tool")
     assert caught.value.endpoints == (KEY,)
     with pytest.raises(InvalidInput, match="timeout_s"):
-        ask_lookup(sessions[1], "r1", "world", "tool", timeout_s=0.0)
+        query_lookup(sessions[1], "r1", "world", "tool", timeout_s=0.0)
 
 
 def test_every_publisher_answers_of_what_it_sent_last(sessions: tuple[Session, Session]):
@@ -133,20 +133,20 @@ def test_every_publisher_answers_of_what_it_sent_last(sessions: tuple[Session, S
     with StatePublisher(writer, RRBOT, "r1", cache_s=1.0) as publisher:
         await_answers(reader)
         with pytest.raises(NoData):
-            ask_lookup(reader, "r1", "world", "tool")
+            query_lookup(reader, "r1", "world", "tool")
         for number in range(150):
             publisher.publish([0.01 * number, 0.25], stamp=STAMP + number * PERIOD)
             if number % 40 == 0:
-                ask_lookup(reader, "r1", "world", "tool")
+                query_lookup(reader, "r1", "world", "tool")
         for number in (49, 100, 149):
-            answer = ask_lookup(reader, "r1", "world", "tool", STAMP + number * PERIOD)
+            answer = query_lookup(reader, "r1", "world", "tool", STAMP + number * PERIOD)
             assert_pose(answer, kinematic_pose(RRBOT, [0.01 * number, 0.25], "world", "tool"))
         with pytest.raises(InPast):
-            ask_lookup(reader, "r1", "world", "tool", STAMP + 48 * PERIOD)
+            query_lookup(reader, "r1", "world", "tool", STAMP + 48 * PERIOD)
         with pytest.raises(UnknownFrame):
-            ask_lookup(reader, "r1", "world", "camera")
+            query_lookup(reader, "r1", "world", "camera")
     with pytest.raises(Unreachable):
-        ask_lookup(reader, "r1", "world", "tool", timeout_s=0.2)
+        query_lookup(reader, "r1", "world", "tool", timeout_s=0.2)
 
 
 def test_without_a_cache_a_publisher_answers_of_its_newest_sample(sessions: tuple[Session, Session]):
@@ -154,11 +154,11 @@ def test_without_a_cache_a_publisher_answers_of_its_newest_sample(sessions: tupl
         await_answers(sessions[1])
         for number in range(3):
             publisher.publish([0.5 * number, 0.25], stamp=STAMP + number * PERIOD)
-        answer = ask_lookup(sessions[1], "r1", "world", "tool")
+        answer = query_lookup(sessions[1], "r1", "world", "tool")
         assert answer.stamp == STAMP + 2 * PERIOD
         assert_pose(answer, kinematic_pose(RRBOT, [1.0, 0.25], "world", "tool"))
         with pytest.raises(InPast):
-            ask_lookup(sessions[1], "r1", "world", "tool", STAMP + PERIOD)
+            query_lookup(sessions[1], "r1", "world", "tool", STAMP + PERIOD)
 
 
 def test_a_driver_and_the_state_publisher_beside_it_answer_the_same(sessions: tuple[Session, Session]):
@@ -172,7 +172,7 @@ def test_a_driver_and_the_state_publisher_beside_it_answer_the_same(sessions: tu
         for publisher in (joints, state):
             publisher.publish([0.5, 0.25], stamp=STAMP)
         for session in sessions:
-            answer = ask_lookup(session, "r1", "world", "tool")
+            answer = query_lookup(session, "r1", "world", "tool")
             assert (answer.stamp, answer.kind) == (STAMP, "exact")
 
 

@@ -9,9 +9,9 @@ from support import SOON_S, until
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput
-from zstate.model.catalog import load_model
-from zstate.model.edges import EdgeTable
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.net.presence import discover
 from zstate.net.session import connect
 from zstate.nodes.publisher import STREAMS, StatePublisher
@@ -131,8 +131,8 @@ def test_moving_and_fixed_edges_are_told_apart_and_are_all_there(sessions):
 
 def test_transforms_are_computed_and_sent_while_somebody_reads_them_only(sessions, monkeypatch):
     computed = []
-    poses = EdgeTable.poses
-    monkeypatch.setattr(EdgeTable, "poses", lambda *given: computed.append(given) or poses(*given))
+    poses = JointTransforms.poses
+    monkeypatch.setattr(JointTransforms, "poses", lambda *given: computed.append(given) or poses(*given))
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
 

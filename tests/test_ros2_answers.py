@@ -21,8 +21,8 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import InvalidInput
-from zstate.model.catalog import load_model
-from zstate.model.coordinates import velocity_slots
+from zstate.model.load import load_model
+from zstate.model.robot import velocity_columns_by_position
 from zstate.net.presence import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -64,7 +64,7 @@ def test_the_answers_are_those_of_the_native_wire_bit_for_bit(sessions, model, f
         for listener in listeners:
             until(lambda one=listener: links <= {frame.name for frame in one.buffer.frames()})
         for number in range(4):
-            rates = random.normal(size=len(velocity_slots(model)))
+            rates = random.normal(size=len(velocity_columns_by_position(model)))
             publisher.publish(
                 random_positions(model, number), rates, rates * 2, stamp=STAMP + number * 10 * MS
             )
@@ -98,7 +98,7 @@ def test_the_answers_are_those_of_the_native_wire_bit_for_bit(sessions, model, f
 def test_joint_states_are_read_back_as_they_were_published(sessions, wire: str):
     writer, reader = sessions
     positions = random_positions(EVERY, 1)
-    rates = np.arange(float(len(velocity_slots(EVERY))))
+    rates = np.arange(float(len(velocity_columns_by_position(EVERY))))
     with (
         SubscribedSource(reader, EVERY, "r1", wire=wire) as source,
         StatePublisher(writer, EVERY, "r1", (wire,), streams=["joint_states"]) as publisher,

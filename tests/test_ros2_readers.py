@@ -8,7 +8,7 @@ import pytest
 from support import until
 from wire.ros2.raw_nodes import tokens
 
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.nodes.listener import TransformListener
 from zstate.sources import SubscribedSource
 

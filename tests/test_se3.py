@@ -14,7 +14,7 @@ from zstate import se3
 angles = st.floats(-math.pi, math.pi)
 lengths = st.floats(-10.0, 10.0)
 vectors = st.tuples(lengths, lengths, lengths)
-quaternions = st.tuples(angles, angles, angles).map(lambda rpy: se3.quaternion_of_rpy(*rpy))
+quaternions = st.tuples(angles, angles, angles).map(lambda rpy: se3.quaternion_from_rpy(*rpy))
 poses = st.builds(lambda t, q: (*t, *q), vectors, quaternions)
 ratios = st.floats(0.0, 1.0)
 
@@ -55,21 +55,21 @@ def test_rpy_is_roll_then_pitch_then_yaw_about_fixed_axes(rpy) -> None:
     roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    np.testing.assert_allclose(matrix_of(se3.quaternion_of_rpy(*rpy)), yaw @ pitch @ roll, atol=1e-14)
+    np.testing.assert_allclose(matrix_of(se3.quaternion_from_rpy(*rpy)), yaw @ pitch @ roll, atol=1e-14)
 
 
 @given(quaternions)
 def test_rpy_and_matrix_of_a_quaternion_lead_back_to_the_same_turn(q) -> None:
-    again = se3.quaternion_of_rpy(*se3.rpy_of_quaternion(q))
+    again = se3.quaternion_from_rpy(*se3.rpy_from_quaternion(q))
     np.testing.assert_allclose(matrix_of(again), matrix_of(q), atol=1e-11)
-    again = se3.quaternion_of_matrix(matrix_of(q))
+    again = se3.quaternion_from_matrix(matrix_of(q))
     np.testing.assert_allclose(matrix_of(again), matrix_of(q), atol=1e-14)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_at_a_pitch_of_a_right_angle_all_of_the_turn_is_yaw(sign: float) -> None:
-    q = se3.quaternion_of_rpy(0.25, sign * math.pi / 2, 0.5)
-    roll, pitch, yaw = se3.rpy_of_quaternion(q)
+    q = se3.quaternion_from_rpy(0.25, sign * math.pi / 2, 0.5)
+    roll, pitch, yaw = se3.rpy_from_quaternion(q)
     assert roll == 0.0
     assert pitch == pytest.approx(sign * math.pi / 2)
     assert yaw == pytest.approx(0.5 - sign * 0.25)
@@ -77,7 +77,7 @@ def test_at_a_pitch_of_a_right_angle_all_of_the_turn_is_yaw(sign: float) -> None
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0.0, -0.8)])
 def test_the_matrix_of_half_a_turn_gives_its_axis(axis) -> None:
-    q = se3.quaternion_of_matrix(2.0 * np.outer(axis, axis) - np.eye(3))
+    q = se3.quaternion_from_matrix(2.0 * np.outer(axis, axis) - np.eye(3))
     assert abs(np.dot(q[:3], axis)) == pytest.approx(1.0, abs=1e-15)
 
 
@@ -85,17 +85,19 @@ def test_the_matrix_of_half_a_turn_gives_its_axis(axis) -> None:
 def test_a_turn_and_its_rotation_vector_undo_each_other(vector) -> None:
     if np.linalg.norm(vector) >= math.pi:
         vector = tuple(0.3 * np.array(vector))
-    again = se3.rotation_vector(se3.turn(vector, se3.SCALARS), se3.SCALARS)
+    again = se3.rotation_vector(se3.quaternion_exp(vector, se3.SCALARS), se3.SCALARS)
     np.testing.assert_allclose(again, vector, atol=1e-14)
 
 
 @given(st.floats(0.0, 3.1), ratios, vectors)
 def test_slerp_turns_at_a_constant_rate_about_one_axis(angle, ratio, translation) -> None:
     first = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    second = (*translation, *se3.turn((0.0, angle, 0.0), se3.SCALARS))
+    second = (*translation, *se3.quaternion_exp((0.0, angle, 0.0), se3.SCALARS))
     between = se3.interpolate(first, second, ratio, se3.SCALARS)
     np.testing.assert_allclose(between[:3], np.multiply(ratio, translation), atol=1e-14)
-    np.testing.assert_allclose(between[3:], se3.turn((0.0, ratio * angle, 0.0), se3.SCALARS), atol=1e-14)
+    np.testing.assert_allclose(
+        between[3:], se3.quaternion_exp((0.0, ratio * angle, 0.0), se3.SCALARS), atol=1e-14
+    )
 
 
 @given(st.floats(-16.0, -6.0))
@@ -124,8 +126,8 @@ def test_at_exactly_half_a_turn_the_quaternion_is_taken_as_given() -> None:
 @given(st.lists(st.tuples(poses, poses, ratios), min_size=1, max_size=8))
 def test_arrays_and_floats_give_the_same_numbers(cases) -> None:
     firsts, seconds, many = (np.array(column) for column in zip(*cases, strict=True))
-    together = se3.interpolate(se3.columns(firsts), se3.columns(seconds), many, se3.ARRAYS)
-    together = se3.normalize(se3.compose(together, se3.invert(se3.columns(seconds))), se3.ARRAYS)
+    together = se3.interpolate(se3.unstack(firsts), se3.unstack(seconds), many, se3.ARRAYS)
+    together = se3.normalize(se3.compose(together, se3.invert(se3.unstack(seconds))), se3.ARRAYS)
     for row, (first, second, ratio) in zip(np.stack(together, axis=-1), cases, strict=True):
         alone = se3.compose(se3.interpolate(first, second, ratio, se3.SCALARS), se3.invert(second))
         np.testing.assert_allclose(row, se3.normalize(alone, se3.SCALARS), atol=1e-13)

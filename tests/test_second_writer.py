@@ -13,17 +13,17 @@ from support import a_free_port, until
 
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.ingest.events import WriterEvent
-from zstate.net.presence import announce, tokens_now
+from zstate.net.presence import announce, current_tokens
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource
 from zstate.transform import Transform
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream, stream_key, writer_key
 from zstate.wire.messages import JointState, RobotDescription, order_digest
 from zstate.wire.native import ENCODINGS, encode
-from zstate.wire.writer import Writer
 
 WRITER = """
     import sys
@@ -56,7 +56,7 @@ RIVAL = """
 
 
 def writers_seen(session: Session) -> int:
-    return len(tokens_now(session, "zstate/r1/@writer/joint_states/*", 1.0))
+    return len(current_tokens(session, "zstate/r1/@writer/joint_states/*", 1.0))
 
 
 def edge(child: str) -> Transform:
@@ -139,14 +139,14 @@ def test_of_two_on_networks_that_are_joined_later_the_later_one_ends(later_publi
 def test_a_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_publishes(
     sessions, monkeypatch: pytest.MonkeyPatch, stream
 ):
-    monkeypatch.setattr("zstate.net.claims._AT_ONCE_S", 0.0)
+    monkeypatch.setattr("zstate.net.ownership._AT_ONCE_S", 0.0)
     ours, theirs = sessions
-    stranger = Writer("stranger", "laptop", 9, 1, 99)
+    stranger = WriterId("stranger", "laptop", 9, 1, 99)
     with StatePublisher(ours, RRBOT, "r1") as publisher:
         for _ in range(2):
             publisher.publish([0.0, 0.0])
         with announce(theirs, writer_key("r1", stream, stranger.identity)):
-            until(lambda: len(tokens_now(ours, f"zstate/r1/@writer/{stream}/*", 1.0)) == 2)
+            until(lambda: len(current_tokens(ours, f"zstate/r1/@writer/{stream}/*", 1.0)) == 2)
             looked_until = time.monotonic() + 0.3
             while time.monotonic() < looked_until:
                 publisher.publish([0.0, 0.0])
@@ -170,7 +170,7 @@ def test_parts_of_a_robot_may_have_a_writer_each(sessions):
         StatePublisher(sessions[1], RRBOT, "r2"),
     ):
         for session in sessions:
-            until(lambda s=session: len(tokens_now(s, "zstate/*/@writer/*/*", 1.0)) == 9)
+            until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/*/*", 1.0)) == 9)
         for publisher in (joints, rest):
             publisher.publish([0.0, 0.0])
         with pytest.raises(SecondWriter) as raised:
@@ -255,7 +255,7 @@ def test_readers_are_told_of_an_edge_that_two_place_with_takeover(sessions):
 
 def test_two_static_writers_of_one_name_are_one_too_many(sessions):
     with StaticPublisher(sessions[0], "r1", "mount"):
-        until(lambda: tokens_now(sessions[1], "zstate/r1/@writer/tf_static/*", 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/r1/@writer/tf_static/*", 1.0))
         with pytest.raises(SecondWriter, match="under the name 'mount'"):
             StaticPublisher(sessions[1], "r1", "mount")
         StaticPublisher(sessions[1], "r2", "mount").close()

@@ -11,7 +11,7 @@ from live import await_reader
 from support import until
 
 from zstate.errors import Closed, NoClock
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.clock import ClockPublisher, SimulatedClock
 from zstate.nodes.listener import TransformListener

@@ -8,7 +8,7 @@ import pytest
 
 from zstate.nodes.publisher_status import Health, PublisherStats, StatusReporter, assess_health
 from zstate.rate import RateReport
-from zstate.wire.writer import Writer
+from zstate.wire.identity import WriterId
 
 SECOND = 1_000_000_000
 OK = Health("ok")
@@ -79,7 +79,7 @@ def test_samples_that_cannot_be_published_are_a_warning_and_an_error_when_there_
 
 def test_a_status_tells_who_how_much_and_what_is_commanded():
     read = [counts(), counts(7, rate_hz=50.0, late=2)]
-    reporter = StatusReporter(Writer("driver", "nuc", 412, 5, 9), lambda: read.pop(0))
+    reporter = StatusReporter(WriterId("driver", "nuc", 412, 5, 9), lambda: read.pop(0))
     status = reporter.status()
     assert (status.program, status.host, status.pid, status.session) == ("driver", "nuc", 412, 9)
     assert (status.sent, status.late) == (7, 2)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from zstate.clock import ManualClock
 from zstate.errors import FrameMismatch, InvalidInput
-from zstate.transform import Transform, Twist, worst_kind
+from zstate.transform import Transform, Twist, combine_kinds
 
 NAN, INF = math.nan, math.inf
 TURN = (0.5, -0.5, 0.5, 0.5)
@@ -141,9 +141,9 @@ def test_a_product_has_the_stamp_that_both_share_or_the_only_one() -> None:
 
 
 def test_a_product_is_of_the_less_certain_kind() -> None:
-    assert worst_kind("static", "exact") == "exact"
-    assert worst_kind("exact", "interpolated") == "interpolated"
-    assert worst_kind("predicted", "interpolated", "static") == "predicted"
+    assert combine_kinds("static", "exact") == "exact"
+    assert combine_kinds("exact", "interpolated") == "interpolated"
+    assert combine_kinds("predicted", "interpolated", "static") == "predicted"
     exact = Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 5)
     predicted = Transform("b", "c", (0, 0, 0), (0, 0, 0, 1), 5, kind="predicted")
     assert (exact @ predicted).kind == "predicted"

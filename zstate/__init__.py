@@ -35,8 +35,8 @@ if TYPE_CHECKING:
         ZStateError,
     )
     from zstate.extension import kernel
-    from zstate.model.catalog import load_model
     from zstate.model.kinematics import Kinematics
+    from zstate.model.load import load_model
     from zstate.model.robot import RobotModel
     from zstate.net.presence import discover
     from zstate.net.session import connect
@@ -103,7 +103,7 @@ _HOMES = {
     "connect": "net.session",
     "discover": "net.presence",
     "kernel": "extension",
-    "load_model": "model.catalog",
+    "load_model": "model.load",
 }
 
 

@@ -71,7 +71,7 @@ class SystemClock:
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
         remaining_s = (stamp - time.time_ns()) * 1e-9
-        return not (wait_in_slices(stop, remaining_s) if remaining_s > 0.0 else stop.is_set())
+        return not (wait_interruptible(stop, remaining_s) if remaining_s > 0.0 else stop.is_set())
 
 
 class ManualClock:
@@ -103,7 +103,7 @@ class ManualClock:
         return not stop.is_set()
 
 
-def wait_in_slices(event: threading.Event, timeout_s: float | None = None) -> bool:
+def wait_interruptible(event: threading.Event, timeout_s: float | None = None) -> bool:
     """``event.wait(timeout_s)`` that Ctrl-C ends within half a second, whenever it comes."""
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
     while True:
@@ -141,7 +141,7 @@ def check_stamps(stamps: ArrayLike) -> NDArray[np.int64]:
     except (TypeError, ValueError) as error:
         raise InvalidInput(f"stamps are a flat array of integer nanoseconds: {error}") from None
     if array.dtype.kind == "M":
-        return _stamps_of_dates(array)
+        return _stamps_from_dates(array)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu") or is_masked(stamps):
         raise InvalidInput(
             f"stamps are a flat array of integer nanoseconds, or of datetime64[ns]; got shape {array.shape} "
@@ -152,7 +152,7 @@ def check_stamps(stamps: ArrayLike) -> NDArray[np.int64]:
     return array.astype(np.int64)
 
 
-def _stamps_of_dates(dates: NDArray[np.datetime64]) -> NDArray[np.int64]:
+def _stamps_from_dates(dates: NDArray[np.datetime64]) -> NDArray[np.int64]:
     unit, _ = np.datetime_data(dates.dtype)
     if dates.ndim != 1 or dates.dtype != np.dtype("datetime64[ns]"):
         raise InvalidInput(
@@ -164,7 +164,7 @@ def _stamps_of_dates(dates: NDArray[np.datetime64]) -> NDArray[np.int64]:
     return dates.astype(np.int64)
 
 
-def stamp_text(stamp: int) -> str:
+def format_stamp(stamp: int) -> str:
     """A stamp as seconds with all nine digits."""
     seconds, nanoseconds = divmod(abs(stamp), 1_000_000_000)
     return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"

@@ -29,7 +29,7 @@ class Kernel(str):
         return kernel
 
 
-def choose(wish: str) -> Kernel:
+def select_kernel(wish: str) -> Kernel:
     """The kernel for what the environment wishes; raises InvalidInput where that cannot be."""
     if wish not in ("", "c", "reference"):
         raise InvalidInput(f"{VARIABLE} is 'c', 'reference' or not set; got {wish!r}")
@@ -54,4 +54,4 @@ def _problem() -> str:
     return ""
 
 
-kernel = choose(os.environ.get(VARIABLE, ""))
+kernel = select_kernel(os.environ.get(VARIABLE, ""))

@@ -27,7 +27,7 @@ IDENTITY: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Functions:
+class Backend:
     """What arithmetic alone cannot do. ``select(condition, a, b)`` evaluates both a and b."""
 
     sin: Any
@@ -50,8 +50,8 @@ def _cos(angle: float) -> float:
 
 
 # ``math`` raises ValueError for infinite angles, where numpy and C answer NaN.
-SCALARS = Functions(_sin, _cos, math.sqrt, math.atan2, _select)
-ARRAYS = Functions(np.sin, np.cos, np.sqrt, np.arctan2, np.where)
+SCALARS = Backend(_sin, _cos, math.sqrt, math.atan2, _select)
+ARRAYS = Backend(np.sin, np.cos, np.sqrt, np.arctan2, np.where)
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -103,14 +103,14 @@ def invert(a_from_b: Pose) -> Pose:
     return (-x, -y, -z, *q)
 
 
-def normalize(pose: Pose, f: Functions) -> Pose:
+def normalize(pose: Pose, f: Backend) -> Pose:
     """The same pose with a quaternion of length one."""
     x, y, z, qx, qy, qz, qw = pose
     scale = 1.0 / f.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     return (x, y, z, qx * scale, qy * scale, qz * scale, qw * scale)
 
 
-def interpolate(first: Pose, second: Pose, ratio: Component, f: Functions) -> Pose:
+def interpolate(first: Pose, second: Pose, ratio: Component, f: Backend) -> Pose:
     """The pose at ``ratio`` of the way: translation along the line, rotation by slerp the short way.
 
     Shoemake, "Animating rotation with quaternion curves" (1985). The half angle comes from the
@@ -133,7 +133,7 @@ def interpolate(first: Pose, second: Pose, ratio: Component, f: Functions) -> Po
     return (*translation, *rotation)  # type: ignore[return-value]
 
 
-def rotation_vector(q: Quaternion, f: Functions) -> Vector:
+def rotation_vector(q: Quaternion, f: Backend) -> Vector:
     """The turn q as axis times angle [rad], the short way round."""
     x, y, z, w = q
     sign = f.select(w < 0.0, -1.0, 1.0)
@@ -144,7 +144,7 @@ def rotation_vector(q: Quaternion, f: Functions) -> Vector:
     return (scale * x, scale * y, scale * z)
 
 
-def turn(vector: Vector, f: Functions) -> Quaternion:
+def quaternion_exp(vector: Vector, f: Backend) -> Quaternion:
     """The quaternion of a turn given as axis times angle [rad]."""
     x, y, z = vector
     angle = f.sqrt(x * x + y * y + z * z)
@@ -164,7 +164,7 @@ def to_matrix(pose: Sequence[float]) -> NDArray[np.float64]:
     return matrix
 
 
-def quaternion_of_matrix(rotation: NDArray[np.float64]) -> Quaternion:
+def quaternion_from_matrix(rotation: NDArray[np.float64]) -> Quaternion:
     """The unit quaternion of a (3, 3) rotation matrix.
 
     Shepperd's method: divide by the largest of the four components, so that none is ill-conditioned.
@@ -183,7 +183,7 @@ def quaternion_of_matrix(rotation: NDArray[np.float64]) -> Quaternion:
     return (x * scale, y * scale, z * scale, w * scale)
 
 
-def quaternion_of_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
+def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
     """URDF's angles: roll about x, then pitch about y, then yaw about z, all of the fixed axes."""
     about_x = (math.sin(roll / 2.0), 0.0, 0.0, math.cos(roll / 2.0))
     about_y = (0.0, math.sin(pitch / 2.0), 0.0, math.cos(pitch / 2.0))
@@ -191,7 +191,7 @@ def quaternion_of_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
     return multiply(about_z, multiply(about_y, about_x))
 
 
-def rpy_of_quaternion(q: Quaternion) -> tuple[float, float, float]:
+def rpy_from_quaternion(q: Quaternion) -> tuple[float, float, float]:
     """Roll, pitch, yaw as in URDF. At a pitch of a right angle all of the turn is given to yaw."""
     m00, m10, m20 = rotate(q, (1.0, 0.0, 0.0))
     m01, m11, m21 = rotate(q, (0.0, 1.0, 0.0))
@@ -203,7 +203,7 @@ def rpy_of_quaternion(q: Quaternion) -> tuple[float, float, float]:
     return (math.atan2(m21, m22), pitch, math.atan2(m10, m00))
 
 
-def columns(poses: ArrayLike) -> Pose:
+def unstack(poses: ArrayLike) -> Pose:
     """Poses (..., 7) as seven component arrays."""
     array = np.asarray(poses, dtype=np.float64)
     return tuple(array[..., k] for k in range(7))  # type: ignore[return-value]

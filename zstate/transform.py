@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate import se3
 from zstate.checks import check_names, real_numbers
-from zstate.clock import Clock, check_stamp, stamp_text
-from zstate.errors import FrameMismatch, InvalidInput, duration_text
+from zstate.clock import Clock, check_stamp, format_stamp
+from zstate.errors import FrameMismatch, InvalidInput, format_duration
 from zstate.extension import kernel
 
 Array: TypeAlias = NDArray[np.float64]
@@ -30,7 +30,7 @@ KINDS: tuple[Kind, ...] = ("static", "exact", "interpolated", "predicted")
 QUATERNION_TOLERANCE = 1e-3
 
 
-def worst_kind(*kinds: Kind) -> Kind:
+def combine_kinds(*kinds: Kind) -> Kind:
     """The kind of an answer that is made of parts of these kinds."""
     return KINDS[max(map(KINDS.index, kinds))]
 
@@ -166,7 +166,7 @@ class Transform(TransformFields):
             )
         if np.abs(array[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
             raise InvalidInput(f"the last row of a transform's matrix is 0 0 0 1; got {array[3].tolist()}")
-        return cls(target, source, array[:3, 3], se3.quaternion_of_matrix(rotation), stamp)
+        return cls(target, source, array[:3, 3], se3.quaternion_from_matrix(rotation), stamp)
 
     @classmethod
     def from_rpy(
@@ -186,7 +186,7 @@ class Transform(TransformFields):
                 f"rpy is three angles in radians, none beyond 2 pi; got {given}. If these are degrees, "
                 f"they are {radians} rad"
             )
-        return cls(target, source, translation, se3.quaternion_of_rpy(*angles.tolist()), stamp)
+        return cls(target, source, translation, se3.quaternion_from_rpy(*angles.tolist()), stamp)
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"a Transform is immutable; make a new one to change {name!r}")
@@ -219,7 +219,7 @@ class Transform(TransformFields):
     @property
     def rpy(self) -> Array:
         """Roll pitch yaw [rad] as in URDF: (3,)."""
-        return _frozen(se3.rpy_of_quaternion(self._pose[3:]))  # type: ignore[arg-type]
+        return _frozen(se3.rpy_from_quaternion(self._pose[3:]))  # type: ignore[arg-type]
 
     def inverse(self) -> Transform:
         """source_from_target at the same instant."""
@@ -254,7 +254,7 @@ class Transform(TransformFields):
             other.source,
             se3.normalize(pose, se3.SCALARS),
             stamps.pop() if len(stamps) == 1 else None,
-            worst_kind(self.kind, other.kind),
+            combine_kinds(self.kind, other.kind),
             max(self.predicted_s, other.predicted_s),
         )
 
@@ -321,11 +321,11 @@ class Transform(TransformFields):
         return hash((self.target, self.source, self.stamp, self._pose[:3]))
 
     def __repr__(self) -> str:
-        when = "at any time" if self.stamp is None else f"at {stamp_text(self.stamp)}"
+        when = "at any time" if self.stamp is None else f"at {format_stamp(self.stamp)}"
         # Adding zero turns -0 into 0.
         x, y, z, *rest = (round(value, 4) + 0.0 for value in self._pose)
         quaternion = ", ".join(f"{value:.4f}" for value in rest)
-        how = f"predicted {duration_text(round(self.predicted_s * 1e9))} ahead" * (self.kind == "predicted")
+        how = f"predicted {format_duration(round(self.predicted_s * 1e9))} ahead" * (self.kind == "predicted")
         return (
             f"<pose of {self.source} in {self.target} {when}: xyz [{x:.4f}, {y:.4f}, {z:.4f}] m, "
             f"quaternion xyzw [{quaternion}], {how or self.kind}>"
@@ -369,7 +369,7 @@ class Twist:
         return self.frame
 
     def __repr__(self) -> str:
-        when = "" if self.stamp is None else f" at {stamp_text(self.stamp)}"
+        when = "" if self.stamp is None else f" at {format_stamp(self.stamp)}"
         return (
             f"<twist of {self.frame} in {self.reference}{when}: linear {_vector_text(self.linear)} m/s, "
             f"angular {_vector_text(self.angular)} rad/s>"

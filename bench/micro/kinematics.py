@@ -19,8 +19,8 @@ from importlib.metadata import version
 import numpy as np
 import pinocchio as pin
 
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 
 ROBOTS = ("panda", "g1", "talos_full_v2", "tiago_dual")

@@ -22,14 +22,14 @@ from zstate import RobotModel, StatePublisher, TransformBuffer, connect, load_mo
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.net.presence import writer_here
+from zstate.model.robot import coordinate_names, velocity_columns_by_position
+from zstate.net.presence import local_writer
 from zstate.net.session import Session
-from zstate.net.wires import wire_named
 from zstate.net.writer import WireWriter
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, RobotDescription, Sample, order_digest, to_block
 from zstate.wire.protocol import EntityId, SerializedSample
-from zstate.wire.sample_names import SampleNames
+from zstate.wire.registry import get_wire
 
 JOINTS = 30
 ROUNDS = 31
@@ -71,7 +71,7 @@ def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
     """The ways to write one sample of positions and velocities; what they open, the session closes."""
     numbers, state = np.linspace(-1.0, 1.0, JOINTS), sample(model, STAMP)
     publisher = StatePublisher(session, model, "whole", (wire,), streams=["joint_states"])
-    wire_writer = WireWriter(session, wire_named(wire), "alone", writer_here(1), sample_names(model))
+    wire_writer = WireWriter(session, get_wire(wire), "alone", local_writer(1), sample_names(model))
     writer = wire_writer.open_stream("joint_states")
     payload, beside = writer.encoder.encode(state), bytes(33)
     bare = session.zenoh.declare_publisher(f"bench/{wire}")
@@ -85,10 +85,10 @@ def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
 
 def reading(wire: str, model: RobotModel) -> dict[str, Call]:
     """The ways into a message, and into a buffer, of samples that follow each other."""
-    spoken = wire_named(wire)
+    spoken = get_wire(wire)
     node, names = EntityId("1", 0), sample_names(model)
     encoder = spoken.stream_encoder(
-        "r1", writer_here(1), "joint_states", node=node, number=1, sample_names=names
+        "r1", local_writer(1), "joint_states", node=node, number=1, sample_names=names
     )
     stamps = count(STAMP, 10_000_000)
 
@@ -114,9 +114,9 @@ def reading(wire: str, model: RobotModel) -> dict[str, Call]:
     }
 
 
-def sample_names(model: RobotModel) -> SampleNames:
+def sample_names(model: RobotModel) -> SampleLayout:
     """What the numbers are called."""
-    return SampleNames(coordinate_names(model), velocity_slots(model))
+    return SampleLayout(coordinate_names(model), velocity_columns_by_position(model))
 
 
 def sample(model: RobotModel, stamp: int) -> JointState:

@@ -25,14 +25,14 @@ def _load() -> Roles:
 
 def _connect(job: Job, role: str) -> Session:
     from zstate import connect  # noqa: PLC0415 - as above
-    from zstate.net.security import Credentials  # noqa: PLC0415
+    from zstate.net.security.credentials import Credentials  # noqa: PLC0415
 
     credentials = Credentials.from_folder(job.folder, role)
     return connect(mode="client", endpoints=f"tls/127.0.0.1:{job.ports[0]}", credentials=credentials)
 
 
 def _services(job: Job) -> Sequence[Service]:
-    from zstate.net.certificates import issue_identities  # noqa: PLC0415 - as above
+    from zstate.net.security.certificates import issue_identities  # noqa: PLC0415 - as above
 
     issue_identities(job.folder, ("router", "writer", "reader"))
     return (router(job, "--certs", job.folder, "--identity", "router", protocol="tls"),)

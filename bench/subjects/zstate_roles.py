@@ -12,7 +12,7 @@ import numpy as np
 from bench.job import Job
 from bench.subjects.subject import Answered, Roles
 from zstate import StatePublisher, Transform, TransformListener, load_model
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 from zstate.errors import LookupFailed
 from zstate.net.session import Session
 
@@ -25,7 +25,7 @@ def roles(connect: Connect, wire: str = "native") -> Roles:
     return partial(Writer, connect, wire), partial(Reader, connect, wire)
 
 
-class Writer(Closing):
+class Writer(Closeable):
     """A ``StatePublisher`` that is given positions and a stamp."""
 
     def __init__(self, connect: Connect, wire: str, job: Job) -> None:
@@ -43,7 +43,7 @@ class Writer(Closing):
         self._session.close()
 
 
-class Reader(Closing):
+class Reader(Closeable):
     """A ``TransformListener``; its buffer's ``watch`` wakes it, and it asks for that stamp.
 
     The watch already hands over the answer; the lookup is made nevertheless, as by everybody else.

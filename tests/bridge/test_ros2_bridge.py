@@ -13,19 +13,19 @@ import pytest
 from live import RRBOT, STAMP, UPRIGHT
 from support import a_free_port, until
 
-from zstate.bridge import Bridge
+from zstate.bridges.ros2 import Bridge
 from zstate.errors import InvalidInput
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamSubscriber
-from zstate.net.wires import wire_named
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.sources import SineSource, SubscribedSource
 from zstate.transform import Transform
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 
 GRIPPER = load_model("gripper")
 EACH = "ros2:namespace=*"
@@ -94,7 +94,7 @@ class Ear:
 
     def __init__(self, session: Session, robot: str, wire: str) -> None:
         self.stamps: Counter[int] = Counter()
-        self._robot, self._wire = robot, wire_named(wire)
+        self._robot, self._wire = robot, get_wire(wire)
         self._subscriber = StreamSubscriber(session, self._wire.expression(robot, "joint_states"), self._take)
 
     def _take(self, arrivals: list[SerializedSample]) -> None:

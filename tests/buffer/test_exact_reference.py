@@ -13,7 +13,7 @@ from worlds import EVERY_JOINT, NOW, S
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.model.robot import Joint
 from zstate.transform import Transform
 

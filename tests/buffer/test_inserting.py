@@ -11,7 +11,7 @@ from worlds import EVERY_JOINT, MS, NOW, S, every_joint, failure, filled, moving
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InFuture, InPast, InsertRefused, InvalidInput, NoData, UnknownFrame
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.transform import Transform
 
 TURN = (0.0, 0.0, 0.0, 1.0)

@@ -11,8 +11,8 @@ from worlds import EVERY_JOINT, NOW, S, every_joint, failure, pose_of_every
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InvalidInput, NoData
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 
 PI = math.pi
 

@@ -20,9 +20,9 @@ from zstate.buffer.path import CompiledPath, TransformPath
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
 from zstate.extension import kernel
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.nodes.robot_encoder import block_of
-from zstate.se3 import ARRAYS, columns, conjugate, multiply, quaternion_of_rpy
+from zstate.se3 import ARRAYS, conjugate, multiply, quaternion_from_rpy, unstack
 from zstate.transform import Transform
 from zstate.wire.messages import to_block
 
@@ -115,7 +115,7 @@ def assert_same_poses(ours: np.ndarray, theirs: np.ndarray) -> None:
     np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs))
     scale = max(1.0, np.nanmax(np.abs(theirs[:, :3]), initial=0.0))
     np.testing.assert_allclose(ours[:, :3], theirs[:, :3], rtol=0.0, atol=1e-14 * scale)
-    turn = multiply(conjugate(columns(ours)[3:]), columns(theirs)[3:])
+    turn = multiply(conjugate(unstack(ours)[3:]), unstack(theirs)[3:])
     assert np.all(np.isnan(turn[3]) | (ARRAYS.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2) < 1e-14))
 
 
@@ -137,7 +137,7 @@ def a_robot(samples: list[list[float]]) -> tuple[TransformBuffer, JointTrack]:
         q[free + 3 : free + 7] = turn / length if length > 1e-3 else (0.0, 0.0, 0.0, 1.0)
         buffer.insert_joints(track, NOW + second * S, q)
         at = NOW + second * S + S // 3
-        buffer.insert(Transform("hall", "root", q[:3], quaternion_of_rpy(*q[:3]), at))
+        buffer.insert(Transform("hall", "root", q[:3], quaternion_from_rpy(*q[:3]), at))
     return buffer, track
 
 

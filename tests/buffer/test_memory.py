@@ -11,7 +11,7 @@ from worlds import MS, NOW, S, moving
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 
 MEGABYTE = 1_000_000
 LIMIT = 8 * MEGABYTE

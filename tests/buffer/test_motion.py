@@ -20,7 +20,7 @@ SPIN = (0.1, 0.4, -0.3)
 
 def positions_at(track: JointTrack, t: float) -> np.ndarray:
     """A smooth motion of every joint; the floating joint turns about a fixed axis."""
-    turned = se3.turn(tuple(t * w for w in SPIN), se3.SCALARS)
+    turned = se3.quaternion_exp(tuple(t * w for w in SPIN), se3.SCALARS)
     return pose_of_every(
         track,
         free=(*(t * v for v in FREE), *turned),

@@ -22,7 +22,7 @@ from zstate.errors import (
     NoData,
     UnknownFrame,
 )
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.transform import Transform
 
 

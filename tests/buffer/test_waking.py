@@ -21,7 +21,7 @@ from zstate.buffer.path import compile_path
 from zstate.buffer.tracks import JointTrack
 from zstate.buffer.waiting import WakeCondition
 from zstate.errors import InsertRefused, UnknownFrame
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.transform import Transform
 
 RRBOT = load_model("rrbot")

@@ -7,8 +7,8 @@ import pytest
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
-from zstate.model.catalog import load_model
-from zstate.se3 import quaternion_of_rpy
+from zstate.model.load import load_model
+from zstate.se3 import quaternion_from_rpy
 from zstate.transform import Transform
 
 MS = 1_000_000
@@ -19,7 +19,7 @@ NOW = 1_790_000_000_123_456_789
 
 def turned(yaw: float) -> tuple[float, float, float, float]:
     """The quaternion of a yaw, which may be any number of turns."""
-    return quaternion_of_rpy(0.0, 0.0, yaw)
+    return quaternion_from_rpy(0.0, 0.0, yaw)
 
 
 def moving(parent: str, child: str, stamp: int, x: float = 0.0, yaw: float = 0.0) -> Transform:

@@ -9,7 +9,7 @@ import pytest
 from looking import RRBOT, Spawn, failure, started, zstate
 
 from zstate import connect
-from zstate.net.security import Credentials
+from zstate.net.security.credentials import Credentials
 from zstate.net.streams import StreamSubscriber
 from zstate.wire.protocol import SerializedSample
 

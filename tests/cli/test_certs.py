@@ -10,7 +10,7 @@ from support import a_free_port
 
 from zstate import connect
 from zstate.errors import AccessDenied
-from zstate.net.security import Credentials
+from zstate.net.security.credentials import Credentials
 
 pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
 pytestmark = pytest.mark.processes

@@ -49,8 +49,8 @@ def test_it_shows_transforms_and_ends_with_a_summary():
 
 def test_without_panda_it_shows_a_robot_of_our_own_and_says_how_to_get_more():
     code = (
-        "from zstate.model import known\n"
-        "known._COLLECTIONS.pop('example-robot-data')\n"
+        "from zstate.model import catalog\n"
+        "catalog._COLLECTIONS.pop('example-robot-data')\n"
         "from zstate.cli.main import main; main()"
     )
     command = [sys.executable, "-c", code, "demo", "--seconds", "0.5"]

@@ -11,18 +11,18 @@ from looking import RRBOT, zstate
 from support import again_and_again
 
 from zstate import StatePublisher, connect, load_model
-from zstate.cli.logs import without_controls
+from zstate.cli.output.logs import without_controls
 from zstate.net.latched import LatchedPublisher
 from zstate.net.presence import announce
 from zstate.net.streams import StreamPublisher
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import reader_key, status_key, stream_key, writer_key
 from zstate.wire.messages import StaticTransforms, Status, to_block
 from zstate.wire.native import ENCODINGS, encode
-from zstate.wire.writer import Announced, Writer
 
 FAKE = "\x1b]0;owned\x07\x1b[2J\x9b31m\nok       robots        all is well\u202e"
 
-EVIL = Writer(f"driver{FAKE}", f"host{FAKE}", 1, 5, 77)
+EVIL = WriterId(f"driver{FAKE}", f"host{FAKE}", 1, 5, 77)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def stranger() -> Iterator[None]:
         session = opened.enter_context(connect())
         publisher = opened.enter_context(StatePublisher(session, load_model(RRBOT), robot="rrbot"))
         publisher.publish([0.0, 0.0])
-        statics = Announced("rrbot", "tf_static", EVIL, f"mount{FAKE}")
+        statics = Announcement("rrbot", "tf_static", EVIL, f"mount{FAKE}")
         for token in (
             writer_key("rrbot", "joint_commands", EVIL.identity),
             writer_key("rrbot", "tf_static", statics.identity),

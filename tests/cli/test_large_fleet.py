@@ -13,7 +13,7 @@ from looking import RRBOT, Spawn, started, zstate
 from support import again_and_again
 
 from zstate import StatePublisher, connect, load_model
-from zstate.net.presence import writer_here
+from zstate.net.presence import local_writer
 from zstate.wire.keys import reader_key, writer_key
 
 ROBOTS = 300
@@ -25,7 +25,7 @@ def fleet() -> Iterator[None]:
     with ExitStack() as opened:
         session = opened.enter_context(connect())
         for number in range(ROBOTS):
-            identity = writer_here(number, "driver").identity
+            identity = local_writer(number, "driver").identity
             for token in (
                 writer_key(f"r{number}", "joint_states", identity),
                 reader_key(f"r{number}", "joint_states", identity),

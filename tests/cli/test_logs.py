@@ -18,7 +18,7 @@ from support import DEADLINE_S, until
 
 from zstate import connect
 from zstate.cli.commands import joints
-from zstate.cli.logs import text_in
+from zstate.cli.output.logs import text_in
 from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import JointState
 from zstate.wire.native import ENCODINGS
@@ -97,7 +97,7 @@ def test_a_warning_of_the_library_tells_its_event_and_reason(spawn: Spawn):
 def test_what_a_thread_ends_with_is_a_json_line_too(spawn: Spawn):
     child = spawn(
         "import threading\n"
-        "from zstate.cli.logs import use_format\n"
+        "from zstate.cli.output.logs import use_format\n"
         "use_format('json')\n"
         "threading.Thread(target=lambda: 1 / 0).start()"
     )
@@ -127,7 +127,7 @@ LIVE = """
     from rich.live import Live
     from rich.text import Text
     from zstate.cli.output.console import print_status
-    from zstate.cli.logs import warn_on_standard_error
+    from zstate.cli.output.logs import warn_on_standard_error
     warn_on_standard_error()
     with Live(Text("live"), auto_refresh=False) as live:
         live.update(Text("12 messages"), refresh=True)

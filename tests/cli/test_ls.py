@@ -12,8 +12,8 @@ from zstate import StaticPublisher, connect
 from zstate.cli.output.robot_table import robots_text
 from zstate.net.presence import RobotInfo
 from zstate.net.topic_statistics import TopicStatistics
-from zstate.net.wires import wire_named
-from zstate.wire.writer import Writer
+from zstate.wire.identity import WriterId
+from zstate.wire.registry import get_wire
 
 pytestmark = pytest.mark.processes
 
@@ -86,9 +86,9 @@ def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
 
 
 def test_a_narrow_terminal_has_less_of_when_and_of_age():
-    writer = Writer("driver", "jetson", 412, 0, 7)
+    writer = WriterId("driver", "jetson", 412, 0, 7)
     robots = (RobotInfo("arm", (("joint_states", writer),)),)
-    with connect() as session, TopicStatistics(session, wire_named("native")) as statistics:
+    with connect() as session, TopicStatistics(session, get_wire("native")) as statistics:
         wide = robots_text(robots, statistics).splitlines()[1]
         headings, robot, narrow = robots_text(robots, statistics, width=55).splitlines()
         narrowest = robots_text(robots, statistics, width=40).splitlines()[1]

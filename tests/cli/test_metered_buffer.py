@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from zstate.cli.metered_buffer import MeteredBuffer
 from zstate.clock import ManualClock
+from zstate.metrics.buffer import MeteredBuffer
 
 SECOND = 1_000_000_000
 NOW = 1_789_000_000 * SECOND

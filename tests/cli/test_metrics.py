@@ -116,7 +116,7 @@ def test_without_the_library_a_command_says_what_to_install(spawn: Spawn):
 def test_commands_without_it_load_no_library():
     code = (
         "import sys\n"
-        "import zstate.cli.commands.monitor, zstate.cli.commands.publish, zstate.cli.metered_buffer\n"
+        "import zstate.cli.commands.monitor, zstate.cli.commands.publish, zstate.metrics.buffer\n"
         "print('prometheus_client' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"False\n"

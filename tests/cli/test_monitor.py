@@ -9,10 +9,7 @@ from support import until
 
 from zstate import StaticPublisher, Transform, connect, load_model
 from zstate.buffer.frame_tree import FrameInfo
-from zstate.cli.monitor.meter import EdgeMeasure, EdgeStatistics
-from zstate.cli.monitor.overview import overview_text
-from zstate.cli.monitor.path import path_between
-from zstate.cli.monitor.report import Row, report_text
+from zstate.cli.monitor import EdgeMeasure, EdgeStatistics, Row, overview_text, path_between, report_text
 from zstate.clock import ClockOffset, ManualClock
 from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import JointState, order_digest, to_block

@@ -12,7 +12,7 @@ from tales import MS, START, Tale, swing
 
 from zstate import NoData, StatePublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.errors import Unreachable
-from zstate.net.service import ask_lookup
+from zstate.net.queryable import query_lookup
 
 pytestmark = pytest.mark.processes
 
@@ -88,7 +88,7 @@ def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, sour
 
     def is_told_what_was_heard() -> bool:
         try:
-            answers.append(ask_lookup(session, "rrbot", "world", "tool"))
+            answers.append(query_lookup(session, "rrbot", "world", "tool"))
         except (NoData, Unreachable):  # nobody of that name is known yet, or nothing was said
             return False
         return listener.buffer.can_lookup("world", "tool", answers[-1].stamp)

@@ -12,7 +12,7 @@ import pytest
 from looking import RRBOT, standing, zstate
 
 from zstate.cli.doctor.diagnosis import effective_network, with_same_options
-from zstate.cli.network import Network
+from zstate.cli.session import SessionOptions
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import Stream
 
@@ -124,19 +124,21 @@ def test_where_no_node_publishes_it_says_in_which_domain(ros_router: str):
 
 def test_a_ros_wire_joins_the_router_of_the_host_where_nothing_is_said(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZENOH_CONFIG", raising=False)
-    assert effective_network(Network(), "ros2") == Network("client", (ROUTER_ENDPOINT,))
-    assert effective_network(Network(), "native") == Network()
-    assert effective_network(Network("lan"), "ros2") == Network("lan")
+    assert effective_network(SessionOptions(), "ros2") == SessionOptions("client", (ROUTER_ENDPOINT,))
+    assert effective_network(SessionOptions(), "native") == SessionOptions()
+    assert effective_network(SessionOptions("lan"), "ros2") == SessionOptions("lan")
 
 
 def test_the_next_command_looks_where_doctor_has_looked():
-    network = Network(connect=("tcp/a:1", "tcp/b:2"))
+    network = SessionOptions(connect=("tcp/a:1", "tcp/b:2"))
     both = "--connect tcp/a:1 --connect tcp/b:2"
     assert (
         with_same_options("zstate hz r1  # how often?", network, "native")
         == f"zstate hz r1 {both}  # how often?"
     )
-    assert with_same_options("zstate ls", Network(), "ros2:domain=5") == "zstate ls --wire ros2:domain=5"
+    assert (
+        with_same_options("zstate ls", SessionOptions(), "ros2:domain=5") == "zstate ls --wire ros2:domain=5"
+    )
     for whole in ("zstate check FILE", "ps -p 7", "zstate ls --wire ros2 --connect tcp/c:3"):
         assert with_same_options(whole, network, "ros2") == whole
 

@@ -9,11 +9,11 @@ from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, star
 from support import until
 
 from zstate import StaticPublisher, Transform, connect
+from zstate.wire.identity import WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.protocol import EntityId
 from zstate.wire.ros2.wire import Ros2Wire
-from zstate.wire.sample_names import SampleNames
-from zstate.wire.writer import Writer
 
 pytestmark = pytest.mark.processes
 
@@ -96,9 +96,9 @@ def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router
     )
     wire = Ros2Wire()
     with connect(mode="client", endpoints=ros_router) as session:
-        writer, node = Writer("driver", "", 0, 0, 1), EntityId(session.zid, 0)
+        writer, node = WriterId("driver", "", 0, 0, 1), EntityId(session.zid, 0)
         encoder = wire.stream_encoder(
-            "r", writer, "joint_states", node=node, number=1, sample_names=SampleNames()
+            "r", writer, "joint_states", node=node, number=1, sample_names=SampleLayout()
         )
         await_reader(session, encoder.key)
         session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))

@@ -11,7 +11,7 @@ from looking import RRBOT, Spawn, failure, interrupted, started, zstate
 from support import until
 
 from zstate import TransformListener, connect
-from zstate.net.security import Credentials
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session
 
 pytestmark = pytest.mark.processes

@@ -8,7 +8,7 @@ from looking import ELBOW, RRBOT, SHOULDER, Spawn, failure, interrupted, standin
 from support import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect, discover, load_model
-from zstate.cli.network import Network
+from zstate.cli.session import SessionOptions
 from zstate.cli.snapshot import (
     Configuration,
     RobotSnapshot,
@@ -92,25 +92,25 @@ def test_a_robot_stands_again_as_it_stood(spawn: Spawn, tmp_path: Path, suffix: 
 @pytest.mark.parametrize(
     ("saved", "options", "network"),
     [
-        (HERE, "", Network()),
-        (Configuration("1", "h", "peer", "ros2"), "--wire ros2", Network()),
+        (HERE, "", SessionOptions()),
+        (Configuration("1", "h", "peer", "ros2"), "--wire ros2", SessionOptions()),
         (
             Configuration("1", "h", "client", connect=("tcp/a:1",)),
             "--mode client --connect tcp/a:1",
-            Network("client", ("tcp/a:1",)),
+            SessionOptions("client", ("tcp/a:1",)),
         ),
         (
             Configuration("1", "h", "peer", "native", ("tcp/a:1",), ("tcp/b:1",), "my file"),
             "--mode peer --connect tcp/a:1 --listen tcp/b:1 --config 'my file'",
-            Network("peer", ("tcp/a:1",), ("tcp/b:1",), "my file"),
+            SessionOptions("peer", ("tcp/a:1",), ("tcp/b:1",), "my file"),
         ),
     ],
 )
-def test_who_saved_it_can_be_followed_onto_the_network(saved, options: str, network: Network):
+def test_who_saved_it_can_be_followed_onto_the_network(saved, options: str, network: SessionOptions):
     assert saved.options() == options
     assert saved.is_default == (not options)
-    assert saved.network(Network()) == network
-    elsewhere = saved.network(Network(connect=("tcp/c:1",)))
+    assert saved.network(SessionOptions()) == network
+    elsewhere = saved.network(SessionOptions(connect=("tcp/c:1",)))
     assert (elsewhere.connect, elsewhere.listen) == (("tcp/c:1",), network.listen)
 
 

@@ -9,30 +9,30 @@ import pytest
 from zstate import Transform, TransformBuffer, connect
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.samples import StreamSamples
-from zstate.cli.metered_buffer import MeteredBuffer
-from zstate.cli.monitor.meter import EdgeStatistics
-from zstate.cli.monitor.report import Row, report_text
-from zstate.cli.output.drawing import ALARM, svg
+from zstate.cli.monitor import EdgeStatistics, Row, report_text
+from zstate.cli.output.drawing import ALARM, draw
+from zstate.cli.output.frames import tree_drawing
 from zstate.cli.output.robot_table import robots_text
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
+from zstate.metrics.buffer import MeteredBuffer
 from zstate.net.presence import RobotInfo
 from zstate.net.topic_statistics import Received, TopicStatistics
-from zstate.net.wires import wire_named
+from zstate.wire.identity import WriterId
 from zstate.wire.messages import JointState, order_digest
-from zstate.wire.writer import Writer
+from zstate.wire.registry import get_wire
 
 # Times between arrivals [s], as recorded over Wi-Fi: jitter, one loss, one pause.
 INTERVALS_50_HZ = [0.020, 0.019, 0.023, 0.018, 0.041, 0.020, 0.016, 0.022, 0.021, 0.085, 0.002, 0.001] * 8
 INTERVALS_2_HZ = [0.50, 0.49, 0.53, 0.47, 0.52, 0.50, 0.48]
 SESSION = 7
-WRITER = Writer("driver", "jetson", 412, 0, SESSION)
+WRITER = WriterId("driver", "jetson", 412, 0, SESSION)
 
 
 def answers(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
     """Which consumers call the writer stale now, whose samples arrived then [ns, monotonic]."""
     now_s = time.monotonic_ns() * 1e-9
-    native, order = wire_named("native"), order_digest(())
+    native, order = get_wire("native"), order_digest(())
     edge = FrameInfo("r1/tool", "r1/base", "joint", str(WRITER), None, None, None, 0)
     found: dict[str, bool] = {}
     with (
@@ -61,7 +61,7 @@ def answers(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
         found["doctor, ROS"] = examined.writers[SESSION].statistics.is_stale()
         found["tf"] = answered.is_missed(now_s)
         found["view"] = is_stale(now_s - arrivals[-1] * 1e-9, tool.rate_hz)
-        found["tree"] = ALARM in svg(buffer.frames(), time.time_ns(), in_full=True, title="")
+        found["tree"] = ALARM in draw(tree_drawing(buffer.frames(), time.time_ns(), in_full=True), "svg", "")
     return found
 
 

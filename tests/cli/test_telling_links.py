@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 from zstate import load_model
-from zstate.cli.telling_links import telling_links
+from zstate.model.representative_links import representative_links
 
 
 def test_the_links_shown_are_ends_of_branches_and_links_on_the_way():
     # Both wheels turn on the base; the camera and the laser are fixed on the lower link.
-    assert telling_links(load_model("diffbot")) == ("left_wheel", "right_wheel")
-    assert telling_links(load_model("rrbot")) == ("lower", "upper")
+    assert representative_links(load_model("diffbot")) == ("left_wheel", "right_wheel")
+    assert representative_links(load_model("rrbot")) == ("lower", "upper")
 
 
 def test_a_robot_without_joints_has_nothing_to_show():
-    assert telling_links(load_model("<robot name='stone'><link name='stone'/></robot>")) == ()
+    assert representative_links(load_model("<robot name='stone'><link name='stone'/></robot>")) == ()

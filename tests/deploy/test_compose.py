@@ -9,7 +9,7 @@ from support import until
 
 from zstate import StatePublisher, connect, discover, load_model
 from zstate.errors import AccessDenied
-from zstate.net.security import Credentials
+from zstate.net.security.credentials import Credentials
 
 pytestmark = pytest.mark.processes
 

@@ -27,7 +27,7 @@ from zstate import (
 )
 from zstate.clock import SystemClock
 from zstate.recording.recorder import Recorder
-from zstate.sources.source import JointReading
+from zstate.sources.joint_source import JointReading
 from zstate.transform import Transform
 
 CLONE_NEWNET = 0x40000000

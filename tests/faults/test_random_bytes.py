@@ -20,11 +20,11 @@ from support import until
 
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
-from zstate.net.wires import wire_named
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.keys import Stream
 from zstate.wire.native import ENCODINGS
+from zstate.wire.registry import get_wire
 
 SECONDS = 60.0 if os.environ.get("ZSTATE_LONG") else 5.0
 BATCH = 150  # all four together fit into every ring: what a full one loses is another test's matter
@@ -61,7 +61,7 @@ def native_keys(follow: Follow) -> tuple[str, ...]:
 
 def ros_keys(follow: Follow) -> tuple[str, ...]:
     streams: tuple[Stream, ...] = (follow, "robot_description", "tf_static")
-    return tuple(wire_named("ros2").expression("r1", stream).replace("*", TYPE_HASH) for stream in streams)
+    return tuple(get_wire("ros2").expression("r1", stream).replace("*", TYPE_HASH) for stream in streams)
 
 
 def put(session: Session, key: str, dice: random.Random) -> None:

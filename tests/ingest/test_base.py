@@ -12,8 +12,8 @@ from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.transforms import TransformIngest
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.wire.messages import (
     JointState,

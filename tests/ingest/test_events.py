@@ -9,18 +9,18 @@ from support import until
 
 from zstate._util.bounded_dict import MAX_ENTRIES
 from zstate.ingest.events import KEPT, EventLog, StaticEdgeOwners, WriterEvent
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
-from zstate.wire.writer import Announced, Writer
 
 HEARD: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states")
 ROS_SHARED: tuple[Stream, ...] = ("tf", "tf_static")
-DRIVER = Writer("driver", "jetson", 412, 5, 7)
-RESTARTED = Writer("driver", "jetson", 413, 6, 8)
-OTHER = Writer("simulator", "laptop", 9, 6, 9)
+DRIVER = WriterId("driver", "jetson", 412, 5, 7)
+RESTARTED = WriterId("driver", "jetson", 413, 6, 8)
+OTHER = WriterId("simulator", "laptop", 9, 6, 9)
 
 
-def said(writer: Writer = DRIVER, stream: Stream = "joint_states", name: str = "") -> Announced:
-    return Announced("r1", stream, writer, name)
+def said(writer: WriterId = DRIVER, stream: Stream = "joint_states", name: str = "") -> Announcement:
+    return Announcement("r1", stream, writer, name)
 
 
 def quiet() -> EventLog:
@@ -156,7 +156,7 @@ def test_of_who_never_spoke_silence_is_not_news():
     told: list[WriterEvent] = []
     with EventLog(HEARD, "joint_states", (), told.append) as events:
         for session in (7, 8):
-            events.on_writer(said(Writer("driver", f"host {session}", 1, 5, session)), alive=True)
+            events.on_writer(said(WriterId("driver", f"host {session}", 1, 5, session)), alive=True)
         for _ in range(2):
             events.on_sample("r1", 7)
         until(lambda: told[-1:] and told[-1].kind == "stale")
@@ -180,7 +180,7 @@ def test_exceptions_of_the_callback_are_counted_and_end_nothing(monkeypatch):
 def test_any_number_of_writers_that_come_and_go_takes_a_bounded_memory():
     with quiet() as events:
         for session in range(2 * MAX_ENTRIES):
-            one = said(Writer("driver", f"host {session}", 1, 5, session), "tf_static", f"mount {session}")
+            one = said(WriterId("driver", f"host {session}", 1, 5, session), "tf_static", f"mount {session}")
             events.on_writer(one, alive=True)
             events.set_static_children("r1", one.name, frozenset({"r1/camera"}))
             events.on_writer(one, alive=False)

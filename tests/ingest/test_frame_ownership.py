@@ -16,8 +16,8 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.static_transforms import StaticTransformIngest
 from zstate.ingest.transforms import TransformIngest
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (

@@ -9,7 +9,7 @@ from live import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, settle
 from support import until
 
 from zstate.errors import InFuture
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from zstate.metrics.pace import Paces
+from zstate.metrics.collectors import Paces
 
 
 class Hands:

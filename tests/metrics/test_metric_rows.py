@@ -22,8 +22,7 @@ from zstate.metrics.collectors import (
     WriterMetrics,
 )
 from zstate.metrics.endpoint import MetricsEndpoint
-from zstate.net.connections import connections
-from zstate.net.presence import RobotInfo, discover, writer_here
+from zstate.net.presence import RobotInfo, connections, discover, local_writer
 from zstate.net.session import connect
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
@@ -150,7 +149,7 @@ def test_a_writer_that_starts_again_and_again_adds_no_row(sessions):
 
 
 def test_robots_beyond_a_limit_are_counted_and_have_no_rows():
-    writer = writer_here(1)
+    writer = local_writer(1)
     robots = [
         RobotInfo(f"r{number:04}", (("joint_states", replace(writer, session=number)),))
         for number in range(MAX_ROBOTS + 3)
@@ -161,7 +160,7 @@ def test_robots_beyond_a_limit_are_counted_and_have_no_rows():
 
 
 def test_two_writers_of_a_stream_are_two():
-    writers = (("tf_static", writer_here(1)), ("tf_static", writer_here(2)))
+    writers = (("tf_static", local_writer(1)), ("tf_static", local_writer(2)))
     rows = collected(WriterMetrics(lambda: [RobotInfo("r1", writers)]))
     assert rows[row("zstate_writers", robot="r1", stream="tf_static")] == 2
 

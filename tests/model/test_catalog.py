@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import InvalidInput, ModelError, UnknownModel
-from zstate.model import known
-from zstate.model.catalog import catalog, load_model
+from zstate.model import catalog
+from zstate.model.load import load_model
 from zstate.model.xml import MAX_BYTES
 
 TEXT = '<robot name="one"><link name="only"/></robot>'
@@ -79,16 +79,16 @@ def test_without_example_robot_data_it_is_told_what_to_install(
 
     monkeypatch.setattr(metadata, "distribution", absent)
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    known._example_robot_data.cache_clear()
+    catalog._example_robot_data.cache_clear()
     try:
         with pytest.raises(UnknownModel, match=r"pip install 'zstate\[robots\]'"):
             load_model("panda")
     finally:
-        known._example_robot_data.cache_clear()
+        catalog._example_robot_data.cache_clear()
 
 
 def test_every_entry_of_the_catalog_is_a_file_of_its_name():
-    entries = catalog()
+    entries = catalog.catalog()
     assert [entry.name for entry in entries] == sorted({entry.name for entry in entries})
     assert all(entry.path.is_file() for entry in entries)
     assert {"rrbot", "diffbot", "gripper"} <= {entry.name for entry in entries if entry.origin == "zstate"}
@@ -121,16 +121,16 @@ def test_clones_of_robot_descriptions_are_found_in_its_cache(tmp_path: Path, mon
     (clone / "cached_arm.urdf").write_text(TEXT)
     monkeypatch.syspath_prepend(str(package.parent))
     monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path / "cache"))
-    known._robot_descriptions.cache_clear()
+    catalog._robot_descriptions.cache_clear()
     try:
         assert load_model("cached_arm").name == "one"
     finally:
-        known._robot_descriptions.cache_clear()
+        catalog._robot_descriptions.cache_clear()
 
 
 def test_loading_a_model_imports_neither_pinocchio_nor_zenoh():
     code = (
-        "import sys; from zstate.model.catalog import load_model; load_model('rrbot');"
+        "import sys; from zstate.model.load import load_model; load_model('rrbot');"
         "print({'pinocchio', 'zenoh', 'cmeel', 'xacro'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -145,7 +145,9 @@ def test_xacro_arguments_for_what_is_no_xacro_are_refused():
 
 
 def test_the_robot_of_examples_is_one_that_is_here(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(known, "_COLLECTIONS", {"zstate": known._own})
-    assert known.example_name() == "rrbot"
-    monkeypatch.setattr(known, "_COLLECTIONS", {"zstate": known._own, "more": lambda: {"panda": Path("p")}})
-    assert known.example_name() == "panda"
+    monkeypatch.setattr(catalog, "_COLLECTIONS", {"zstate": catalog._bundled})
+    assert catalog.example_name() == "rrbot"
+    monkeypatch.setattr(
+        catalog, "_COLLECTIONS", {"zstate": catalog._bundled, "more": lambda: {"panda": Path("p")}}
+    )
+    assert catalog.example_name() == "panda"

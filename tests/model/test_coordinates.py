@@ -3,9 +3,8 @@
 import pytest
 from kinds_of_robot import every_joint
 
-from zstate.model.catalog import load_model
-from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.model.robot import VELOCITY_COUNTS
+from zstate.model.load import load_model
+from zstate.model.robot import VELOCITY_COUNTS, coordinate_names, velocity_columns_by_position
 
 EVERY = every_joint().model
 
@@ -25,7 +24,7 @@ def test_a_joint_of_one_number_is_called_by_its_name_and_others_by_their_parts()
 
 def test_velocities_stand_under_their_coordinates_but_none_under_the_last_of_a_quaternion():
     names = coordinate_names(EVERY)
-    assert [names[slot] for slot in velocity_slots(EVERY)] == [
+    assert [names[slot] for slot in velocity_columns_by_position(EVERY)] == [
         *(f"zz body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz")),
         *names[7:],
     ]
@@ -33,7 +32,7 @@ def test_velocities_stand_under_their_coordinates_but_none_under_the_last_of_a_q
 
 @pytest.mark.parametrize("model", [EVERY, *map(load_model, ("rrbot", "gripper"))])
 def test_there_are_as_many_as_numbers_each_its_own(model):
-    names, slots = coordinate_names(model), velocity_slots(model)
+    names, slots = coordinate_names(model), velocity_columns_by_position(model)
     assert len(names) == len(set(names)) == model.position_count
     assert len(slots) == len(set(slots)) == sum(VELOCITY_COUNTS[j.type] for j in model.driven_joints)
     assert set(slots) <= set(range(len(names)))
@@ -44,4 +43,4 @@ def test_there_are_as_many_as_numbers_each_its_own(model):
 
 def test_a_robot_that_does_not_move_has_none():
     stone = load_model('<robot name="stone"><link name="only"/></robot>')
-    assert (coordinate_names(stone), velocity_slots(stone)) == ((), ())
+    assert (coordinate_names(stone), velocity_columns_by_position(stone)) == ((), ())

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
-from zstate.model.edges import NORM_TOLERANCE, EdgeTable, edge_forms
+from zstate.model.joint_transforms import NORM_TOLERANCE, JointTransforms, edge_forms
 from zstate.model.robot import Joint, JointType, Limits, Mimic, RobotModel
 
 Pose = tuple[float, float, float, float, float, float, float]
@@ -66,7 +66,7 @@ def matrix_of(pose: np.ndarray) -> np.ndarray:
 
 
 def only_pose(model: RobotModel, *positions: float) -> np.ndarray:
-    (pose,) = EdgeTable(model).poses(np.array(positions, dtype=np.float64))
+    (pose,) = JointTransforms(model).poses(np.array(positions, dtype=np.float64))
     return pose
 
 
@@ -112,7 +112,7 @@ def test_a_floating_quaternion_that_is_nearly_of_unit_length_is_normalised() -> 
 @pytest.mark.parametrize("length", [0.0, 0.9, 1.0 + 1.1 * NORM_TOLERANCE, -2.0])
 def test_a_floating_quaternion_far_from_unit_length_is_refused_by_name(length: float) -> None:
     model = robot(joint("bolt", "fixed", "root"), joint("body", "floating", "bolt_link"))
-    table = EdgeTable(model)
+    table = JointTransforms(model)
     positions = np.array([[0, 0, 0, 0, 0, 0, 1.0], [0, 0, 0, 0, 0, 0, length]])
     with pytest.raises(InvalidInput, match=f"'bolt_link' -> 'body_link' .* length {abs(length):.6g};"):
         table.poses(positions)
@@ -129,7 +129,7 @@ def test_a_chain_of_mimics_is_multiplied_out() -> None:
     assert (tip.scale, tip.shift, tip.column) == (-6.0, -0.75, 0)
     assert (middle.scale, middle.shift, middle.column) == (3.0, 0.5, 0)
     assert (drive.scale, drive.shift, drive.column) == (1.0, 0.0, 0)
-    poses = EdgeTable(model).poses(np.array([0.1]))
+    poses = JointTransforms(model).poses(np.array([0.1]))
     assert np.allclose(poses[0], only_pose(robot(joint("hip", "revolute", "root")), -1.35), atol=1e-15)
     assert np.allclose(poses[1], only_pose(robot(joint("shin", "prismatic", "root")), 0.8), atol=1e-15)
 
@@ -146,7 +146,7 @@ def test_forms_stand_in_the_order_of_the_joints_and_name_their_columns() -> None
 def test_one_form_evaluated_by_its_formula_is_the_row_of_the_table() -> None:
     model = everything()
     (positions,) = random_positions(model, 1, 3.0)
-    poses = EdgeTable(model).poses(positions)
+    poses = JointTransforms(model).poses(positions)
     for form, pose in zip(edge_forms(model), poses, strict=True):
         if form.kind not in ("hinge", "slide"):
             continue
@@ -161,13 +161,13 @@ def test_quaternions_are_of_unit_length_at_any_number_of_turns(angle: float) -> 
     model = everything()
     positions = random_positions(model, 1, 1.0)[0]
     positions[7:] = angle
-    poses = EdgeTable(model).poses(positions)
+    poses = JointTransforms(model).poses(positions)
     assert np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1.0).max() < 1e-15
 
 
 def test_a_batch_is_its_rows_one_by_one() -> None:
     model = everything()
-    table = EdgeTable(model)
+    table = JointTransforms(model)
     positions = random_positions(model, 5, 4.0)
     batch = table.poses(positions)
     assert batch.shape == (5, 8, 7)
@@ -177,7 +177,7 @@ def test_a_batch_is_its_rows_one_by_one() -> None:
 
 def test_the_answer_is_written_into_out_and_positions_are_left_alone() -> None:
     model = everything()
-    table = EdgeTable(model)
+    table = JointTransforms(model)
     (positions,) = random_positions(model, 1, 4.0)
     before = positions.copy()
     out = np.full((8, 7), np.nan)
@@ -189,13 +189,13 @@ def test_the_answer_is_written_into_out_and_positions_are_left_alone() -> None:
 def test_a_robot_that_cannot_move_has_its_fixed_edges_and_takes_no_numbers() -> None:
     pose = only_pose(robot(joint("bolt", "fixed", "root")))
     assert np.allclose(pose, TURNED_ABOUT_Z, rtol=0.0, atol=1e-15)
-    assert EdgeTable(robot()).poses(np.empty(0)).shape == (0, 7)
+    assert JointTransforms(robot()).poses(np.empty(0)).shape == (0, 7)
 
 
 @pytest.mark.parametrize("count", [0, 1, 50])
 def test_the_extension_and_numpy_agree(count: int) -> None:
     model = everything()
-    compiled, in_numpy = EdgeTable(model), EdgeTable(model)
+    compiled, in_numpy = JointTransforms(model), JointTransforms(model)
     in_numpy._compiled = None
     positions = random_positions(model, count, 20.0)
     np.testing.assert_allclose(compiled.poses(positions), in_numpy.poses(positions), rtol=0.0, atol=3e-14)

@@ -7,7 +7,7 @@ import pytest
 from kinds_of_robot import every_joint
 
 from zstate.errors import InvalidInput
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.model.robot import near_joint
 
 JOINTS = ("pan", "lift", "elbow", "wrist_1_joint", "wrist_2_joint", "finger_left", "finger_right")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ModelError
-from zstate.model.catalog import catalog, load_model
+from zstate.model.load import catalog, load_model
 
 pytestmark = pytest.mark.robots
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ModelError
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 
 NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 ARM = f"""<robot name="arm" {NAMESPACE}>
@@ -100,7 +100,7 @@ def test_without_a_xacro_package_it_is_told_what_to_install(arm: Path):
     code = (
         "import sys; sys.modules['xacro'] = sys.modules['xacrodoc'] = None\n"
         "from zstate.errors import ModelError\n"
-        "from zstate.model.catalog import load_model\n"
+        "from zstate.model.load import load_model\n"
         "try: load_model(sys.argv[1])\n"
         "except ModelError as error: print(error)\n"
     )

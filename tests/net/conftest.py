@@ -9,7 +9,7 @@ import pytest
 from refusing import ROUTERS, Fleet
 from support import Child, a_free_port
 
-from zstate.net.certificates import issue_identities
+from zstate.net.security.certificates import issue_identities
 
 
 @pytest.fixture(scope="module")

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from zstate.net.security import Credentials
+from zstate.net.security.credentials import Credentials
 
 ROUTERS = """
     import sys
     from pathlib import Path
-    from zstate.net.security import Credentials
+    from zstate.net.security.credentials import Credentials
     from zstate.net.session import connect
     folder, *endpoints = sys.argv[1:]
     users = Path(folder) / "users"

@@ -16,8 +16,8 @@ from support import a_free_port, until
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import InvalidInput
-from zstate.net.access import Fleet, access_control, access_text
 from zstate.net.presence import announce, discover_readers
+from zstate.net.security.acl import AclRoles, access_control, access_text
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import STREAMS
@@ -25,14 +25,14 @@ from zstate.wire import keys
 from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
-FLEET = Fleet(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
+FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
 USERS = (*FLEET.names, "stranger")
 
 
 class Site:
     """A router with users, and sessions that come to it."""
 
-    def __init__(self, folder: Any, fleet: Fleet) -> None:
+    def __init__(self, folder: Any, fleet: AclRoles) -> None:
         self.endpoint = f"tcp/127.0.0.1:{a_free_port()}"
         users = folder / "users.txt"
         users.write_text("".join(f"{name}:secret\n" for name in USERS))
@@ -60,7 +60,7 @@ class Site:
 
 
 @contextmanager
-def a_site(folder: Any, fleet: Fleet) -> Iterator[Site]:
+def a_site(folder: Any, fleet: AclRoles) -> Iterator[Site]:
     site = Site(folder, fleet)
     with site.opened:
         yield site
@@ -229,7 +229,7 @@ def test_whoever_reads_is_known_to_viewers(site: Site):
 
 def test_a_robot_that_is_a_viewer_too_sees_the_others_move(tmp_path):
     with (
-        a_site(tmp_path, Fleet(("r1", "r2"), ("r2",))) as site,
+        a_site(tmp_path, AclRoles(("r1", "r2"), ("r2",))) as site,
         StatePublisher(site.join("r1"), RRBOT, "r1") as publisher,
         TransformListener(site.join("r2"), "r1") as listener,
     ):
@@ -255,7 +255,7 @@ def test_what_answers_lookups_is_asked_by_viewers_and_stands_under_its_own_robot
 
 def test_a_namespace_stands_before_every_key(tmp_path):
     with (
-        a_site(tmp_path, Fleet(("r1",), ("desk",), namespace="hall/east")) as site,
+        a_site(tmp_path, AclRoles(("r1",), ("desk",), namespace="hall/east")) as site,
         StatePublisher(site.join("r1", namespace="hall/east"), RRBOT, "r1") as publisher,
         TransformListener(site.join("desk", namespace="hall/east"), "r1") as listener,
     ):
@@ -268,7 +268,7 @@ def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
     settings = {
         "mode": "router",
         "listen": {"endpoints": [endpoint]},
-        "access_control": access_control(Fleet(("r1",), ("desk",))),
+        "access_control": access_control(AclRoles(("r1",), ("desk",))),
     }
     with (
         connect(settings),
@@ -282,7 +282,7 @@ def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
 def test_every_chunk_that_wildcards_go_past_is_named():
     chunks = set(re.findall(r"/(@\w+)/", keys.__doc__ or "")) | {"@adv"}
     assert len(chunks) >= 2
-    for rule in access_control(Fleet(("r1",), ("desk",)))["rules"]:
+    for rule in access_control(AclRoles(("r1",), ("desk",)))["rules"]:
         if rule["id"] in ("r1 writes", "viewers read"):
             root = rule["key_exprs"][0].removesuffix("/**")
             assert {f"{root}/**/{chunk}/**" for chunk in chunks} <= set(rule["key_exprs"])
@@ -298,22 +298,22 @@ def test_the_text_says_the_same_to_zenoh():
 
 
 def test_only_the_rules_that_somebody_has_are_there():
-    rules = [rule["id"] for rule in access_control(Fleet(viewers=("desk", "desk")))["rules"]]
+    rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
     assert rules == ["viewers read", "viewers are given", "readers are known"]
 
 
 @pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])
 def test_a_name_that_cannot_be_one_is_refused(name: str):
     with pytest.raises(InvalidInput, match="cannot be the name of an identity"):
-        Fleet((name,))
+        AclRoles((name,))
 
 
 @pytest.mark.parametrize("namespace", ["/hall", "hall/", "a//b", "h*", "@x"])
 def test_a_namespace_that_cannot_stand_before_keys_is_refused(namespace: str):
     with pytest.raises(InvalidInput, match="is not made of chunks"):
-        Fleet(("r1",), namespace=namespace)
+        AclRoles(("r1",), namespace=namespace)
 
 
 def test_a_fleet_of_nobody_is_refused():
     with pytest.raises(InvalidInput, match="nobody is named"):
-        Fleet()
+        AclRoles()

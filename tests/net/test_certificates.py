@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.net.certificates import issue_identities
+from zstate.net.security.certificates import issue_identities
 
 x509 = pytest.importorskip("cryptography.x509", reason="needs cryptography: pip install 'zstate[certs]'")
 
@@ -138,7 +138,7 @@ def test_without_the_library_the_text_says_what_to_install():
     code = (
         "import sys; sys.modules['cryptography'] = None\n"
         "from zstate.errors import LibraryMissing\n"
-        "from zstate.net.certificates import issue_identities\n"
+        "from zstate.net.security.certificates import issue_identities\n"
         "try: issue_identities('nowhere', ['r1'])\n"
         "except LibraryMissing as error: print(error)"
     )

@@ -10,29 +10,30 @@ import pytest
 from support import until
 
 from zstate.errors import Closed, SecondWriter
-from zstate.net.claims import GONE_WITHIN_S, Claim
-from zstate.net.placing import check_edges
-from zstate.net.presence import announce, tokens_now
+from zstate.net.ownership import GONE_WITHIN_S, WriterClaim, check_edges
+from zstate.net.presence import announce, current_tokens
 from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream, writer_key
-from zstate.wire.writer import Announced, Writer
 
-FIRST = Writer("driver", "jetson", 412, 1_000_000_000, 7)
-SECOND = Writer("simulator", "laptop", 9, 2_000_000_000, 8)
-
-
-def said(writer: Writer, stream: Stream = "joint_states", name: str = "", robot: str = "r1") -> Announced:
-    return Announced(robot, stream, writer, name)
+FIRST = WriterId("driver", "jetson", 412, 1_000_000_000, 7)
+SECOND = WriterId("simulator", "laptop", 9, 2_000_000_000, 8)
 
 
-def told(session: Session, announced: Announced):
+def said(
+    writer: WriterId, stream: Stream = "joint_states", name: str = "", robot: str = "r1"
+) -> Announcement:
+    return Announcement(robot, stream, writer, name)
+
+
+def told(session: Session, announced: Announcement):
     return announce(session, writer_key(announced.robot, announced.stream, announced.identity))
 
 
 def await_tokens(session: Session, count: int) -> None:
-    until(lambda: len(tokens_now(session, "zstate/*/@writer/*/*", 1.0)) == count)
+    until(lambda: len(current_tokens(session, "zstate/*/@writer/*/*", 1.0)) == count)
 
 
 def edge(parent: str, child: str) -> Transform:
@@ -44,7 +45,7 @@ def test_who_comes_second_is_told_who_writes_already_and_what_to_do(sessions):
     with told(theirs, said(FIRST)):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="joint_states of 'r1'") as raised:
-            Claim(ours, [said(SECOND)])
+            WriterClaim(ours, [said(SECOND)])
     assert "'driver@jetson pid 412', there since 1970-01-01" in str(raised.value)
     assert "takeover=True" in str(raised.value)
     error = pickle.loads(pickle.dumps(raised.value))
@@ -56,7 +57,7 @@ def test_it_is_the_second_however_early_its_clock_says_it_began(sessions):
     with told(theirs, said(SECOND)):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter):
-            Claim(ours, [said(FIRST)])
+            WriterClaim(ours, [said(FIRST)])
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,7 @@ def test_who_writes_something_else_is_in_nobodys_way(sessions, other):
     ours, theirs = sessions
     with told(theirs, other):
         await_tokens(ours, 1)
-        with Claim(ours, [said(SECOND), said(SECOND, "tf_static", "room")]) as claim:
+        with WriterClaim(ours, [said(SECOND), said(SECOND, "tf_static", "room")]) as claim:
             claim.check()
 
 
@@ -81,7 +82,7 @@ def test_static_edges_under_one_name_have_one_writer(sessions):
     with told(theirs, said(FIRST, "tf_static", "mount")):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="static edges of 'r1' under the name 'mount'"):
-            Claim(ours, [said(SECOND, "tf_static", "mount")])
+            WriterClaim(ours, [said(SECOND, "tf_static", "mount")])
 
 
 def test_a_writer_that_is_leaving_is_waited_for(sessions):
@@ -90,14 +91,14 @@ def test_a_writer_that_is_leaving_is_waited_for(sessions):
     await_tokens(ours, 1)
     timer = threading.Timer(GONE_WITHIN_S / 5, leaving.close)
     timer.start()
-    Claim(ours, [said(SECOND)]).close()
+    WriterClaim(ours, [said(SECOND)]).close()
     timer.join()
 
 
 @pytest.mark.parametrize("asks_first", [True, False])
 def test_of_two_that_open_at_once_only_the_later_one_is_told_and_ever_after(sessions, asks_first):
     ours, theirs = sessions
-    first, second = Claim(ours, [said(FIRST)]), Claim(theirs, [said(SECOND)])
+    first, second = WriterClaim(ours, [said(FIRST)]), WriterClaim(theirs, [said(SECOND)])
     with told(ours, said(FIRST)), told(theirs, said(SECOND)):
         for session in sessions:
             await_tokens(session, 2)
@@ -120,14 +121,14 @@ def test_a_session_that_has_just_connected_sees_who_is_there():
     with connect() as theirs, told(theirs, said(FIRST)):
         for _ in range(3):
             with connect() as ours, pytest.raises(SecondWriter):
-                Claim(ours, [said(SECOND)])
+                WriterClaim(ours, [said(SECOND)])
 
 
 def test_a_claim_needs_no_thread_and_a_check_is_not_another_opening(sessions):
     before = threading.active_count()
     until(lambda: time.monotonic() - sessions[0].opened_at > 0.05)
     began = time.perf_counter()
-    claims = [Claim(sessions[0], [said(SECOND, robot=f"r{number}")]) for number in range(100)]
+    claims = [WriterClaim(sessions[0], [said(SECOND, robot=f"r{number}")]) for number in range(100)]
     opened = time.perf_counter()
     for claim in claims:
         claim.check()
@@ -139,7 +140,7 @@ def test_a_claim_needs_no_thread_and_a_check_is_not_another_opening(sessions):
 
 
 def test_a_closed_session_is_said_to_be_closed(sessions):
-    claim = Claim(sessions[0], [said(FIRST)])
+    claim = WriterClaim(sessions[0], [said(FIRST)])
     sessions[0].close()
     with pytest.raises(Closed):
         claim.check()

@@ -11,15 +11,15 @@ from support import SOON_S, a_free_port, until
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
-from zstate.net.clock_offset import OffsetMeter, measure_offsets
-from zstate.net.service import Answer, Service
+from zstate.net.clock_offset import ClockOffsetMonitor, measure_offsets
+from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
-from zstate.wire.messages import Clock
+from zstate.wire.messages import ClockMessage
 from zstate.wire.native import ENCODINGS, encode
-from zstate.wire.writer import Writer
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -94,10 +94,10 @@ def test_who_answers_nonsense_or_not_at_all_is_passed_over(sessions):
 
 @pytest.mark.parametrize("session", [5, 6])
 def test_an_answer_counts_on_the_key_and_with_the_session_of_the_writer_that_was_asked(sessions, session):
-    ours = Writer("driver", "nuc", 3, 1, 5)
+    ours = WriterId("driver", "nuc", 3, 1, 5)
     key = clock_key("r1", ours.identity)
-    said = encode(Clock(time.time_ns(), 0, session))
-    answer = lambda query: query.reply(key, said, encoding=ENCODINGS[Clock])  # noqa: E731
+    said = encode(ClockMessage(time.time_ns(), 0, session))
+    answer = lambda query: query.reply(key, said, encoding=ENCODINGS[ClockMessage])  # noqa: E731
     queryable = sessions[0].zenoh.declare_queryable(key, answer)
     found = measure_offsets(sessions[1], "r1", timeout_s=0.5)
     assert [one.writer for one in found] == ([ours] if session == 5 else [])
@@ -174,7 +174,10 @@ def test_a_clock_that_agrees_is_known_and_not_worth_a_word(sessions, follow):
 
 def test_a_measurement_is_made_once_however_often_it_is_asked_for(sessions):
     writer, reader = sessions
-    with StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)), OffsetMeter(reader, Ahead(0)) as meter:
+    with (
+        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
+        ClockOffsetMonitor(reader, Ahead(0)) as meter,
+    ):
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         ask = meter.follow("r1", known.writer)
@@ -185,7 +188,7 @@ def test_a_measurement_is_made_once_however_often_it_is_asked_for(sessions):
 
 def test_a_meter_whose_session_is_gone_falls_silent(sessions):
     writer, reader = sessions
-    with StatePublisher(writer, RRBOT, "r1"), OffsetMeter(reader, Ahead(0)) as meter:
+    with StatePublisher(writer, RRBOT, "r1"), ClockOffsetMonitor(reader, Ahead(0)) as meter:
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         reader.close()
@@ -194,10 +197,13 @@ def test_a_meter_whose_session_is_gone_falls_silent(sessions):
 
 def test_many_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions):
     writer, reader = sessions
-    silent = [Writer("p", "h", 1, 1, session) for session in range(100)]
+    silent = [WriterId("p", "h", 1, 1, session) for session in range(100)]
     kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
     queryable = writer.zenoh.declare_queryable("zstate/r2/@clock/*", kept)
-    with StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)), OffsetMeter(reader, Ahead(0)) as meter:
+    with (
+        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
+        ClockOffsetMonitor(reader, Ahead(0)) as meter,
+    ):
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         for one in silent:
@@ -209,13 +215,13 @@ def test_many_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(ses
 
 def test_an_answer_counts_only_from_the_writer_whose_clock_was_asked(sessions):
     writer, reader = sessions
-    asked, other = (Writer("p", "h", 1, 1, session) for session in (7, 8))
+    asked, other = (WriterId("p", "h", 1, 1, session) for session in (7, 8))
     key = clock_key("r1", asked.identity)
 
-    def answer(session: int) -> Answer:
-        return Answer(encode(Clock(STAMP, 0, session)), ENCODINGS[Clock])
+    def answer(session: int) -> Reply:
+        return Reply(encode(ClockMessage(STAMP, 0, session)), ENCODINGS[ClockMessage])
 
-    with Service(writer, key, lambda _: answer(other.session)):
+    with Queryable(writer, key, lambda _: answer(other.session)):
         assert measure_offsets(reader, "r1", timeout_s=0.3) == ()
-    with Service(writer, key, lambda _: answer(asked.session)):
+    with Queryable(writer, key, lambda _: answer(asked.session)):
         until(lambda: [one.writer for one in measure_offsets(reader, "r1")] == [asked])

@@ -11,8 +11,8 @@ from zstate.net.graph import GraphMonitor, StreamUse, graph_of
 from zstate.net.presence import RobotInfo
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
-from zstate.wire.writer import Announced, Writer
 
 
 def test_writers_and_readers_of_a_stream_are_seen_and_how_the_writers_do(sessions):
@@ -44,14 +44,14 @@ def test_a_publisher_that_is_gone_says_nothing_any_more(sessions):
 
 
 DRIVER, MOUNT, VIEWER = (
-    Writer(name, "", 0, 0, number) for number, name in enumerate(("driver", "mount", "view"))
+    WriterId(name, "", 0, 0, number) for number, name in enumerate(("driver", "mount", "view"))
 )
 
 
 def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_of_their_writers():
     statics = (("left", MOUNT), ("right", MOUNT))
     arm = RobotInfo("arm", (("joint_states", DRIVER), ("tf_static", MOUNT)), statics)
-    readers = [Announced(ANY, "joint_states", VIEWER), Announced("base", "tf", VIEWER)]
+    readers = [Announcement(ANY, "joint_states", VIEWER), Announcement("base", "tf", VIEWER)]
     graph = graph_of([arm], readers, lambda robot, stream, writer: 500.0 if writer == DRIVER else None)
     assert graph.streams == (
         StreamUse("arm", "joint_states", ("driver",), ("view",), 500.0),
@@ -63,7 +63,7 @@ def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_
 
 
 def test_without_writers_a_reader_of_all_robots_is_in_the_graph():
-    graph = graph_of([], [Announced(ANY, "tf", VIEWER)])
+    graph = graph_of([], [Announcement(ANY, "tf", VIEWER)])
     assert graph.streams == (StreamUse(ANY, "tf", (), ("view",)),)
 
 

@@ -10,18 +10,18 @@ from live import SECOND, STAMP
 from support import until
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.net.history import (
+from zstate.net.queryable import Queryable, Reply
+from zstate.net.sample_history import (
     MOST_BYTES,
     MOST_PAGE_BYTES,
     PAGE_BYTES,
     PAGE_SAMPLES,
-    Memory,
-    PastReader,
-    answer_past,
+    HistoryReader,
+    SampleCache,
+    serve_history,
 )
-from zstate.net.service import Answer, Service
 from zstate.net.session import Session
-from zstate.wire.messages import JointState, Past
+from zstate.wire.messages import HistoryPage, JointState
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
 
@@ -34,8 +34,8 @@ def state(seq: int, stamp: int | None = None, session: int = 7, numbers: int = 2
     return JointState(STAMP + seq * MS if stamp is None else stamp, seq, session, ORDER, bytes(8 * numbers))
 
 
-def remembering(count: int, span_s: float = 1e6, numbers: int = 2, session: int = 7) -> Memory:
-    memory = Memory(span_s, numbers, session)
+def remembering(count: int, span_s: float = 1e6, numbers: int = 2, session: int = 7) -> SampleCache:
+    memory = SampleCache(span_s, numbers, session)
     for seq in range(count):
         memory.append(state(seq, session=session, numbers=numbers))
     return memory
@@ -63,7 +63,7 @@ def test_pages_go_back_from_the_newest():
         ([], False),
     ]
     assert seqs(memory.before(10**15, 4)[0]) == [6, 7, 8, 9]
-    assert Memory(1.0, 2, 7).before(None, 4) == ([], False)
+    assert SampleCache(1.0, 2, 7).before(None, 4) == ([], False)
 
 
 def test_after_a_clock_was_set_back_only_what_came_then_is_remembered():
@@ -93,7 +93,7 @@ def test_a_stamp_slightly_back_forgets_nothing():
 
 
 def test_memory_is_bounded_whatever_the_stamps_say():
-    memory = Memory(1e6, 100_000, 7)
+    memory = SampleCache(1e6, 100_000, 7)
     for seq in range(100):
         memory.append(state(seq, STAMP, numbers=1))
     kept = seqs(memory.since(0))
@@ -104,7 +104,7 @@ def test_memory_is_bounded_whatever_the_stamps_say():
 @pytest.mark.parametrize("span_s", [-1.0, 0.0, float("nan"), float("inf")])
 def test_a_span_that_is_none_is_refused(span_s: float):
     with pytest.raises(InvalidInput, match="cache_s"):
-        Memory(span_s, 2, 7)
+        SampleCache(span_s, 2, 7)
 
 
 class Heard:
@@ -114,7 +114,7 @@ class Heard:
         self.pages: list[list[SerializedSample]] = []
         self.errors: list[MessageError] = []
         self._most = most
-        self.reader = PastReader(session, self._take, lambda _, error: self.errors.append(error))
+        self.reader = HistoryReader(session, self._take, lambda _, error: self.errors.append(error))
 
     def _take(self, arrivals: list[SerializedSample], writer: int) -> bool:
         self.pages.append(arrivals)
@@ -134,7 +134,7 @@ def test_a_reader_gets_every_sample_as_it_was_sent_the_newest_page_first(session
     writer, reader = sessions
     memory = remembering(PAGE_SAMPLES + 3)
     heard = Heard(reader)
-    with answer_past(writer, "r1", "joint_states", memory, encode), heard.reader:
+    with serve_history(writer, "r1", "joint_states", memory, encode), heard.reader:
         await_answers(reader)
         heard.reader.ask(KEY, 7)
         until(lambda: len(heard.pages) == 2)
@@ -149,7 +149,7 @@ def test_a_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Se
     for numbers in (100, 10_000):
         memory = remembering(100, numbers=numbers)
         heard = Heard(reader, most=3)
-        with answer_past(writer, "r1", "joint_states", memory, encode), heard.reader:
+        with serve_history(writer, "r1", "joint_states", memory, encode), heard.reader:
             await_answers(reader)
             heard.reader.ask(KEY, 7)
             until(lambda heard=heard: len(heard.pages) == 3)
@@ -162,7 +162,7 @@ def test_a_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Se
 
 def test_a_writer_that_has_said_nothing_says_so_and_is_not_asked_again(sessions):
     writer, reader = sessions
-    with answer_past(writer, "r1", "joint_states", Memory(1.0, 2, 7), encode) as service:
+    with serve_history(writer, "r1", "joint_states", SampleCache(1.0, 2, 7), encode) as service:
         await_answers(reader)
         before = service.answered
         heard = Heard(reader)
@@ -174,11 +174,11 @@ def test_a_writer_that_has_said_nothing_says_so_and_is_not_asked_again(sessions)
 
 def test_an_answer_on_another_key_than_was_asked_is_none(sessions: tuple[Session, Session]):
     writer, reader = sessions
-    past = encode(Past(ENCODINGS[JointState], (encode(state(0)),), None))
+    past = encode(HistoryPage(ENCODINGS[JointState], (encode(state(0)),), None))
     asked = threading.Semaphore(0)
 
     def answer(query: zenoh.Query) -> None:
-        query.reply("zstate/*/joint_states", past, encoding=ENCODINGS[Past])
+        query.reply("zstate/*/joint_states", past, encoding=ENCODINGS[HistoryPage])
         query.drop()
         asked.release()
 
@@ -199,8 +199,8 @@ def test_each_writer_of_a_key_is_asked_for_itself(sessions: tuple[Session, Sessi
     one, other = remembering(3, session=7), remembering(5, session=8)
     heard = Heard(reader)
     with (
-        answer_past(writer, "r1", "joint_states", one, encode),
-        answer_past(writer, "r1", "joint_states", other, encode),
+        serve_history(writer, "r1", "joint_states", one, encode),
+        serve_history(writer, "r1", "joint_states", other, encode),
         heard.reader,
     ):
         await_answers(reader)
@@ -214,7 +214,7 @@ def test_more_writers_than_are_asked_at_once_all_have_their_turn(sessions: tuple
     writer, reader = sessions
     memory = remembering(2)
     heard = Heard(reader)
-    with answer_past(writer, "r1", "joint_states", memory, encode), heard.reader:
+    with serve_history(writer, "r1", "joint_states", memory, encode), heard.reader:
         await_answers(reader)
         for _ in range(30):
             heard.reader.ask(KEY, 7)
@@ -224,14 +224,14 @@ def test_more_writers_than_are_asked_at_once_all_have_their_turn(sessions: tuple
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
-        (Answer(b"\x93", ENCODINGS[Past]), "truncated"),
-        (Answer(encode(state(0)), ENCODINGS[JointState]), "foreign"),
+        (Reply(b"\x93", ENCODINGS[HistoryPage]), "truncated"),
+        (Reply(encode(state(0)), ENCODINGS[JointState]), "foreign"),
     ],
 )
-def test_an_answer_that_is_none_is_told_and_ends_the_asking(sessions, answer: Answer, reason: str):
+def test_an_answer_that_is_none_is_told_and_ends_the_asking(sessions, answer: Reply, reason: str):
     writer, reader = sessions
     heard = Heard(reader)
-    with Service(writer, KEY, lambda _: answer), heard.reader:
+    with Queryable(writer, KEY, lambda _: answer), heard.reader:
         await_answers(reader)
         heard.reader.ask(KEY, 7)
         until(lambda: len(heard.errors) == 1)
@@ -240,15 +240,15 @@ def test_an_answer_that_is_none_is_told_and_ends_the_asking(sessions, answer: An
 
 def test_a_writer_that_always_names_the_same_older_page_is_not_asked_for_ever(sessions):
     writer, reader = sessions
-    page = encode(Past(ENCODINGS[JointState], (encode(state(5)),), 5))
+    page = encode(HistoryPage(ENCODINGS[JointState], (encode(state(5)),), 5))
     asked: list[str] = []
 
     def answer(parameters):
         asked.append(parameters.get("before", ""))
-        return Answer(page, ENCODINGS[Past])
+        return Reply(page, ENCODINGS[HistoryPage])
 
     heard = Heard(reader)
-    with Service(writer, KEY, answer), heard.reader:
+    with Queryable(writer, KEY, answer), heard.reader:
         await_answers(reader)
         asked.clear()
         heard.reader.ask(KEY, 7)
@@ -268,9 +268,13 @@ def test_who_answers_only_later_is_heard_all_the_same(sessions: tuple[Session, S
         def answer(parameters):
             first = not asked.is_set()
             asked.set()
-            return None if first else Answer(encode(Past(ENCODINGS[JointState], (b"x",))), ENCODINGS[Past])
+            return (
+                None
+                if first
+                else Reply(encode(HistoryPage(ENCODINGS[JointState], (b"x",))), ENCODINGS[HistoryPage])
+            )
 
-        with Service(writer, KEY, answer):
+        with Queryable(writer, KEY, answer):
             until(lambda: heard.pages)
     assert [[one.payload for one in page] for page in heard.pages] == [[b"x"]]
 
@@ -291,7 +295,7 @@ def test_many_silent_writers_of_one_robot_do_not_delay_the_history_of_another(se
     kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
     silent = writer.zenoh.declare_queryable("zstate/r2/joint_states", kept)
     heard = Heard(reader)
-    with answer_past(writer, "r1", "joint_states", remembering(PAGE_SAMPLES + 3), encode), heard.reader:
+    with serve_history(writer, "r1", "joint_states", remembering(PAGE_SAMPLES + 3), encode), heard.reader:
         await_answers(reader)
         for session in range(500):
             heard.reader.ask("zstate/r2/joint_states", session)
@@ -321,13 +325,13 @@ def test_a_writer_that_keeps_silent_is_asked_three_times(sessions):
 
 def test_of_many_replies_the_first_on_the_right_key_is_the_page(sessions):
     writer, reader = sessions
-    right, wrong = (encode(Past(ENCODINGS[JointState], (sample,))) for sample in (b"right", b"wrong"))
+    right, wrong = (encode(HistoryPage(ENCODINGS[JointState], (sample,))) for sample in (b"right", b"wrong"))
 
     def answer(query: zenoh.Query) -> None:
         with query:
-            query.reply("zstate/*/joint_states", wrong, encoding=ENCODINGS[Past])
+            query.reply("zstate/*/joint_states", wrong, encoding=ENCODINGS[HistoryPage])
             for payload in (right, wrong, wrong):
-                query.reply(KEY, payload, encoding=ENCODINGS[Past])
+                query.reply(KEY, payload, encoding=ENCODINGS[HistoryPage])
 
     queryable = writer.zenoh.declare_queryable(KEY, answer)
     heard = Heard(reader)
@@ -340,9 +344,9 @@ def test_of_many_replies_the_first_on_the_right_key_is_the_page(sessions):
 
 def test_a_page_that_is_too_large_is_refused(sessions):
     writer, reader = sessions
-    page = encode(Past(ENCODINGS[JointState], (bytes(MOST_PAGE_BYTES),)))
+    page = encode(HistoryPage(ENCODINGS[JointState], (bytes(MOST_PAGE_BYTES),)))
     heard = Heard(reader)
-    with Service(writer, KEY, lambda _: Answer(page, ENCODINGS[Past])), heard.reader:
+    with Queryable(writer, KEY, lambda _: Reply(page, ENCODINGS[HistoryPage])), heard.reader:
         await_answers(reader)
         heard.reader.ask(KEY, 7)
         until(lambda: heard.errors)
@@ -361,8 +365,8 @@ def test_a_page_that_cannot_be_taken_does_not_end_the_asking_of_others(sessions,
             raise InvalidInput("the first")
         return True
 
-    past = PastReader(reader, take, lambda *_: None)
-    with answer_past(writer, "r1", "joint_states", remembering(3), encode), past:
+    past = HistoryReader(reader, take, lambda *_: None)
+    with serve_history(writer, "r1", "joint_states", remembering(3), encode), past:
         await_answers(reader)
         past.ask(KEY, 7)
         past.ask(KEY, 7)

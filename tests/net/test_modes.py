@@ -14,7 +14,7 @@ import pytest
 from support import Child, a_free_port, until
 
 from zstate.errors import ConfigError, InvalidInput
-from zstate.net.certificates import issue_identities
+from zstate.net.security.certificates import issue_identities
 from zstate.net.session import connect
 
 LAN_PEER = """
@@ -165,7 +165,7 @@ def test_where_multicast_is_blocked_they_meet_through_one_that_all_connect_to(ma
 
 SECURED = """
     import logging, sys
-    from zstate.net.security import Credentials
+    from zstate.net.security.credentials import Credentials
     from zstate.net.session import connect
     logging.basicConfig(format="%(message)s")
     folder, name = sys.argv[1:]

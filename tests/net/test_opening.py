@@ -11,8 +11,8 @@ import zenoh
 from support import Child, a_free_port
 
 from zstate.errors import AccessDenied, PortBusy, Unreachable
-from zstate.net.opening import patience_in
-from zstate.net.security import Credentials
+from zstate.net.open import connect_timeout
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
 LONG_S = 60.0
@@ -88,7 +88,7 @@ def test_of_several_endpoints_in_a_configuration_of_zenoh_a_dead_one_holds_nobod
 
 def test_a_configuration_says_how_long_to_wait():
     def patience(**connecting: object) -> float:
-        return patience_in(zenoh.Config.from_json5(json.dumps(client([nowhere()], **connecting))))
+        return connect_timeout(zenoh.Config.from_json5(json.dumps(client([nowhere()], **connecting))))
 
     assert patience() == 0.0
     assert patience(timeout_ms=2500) == 2.5

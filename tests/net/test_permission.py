@@ -9,8 +9,8 @@ from support import a_free_port
 
 from zstate import StatePublisher, StaticPublisher, connect, discover
 from zstate.errors import AccessDenied
-from zstate.net.access import Fleet, access_control
-from zstate.net.security import Credentials
+from zstate.net.security.acl import AclRoles, access_control
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session
 
 USERS = ("r1", "r2", "desk", "stranger")
@@ -27,7 +27,7 @@ def endpoint(tmp_path) -> Iterator[str]:
         "listen": {"endpoints": [endpoint]},
         "scouting": {"multicast": {"enabled": False}},
         "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
-        "access_control": access_control(Fleet(("r1", "r2"), ("desk",))),
+        "access_control": access_control(AclRoles(("r1", "r2"), ("desk",))),
     }
     with connect(settings):
         yield endpoint
@@ -70,7 +70,7 @@ def test_who_shows_nothing_cannot_be_told_apart_and_is_not_asked():
         connect(mode="client", endpoints=endpoint) as session,
         StatePublisher(session, RRBOT, "r1"),
     ):
-        assert session.twin is None
+        assert session.probe is None
 
 
 def test_where_the_router_is_gone_nothing_is_held_against_the_writer(tmp_path):

@@ -14,14 +14,14 @@ from live import RRBOT
 from support import Child, until
 
 from zstate.errors import SecondWriter
-from zstate.net.presence import announce, tokens_now
+from zstate.net.presence import announce, current_tokens
 from zstate.net.session import Session, connect
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import edge_key
-from zstate.wire.writer import Announced, Writer
 
 ROUTER = """
     import sys
@@ -79,7 +79,7 @@ def test_of_two_who_place_a_frame_at_once_one_is_told_of_the_other_whose_edge_ho
             StaticPublisher(pair[1], "r2", "room", program="room") as room,
         ):
             for session in pair:
-                until(lambda s=session: len(tokens_now(s, "zstate/*/@writer/tf_static/*", 1.0)) == 2)
+                until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/tf_static/*", 1.0)) == 2)
             errors = at_once(
                 lambda mount=mount: mount.set(edge("fleet/base", 1.0)),
                 lambda room=room: room.set(edge("fleet/base", 2.0)),
@@ -113,12 +113,12 @@ def test_who_comes_second_in_a_session_is_told_always(pair):
 
 def test_what_somebody_was_about_to_place_who_left_may_be_placed(sessions):
     ours, theirs = sessions
-    early = Announced("r2", "tf_static", Writer("room", "laptop", 9, 1, 8), "room")
+    early = Announcement("r2", "tf_static", WriterId("room", "laptop", 9, 1, 8), "room")
     with StaticPublisher(ours, "r1", "mount") as mount:
         with announce(theirs, edge_key("r2", ("fleet/base", "fleet/camera"), early.identity)):
-            until(lambda: tokens_now(ours, "zstate/*/@edge/**", 1.0))
+            until(lambda: current_tokens(ours, "zstate/*/@edge/**", 1.0))
             with pytest.raises(SecondWriter, match="is placing 'fleet/camera' on 'fleet/base'") as raised:
                 mount.set(edge("fleet/base", 1.0))
             assert raised.value.first == early.writer
-        until(lambda: not tokens_now(ours, "zstate/*/@edge/**", 1.0))
+        until(lambda: not current_tokens(ours, "zstate/*/@edge/**", 1.0))
         mount.set(edge("fleet/base", 1.0))

@@ -9,51 +9,51 @@ from support import Child, until
 
 from zstate.errors import InvalidInput
 from zstate.net.presence import (
-    Announcement,
+    LivelinessToken,
     RobotInfo,
     announce,
     announce_reader,
     discover,
     discover_readers,
+    local_writer,
     watch,
-    writer_here,
 )
 from zstate.net.session import Session, connect
-from zstate.net.wires import wire_named
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream, check_writer, writer_key
-from zstate.wire.writer import Announced, Writer
+from zstate.wire.registry import get_wire
 
-DRIVER = Writer("arm driver", "jetson", 412, 5, 7)
-CAMERA = Writer("camera", "nuc", 9, 6, 8)
+DRIVER = WriterId("arm driver", "jetson", 412, 5, 7)
+CAMERA = WriterId("camera", "nuc", 9, 6, 8)
 
 WRITER = """
     import sys
-    from zstate.net.presence import announce, writer_here
+    from zstate.net.presence import announce, local_writer
     from zstate.net.session import connect
     from zstate.wire.keys import writer_key
-    token = writer_key(sys.argv[1], "joint_states", writer_here(3, "driver").identity)
+    token = writer_key(sys.argv[1], "joint_states", local_writer(3, "driver").identity)
     with connect() as session, announce(session, token):
         print("announced")
         sys.stdin.readline()
 """
 
 
-def said(session: Session, robot: str, stream: Stream, writer: Writer) -> Announcement:
+def said(session: Session, robot: str, stream: Stream, writer: WriterId) -> LivelinessToken:
     return announce(session, writer_key(robot, stream, writer.identity))
 
 
 def test_a_writer_is_said_as_program_host_and_pid():
-    assert str(Writer("zstate-publish", "jetson", 412, 0, 0)) == "zstate-publish@jetson pid 412"
+    assert str(WriterId("zstate-publish", "jetson", 412, 0, 0)) == "zstate-publish@jetson pid 412"
 
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=6)
-WRITERS = st.builds(Writer, *[NAMES] * 2, *[st.integers(0, 2**63 - 1)] * 2, st.integers(0, 2**64 - 1))
+WRITERS = st.builds(WriterId, *[NAMES] * 2, *[st.integers(0, 2**63 - 1)] * 2, st.integers(0, 2**64 - 1))
 
 
 @given(WRITERS)
-def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: Writer):
+def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: WriterId):
     assert check_writer(writer.identity) == writer.identity
-    assert Writer.parse(writer.identity) == writer
+    assert WriterId.parse(writer.identity) == writer
 
 
 @pytest.mark.parametrize(
@@ -69,34 +69,34 @@ def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: Writer):
 )
 def test_an_identity_that_is_not_ours_is_refused(identity: str):
     with pytest.raises(InvalidInput):
-        Writer.parse(identity)
+        WriterId.parse(identity)
 
 
 @given(st.from_regex(r"[\w.,-]{0,6}", fullmatch=True))
 def test_the_name_of_static_edges_stands_in_the_token_and_without_one_it_is_as_before(name: str):
-    announced = Announced("r1", "tf_static", DRIVER, name)
-    assert Announced.parse("r1", "tf_static", check_writer(announced.identity)) == announced
-    assert Announced.parse("r1", "tf_static", DRIVER.identity).name == ""
+    announced = Announcement("r1", "tf_static", DRIVER, name)
+    assert Announcement.parse("r1", "tf_static", check_writer(announced.identity)) == announced
+    assert Announcement.parse("r1", "tf_static", DRIVER.identity).name == ""
 
 
 @pytest.mark.parametrize("name", ["a/b", "line\nend", "\x1b[2J", "@writer", " "])
 def test_a_token_whose_static_name_cannot_be_one_is_foreign(name: str):
     with pytest.raises(InvalidInput):
-        Announced.parse("r1", "tf_static", Announced("r1", "tf_static", DRIVER, name).identity)
+        Announcement.parse("r1", "tf_static", Announcement("r1", "tf_static", DRIVER, name).identity)
 
 
 def test_a_name_stands_nowhere_else():
     with pytest.raises(InvalidInput):
-        Announced.parse("r1", "joint_states", f"{DRIVER.identity},mount")
+        Announcement.parse("r1", "joint_states", f"{DRIVER.identity},mount")
 
 
 def test_a_writer_here_tells_this_process():
     before = time.time_ns()
-    writer = writer_here(7)
+    writer = local_writer(7)
     assert (writer.pid, writer.session) == (os.getpid(), 7)
     assert before <= writer.since <= time.time_ns()
     assert writer.program
-    assert writer_here(7, "driver").program == "driver"
+    assert local_writer(7, "driver").program == "driver"
 
 
 def test_discover_names_every_robot_with_its_writers_sorted():
@@ -133,7 +133,7 @@ def test_discover_of_nobody_takes_its_time_and_no_more():
 
 def test_readers_are_announced_apart_from_writers_each_by_itself():
     with connect() as one, connect() as asker, ExitStack() as reading:
-        wire = wire_named("native")
+        wire = get_wire("native")
         for robot, streams in (("r1", ("tf", "tf_static")), ("*", ("tf",)), ("*", ("tf",))):
             for announcement in announce_reader(one, wire, robot, streams):
                 reading.enter_context(announcement)
@@ -164,8 +164,8 @@ def test_tokens_that_are_not_ours_are_passed_over_and_counted():
 
 
 def test_a_watch_hears_who_is_there_who_comes_and_who_goes():
-    events: list[tuple[Announced, bool]] = []
-    camera, driver = Announced("r1", "tf", CAMERA), Announced("r1", "joint_states", DRIVER)
+    events: list[tuple[Announcement, bool]] = []
+    camera, driver = Announcement("r1", "tf", CAMERA), Announcement("r1", "joint_states", DRIVER)
     with (
         connect() as writer,
         connect() as reader,
@@ -183,7 +183,7 @@ def test_a_watch_hears_who_is_there_who_comes_and_who_goes():
 
 
 def test_a_killed_writer_is_heard_to_go(spawn):
-    events: list[tuple[Announced, bool]] = []
+    events: list[tuple[Announcement, bool]] = []
     with connect() as reader, watch(reader, "*", lambda *event: events.append(event)):
         child: Child = spawn(WRITER, "r1")
         until(lambda: len(events) == 1)

@@ -8,7 +8,7 @@ import pytest
 from refusing import ROUTERS, Fleet
 
 from zstate.errors import AccessDenied, Unreachable
-from zstate.net.security import Credentials
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
 
@@ -185,8 +185,8 @@ def test_idle_connections_do_not_keep_a_client_out_of_a_router_that_asks_for_use
     endpoint = f"tcp/127.0.0.1:{free_port}"
     code = """
         import sys
-        from zstate.net.router_config import RouterConfig
-        from zstate.net.security import Credentials
+        from zstate.net.security.router_config import RouterConfig
+        from zstate.net.security.credentials import Credentials
         from zstate.net.session import connect
         with connect(RouterConfig((sys.argv[1],), credentials=Credentials(users=sys.argv[2])).settings()):
             print("ready")

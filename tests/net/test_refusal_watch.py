@@ -11,8 +11,8 @@ import pytest
 from refusing import Fleet
 from support import Child, a_free_port, until
 
-from zstate.net import refusal_watch
-from zstate.net.security import Credentials
+from zstate.net.security import connection_monitor
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
 CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | None]]] = {
@@ -36,8 +36,8 @@ CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | N
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """It looks every tenth of a second."""
-    monkeypatch.setattr(refusal_watch, "FIRST_LOOK_S", 0.1)
-    monkeypatch.setattr(refusal_watch, "PERIOD_S", 0.1)
+    monkeypatch.setattr(connection_monitor, "FIRST_LOOK_S", 0.1)
+    monkeypatch.setattr(connection_monitor, "PERIOD_S", 0.1)
 
 
 def refusals(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
@@ -94,7 +94,7 @@ def test_only_of_those_who_refuse_something_is_said_and_once(fleet: Fleet, caplo
 
 ROUTER = """
     import sys
-    from zstate.net.security import Credentials
+    from zstate.net.security.credentials import Credentials
     from zstate.net.session import connect
     with connect(mode="router", listen=sys.argv[1], credentials=Credentials(users=sys.argv[2])):
         print("ready")

@@ -13,17 +13,17 @@ import zenoh
 from support import SOON_S, until
 
 from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.net import replies
-from zstate.net.presence import RobotInfo, discover, discover_readers, tokens_now, watch, writer_here
-from zstate.net.replies import query, query_tokens
+from zstate.net import queryable
+from zstate.net.presence import RobotInfo, current_tokens, discover, discover_readers, local_writer, watch
+from zstate.net.queryable import query, query_tokens
 from zstate.net.session import Session, connect
-from zstate.net.wires import wire_named
 from zstate.net.writer import WireWriter, write_all
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement
 from zstate.wire.keys import reader_key, writer_key
 from zstate.wire.messages import StaticTransforms, to_block
-from zstate.wire.writer import Announced
+from zstate.wire.registry import get_wire
 
 MORE_THAN_THE_DEFAULT = 300  # Zenoh's default channel holds 256
 
@@ -39,8 +39,8 @@ def many_tokens(session: Session, count: int) -> Iterator[list[str]]:
         key
         for number in range(count)
         for key in (
-            writer_key(f"r{number}", "joint_states", writer_here(number).identity),
-            reader_key(f"r{number}", "joint_states", writer_here(number).identity),
+            writer_key(f"r{number}", "joint_states", local_writer(number).identity),
+            reader_key(f"r{number}", "joint_states", local_writer(number).identity),
         )
     ]
     with ExitStack() as declared:
@@ -50,7 +50,7 @@ def many_tokens(session: Session, count: int) -> Iterator[list[str]]:
 
 
 def test_more_tokens_than_the_default_channel_holds_are_discovered_in_the_session_that_announces_them():
-    heard: list[Announced] = []
+    heard: list[Announcement] = []
     with (
         connect() as session,
         many_tokens(session, MORE_THAN_THE_DEFAULT),
@@ -65,7 +65,7 @@ def test_more_tokens_than_the_default_channel_holds_are_discovered_in_the_sessio
 def test_they_are_discovered_in_a_session_that_follows_them(sessions: tuple[Session, Session]):
     ours, theirs = sessions
     with many_tokens(theirs, MORE_THAN_THE_DEFAULT), watch(ours, "*", lambda *_: None):
-        until(lambda: len(tokens_now(ours, "zstate/*/@writer/*/*", 1.0)) == MORE_THAN_THE_DEFAULT)
+        until(lambda: len(current_tokens(ours, "zstate/*/@writer/*/*", 1.0)) == MORE_THAN_THE_DEFAULT)
         assert len(discover(ours)) == MORE_THAN_THE_DEFAULT
         ours.zenoh.put("zstate/r1/joint_states", b"")
 
@@ -73,7 +73,7 @@ def test_they_are_discovered_in_a_session_that_follows_them(sessions: tuple[Sess
 def test_one_session_has_more_static_writers_than_the_default_channel_holds():
     with connect() as session, ExitStack() as opened:
         for number in range(MORE_THAN_THE_DEFAULT):
-            wire_writer = WireWriter(session, wire_named("native"), "r1", writer_here(number))
+            wire_writer = WireWriter(session, get_wire("native"), "r1", local_writer(number))
             latched = opened.enter_context(wire_writer).open_latched("tf_static", f"mount{number}")
             edges = (("base", f"camera{number}"),)
             write_all([latched], StaticTransforms(number, edges, to_block([1, 0, 0, 0, 0, 0, 1])))
@@ -111,7 +111,7 @@ def test_closing_the_session_ends_a_query_that_waits(sessions: tuple[Session, Se
 def test_replies_beyond_the_bound_are_counted_in_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    monkeypatch.setattr(replies, "MOST_REPLIES", 10)
+    monkeypatch.setattr(queryable, "MOST_REPLIES", 10)
     with connect() as session, many_tokens(session, 30), caplog.at_level(logging.WARNING, "zstate"):
         assert len(list(query_tokens(session.zenoh, "zstate/*/@writer/*/*", 1.0))) == 10
     (record,) = caplog.records
@@ -120,16 +120,16 @@ def test_replies_beyond_the_bound_are_counted_in_a_warning(
 
 def test_a_watch_loses_no_token_in_a_burst_that_overflows_its_ring(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zstate.net.presence.CAPACITY", 64)
-    alive: set[Announced] = set()
+    alive: set[Announcement] = set()
     may_go_on = threading.Event()
 
-    def note(announced: Announced, is_alive: bool) -> None:
+    def note(announced: Announcement, is_alive: bool) -> None:
         may_go_on.wait()
         (alive.add if is_alive else alive.discard)(announced)
 
     with connect() as writer, connect() as reader, watch(reader, "*", note):
         with many_tokens(writer, 300):
-            until(lambda: len(tokens_now(reader, "zstate/*/@writer/*/*", 1.0)) == 300)
+            until(lambda: len(current_tokens(reader, "zstate/*/@writer/*/*", 1.0)) == 300)
             may_go_on.set()
             until(lambda: len(alive) == 300)
         until(lambda: not alive)
@@ -138,7 +138,7 @@ def test_a_watch_loses_no_token_in_a_burst_that_overflows_its_ring(monkeypatch: 
 def test_a_callback_that_raises_costs_no_other_token_its_call(monkeypatch: pytest.MonkeyPatch):
     heard: list[str] = []
 
-    def note(announced: Announced, is_alive: bool) -> None:
+    def note(announced: Announcement, is_alive: bool) -> None:
         if announced.robot == "r3":
             raise InvalidInput("r3")
         heard.append(announced.robot)
@@ -154,7 +154,7 @@ def test_a_closed_session_refuses_a_query():
     session = connect()
     session.close()
     with pytest.raises(Closed):
-        tokens_now(session, "zstate/*/@writer/*/*", 1.0)
+        current_tokens(session, "zstate/*/@writer/*/*", 1.0)
 
 
 def test_robots_of_a_large_fleet_are_discovered_within_the_default_timeout():

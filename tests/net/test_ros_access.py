@@ -13,13 +13,13 @@ from support import Child, until
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import AccessDenied, InvalidInput
-from zstate.net.access import Fleet, access_control, access_text
-from zstate.net.presence import tokens_now
-from zstate.net.security import Credentials
+from zstate.net.presence import current_tokens
+from zstate.net.security.acl import AclRoles, access_control, access_text
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"
-FLEET = Fleet(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,))
+FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,))
 USERS = (*FLEET.names, "stranger")
 JOINTS = "sensor_msgs::msg::dds_::JointState_/hash"
 ENDPOINT = "@ros2_lv/7/z/0/{number}/{kind}/%/%{robot}/node/%{topic}/type/hash/::,10:,:,:,,"
@@ -111,7 +111,7 @@ def test_each_stands_in_the_graph_with_what_is_theirs(join: Join):
     for observer in ("hand", "r2"):
 
         def seen(session: Session = sessions[observer]) -> frozenset[str]:
-            return tokens_now(session, "@ros2_lv/7/**", 1.0)
+            return current_tokens(session, "@ros2_lv/7/**", 1.0)
 
         until(lambda seen=seen: len(seen()) >= len(allowed))
         assert seen() == allowed
@@ -165,7 +165,7 @@ def test_services_are_called_by_operators_and_answered_by_their_robot(join: Join
 
 def test_several_wires_stand_side_by_side():
     def rules(*wires: str) -> list[object]:
-        listed = access_control(Fleet(("r1",), ("desk",), wires=wires))["rules"]
+        listed = access_control(AclRoles(("r1",), ("desk",), wires=wires))["rules"]
         return [rule["id"] for rule in listed]  # type: ignore[index, union-attr]
 
     other = "ros2:domain=5,namespace=*"
@@ -174,21 +174,21 @@ def test_several_wires_stand_side_by_side():
 
 
 def test_a_robot_alone_in_the_root_namespace_has_its_domain():
-    (written, *_) = access_control(Fleet(("r1",), wires=("ros2:domain=5",)))["rules"]  # type: ignore[misc]
+    (written, *_) = access_control(AclRoles(("r1",), wires=("ros2:domain=5",)))["rules"]  # type: ignore[misc]
     assert written["key_exprs"] == ["5/**", "5/**/@adv/**", "@ros2_lv/5/**"]
 
 
 @pytest.mark.parametrize(
     ("fleet", "text"),
     [
-        (Fleet(("r1", "r2"), wires=("ros2",)), "'ros2:namespace=*'"),
-        (Fleet(("r1", "r2"), wires=("ros2:namespace=site",)), "the same topics"),
-        (Fleet(("r-1",), wires=("ros2:namespace=*",)), "ROS names are made of"),
-        (Fleet(("r1",), namespace="hall", wires=("ros2",)), "no Zenoh namespace"),
-        (Fleet(("r1",), wires=("ros2dds",)), "no access control for the wire 'ros2dds'"),
-        (Fleet(("r1",), wires=("pigeon",)), "there is for 'native' and 'ros2'"),
+        (AclRoles(("r1", "r2"), wires=("ros2",)), "'ros2:namespace=*'"),
+        (AclRoles(("r1", "r2"), wires=("ros2:namespace=site",)), "the same topics"),
+        (AclRoles(("r-1",), wires=("ros2:namespace=*",)), "ROS names are made of"),
+        (AclRoles(("r1",), namespace="hall", wires=("ros2",)), "no Zenoh namespace"),
+        (AclRoles(("r1",), wires=("ros2dds",)), "no access control for the wire 'ros2dds'"),
+        (AclRoles(("r1",), wires=("pigeon",)), "there is for 'native' and 'ros2'"),
     ],
 )
-def test_what_cannot_be_told_apart_or_is_no_wire_is_refused(fleet: Fleet, text: str):
+def test_what_cannot_be_told_apart_or_is_no_wire_is_refused(fleet: AclRoles, text: str):
     with pytest.raises(InvalidInput, match=text.replace("*", r"\*")):
         access_control(fleet)

@@ -11,12 +11,10 @@ from support import a_free_port, until
 
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
-from zstate.net.access import Fleet, access_control, access_text
-from zstate.net.access_file import read_access_control
-from zstate.net.config import our_config
-from zstate.net.router_config import RouterConfig
-from zstate.net.security import Credentials
-from zstate.net.thinning import Thinning
+from zstate.net.config import default_config
+from zstate.net.security.acl import AclRoles, access_control, access_text, read_access_control
+from zstate.net.security.credentials import Credentials
+from zstate.net.security.router_config import Downsampling, RouterConfig
 
 FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
 CONFIGURATIONS = {
@@ -26,8 +24,8 @@ CONFIGURATIONS = {
         listen=("tls/[::]:7447", "tcp/127.0.0.1:7447"),
         connect=("tls/fleet.example.com:7447", "tls/spare.example.com:7447"),
         credentials=FILES,
-        thinning=Thinning({"joint_states": 10.0, "tf": 2.5}, ("r1", "r2"), ("wwan0",)),
-        access_control=access_control(Fleet(("r1",), ("desk",))),
+        thinning=Downsampling({"joint_states": 10.0, "tf": 2.5}, ("r1", "r2"), ("wwan0",)),
+        access_control=access_control(AclRoles(("r1",), ("desk",))),
     ),
     "users": RouterConfig(credentials=Credentials(user="r1", password="secret", users="/etc/users")),
 }
@@ -54,7 +52,7 @@ def test_every_section_says_what_it_is_for(name: str):
 
 def test_it_differs_from_a_session_in_router_mode_by_nothing_that_matters_to_a_router():
     made = parsed(CONFIGURATIONS["plain"].text())
-    opened = json.loads(str(our_config("router", (), ("tcp/127.0.0.1:7447",))))
+    opened = json.loads(str(default_config("router", (), ("tcp/127.0.0.1:7447",))))
     for ours in (made, opened):
         for of_others in ("connect", "scouting"):
             del ours[of_others]
@@ -77,7 +75,7 @@ def test_what_stays_on_this_host_needs_no_encryption():
 
 
 def test_access_control_without_names_is_refused():
-    access = access_control(Fleet(("r1",)))
+    access = access_control(AclRoles(("r1",)))
     with pytest.raises(ConfigError, match="nobody is asked for a name"):
         RouterConfig(access_control=access)
     with pytest.raises(ConfigError, match="nobody is asked for a name"):
@@ -86,7 +84,7 @@ def test_access_control_without_names_is_refused():
 
 
 def test_access_control_is_read_from_a_file_as_it_was_written(tmp_path: Path):
-    fleet = Fleet(("r1", "r2"), ("desk",))
+    fleet = AclRoles(("r1", "r2"), ("desk",))
     file = tmp_path / "acl.json5"
     file.write_text(access_text(fleet))
     assert read_access_control(file) == access_control(fleet)
@@ -103,7 +101,7 @@ def test_a_file_without_access_control_is_refused(tmp_path: Path, text: str):
 def test_each_robot_is_thinned_apart_and_latched_values_are_not():
     """For one rule of both, Zenoh would let through as much of them together as of one."""
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
-    thinning = Thinning({"joint_states": 20.0}, ("r1", "r2"))
+    thinning = Downsampling({"joint_states": 20.0}, ("r1", "r2"))
     with (
         connect(RouterConfig((endpoint,), thinning=thinning).settings()),
         connect(mode="client", endpoints=endpoint) as writer,
@@ -133,7 +131,7 @@ def test_each_robot_is_thinned_apart_and_latched_values_are_not():
 
 def test_elsewhere_nothing_is_thinned():
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
-    thinning = Thinning({"joint_states": 0.01}, ("r1",), ("no-such-interface",))
+    thinning = Downsampling({"joint_states": 0.01}, ("r1",), ("no-such-interface",))
     with (
         connect(RouterConfig((endpoint,), thinning=thinning).settings()),
         connect(mode="client", endpoints=endpoint) as writer,
@@ -157,9 +155,9 @@ def test_elsewhere_nothing_is_thinned():
 )
 def test_thinning_that_would_starve_somebody_is_refused(rates_hz, robots, text: str):
     with pytest.raises(InvalidInput, match=text):
-        Thinning(rates_hz, robots)
+        Downsampling(rates_hz, robots)
 
 
 def test_a_namespace_stands_before_the_keys_that_are_thinned():
-    (section,) = Thinning({"tf": 1.0}, ("r1",), namespace="hall/east").settings()
+    (section,) = Downsampling({"tf": 1.0}, ("r1",), namespace="hall/east").settings()
     assert section["rules"] == [{"key_expr": "hall/east/zstate/r1/tf", "freq": 1.0}]

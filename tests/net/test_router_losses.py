@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from support import until
 
-from zstate.net.presence import announce, watch
-from zstate.net.router_losses import RouterLosses
+from zstate.net.presence import RouterLossDetector, announce, watch
 from zstate.net.session import connect
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import writer_key
-from zstate.wire.writer import Writer
 
-TOKEN = writer_key("r1", "joint_states", Writer("driver", "jetson", 412, 5, 7).identity)
+TOKEN = writer_key("r1", "joint_states", WriterId("driver", "jetson", 412, 5, 7).identity)
 
 ROUTER = """
     import sys
@@ -48,6 +47,6 @@ def test_a_writer_that_leaves_is_told_from_a_router_that_is_lost(spawn, free_por
 
 def test_among_peers_no_router_is_lost(sessions):
     ours, theirs = sessions
-    with RouterLosses(ours) as losses:
+    with RouterLossDetector(ours) as losses:
         theirs.close()
-        assert not losses.happened_just_now()
+        assert not losses.lost_recently()

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from zstate.errors import ConfigError
-from zstate.net.certificates import issue_identities
-from zstate.net.security import Credentials
+from zstate.net.security.certificates import issue_identities
+from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
 HERE = "tls/127.0.0.1:1"

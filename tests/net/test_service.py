@@ -8,7 +8,7 @@ import time
 import pytest
 from support import SOON_S, until
 
-from zstate.net.service import Answer, Service, parameters_of
+from zstate.net.queryable import Queryable, Reply, parse_parameters
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher, StreamSubscriber
 
@@ -39,9 +39,9 @@ def answered(session: Session, selector: str) -> list[tuple[bool, bytes, str]]:
 
 def test_a_question_has_its_answer_and_an_error_is_one_to_zenoh(sessions: tuple[Session, Session]):
     def answer(parameters):
-        return Answer(repr(parameters).encode(), "text/plain", is_error="wrong" in parameters)
+        return Reply(repr(parameters).encode(), "text/plain", is_error="wrong" in parameters)
 
-    with Service(sessions[0], KEY, answer) as service:
+    with Queryable(sessions[0], KEY, answer) as service:
         said = answered(sessions[1], f"{KEY}?a=1;b=x=y")
         assert said == [(True, b"{'a': '1', 'b': 'x=y'}", "text/plain")]
         assert replies(sessions[1], f"{KEY}?wrong") == [(False, b"{'wrong': ''}", "text/plain")]
@@ -50,7 +50,7 @@ def test_a_question_has_its_answer_and_an_error_is_one_to_zenoh(sessions: tuple[
 
 
 def test_no_answer_is_said_at_once(sessions: tuple[Session, Session]):
-    with Service(sessions[0], KEY, lambda parameters: Answer(b"x", "") if parameters else None):
+    with Queryable(sessions[0], KEY, lambda parameters: Reply(b"x", "") if parameters else None):
         answered(sessions[1], f"{KEY}?a=1")
         start = time.monotonic()
         assert replies(sessions[1], KEY, timeout_s=30.0) == []
@@ -64,9 +64,9 @@ def test_an_answer_that_fails_is_counted_and_reported_once_and_the_next_is_given
     monkeypatch.setattr(threading, "excepthook", reported.append)
 
     def answer(parameters):
-        return Answer(str(1 / int(parameters["n"])).encode(), "")
+        return Reply(str(1 / int(parameters["n"])).encode(), "")
 
-    with Service(sessions[0], KEY, answer) as service:
+    with Queryable(sessions[0], KEY, answer) as service:
         answered(sessions[1], f"{KEY}?n=1")
         for _ in range(2):
             assert replies(sessions[1], f"{KEY}?n=0") == []
@@ -85,7 +85,7 @@ def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
         if parameters:
             asked.set()
             may_answer.wait(30.0)
-        return Answer(b"x", "")
+        return Reply(b"x", "")
 
     heard: list[bytes] = []
     with (
@@ -93,7 +93,7 @@ def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
         StreamSubscriber(
             writer, "zstate/r1/tf", lambda arrivals: heard.extend(one.payload for one in arrivals)
         ),
-        Service(writer, KEY, answer, capacity=4) as service,
+        Queryable(writer, KEY, answer, capacity=4) as service,
     ):
         until(lambda: stream.has_readers)
         answered(reader, KEY)
@@ -115,7 +115,7 @@ def next_reply(get) -> bool:
 
 
 def test_closing_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):
-    service = Service(sessions[0], KEY, lambda _: None)
+    service = Queryable(sessions[0], KEY, lambda _: None)
     start = time.monotonic()
     service.close()
     service.close()
@@ -133,4 +133,4 @@ def test_closing_is_quick_and_may_be_repeated(sessions: tuple[Session, Session])
     ],
 )
 def test_parameters_are_pairs(text: str, parameters: dict[str, str]):
-    assert parameters_of(text) == parameters
+    assert parse_parameters(text) == parameters

@@ -19,13 +19,13 @@ from zstate.net.status import StatusPublisher, watch_status
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import status_key
 from zstate.wire.messages import Status
 from zstate.wire.native import ENCODINGS, encode
-from zstate.wire.writer import Writer
 
 OK = Status(1, 2, "ok", "driver", "nuc", 3, 100.0, 4, 0)
-ME = Writer("driver", "nuc", 3, 1, OK.session).identity
+ME = WriterId("driver", "nuc", 3, 1, OK.session).identity
 
 
 class Heard:
@@ -186,7 +186,7 @@ def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
 def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     heard = Heard(sessions[1])
     await_reader(sessions[0], status_key("r1", ME))
-    theirs = Writer("driver", "nuc", 3, 1, 99).identity
+    theirs = WriterId("driver", "nuc", 3, 1, 99).identity
     wrong = [("r1", theirs, OK), ("*", ME, OK), ("r1", ME, replace(OK, rate_hz=float("nan")))]
     wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]
     for robot, identity, status in wrong:

@@ -10,8 +10,8 @@ from zstate.net.topic_statistics import (
     TopicStatistics,
     WriterKey,
 )
-from zstate.net.wires import wire_named
 from zstate.wire.messages import JointState, order_digest
+from zstate.wire.registry import get_wire
 
 MS = 1_000_000
 
@@ -66,7 +66,7 @@ def test_gaps_are_counted_for_each_session_and_late_samples_fill_none_twice():
 
 
 def test_samples_of_one_message_are_one_for_each_source():
-    with connect() as session, TopicStatistics(session, wire_named("native")) as topic:
+    with connect() as session, TopicStatistics(session, get_wire("native")) as topic:
         for seq in (1, 1, 2):
             topic.add("r1", "joint_states", JointState(0, seq, 7, order_digest(()), b""), seq, 0)
         statistics = topic.get(WriterKey("r1", "joint_states", 7))

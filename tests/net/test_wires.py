@@ -3,8 +3,8 @@
 import pytest
 
 from zstate.errors import InvalidInput
-from zstate.net.wires import wire_named
 from zstate.wire.native import NativeWire
+from zstate.wire.registry import get_wire
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
 
@@ -15,7 +15,7 @@ def no_domain(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def options(name: str) -> Ros2Options:
-    wire = wire_named(name)
+    wire = get_wire(name)
     assert isinstance(wire, Ros2Wire)
     return wire.options
 
@@ -24,7 +24,7 @@ def options(name: str) -> Ros2Options:
     ("name", "kind"), [("native", NativeWire), ("ros2", Ros2Wire), ("ros2dds", Ros2DdsWire)]
 )
 def test_each_name_gives_its_wire_anew(name: str, kind: type):
-    one, other = wire_named(name), wire_named(name)
+    one, other = get_wire(name), get_wire(name)
     assert type(one) is type(other) is kind
     assert one is not other
     assert one.name == name
@@ -52,7 +52,7 @@ def test_options_stand_behind_a_colon():
 )
 def test_the_domain_is_that_of_the_environment_unless_given(monkeypatch, name, variable, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", variable)
-    wire = wire_named(name)
+    wire = get_wire(name)
     assert getattr(getattr(wire, "options", None), "domain", None) == domain
 
 
@@ -60,7 +60,7 @@ def test_the_domain_is_that_of_the_environment_unless_given(monkeypatch, name, v
 def test_a_domain_of_the_environment_that_cannot_be_names_the_variable(monkeypatch, variable: str):
     monkeypatch.setenv("ROS_DOMAIN_ID", variable)
     with pytest.raises(InvalidInput, match="ROS_DOMAIN_ID"):
-        wire_named("ros2")
+        get_wire("ros2")
 
 
 @pytest.mark.parametrize(
@@ -78,4 +78,4 @@ def test_a_domain_of_the_environment_that_cannot_be_names_the_variable(monkeypat
 )
 def test_what_is_no_wire_is_refused_with_those_there_are(name: str, said: str):
     with pytest.raises(InvalidInput, match=said):
-        wire_named(name)
+        get_wire(name)

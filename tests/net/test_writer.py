@@ -6,15 +6,15 @@ from support import until
 from wire.ros2.raw_nodes import DESCRIPTION, JOINT_STATES, Ear, key_of, tokens
 
 from zstate.errors import Closed, InvalidInput
-from zstate.net.presence import discover, writer_here
+from zstate.net.presence import discover, local_writer
 from zstate.net.session import connect
-from zstate.net.wires import wire_named
 from zstate.net.writer import WireWriter, write_all
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
-from zstate.wire.sample_names import SampleNames
+from zstate.wire.registry import get_wire
 
 WIRES = ("native", "ros2", "ros2dds")
-LAYOUT = SampleNames(("a", "b"), (0, 1))
+LAYOUT = SampleLayout(("a", "b"), (0, 1))
 STATE = JointState(STAMP, 0, 1, order_digest(("a", "b")), to_block([1.0, 2.0]))
 UNSTAMPED = JointState(0, 0, 1, STATE.order, STATE.positions)
 DESCRIBED = RobotDescription(1, "<robot/>", "digest", (), ())
@@ -31,7 +31,7 @@ def no_domain(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def opened(session, wire: str) -> WireWriter:
-    return WireWriter(session, wire_named(wire), "r1", writer_here(3), LAYOUT)
+    return WireWriter(session, get_wire(wire), "r1", local_writer(3), LAYOUT)
 
 
 @pytest.mark.parametrize("wire", WIRES)

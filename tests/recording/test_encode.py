@@ -26,7 +26,7 @@ from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import Record
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import (
-    Clock,
+    ClockMessage,
     JointState,
     RobotDescription,
     StaticTransforms,
@@ -245,7 +245,7 @@ def test_a_writer_that_starts_again_has_a_channel_of_its_own(desk: Desk):
 
 def repeated(desk: Desk) -> list[tuple[str, str, list[str]]]:
     """What holds at the beginning of a next file: topic, session, and the children of its edges."""
-    desk.encoder.write_message("cart", Clock(1, 0, 9), NOW + 200 * S)
+    desk.encoder.write_message("cart", ClockMessage(1, 0, 9), NOW + 200 * S)
     desk.writer.close()
     with RecordingReader(desk.path.with_name("run_1.mcap")) as reader:
         return [
@@ -314,7 +314,7 @@ def test_statics_without_a_writers_name_add_up_as_in_ros(desk: Desk):
 
 def test_simulated_time_is_recorded_from_zero_on(desk: Desk):
     for number in range(3):
-        desk.encoder.write_message("ros", Clock(number * S, number, 5), NOW + number)
+        desk.encoder.write_message("ros", ClockMessage(number * S, number, 5), NOW + number)
     assert [message.clock.sec for message in desk.read("/clock")] == [0, 1, 2]
     assert {record.publish_time for record in desk.records()} == {0, S, 2 * S}
     assert "zstate.robot" not in desk.records()[0].metadata

@@ -12,7 +12,7 @@ from support import until
 from tales import MS, START, Tale, pose
 
 from zstate.errors import SecondWriter
-from zstate.net.presence import tokens_now
+from zstate.net.presence import current_tokens
 from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
@@ -42,7 +42,7 @@ def replay(session, path: Path, **options: object) -> int:
 
 def test_samples_that_somebody_writes_are_not_replayed_but_with_takeover(sessions, cart: Path):
     with StatePublisher(sessions[0], RRBOT, "cart", streams=["tf"], program="driver"):
-        until(lambda: tokens_now(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
         with pytest.raises(SecondWriter) as raised:
             replay(sessions[1], cart)
         assert (raised.value.stream, raised.value.first.program) == ("tf", "driver")
@@ -66,7 +66,7 @@ def test_a_replay_keeps_others_from_writing_the_same(sessions, cart: Path):
     with Player(sessions[0], cart, rate=0.01) as replayer:
         thread = threading.Thread(target=replayer.run)
         thread.start()
-        until(lambda: tokens_now(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
+        until(lambda: current_tokens(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
         with pytest.raises(SecondWriter):
             StatePublisher(sessions[1], RRBOT, "cart", streams=["tf"])
         replayer.close()
@@ -91,6 +91,6 @@ def test_behind_a_router_it_is_the_same(cart: Path, free_port: int):
         connect(mode="client", endpoints=endpoint) as theirs,
         StatePublisher(theirs, RRBOT, "cart", streams=["tf"]),
     ):
-        until(lambda: tokens_now(ours, "zstate/cart/@writer/tf/*", 1.0))
+        until(lambda: current_tokens(ours, "zstate/cart/@writer/tf/*", 1.0))
         with pytest.raises(SecondWriter):
             replay(ours, cart)

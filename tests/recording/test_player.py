@@ -23,7 +23,7 @@ from zstate.net.session import Session
 from zstate.recording.player import Player, PlayerReport
 from zstate.recording.recorder import Recorder
 from zstate.transform import Transform
-from zstate.wire.messages import Clock, JointState, StaticTransforms, TransformSample, from_block
+from zstate.wire.messages import ClockMessage, JointState, StaticTransforms, TransformSample, from_block
 from zstate.wire.native import ENCODINGS, decode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.ros2.options import Ros2Options
@@ -208,7 +208,11 @@ def test_each_pass_of_a_loop_is_a_new_epoch(sessions, arm: Path):
     for states in list(by_session.values())[:3]:
         assert [state.seq for state in states] == list(range(COUNT))
         assert states[0].stamp == START
-    until(lambda: len({decode(p, ENCODINGS[Clock], Clock).session for p in clocks.payloads(1)}) >= 3)
+    until(
+        lambda: (
+            len({decode(p, ENCODINGS[ClockMessage], ClockMessage).session for p in clocks.payloads(1)}) >= 3
+        )
+    )
 
 
 def test_the_time_of_the_recording_is_said(sessions, arm: Path):
@@ -220,7 +224,7 @@ def test_the_time_of_the_recording_is_said(sessions, arm: Path):
         first, last = replayer.span
         # 100 times a second at five times the speed: every 50 ms of the recording.
         expected = list(range(first, last + 1, 50 * MS))
-        stamps = [decode(p, ENCODINGS[Clock], Clock).stamp for p in tap.payloads(len(expected))]
+        stamps = [decode(p, ENCODINGS[ClockMessage], ClockMessage).stamp for p in tap.payloads(len(expected))]
     assert stamps == expected
 
 
@@ -228,13 +232,15 @@ def test_a_recorded_clock_is_said_as_it_was(sessions, tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(5):
-            tale.scribe.write_message("ros", Clock(n * MS, n, 9), START + n * S)
+            tale.scribe.write_message("ros", ClockMessage(n * MS, n, 9), START + n * S)
     writer, reader = sessions
     tap = Tap(reader, "zstate/clock")
     await_reader(writer, "zstate/clock")
     with Player(writer, tmp_path / "r.mcap", rate=math.inf) as replayer:
         replayer.run()
-    assert [decode(p, ENCODINGS[Clock], Clock).stamp for p in tap.payloads(5)] == [n * MS for n in range(5)]
+    assert [decode(p, ENCODINGS[ClockMessage], ClockMessage).stamp for p in tap.payloads(5)] == [
+        n * MS for n in range(5)
+    ]
 
 
 def test_it_can_be_paused_and_resumed(sessions, arm: Path):

@@ -18,8 +18,8 @@ from rosbags.highlevel import AnyReader
 from support import SOON_S, until
 
 from zstate.errors import InvalidInput, RecordingError
-from zstate.model.catalog import load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session, connect
 from zstate.net.streams import StreamPublisher
@@ -29,7 +29,7 @@ from zstate.recording.reader import RecordingReader
 from zstate.recording.recorder import Recorder
 from zstate.sources import SineSource
 from zstate.transform import Transform
-from zstate.wire.messages import Clock, JointState, order_digest, to_block
+from zstate.wire.messages import ClockMessage, JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 PERIOD = 1_000_000
@@ -292,10 +292,10 @@ def test_simulated_time_is_recorded_beside_the_robots(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
-        StreamPublisher(writer, "zstate/clock", ENCODINGS[Clock]) as clock,
+        StreamPublisher(writer, "zstate/clock", ENCODINGS[ClockMessage]) as clock,
     ):
         until(lambda: clock.has_readers)
-        clock.put(encode(Clock(3_000_000_007, 0, 9)))
+        clock.put(encode(ClockMessage(3_000_000_007, 0, 9)))
         until(lambda: count(recorder, "ros", "clock") == 1)
     (message,) = read(tmp_path / "run.mcap", "/clock")
     assert (message.clock.sec, message.clock.nanosec) == (3, 7)

@@ -11,7 +11,7 @@ from support import Stepping
 from tales import MS, START, Bag, S, Tale, swing, swing_rates
 
 from zstate.errors import InvalidInput
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.session import connect
 from zstate.nodes.publisher import StatePublisher
 from zstate.recording.source import RecordedSource

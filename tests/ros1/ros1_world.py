@@ -18,8 +18,8 @@ from typing import Any
 
 from support import Child, a_free_port, until
 
+from zstate.bridges.ros1.node import Master
 from zstate.errors import Unreachable
-from zstate.ros1.master import Master
 
 DEBIAN_PYTHON = "/usr/bin/python3"
 DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"

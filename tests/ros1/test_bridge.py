@@ -29,7 +29,7 @@ from ros1_world import (
 from support import DEADLINE_S, Child, until
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
-from zstate.ros1.master import Master
+from zstate.bridges.ros1.node import Master
 from zstate.sources import SubscribedSource
 
 pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(why_no_ros()), reason=why_no_ros())]
@@ -282,7 +282,7 @@ def test_rospy_leaves_the_logging_of_others_alone(namespace: str, spawn: Spawn):
         sys.path.append({DEBIAN_PACKAGES!r})
         logging.basicConfig(level=logging.ERROR)
         before = logging.root.handlers[:], logging.root.level, logging.getLoggerClass()
-        from zstate.ros1.node import Node
+        from zstate.bridges.ros1.node import Node
         with Node():
             print(before == (logging.root.handlers, logging.root.level, logging.getLoggerClass()))
         """

@@ -13,10 +13,15 @@ from ros1_world import JOINTS, RRBOT, Spawn
 from support import until
 
 from zstate import load_model
+from zstate.bridges.ros1.messages import (
+    JointStateReader,
+    JointStateWriter,
+    Ros1FrameNames,
+    get_stamp,
+    set_stamp,
+)
+from zstate.bridges.ros1.node import RospyModules
 from zstate.errors import MessageError
-from zstate.ros1.messages import JointStateReader, JointStateWriter, get_stamp, set_stamp
-from zstate.ros1.names import FrameNames
-from zstate.ros1.node import Ros
 from zstate.wire.joint_order import JointNumbers
 
 MODEL = load_model(RRBOT)
@@ -32,7 +37,7 @@ def joint_state(names: Any, position: Any = (), velocity: Any = (), effort: Any 
 
 
 # A message of ROS, without ROS: the fields that its class has.
-ROS = Ros(None, lambda name: SimpleNamespace(header=header(), name=name), None, None)
+ROS = RospyModules(None, lambda name: SimpleNamespace(header=header(), name=name), None, None)
 
 
 @given(st.integers(1, 2**32 * 10**9 - 1))
@@ -58,7 +63,7 @@ def test_a_zero_stamp_of_ros_is_none():
 
 @given(BARE, st.sampled_from(["", "left_", "tf/"]))
 def test_a_frame_name_comes_back_from_ros(bare: str, prefix: str):
-    names = FrameNames("rrbot", prefix)
+    names = Ros1FrameNames("rrbot", prefix)
     for frame in (bare, f"rrbot/{bare}"):
         if frame == bare and "/" in bare:
             assert names.in_ros(frame) == frame  # it is another robot's, in full
@@ -68,11 +73,11 @@ def test_a_frame_name_comes_back_from_ros(bare: str, prefix: str):
 
 
 def test_old_programs_put_a_slash_before_a_frame_name():
-    assert FrameNames("rrbot", "left_").in_zstate("/left_tool", frozenset()) == "tool"
+    assert Ros1FrameNames("rrbot", "left_").in_zstate("/left_tool", frozenset()) == "tool"
 
 
 def test_a_link_with_a_slash_in_its_name_is_the_robots_own():
-    names = FrameNames("rrbot")
+    names = Ros1FrameNames("rrbot")
     assert names.in_zstate("camera/lens", frozenset({"camera/lens"})) == "rrbot/camera/lens"
     assert names.in_zstate("fleet/map", frozenset({"camera/lens"})) == "fleet/map"
 

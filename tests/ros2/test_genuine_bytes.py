@@ -27,7 +27,7 @@ from support import Child
 from zstate.wire.messages import to_block
 from zstate.wire.ros2 import types
 from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
-from zstate.wire.ros2.plain import decode_clock, decode_string, encode_clock, encode_string
+from zstate.wire.ros2.simple_messages import decode_clock, decode_string, encode_clock, encode_string
 from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
 
 pytestmark = [pytest.mark.heavy, pytest.mark.processes]

@@ -6,11 +6,11 @@ import pytest
 from live import RRBOT
 from support import until
 
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.latched import LatchedPublisher
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
-from zstate.sources.descriptions import Descriptions
+from zstate.sources.subscribed import DescriptionSubscriber
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import ENCODINGS, encode
 
@@ -45,7 +45,7 @@ def test_the_model_is_heard_on_every_wire_by_early_and_late_joiners(sessions, wi
     heard = Heard()
     opened = [
         lambda: StatePublisher(writer, RRBOT, "r1", (wire,)),
-        lambda: Descriptions(reader, "r1", heard.note, wire),
+        lambda: DescriptionSubscriber(reader, "r1", heard.note, wire),
     ]
     first, second = opened if publisher_is_first else reversed(opened)
     with first(), second():
@@ -60,7 +60,7 @@ def test_every_robot_is_heard_with_its_own_name(sessions, wire):
     with (
         StatePublisher(writer, RRBOT, "r1", (wire,)),
         StatePublisher(writer, GRIPPER, "r2", (wire,)),
-        Descriptions(reader, "*", heard.note, wire),
+        DescriptionSubscriber(reader, "*", heard.note, wire),
     ):
         until(lambda: len(heard) == 2)
     assert sorted(heard) == [("r1", RRBOT.digest), ("r2", GRIPPER.digest)]
@@ -69,7 +69,7 @@ def test_every_robot_is_heard_with_its_own_name(sessions, wire):
 def test_only_another_model_is_told_again(sessions):
     writer, reader = sessions
     heard = Heard()
-    with Descriptions(reader, "r1", heard.note), latch(writer, description(RRBOT.urdf)) as publisher:
+    with DescriptionSubscriber(reader, "r1", heard.note), latch(writer, description(RRBOT.urdf)) as publisher:
         until(lambda: heard)
         publisher.set(description(RRBOT.urdf, session=2))
         publisher.withdraw()
@@ -91,7 +91,10 @@ def test_only_another_model_is_told_again(sessions):
 def test_what_describes_no_robot_is_counted_and_logged_once(sessions, caplog, payload, encoding, reason):
     writer, reader = sessions
     heard = Heard()
-    with Descriptions(reader, "r1", heard.note) as descriptions, caplog.at_level(logging.WARNING, "zstate"):
+    with (
+        DescriptionSubscriber(reader, "r1", heard.note) as descriptions,
+        caplog.at_level(logging.WARNING, "zstate"),
+    ):
         with latch(writer, payload, encoding=encoding) as publisher:
             until(lambda: descriptions.refused[reason] == 1)
             publisher.set(payload)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from zstate.errors import InvalidInput
-from zstate.model.catalog import catalog, load_model
 from zstate.model.kinematics import Kinematics
+from zstate.model.load import catalog, load_model
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, RobotModel
 from zstate.sources import SineSource
 

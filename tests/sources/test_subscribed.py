@@ -5,7 +5,7 @@ import pytest
 from live import RRBOT, await_reader
 from support import until
 
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import StatePublisher

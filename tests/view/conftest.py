@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
     from zstate.net.session import Session
-    from zstate.view.page import Page
-    from zstate.view.sliders import Sliders
+    from zstate.view.data_source import ViewSource
+    from zstate.view.server import ViewServer
+    from zstate.view.sliders import SliderPublisher
     from zstate.view.view import View
-    from zstate.view.world import World
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = (
@@ -82,17 +82,17 @@ class Looker:
 
 
 @pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
+def page() -> Iterator[ViewServer]:
     """A page that no browser shows."""
     pytest.importorskip("viser")
-    from zstate.view.page import Page
+    from zstate.view.server import ViewServer
 
-    with Page(port=0) as opened:
+    with ViewServer(port=0) as opened:
         yield opened
 
 
 @pytest.fixture
-def server(page: Page) -> Iterator[ViserServer]:
+def server(page: ViewServer) -> Iterator[ViserServer]:
     """The server of that page, with nothing on it."""
     page.server.scene.reset()
     with warnings.catch_warnings():
@@ -142,8 +142,8 @@ def look(browser: Browser) -> Iterator[Callable[..., Looker]]:
 class Shown:
     """A view at work."""
 
-    world: World
-    page: Page
+    world: ViewSource
+    page: ViewServer
     view: View
 
 
@@ -154,20 +154,24 @@ def show() -> Iterator[Callable[..., Shown]]:
 
     with ExitStack() as opened:
 
-        def shown(session: Session, *robots: str, sliders: Sequence[Sliders] = ()) -> Shown:
+        def shown(session: Session, *robots: str, sliders: Sequence[SliderPublisher] = ()) -> Shown:
             return opened.enter_context(_shown(session, robots, sliders))
 
         yield shown
 
 
 @contextmanager
-def _shown(session: Session, robots: Sequence[str], sliders: Sequence[Sliders]) -> Generator[Shown]:
-    from zstate.view.page import Page
+def _shown(session: Session, robots: Sequence[str], sliders: Sequence[SliderPublisher]) -> Generator[Shown]:
+    from zstate.view.data_source import ViewSource
+    from zstate.view.server import ViewServer
     from zstate.view.view import View
-    from zstate.view.world import World
 
     stop = threading.Event()
-    with World(session, robots) as world, Page(port=0) as page, View(world, page, sliders=sliders) as view:
+    with (
+        ViewSource(session, robots) as world,
+        ViewServer(port=0) as page,
+        View(world, page, sliders=sliders) as view,
+    ):
         drawing = threading.Thread(target=view.run, args=(stop,), daemon=True)
         drawing.start()
         try:

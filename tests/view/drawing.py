@@ -19,7 +19,7 @@ HERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Pose:
-    return (x, y, z, *se3.quaternion_of_rpy(0.0, 0.0, yaw))
+    return (x, y, z, *se3.quaternion_from_rpy(0.0, 0.0, yaw))
 
 
 def tree(parents: Mapping[str, str | None]) -> FrameTable:

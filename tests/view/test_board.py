@@ -8,10 +8,10 @@ from live import RRBOT, SECOND
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
 from zstate.transform import Transform
-from zstate.view.panels.board import Board
-from zstate.view.panels.choice import Choice, FrameChoice
+from zstate.view.data_source import ViewSource
+from zstate.view.panels.layout import PanelLayout
+from zstate.view.panels.widgets import BoundWidget, FrameChoice
 from zstate.view.scene.scene import Scene
-from zstate.view.world import World
 
 
 @pytest.fixture
@@ -26,22 +26,22 @@ def buffer() -> TransformBuffer:
 
 def test_what_a_person_chose_is_taken_once(page):
     box = page.server.gui.add_checkbox("box", False)
-    choice = Choice[bool](box)
-    assert choice.taken() is None
+    choice = BoundWidget[bool](box)
+    assert choice.poll_change() is None
     box.value = True
-    assert choice.taken() is True
-    assert choice.taken() is None
+    assert choice.poll_change() is True
+    assert choice.poll_change() is None
 
 
 def test_what_a_person_chose_is_not_overwritten_by_what_was_shown_before(page):
     number = page.server.gui.add_number("number", 1.0)
-    choice = Choice[float](number)
+    choice = BoundWidget[float](number)
     number.value = 2.0
     choice.show(1.0)
-    assert choice.taken() == 2.0
+    assert choice.poll_change() == 2.0
     choice.show(3.0)
     assert number.value == 3.0
-    assert choice.taken() is None
+    assert choice.poll_change() is None
 
 
 def test_a_frame_stays_chosen_while_others_come(page):
@@ -52,12 +52,15 @@ def test_a_frame_stays_chosen_while_others_come(page):
     assert choice.frame == "b"
     choice.offer(("c", "a"), None)
     assert choice.frame is None
-    assert choice.taken() is None
+    assert choice.poll_change() is None
 
 
 def test_a_board_of_nothing_waits_for_the_first_robot(page):
     buffer = TransformBuffer()
-    with World(None, buffer=buffer) as world, Board(page.server, world, Scene(page.server)) as board:
+    with (
+        ViewSource(None, buffer=buffer) as world,
+        PanelLayout(page.server, world, Scene(page.server)) as board,
+    ):
         moment = world.moment(board.stamp)
         board.update(moment)
         assert board.fixed(moment) == ""
@@ -68,7 +71,10 @@ def test_a_board_of_nothing_waits_for_the_first_robot(page):
 
 
 def test_a_recording_is_shown_at_an_instant_of_its_own_and_not_at_its_end(page, buffer):
-    with World(None, buffer=buffer) as world, Board(page.server, world, Scene(page.server)) as board:
+    with (
+        ViewSource(None, buffer=buffer) as world,
+        PanelLayout(page.server, world, Scene(page.server)) as board,
+    ):
         board.clock.pause()
         assert board.stamp == 0
         board.clock.seek(4 * SECOND)
@@ -81,7 +87,10 @@ def test_a_recording_is_shown_at_an_instant_of_its_own_and_not_at_its_end(page, 
 
 def test_where_nothing_is_new_nothing_is_sent(page, buffer, monkeypatch):
     sent: list[object] = []
-    with World(None, buffer=buffer) as world, Board(page.server, world, Scene(page.server)) as board:
+    with (
+        ViewSource(None, buffer=buffer) as world,
+        PanelLayout(page.server, world, Scene(page.server)) as board,
+    ):
         board.clock.pause()
         board.update(world.moment(board.stamp))
         pipe = page.server.gui._websock_interface

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.se3 import quaternion_of_rpy
-from zstate.view.dials import Dial, Dials
+from zstate.se3 import quaternion_from_rpy
+from zstate.view.sliders import SliderMapping, SliderSpec
 
 ROBOT = """<robot name="cart">
   <link name="world"/><link name="body"/><link name="deck"/><link name="arm"/><link name="lift"/>
@@ -34,30 +34,30 @@ def cart() -> RobotModel:
 
 
 def test_every_driven_joint_has_its_dials_within_its_limits(cart):
-    names = [dial.name for dial in Dials(cart).dials]
+    names = [dial.name for dial in SliderMapping(cart).dials]
     floating = [f"float.{part}" for part in ("x", "y", "z", "roll", "pitch", "yaw")]
     assert names == [*floating, "drive.x", "drive.y", "drive.yaw", "swing", "rise", "roll"]
-    by_name = {dial.name: dial for dial in Dials(cart).dials}
-    assert by_name["swing"] == Dial("swing", "rad", -0.5, 1.5)
-    assert by_name["rise"] == Dial("rise", "m", 0.0, 0.25)
+    by_name = {dial.name: dial for dial in SliderMapping(cart).dials}
+    assert by_name["swing"] == SliderSpec("swing", "rad", -0.5, 1.5)
+    assert by_name["rise"] == SliderSpec("rise", "m", 0.0, 0.25)
 
 
 def test_what_has_no_limits_moves_a_turn_or_two_metres(cart):
-    by_name = {dial.name: dial for dial in Dials(cart).dials}
-    assert by_name["roll"] == Dial("roll", "rad", -math.pi, math.pi)
-    assert by_name["drive.yaw"] == Dial("drive.yaw", "rad", -math.pi, math.pi)
-    assert by_name["drive.x"] == Dial("drive.x", "m", -2.0, 2.0)
+    by_name = {dial.name: dial for dial in SliderMapping(cart).dials}
+    assert by_name["roll"] == SliderSpec("roll", "rad", -math.pi, math.pi)
+    assert by_name["drive.yaw"] == SliderSpec("drive.yaw", "rad", -math.pi, math.pi)
+    assert by_name["drive.x"] == SliderSpec("drive.x", "m", -2.0, 2.0)
 
 
 def test_positions_are_those_of_the_dials_in_the_order_of_the_model(cart):
     values = np.array([1.0, 2.0, 0.5, 0.1, -0.2, 0.3, -1.0, 0.25, 0.75, 1.25, 0.125, -3.0])
-    x, y, z, w = quaternion_of_rpy(0.1, -0.2, 0.3)
+    x, y, z, w = quaternion_from_rpy(0.1, -0.2, 0.3)
     expected = [1.0, 2.0, 0.5, x, y, z, w, -1.0, 0.25, 0.75, 1.25, 0.125, -3.0]
-    np.testing.assert_allclose(Dials(cart).positions(values), expected, atol=1e-15)
+    np.testing.assert_allclose(SliderMapping(cart).positions(values), expected, atol=1e-15)
 
 
 def test_values_are_the_way_back(cart):
-    dials, generator = Dials(cart), np.random.default_rng(3)
+    dials, generator = SliderMapping(cart), np.random.default_rng(3)
     for _ in range(20):
         values = generator.uniform(dials.lower, dials.upper)
         np.testing.assert_allclose(dials.values(dials.positions(values)), values, atol=1e-9)
@@ -65,7 +65,7 @@ def test_values_are_the_way_back(cart):
 
 def test_a_robot_that_cannot_move_has_no_dials():
     fixed = parse_urdf('<robot name="rock"><link name="rock"/></robot>', "rock.urdf")
-    dials = Dials(fixed)
+    dials = SliderMapping(fixed)
     assert dials.dials == ()
     assert dials.positions(np.empty(0)).shape == (0,)
 
@@ -73,4 +73,4 @@ def test_a_robot_that_cannot_move_has_no_dials():
 @pytest.mark.robots
 def test_pandas_dials_are_its_joints():
     panda = load_model("panda")
-    assert tuple(dial.name for dial in Dials(panda).dials) == panda.joint_names
+    assert tuple(dial.name for dial in SliderMapping(panda).dials) == panda.joint_names

@@ -7,15 +7,15 @@ from collections.abc import Mapping
 import pytest
 from websockets.datastructures import Headers
 
-from zstate.view.door import Door, Refused, is_loopback
+from zstate.view.access import AccessCheck, AccessDeniedResponse, is_loopback
 
 UPGRADE = {"Upgrade": "websocket", "Connection": "Upgrade"}
-HERE = Door.at("127.0.0.1", 8080)
-OPEN = Door("0.0.0.0", 8080, "secret")
+HERE = AccessCheck.at("127.0.0.1", 8080)
+OPEN = AccessCheck("0.0.0.0", 8080, "secret")
 
 
-def objection(door: Door, path: str, headers: Mapping[str, str]) -> Refused | None:
-    return door.objection(path, Headers(headers))
+def objection(door: AccessCheck, path: str, headers: Mapping[str, str]) -> AccessDeniedResponse | None:
+    return door.check(path, Headers(headers))
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_on_loopback_whoever_asks_for_this_machine_comes_in(host: str):
 
 
 def test_the_port_of_http_need_not_be_named():
-    door = Door.at("::1", 80)
+    door = AccessCheck.at("::1", 80)
     assert objection(door, "/", {"Host": "localhost"}) is None
     assert objection(door, "/", {"Host": "[::1]"}) is None
     assert objection(HERE, "/", {"Host": "localhost"}) is not None
@@ -84,12 +84,12 @@ def test_another_name_or_port_does_not_come_in_even_if_it_leads_to_loopback(host
 
 @pytest.mark.parametrize("name", ["Host", "Origin", "Upgrade", "Cookie"])
 @pytest.mark.parametrize("door", [HERE, OPEN])
-def test_a_header_that_decides_comes_once(door: Door, name: str):
+def test_a_header_that_decides_comes_once(door: AccessCheck, name: str):
     headers = Headers(
         {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", **UPGRADE, "Cookie": "a=b"}
     )
     headers[name] = headers[name]
-    refused = door.objection("/?token=secret", headers)
+    refused = door.check("/?token=secret", headers)
     assert refused is not None
     assert refused.status == 400
     assert name in refused.text
@@ -106,7 +106,7 @@ def test_an_origin_without_this_host_opens_no_websocket(origin: str):
 
 
 @pytest.mark.parametrize("door", [HERE, OPEN])
-def test_a_page_from_elsewhere_opens_no_websocket(door: Door):
+def test_a_page_from_elsewhere_opens_no_websocket(door: AccessCheck):
     headers = {"Host": "127.0.0.1:8080", "Origin": "https://evil.example", **UPGRADE}
     refused = objection(door, "/?token=secret", headers)
     assert refused is not None
@@ -140,14 +140,14 @@ def test_beyond_loopback_nothing_else_does(query: str, cookie: str, more: dict[s
 
 
 def test_the_token_is_kept_for_the_port_it_belongs_to():
-    door = Door("0.0.0.0", 8081, "secret")
+    door = AccessCheck("0.0.0.0", 8081, "secret")
     assert "zstate_view_8081=secret;" in door.headers()["Set-Cookie"]
     assert "HttpOnly" in door.headers()["Set-Cookie"]
     assert "Set-Cookie" not in HERE.headers()
 
 
 def test_two_doors_have_two_tokens_which_nobody_guesses():
-    first, second = Door.at("0.0.0.0", 80).token, Door.at("0.0.0.0", 80).token
+    first, second = AccessCheck.at("0.0.0.0", 80).token, AccessCheck.at("0.0.0.0", 80).token
     assert first != second
     assert first is not None
     assert len(first) > 20

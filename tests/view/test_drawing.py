@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from support import DEADLINE_S, again_and_again, until
 
 from zstate import StatePublisher, load_model
-from zstate.model.shapes import shapes_of
+from zstate.model.geometry import parse_shapes
 from zstate.net.session import Session
-from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of
-from zstate.view.page import Page
+from zstate.view.camera import FIELD_OF_VIEW, CameraPose, fit_camera
+from zstate.view.data_source import ViewSource
+from zstate.view.server import ViewServer
 from zstate.view.view import View
-from zstate.view.world import World
 
 pytest.importorskip("viser")
 
@@ -63,7 +63,7 @@ def changed(before: NDArray[np.int16], after: NDArray[np.int16]) -> Mask:
     return np.abs(before - after).max(axis=2) > 10
 
 
-def pixels_of(points: NDArray[np.float64], framing: Framing, size: tuple[int, int]) -> NDArray[np.float64]:
+def pixels_of(points: NDArray[np.float64], framing: CameraPose, size: tuple[int, int]) -> NDArray[np.float64]:
     """Where a camera that stands and looks so sees points, in pixels: right, down."""
     width, height = size
     ahead = np.subtract(framing.look_at, framing.position)
@@ -95,10 +95,10 @@ def test_a_robot_is_drawn_with_its_meshes_where_its_links_are(robot: str, look, 
         moment = shown.world.moment()
         fixed = f"{robot}/{load_model(robot).root}"
         placed = moment.poses_in(fixed)
-        framing = framing_of(moment, placed, 1.0, shown.view.scene.corners(moment.tree, placed))
+        framing = fit_camera(moment, placed, 1.0, shown.view.scene.corners(moment.tree, placed))
         assert framing is not None
         height, width = surface.shape
-        drawn = {shape.link for shape in shapes_of(shown.world.models[robot]) if shape.role == "visual"}
+        drawn = {shape.link for shape in parse_shapes(shown.world.models[robot]) if shape.role == "visual"}
         rows = [row for row, name in enumerate(moment.tree.names) if name.partition("/")[2] in drawn]
         places = pixels_of(placed[rows, :3], framing, (width, height))
         # Every link that has a mesh is seen where its frame is ...
@@ -137,7 +137,11 @@ def test_several_browsers_look_at_once_and_nothing_is_drawn_for_nobody(look, sho
 
 
 def test_beyond_loopback_a_browser_needs_the_address_with_the_token(browser, look, sessions):
-    with World(sessions[1], ["rrbot"]) as world, Page("0.0.0.0", 0) as page, View(world, page) as view:
+    with (
+        ViewSource(sessions[1], ["rrbot"]) as world,
+        ViewServer("0.0.0.0", 0) as page,
+        View(world, page) as view,
+    ):
         view.draw()
         stranger = browser.new_page()
         stranger.goto(f"http://127.0.0.1:{page.port}/")

@@ -6,8 +6,7 @@ from live import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.transform import Transform
-from zstate.view.fixed_frame import FixedFrame, default_fixed_frame
-from zstate.view.world import World
+from zstate.view.data_source import FixedFrame, ViewSource, default_fixed_frame
 
 
 def filled() -> TransformBuffer:
@@ -19,19 +18,19 @@ def filled() -> TransformBuffer:
 def test_everything_is_seen_from_the_root_with_the_most_frames():
     buffer = filled()
     buffer.insert_static(Transform("map", "odom", [0, 0, 0], [0, 0, 0, 1]))
-    with World(None, buffer=buffer) as world:
+    with ViewSource(None, buffer=buffer) as world:
         assert default_fixed_frame(world.moment().tree) == f"r1/{RRBOT.root}"
 
 
 def test_a_chosen_frame_is_kept_while_it_is_there():
-    with World(None, buffer=filled()) as world:
+    with ViewSource(None, buffer=filled()) as world:
         tree, fixed = world.moment().tree, FixedFrame()
         fixed.chosen = tree.names[2]
-        assert fixed.of(tree) == tree.names[2]
+        assert fixed.choose(tree) == tree.names[2]
         fixed.chosen = "gone"
-        assert fixed.of(tree) == f"r1/{RRBOT.root}"
+        assert fixed.choose(tree) == f"r1/{RRBOT.root}"
 
 
 def test_where_there_is_no_frame_there_is_none_to_see_from():
-    with World(None, buffer=TransformBuffer()) as world:
-        assert FixedFrame().of(world.moment().tree) == ""
+    with ViewSource(None, buffer=TransformBuffer()) as world:
+        assert FixedFrame().choose(world.moment().tree) == ""

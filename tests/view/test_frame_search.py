@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zstate.view.frame_search import found_frames
+from zstate.view.panels.frames_panel import found_frames
 
 NAMES = (
     "panda/panda_link0",

@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from zstate.buffer.snapshot import FramePoses, FrameTable
-from zstate.view.framing import FIELD_OF_VIEW, Framing, framing_of, sights
+from zstate.view.camera import FIELD_OF_VIEW, CameraPose, fit_camera, sights
 
 
 def moment_of(*frames: tuple[str, tuple[float, float, float]]) -> FramePoses:
@@ -26,7 +26,9 @@ coordinates = st.floats(-20.0, 20.0)
 places = st.tuples(coordinates, coordinates, coordinates)
 
 
-def in_picture(framing: Framing, points: Sequence[tuple[float, float, float]], aspect: float) -> list[bool]:
+def in_picture(
+    framing: CameraPose, points: Sequence[tuple[float, float, float]], aspect: float
+) -> list[bool]:
     """Whether a camera that stands and looks so, with z up, sees each point."""
     ahead = np.subtract(framing.look_at, framing.position)
     ahead /= np.linalg.norm(ahead)
@@ -46,7 +48,7 @@ def in_picture(framing: Framing, points: Sequence[tuple[float, float, float]], a
 def test_every_frame_of_a_robot_and_all_that_is_drawn_is_in_the_picture(points, corners, aspect: float):
     origin = ("a/root", (0.0, 0.0, 0.0))
     moment = moment_of(origin, *((f"a/l{n}", point) for n, point in enumerate(points)))
-    framing = framing_of(moment, moment.poses_in("a/root"), aspect, np.reshape(corners, (-1, 3)))
+    framing = fit_camera(moment, moment.poses_in("a/root"), aspect, np.reshape(corners, (-1, 3)))
     assert framing is not None
     assert all(in_picture(framing, [(0.0, 0.0, 0.0), *points, *corners], aspect))
 
@@ -55,7 +57,7 @@ def test_every_frame_of_a_robot_and_all_that_is_drawn_is_in_the_picture(points, 
 def test_a_robot_is_in_a_picture_where_one_of_its_frames_is(points, position, look_at, aspect: float):
     ahead = np.subtract(look_at, position)
     assume(np.linalg.norm(np.cross(ahead, (0.0, 0.0, 1.0))) > 1e-3)
-    framing = Framing(position, look_at, 0.0, 3)
+    framing = CameraPose(position, look_at, 0.0, 3)
     assume(all(np.linalg.norm(np.subtract(point, position)) > 1e-3 for point in points))
     robots = [f"r{n}" for n in range(len(points))]
     bases = ((f"{robot}/base", point) for robot, point in zip(robots, points, strict=True))
@@ -71,7 +73,7 @@ def test_a_robot_that_is_not_in_a_picture_has_a_reason():
     poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (5, 1))
     poses[4, :3] = (-50.0, 0.0, 0.0)
     moment = FramePoses(None, tree, poses, known, {2: "no joint sample of 'a'", 3: "no sample of 'b'"})
-    camera = Framing((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 3)
+    camera = CameraPose((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 3)
     found = list(sights(moment, moment.poses_in("map"), camera, 1.0, ["a", "b", "c", "d"]))
     assert [(one.robot, one.is_seen, one.root) for one in found] == [
         ("a", True, "map"),
@@ -89,7 +91,7 @@ def test_a_robot_that_is_not_in_a_picture_has_a_reason():
 
 def test_it_looks_from_in_front_and_above():
     moment = moment_of(("a/root", (0.0, 0.0, 0.0)), ("a/tip", (0.0, 0.0, 1.0)))
-    framing = framing_of(moment, moment.poses_in("a/root"))
+    framing = fit_camera(moment, moment.poses_in("a/root"))
     assert framing is not None
     assert framing.look_at == (0.0, 0.0, 0.5)
     assert framing.position[0] > 0.0
@@ -99,13 +101,13 @@ def test_it_looks_from_in_front_and_above():
 def test_the_floor_is_where_a_robot_stands_that_is_placed_by_its_hip():
     walker = moment_of(("a/hip", (0.0, 0.0, 0.0)), ("a/foot", (0.0, 0.0, -1.0)))
     arm = moment_of(("a/base", (0.0, 0.0, 0.0)), ("a/tip", (0.0, 0.0, 1.0)))
-    framings = [framing_of(walker, walker.poses_in("a/hip")), framing_of(arm, arm.poses_in("a/base"))]
+    framings = [fit_camera(walker, walker.poses_in("a/hip")), fit_camera(arm, arm.poses_in("a/base"))]
     assert [framing.floor for framing in framings if framing] == [-1.0, 0.0]
 
 
 def test_the_floor_goes_beyond_every_robot():
     moment = moment_of(("a/root", (0.0, 0.0, 0.0)), ("b/root", (0.0, -7.5, 0.0)))
-    framing = framing_of(moment, moment.poses_in("a/root"))
+    framing = fit_camera(moment, moment.poses_in("a/root"))
     assert framing is not None
     assert framing.reach > 8
 
@@ -113,11 +115,11 @@ def test_the_floor_goes_beyond_every_robot():
 def test_a_map_that_begins_far_away_does_not_make_the_robot_small():
     frames = (("a/root", (100.0, 0.0, 0.0)), ("a/tip", (100.0, 0.0, 1.0)))
     far = moment_of(("map", (0.0, 0.0, 0.0)), *frames)
-    framing = framing_of(far, far.poses_in("map"))
+    framing = fit_camera(far, far.poses_in("map"))
     assert framing is not None
     assert np.linalg.norm(np.subtract(framing.position, framing.look_at)) < 5.0
 
 
 def test_there_is_nothing_to_look_at_where_no_robot_has_a_place():
     moment = moment_of(("map", (0.0, 0.0, 0.0)))
-    assert framing_of(moment, np.full((1, 7), np.nan)) is None
+    assert fit_camera(moment, np.full((1, 7), np.nan)) is None

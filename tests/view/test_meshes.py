@@ -14,7 +14,7 @@ from PIL import Image
 trimesh = pytest.importorskip("trimesh")
 
 from zstate import load_model  # noqa: E402
-from zstate.model.shapes import Box, Cylinder, MeshFile, Shape, Sphere, shapes_of  # noqa: E402
+from zstate.model.geometry import Box, Cylinder, MeshFile, Shape, Sphere, parse_shapes  # noqa: E402
 from zstate.se3 import IDENTITY  # noqa: E402
 from zstate.view.mesh_geometry import smooth_normals  # noqa: E402
 from zstate.view.mesh_paths import MissingFile  # noqa: E402
@@ -247,7 +247,7 @@ def test_a_format_nobody_reads_says_which_are_read(tmp_path):
 @pytest.mark.parametrize("name", ["panda", "talos", "ur5", "anymal_c"])
 def test_nothing_of_a_known_robot_is_missing(name):
     meshes = Meshes()
-    for one in shapes_of(load_model(name)):
+    for one in parse_shapes(load_model(name)):
         assert not isinstance(meshes.load(one), MissingFile)
         assert meshes.missing_texture(one) is None
 

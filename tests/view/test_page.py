@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from zstate.errors import InvalidInput
-from zstate.view.page import Page
+from zstate.view.server import ViewServer
 
 PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
 
@@ -49,7 +49,7 @@ def another_address() -> str | None:
 
 
 def test_it_is_on_loopback_unless_somebody_says_otherwise():
-    with Page(port=0) as page:
+    with ViewServer(port=0) as page:
         assert page.url == f"http://127.0.0.1:{page.port}"
         assert status(page.url) == 200
         assert status(page.url, {"Host": "evil.example"}) == 403
@@ -59,7 +59,7 @@ def test_it_is_on_loopback_unless_somebody_says_otherwise():
 
 
 def test_a_websocket_comes_through_the_same_door():
-    with Page(port=0) as page:
+    with ViewServer(port=0) as page:
         address = f"ws://127.0.0.1:{page.port}"
         with connect(address, subprotocols=PROTOCOL, compression=None) as socket:
             assert socket.recv(timeout=10)
@@ -87,7 +87,7 @@ WEBSOCKET = (
 
 @pytest.mark.parametrize("upgrade", [(), WEBSOCKET])
 def test_a_name_that_leads_to_loopback_is_not_answered_and_no_request_is_an_error_here(upgrade):
-    with Page(port=0) as page:
+    with ViewServer(port=0) as page:
         here, evil = (f"{name}:{page.port}" for name in ("127.0.0.1", "127.0.0.1.evil.example"))
         expected = 101 if upgrade else 200
         assert raw_status(page.port, f"Host: {here}", f"Origin: http://{here}", *upgrade) == expected
@@ -99,7 +99,7 @@ def test_a_name_that_leads_to_loopback_is_not_answered_and_no_request_is_an_erro
 
 
 def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
-    with Page("0.0.0.0", 0) as page:
+    with ViewServer("0.0.0.0", 0) as page:
         here = f"127.0.0.1:{page.port}"
         assert page.door.token is not None
         assert page.url.endswith(f":{page.port}/?token={page.door.token}")
@@ -114,7 +114,7 @@ def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
 
 
 def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
-    page = Page(port=0)
+    page = ViewServer(port=0)
     with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as vanished:
         host = f"Host: 127.0.0.1:{page.port}"
         vanished.sendall("\r\n".join(["GET / HTTP/1.1", host, *WEBSOCKET, "", ""]).encode())
@@ -125,10 +125,10 @@ def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
 
 
 def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
-    with Page(port=a_free_port()) as first:
+    with ViewServer(port=a_free_port()) as first:
         with pytest.raises(InvalidInput, match=f"port {first.port} is taken"):
-            Page(port=first.port)
-        with Page() as second, Page() as third:
+            ViewServer(port=first.port)
+        with ViewServer() as second, ViewServer() as third:
             assert len({first.port, second.port, third.port}) == 3
             assert [status(page.url) for page in (second, third)] == [200, 200]
 
@@ -136,16 +136,16 @@ def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
 @pytest.mark.parametrize(("host", "port"), [("nowhere.invalid", 0), ("127.0.0.1", 99999)])
 def test_what_cannot_be_listened_at_is_an_error_of_the_user(host: str, port: int):
     with pytest.raises(InvalidInput, match="nobody can listen"):
-        Page(host, port)
+        ViewServer(host, port)
 
 
 def test_nobody_is_shown_the_way_to_the_internet():
-    with Page(port=0) as page:
+    with ViewServer(port=0) as page:
         assert page.server.request_share_url() is None
 
 
 def test_it_prints_nothing(capsys: pytest.CaptureFixture[str]):
-    with Page(port=0) as page:
+    with ViewServer(port=0) as page:
         until(lambda: listens("127.0.0.1", page.port))
     said = capsys.readouterr()
     assert "viser" not in said.out + said.err

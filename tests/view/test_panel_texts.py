@@ -12,7 +12,7 @@ from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.net.graph import Graph, StreamUse, WriterState
 from zstate.view.panels import html
 from zstate.view.panels.graph_panel import graph_html
-from zstate.view.panels.robots_panel import apart_html, silence_text, unplaced_html
+from zstate.view.panels.robots_panel import disconnected_html, silence_text, unplaced_html
 from zstate.wire.messages import Level, Status
 
 SCRIPT = "<img src=x onerror=alert(1)>\"'&"
@@ -58,12 +58,12 @@ def test_robots_that_stand_on_nothing_in_common_are_told_of_with_what_joins_them
     parents = np.array([-1, 0, -1, 2, -1], dtype=np.intp)
     names = ("a/base", "a/tip", "b/base", "b/tip", "map")
     tree = FrameTable(names, parents, ("root", "joint", "root", "joint", "root"), (None,) * 5)
-    text = plain(apart_html(tree, "a/tip"))
+    text = plain(disconnected_html(tree, "a/tip"))
     assert "2 frames are not joined to the fixed frame" in text
     assert "b/base, and 1 below it\nmap" in text
     assert "zstate static a/base b/base --xyz 1 0 0" in text
     joined = FrameTable(names[:2], parents[:2], ("root", "joint"), (None,) * 2)
-    assert not apart_html(joined, "a/base")
+    assert not disconnected_html(joined, "a/base")
 
 
 def test_nothing_is_said_where_every_frame_has_its_pose():

@@ -9,11 +9,11 @@ from collections.abc import Callable
 import pytest
 from support import until as until_then
 
-from zstate.model.catalog import load_model
+from zstate.model.load import load_model
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
 from zstate.nodes.publisher import StatePublisher
-from zstate.view.sliders import Sliders
+from zstate.view.sliders import SliderPublisher
 
 pytestmark = [pytest.mark.browser, pytest.mark.processes]
 
@@ -82,7 +82,7 @@ def panels(look, show) -> Callable[..., Panels]:
 
 
 def test_a_slider_moves_the_joint_and_what_is_read_of_the_link(panels, sessions):
-    with Sliders(sessions[0], RRBOT, "r1") as sliders:
+    with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
         page = panels(sessions[1], "r1", sliders=[sliders])
         page.open("Joints")
         page.field(SHOULDER).fill("0.5")
@@ -110,7 +110,7 @@ def test_a_slider_moves_the_joint_and_what_is_read_of_the_link(panels, sessions)
 def test_a_slider_that_would_fight_another_writer_says_who_that_is(panels, sessions):
     with (
         StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver,
-        Sliders(sessions[1], RRBOT, "r1") as sliders,
+        SliderPublisher(sessions[1], RRBOT, "r1") as sliders,
     ):
         driver.publish([0.0, 0.0])
         page = panels(sessions[1], "r1", sliders=[sliders])

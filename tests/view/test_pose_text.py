@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from zstate.se3 import quaternion_of_rpy
-from zstate.view.pose_text import digits, listed, pose_rows
+from zstate.se3 import quaternion_from_rpy
+from zstate.view.panels.html import digits, listed, pose_rows
 
 
 def test_a_pose_is_told_in_every_way_that_people_ask_for():
-    pose = (0.3, -0.4, 1.2, *quaternion_of_rpy(0.0, 0.0, math.pi / 2))
+    pose = (0.3, -0.4, 1.2, *quaternion_from_rpy(0.0, 0.0, math.pi / 2))
     rows = {name: value.split() for name, value in pose_rows(pose)}
     assert rows["xyz [m]"] == ["0.3000", "-0.4000", "1.2000"]
     assert rows["distance [m]"] == ["1.3000"]  # 0.3, 0.4 and 1.2 are the sides of a box with diagonal 1.3

@@ -16,17 +16,17 @@ pytest.importorskip("viser")
 from zstate import StatePublisher, StaticPublisher, Transform, load_model
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses
-from zstate.view.framing import Camera, Sight, framing_of
-from zstate.view.page import Page
+from zstate.view.camera import Camera, Sight, fit_camera
+from zstate.view.data_source import ViewSource
+from zstate.view.server import ViewServer
 from zstate.view.view import View
-from zstate.view.world import World
 
 CART = load_model("diffbot")
 STILL = [0.0, 0.0, 0.0, 1.0]
 
 
 @contextmanager
-def drawing(view: View, page: Page) -> Iterator[threading.Thread]:
+def drawing(view: View, page: ViewServer) -> Iterator[threading.Thread]:
     """``view.run`` in a thread of its own, at full rate as if a browser showed the page."""
     page.connected.set()
     stop = threading.Event()
@@ -40,7 +40,7 @@ def drawing(view: View, page: Page) -> Iterator[threading.Thread]:
         page.connected.clear()
 
 
-class FailingWorld(World):
+class FailingWorld(ViewSource):
     """A world that cannot be read while ``fails``."""
 
     fails = False
@@ -104,7 +104,7 @@ def test_a_picture_that_is_held_is_of_one_instant_with_the_camera_fitted_to_it(p
     track = buffer.add_robot(RRBOT, "r1")
     lifted, lowered = [0.0, 0.0], [2.0, 2.0]
     buffer.insert_joints(track, 1, lifted)
-    with World(None, buffer=buffer) as world, View(world, page) as view:
+    with ViewSource(None, buffer=buffer) as world, View(world, page) as view:
         with drawing(view, page):
             assert view.hold(DEADLINE_S)
         moment = view.draw()
@@ -117,7 +117,7 @@ def test_a_picture_that_is_held_is_of_one_instant_with_the_camera_fitted_to_it(p
         assert view.sights() == (Sight("r1", True, "", "r1/world"),)
     placed = moment.poses_in("r1/world")
     corners = view.scene.corners(moment.tree, placed)
-    framing = framing_of(moment, placed, 1.0, corners)
+    framing = fit_camera(moment, placed, 1.0, corners)
     assert framing is not None
     assert len(corners) > 8
     np.testing.assert_allclose(before, [framing.position, framing.look_at])
@@ -127,7 +127,7 @@ def test_a_page_begins_with_the_frame_and_the_camera_that_were_asked_for(page):
     buffer = TransformBuffer()
     buffer.insert_joints(buffer.add_robot(RRBOT, "r1"), 1, [0.0, 0.0])
     camera = Camera((3.0, 2.0, 1.0), (0.0, 0.0, 0.5))
-    with World(None, buffer=buffer) as world:
+    with ViewSource(None, buffer=buffer) as world:
         with View(world, page, fixed_frame="r1/tool", camera=camera) as view:
             view.draw()
         at_tool = world.moment().poses_in("r1/tool")

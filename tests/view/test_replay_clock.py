@@ -6,7 +6,7 @@ import pytest
 
 from zstate.buffer.snapshot import TimeSpan
 from zstate.errors import InvalidInput
-from zstate.view.replay_clock import ReplayClock
+from zstate.view.time_cursor import TimeCursor
 
 SECOND = 1_000_000_000
 
@@ -27,13 +27,13 @@ def time() -> Time:
 
 
 @pytest.fixture
-def live(time) -> ReplayClock:
-    return ReplayClock(now_s=time)
+def live(time) -> TimeCursor:
+    return TimeCursor(now_s=time)
 
 
 @pytest.fixture
-def recorded(time) -> ReplayClock:
-    return ReplayClock(live=False, now_s=time)
+def recorded(time) -> TimeCursor:
+    return TimeCursor(live=False, now_s=time)
 
 
 def span(oldest_s: float, newest_s: float) -> TimeSpan:

@@ -10,12 +10,12 @@ viser = pytest.importorskip("viser")
 from drawing import at, drawn, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
-from zstate.model.shapes import Box, MeshFile, Shape, Sphere  # noqa: E402
+from zstate.model.geometry import Box, MeshFile, Shape, Sphere  # noqa: E402
 from zstate.model.urdf import parse_urdf  # noqa: E402
 from zstate.view.scene.scene import Scene  # noqa: E402
 
 CART = parse_urdf('<robot name="cart"><link name="base"/></robot>', "cart.urdf")
-ORIGIN = (0.1, 0.2, 0.3, *se3.quaternion_of_rpy(0.4, 0.5, 0.6))
+ORIGIN = (0.1, 0.2, 0.3, *se3.quaternion_from_rpy(0.4, 0.5, 0.6))
 SHAPES = (Shape("base", "visual", ORIGIN, Box((1, 2, 3))), Shape("base", "collision", ORIGIN, Sphere(1.0)))
 NAMES = [f"r{k}" for k in range(5)]
 TREE = tree({"map": None} | {f"{name}/base": "map" for name in NAMES})

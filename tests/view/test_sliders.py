@@ -15,7 +15,7 @@ from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.view.sliders import Sliders
+from zstate.view.sliders import SliderPublisher
 from zstate.wire.messages import from_block
 
 ARM = parse_urdf(
@@ -33,7 +33,7 @@ ARM = parse_urdf(
 
 @pytest.fixture
 def arm(sessions):
-    with Sliders(sessions[0], ARM, "arm1", rate_hz=200.0) as sliders:
+    with SliderPublisher(sessions[0], ARM, "arm1", rate_hz=200.0) as sliders:
         yield sliders
 
 
@@ -109,7 +109,7 @@ def test_where_somebody_else_writes_the_joints_nothing_is_published_and_it_is_sa
     with StatePublisher(sessions[1], RRBOT, "r1", program="driver") as driver:
         driver.publish([0.0, 0.0])
         until(lambda: discover(sessions[0], 0.2))
-        with Sliders(sessions[0], RRBOT, "r1") as sliders:
+        with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
             until(lambda: sliders.refusal)
             assert sliders.achieved_hz is None
             assert f"pid {os.getpid()}" in sliders.refusal
@@ -126,7 +126,7 @@ def test_they_move_the_joints_of_a_robot_whose_model_another_program_tells(sessi
     streams = ("robot_description", "tf_static", "tf")
     with StatePublisher(sessions[1], RRBOT, "r1", streams=streams, program="model"):
         until(lambda: discover(sessions[0], 0.2))
-        with Sliders(sessions[0], RRBOT, "r1") as sliders:
+        with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
             assert sliders.refusal == ""
             (robot,) = discover(sessions[1])
             writers = {(stream, writer.program) for stream, writer in robot.writers}
@@ -135,7 +135,7 @@ def test_they_move_the_joints_of_a_robot_whose_model_another_program_tells(sessi
 
 
 def test_closed_sliders_are_gone_from_the_network_and_do_not_open_again(sessions):
-    sliders = Sliders(sessions[0], RRBOT, "r1")
+    sliders = SliderPublisher(sessions[0], RRBOT, "r1")
     sliders.close()
     sliders.close()
     until(lambda: not discover(sessions[1], 0.2))

@@ -12,7 +12,7 @@ from wire.ros2.raw_nodes import JOINT_STATES, key_of
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
 from zstate.recording.recorder import Recorder
-from zstate.view.world import World
+from zstate.view.data_source import ViewSource
 
 MODEL = load_model("rrbot")
 SECOND = 1_000_000_000
@@ -23,14 +23,14 @@ def shifted(target: str, source: str, x: float, stamp: int | None = None) -> Tra
     return Transform(target, source, (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp=stamp)
 
 
-def world_of(*robots: str, shown: tuple[str, ...] = ()) -> World:
+def world_of(*robots: str, shown: tuple[str, ...] = ()) -> ViewSource:
     buffer = TransformBuffer()
     for robot in robots:
         buffer.add_robot(MODEL, robot)
-    return World(None, shown, buffer=buffer)
+    return ViewSource(None, shown, buffer=buffer)
 
 
-def track_of(world: World, robot: str):
+def track_of(world: ViewSource, robot: str):
     return world.buffer.tree_snapshot().robots[robot]
 
 
@@ -56,7 +56,7 @@ def test_every_pose_is_what_the_buffer_says_of_that_edge():
 
 
 def test_frames_of_one_feed_are_read_together_between_its_samples():
-    world = World(None, buffer=TransformBuffer())
+    world = ViewSource(None, buffer=TransformBuffer())
     edges = [("odom", "base"), ("odom", "cart")]
     half_turn_less = [1.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]
     world.buffer.insert_many(edges, 1 * SECOND, [IDENTITY, IDENTITY])
@@ -67,7 +67,7 @@ def test_frames_of_one_feed_are_read_together_between_its_samples():
 
 
 def test_parents_stand_before_children_whoever_was_named_first():
-    world = World(None, buffer=TransformBuffer())
+    world = ViewSource(None, buffer=TransformBuffer())
     world.buffer.insert_static(shifted("b", "c", 1.0))
     world.buffer.insert_static(shifted("a", "b", 1.0))
     tree = world.moment().tree
@@ -123,7 +123,7 @@ def test_only_the_chosen_robots_are_seen_with_what_they_stand_on():
 def test_a_robot_on_the_network_is_found_and_its_silence_is_counted(sessions):
     writing, reading = sessions
     source = SineSource(MODEL)
-    with World(reading) as world:
+    with ViewSource(reading) as world:
         assert world.robots() == ()
         with StatePublisher(writing, MODEL, "r1") as publisher:
             publisher.publish(source.read(SECOND).positions)
@@ -135,7 +135,7 @@ def test_a_robot_on_the_network_is_found_and_its_silence_is_counted(sessions):
             until(lambda: (world.silent_s("r1") or 0.0) > first + 0.05)
             publisher.publish(source.read(2 * SECOND).positions)
             silent = world.silent_s("r1")
-            until(lambda: world.look() or (world.silent_s("r1") or 0.0) < silent)
+            until(lambda: world.poll() or (world.silent_s("r1") or 0.0) < silent)
         assert world.silent_s("nobody") is None
 
 
@@ -148,7 +148,7 @@ def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
         stamps = [publisher.publish(source.read(n * SECOND).positions) for n in range(3)]
         assert stamps
         until(lambda: sum(recorder.stats.messages.values()) >= 4)
-    with World.of_recording(file) as world:
+    with ViewSource.of_recording(file) as world:
         assert world.robots() == ("r1",)
         assert world.moment().known.all()
         assert world.silent_s("r1") is None
@@ -158,7 +158,7 @@ def test_robots_that_speak_ros_are_seen_like_others(sessions, monkeypatch: pytes
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     with (
         StatePublisher(sessions[0], MODEL, wires="ros2") as publisher,
-        World(sessions[1], wire="ros2") as world,
+        ViewSource(sessions[1], wire="ros2") as world,
     ):
         await_reader(sessions[0], key_of(JOINT_STATES))
         publisher.publish([0.5, -0.5])

@@ -8,7 +8,7 @@ import pytest
 
 from zstate import Transform
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.json import from_json, to_json
+from zstate.wire.lookup_request import from_json, to_json
 
 HALF = 0.5**0.5
 

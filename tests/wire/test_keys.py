@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput
 from zstate.wire import keys
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.native import NativeWire
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
-from zstate.wire.writer import Announced, Writer
 
 NUMBER = st.one_of(
     st.integers(-(2**70), 2**70).map(str), st.sampled_from(["1" * 5000, "9" * 20, "", "\u0661", "1_0", "nan"])
@@ -42,8 +42,8 @@ PARSERS: tuple[Callable[[str], object], ...] = (
     keys.parse_reader_key,
     keys.parse_clock_key,
     keys.parse_edge_key,
-    keys.robot_of,
-    Writer.parse,
+    keys.robot_from_key,
+    WriterId.parse,
     NativeWire().statics_writer,
 )
 
@@ -71,7 +71,7 @@ def test_an_announced_writer_is_one_that_can_be_asked_under_its_own_keys(key: st
     if announced is not None:
         again = keys.writer_key(announced.robot, announced.stream, announced.identity)
         assert again == key
-        assert Announced.parse(*keys.parse_writer_key(again)) == announced
+        assert Announcement.parse(*keys.parse_writer_key(again)) == announced
         clock = keys.clock_key(announced.robot, announced.writer.identity)
         assert keys.parse_clock_key(clock) == (announced.robot, announced.writer.identity)
 
@@ -85,7 +85,7 @@ def test_an_announced_writer_is_one_that_can_be_asked_under_its_own_keys(key: st
 )
 def test_a_key_with_a_wildcard_or_a_robot_that_cannot_be_one_is_of_no_robot(key: str):
     with pytest.raises(InvalidInput) as caught:
-        keys.robot_of(key)
+        keys.robot_from_key(key)
     assert len(str(caught.value)) < 1000
 
 
@@ -192,10 +192,10 @@ def test_a_star_is_no_robot_to_write_for():
 
 
 def test_the_robot_of_a_key_is_its_second_chunk():
-    assert keys.robot_of("zstate/panda/tf_static/mount") == "panda"
+    assert keys.robot_from_key("zstate/panda/tf_static/mount") == "panda"
     for stranger in ("zstate/clock", "ros/panda/tf", "zstate//tf", ""):
         with pytest.raises(InvalidInput, match="not of the form"):
-            keys.robot_of(stranger)
+            keys.robot_from_key(stranger)
 
 
 def test_a_bare_frame_gets_its_robot_and_a_full_name_stays():

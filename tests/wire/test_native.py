@@ -7,13 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
-    Clock,
+    ClockMessage,
+    HistoryPage,
     JointCommand,
     JointState,
     Message,
-    Past,
     RobotDescription,
     StaticTransforms,
     Status,
@@ -23,10 +25,8 @@ from zstate.wire.messages import (
 )
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
 from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder, Wire
-from zstate.wire.sample_names import SampleNames
-from zstate.wire.writer import Announced, Writer
 
-WRITER = Writer("arm", "jetson", 412, 5, 7)
+WRITER = WriterId("arm", "jetson", 412, 5, 7)
 NAMES = ("j1", "j2")
 ORDER = order_digest(NAMES)
 EDGES = (("b", "a"), ("a", "h"))
@@ -95,7 +95,7 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + fixstr("h")
         + fixstr("system"),
     ),
-    "clock": (Clock(0, 1, 2), b"\x93\x00\x01\x02"),
+    "clock": (ClockMessage(0, 1, 2), b"\x93\x00\x01\x02"),
     "status": (
         Status(1, 2, "warn", "driver", "nuc", 3, 0.5, 4, 5, "slow", {"refused": "6"}),
         b"\x9b\x01\x02"
@@ -109,7 +109,7 @@ GOLDEN: dict[str, tuple[Message, bytes]] = {
         + fixstr("6"),
     ),
     "past": (
-        Past("e", (b"ab", b""), 5),
+        HistoryPage("e", (b"ab", b""), 5),
         b"\x93" + fixstr("e") + b"\x92" + b"\xc4\x02ab" + b"\xc4\x00" + b"\x05",
     ),
 }
@@ -241,7 +241,7 @@ def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, a
 def encoder_of(stream: Stream, name: str = "") -> StreamEncoder:
     node = EntityId("z1", 0)
     return NativeWire().stream_encoder(
-        "r1", WRITER, stream, node=node, number=0, sample_names=SampleNames(), name=name
+        "r1", WRITER, stream, node=node, number=0, sample_names=SampleLayout(), name=name
     )
 
 
@@ -262,5 +262,5 @@ def test_a_token_of_the_native_wire_says_who_writes_what():
     wire = NativeWire()
     encoder = encoder_of("tf")
     assert encoder.token is not None
-    assert wire.announced(encoder.token, "r1") == Announced("r1", "tf", WRITER)
+    assert wire.announced(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
     assert wire.announced("zstate/r1/@writer/tf/nonsense", "r1") is None

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import Disconnected, InFuture, InvalidInput, NetworkError, UnknownFrame, Unreachable
-from zstate.wire.questions import LookupQuestion, error_from_json, error_to_json
+from zstate.wire.lookup_request import LookupRequest, error_from_json, error_to_json
 
 
 def test_what_is_asked_is_read_back():
-    for asked in (LookupQuestion("map", "r1/tool"), LookupQuestion("a", "b", -5)):
+    for asked in (LookupRequest("map", "r1/tool"), LookupRequest("a", "b", -5)):
         pairs = dict(part.split("=") for part in asked.parameters().split(";"))
-        assert LookupQuestion.parse(pairs) == asked
+        assert LookupRequest.parse(pairs) == asked
 
 
 @pytest.mark.parametrize(
@@ -34,13 +34,13 @@ def test_what_is_asked_is_read_back():
 )
 def test_a_bad_parameter_is_named(parameters: dict[str, str], said: str):
     with pytest.raises(InvalidInput, match=said):
-        LookupQuestion.parse(parameters)
+        LookupRequest.parse(parameters)
 
 
 @pytest.mark.parametrize("frame", ["", "a;b"])
 def test_a_frame_that_no_selector_can_say_is_refused(frame: str):
     with pytest.raises(InvalidInput, match="cannot be asked for"):
-        LookupQuestion("a", frame).parameters()
+        LookupRequest("a", frame).parameters()
 
 
 FUTURE = InFuture("a", "b", edge=("a", "b"), requested=7, oldest=1, newest=3, rate_hz=100.0, writer="arm")

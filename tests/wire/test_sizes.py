@@ -16,12 +16,12 @@ from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
-from zstate.net.wires import wire_named
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 from zstate.wire.sizes import MOST_BYTES, STATIC_EDGES
 
 ORDER = order_digest(("a",))
@@ -41,7 +41,7 @@ def test_each_stream_has_a_largest_payload(wire, stream):
         SerializedSample("key", b"\0", "any", None, size),
     ):
         with pytest.raises(MessageError) as caught:
-            wire_named(wire).decode(stream, arrival, "r1")
+            get_wire(wire).decode(stream, arrival, "r1")
         assert caught.value.reason == "too large"
 
 

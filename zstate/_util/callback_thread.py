@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from zstate.closing import Closing
-from zstate.locks import outlive_fork
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe
 
 T = TypeVar("T")
 
@@ -20,7 +20,7 @@ _MAX_TICK_S = 0.5
 _CLOSES_WITHIN_S = 0.8
 
 
-class CallbackThread(Closing, Generic[T]):
+class CallbackThread(Closeable, Generic[T]):
     """Calls ``callback`` with every submitted item, in order. Drops the oldest of more than 1024.
 
     ``tick(now)`` is called from the same thread at least every half second; it returns when it is due next,
@@ -33,7 +33,7 @@ class CallbackThread(Closing, Generic[T]):
         self._callback = callback
         self._tick = tick
         self._queue: deque[T] = deque(maxlen=QUEUE_SIZE)
-        self._wake = outlive_fork(threading.Condition())
+        self._wake = fork_safe(threading.Condition())
         self._is_open = True
         self._thread = threading.Thread(target=self._run, name="zstate events", daemon=True)
         self._thread.start()

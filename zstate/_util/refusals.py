@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 
-from zstate.locks import new_lock
+from zstate._util.fork_safe import fork_safe_lock
 
 _LOG = logging.getLogger("zstate")
 
@@ -23,7 +23,7 @@ class Refusals:
         """The text of the first refusal of each reason."""
         self._prefix = f"{subject} " if subject else ""
         self._parent = parent
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
 
     def count(self, reason: str, text: object) -> None:
         """Count one refusal for ``reason``; ``text`` explains it."""

@@ -27,8 +27,8 @@ from zstate.buffer.snapshot import (
 from zstate.buffer.tracks import JointTrack
 from zstate.buffer.waiting import TransformWatch
 from zstate.checks import check_names
-from zstate.clock import Clock, check_stamp, check_stamps, wait_in_slices
-from zstate.errors import Closed, InvalidInput, LookupFailed, NotFinite, timed_out
+from zstate.clock import Clock, check_stamp, check_stamps, wait_interruptible
+from zstate.errors import Closed, InvalidInput, LookupFailed, NotFinite, as_timeout
 from zstate.transform import Transform, Twist
 
 S = TypeVar("S")
@@ -205,7 +205,7 @@ class TransformBuffer(BufferCore):
                 try:
                     await asyncio.wait_for(event.wait(), deadline - loop.time())
                 except (TimeoutError, asyncio.TimeoutError):
-                    raise timed_out(outcome, timeout_s) from None
+                    raise as_timeout(outcome, timeout_s) from None
 
     def _wait(self, query: Query, timeout_s: float) -> Transform:
         event = threading.Event()
@@ -216,8 +216,8 @@ class TransformBuffer(BufferCore):
                 outcome = self._lookup_or_expect(query, waiter)
                 if isinstance(outcome, Transform):
                     return outcome
-                if not wait_in_slices(event, deadline - time.monotonic()):
-                    raise timed_out(outcome, timeout_s)
+                if not wait_interruptible(event, deadline - time.monotonic()):
+                    raise as_timeout(outcome, timeout_s)
 
     def watch(
         self,

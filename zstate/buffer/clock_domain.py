@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from zstate.locks import new_lock
+from zstate._util.fork_safe import fork_safe_lock
 
 _CAPACITY = 4096
 """The number of robots and of frames that are remembered; then the oldest are dropped."""
@@ -24,7 +24,7 @@ class ClockDomain:
         self._by_robot: dict[str, str] = {}
         self._present: dict[str, None] = {}
         self._robot_by_child: dict[str, str] = {}
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
 
     @property
     def name(self) -> str | None:

@@ -12,6 +12,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.fork_safe import fork_safe
 from zstate.buffer.clock_domain import ClockDomain
 from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencies, TreeSnapshot
 from zstate.buffer.history import HistoryView, insert_together, keep_only_around
@@ -34,7 +35,6 @@ from zstate.errors import (
     Stale,
     UnknownFrame,
 )
-from zstate.locks import outlive_fork
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 
@@ -83,7 +83,7 @@ class BufferCore:
         """The number of samples that were older than the history reaches."""
         self._owner = TrackOwner()
         self._span_ns = round(history_s * 1e9)
-        self._lock = outlive_fork(threading.RLock())
+        self._lock = fork_safe(threading.RLock())
         self._writes = 0
         self._tree = FrameTree(self.domain)
         self._waiters = WaiterRegistry(self._tree)

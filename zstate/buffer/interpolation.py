@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from zstate import se3
 from zstate.buffer.history import HistoryView
-from zstate.model.edges import EdgeForm
-from zstate.se3 import Component, Functions, Pose, Vector
+from zstate.model.joint_transforms import JointTransform
+from zstate.se3 import Backend, Component, Pose, Vector
 
 Row: TypeAlias = Sequence[Component]
 Rate: TypeAlias = tuple[Vector, Vector]
@@ -41,7 +41,7 @@ class Bracket:
     b: Any
     ratio: Component
     seconds: Component
-    f: Functions
+    f: Backend
 
 
 def rows_around(
@@ -158,7 +158,7 @@ class LinearInterpolator:
             published = now.f.select(curved == curved, curved, published)  # noqa: PLR0124 - a test for NaN
         return now.f.select(published == published, published, slope)  # noqa: PLR0124
 
-    def extrapolate(self, row: Row, rate: float, seconds: float, f: Functions) -> float:
+    def extrapolate(self, row: Row, rate: float, seconds: float, f: Backend) -> float:
         """The number ``seconds`` after ``row``, at a constant ``rate``."""
         return row[self.column] + rate * seconds
 
@@ -221,11 +221,11 @@ class PoseInterpolator:
         linear = ((b[0] - a[0]) * per_second, (b[1] - a[1]) * per_second, (b[2] - a[2]) * per_second)
         return linear, (x * per_second, y * per_second, z * per_second)
 
-    def extrapolate(self, row: Row, rate: Rate, seconds: float, f: Functions) -> Pose:
+    def extrapolate(self, row: Row, rate: Rate, seconds: float, f: Backend) -> Pose:
         """The pose ``seconds`` after ``row``, at a constant ``rate``."""
         (vx, vy, vz), (wx, wy, wz) = rate
         x, y, z, *q = self._pose(row)
-        rotation = se3.turn((wx * seconds, wy * seconds, wz * seconds), f)
+        rotation = se3.quaternion_exp((wx * seconds, wy * seconds, wz * seconds), f)
         turned = se3.multiply(rotation, (q[0], q[1], q[2], q[3]))
         return (x + vx * seconds, y + vy * seconds, z + vz * seconds, *turned)
 
@@ -239,7 +239,7 @@ class StaticStep:
 
     constant: Pose
 
-    def pose(self, values: Values, f: Functions) -> Pose:
+    def pose(self, values: Values, f: Backend) -> Pose:
         """parent_from_child."""
         return self.constant
 
@@ -250,13 +250,13 @@ class StaticStep:
 
 @dataclass(frozen=True, slots=True)
 class RevoluteStep:
-    """A revolute or continuous joint; ``zstate.model.edges`` has the formula."""
+    """A revolute or continuous joint; ``zstate.model.joint_transforms`` has the formula."""
 
-    form: EdgeForm
+    form: JointTransform
     use: int
     column: int
 
-    def pose(self, values: Values, f: Functions) -> Pose:
+    def pose(self, values: Values, f: Backend) -> Pose:
         """parent_from_child."""
         form = self.form
         half = 0.5 * (form.scale * values[self.use][self.column] + form.shift)
@@ -276,11 +276,11 @@ class RevoluteStep:
 class PrismaticStep:
     """A prismatic joint."""
 
-    form: EdgeForm
+    form: JointTransform
     use: int
     column: int
 
-    def pose(self, values: Values, f: Functions) -> Pose:
+    def pose(self, values: Values, f: Backend) -> Pose:
         """parent_from_child."""
         form = self.form
         n = form.scale * values[self.use][self.column] + form.shift
@@ -298,11 +298,11 @@ class PrismaticStep:
 class PlanarStep:
     """A joint that moves in a plane: interpolators of x, y and yaw, one after the other."""
 
-    form: EdgeForm
+    form: JointTransform
     use: int
     column: int
 
-    def pose(self, values: Values, f: Functions) -> Pose:
+    def pose(self, values: Values, f: Backend) -> Pose:
         """parent_from_child."""
         x, y, yaw = values[self.use][self.column : self.column + 3]
         return se3.compose(self.form.origin, (x, y, 0.0, 0.0, 0.0, f.sin(0.5 * yaw), f.cos(0.5 * yaw)))
@@ -322,7 +322,7 @@ class PoseStep:
     use: int
     column: int
 
-    def pose(self, values: Values, f: Functions) -> Pose:
+    def pose(self, values: Values, f: Backend) -> Pose:
         """parent_from_child."""
         sampled: Pose = values[self.use][self.column]
         return sampled if self.origin == se3.IDENTITY else se3.compose(self.origin, sampled)
@@ -368,7 +368,7 @@ def _sum(*vectors: Vector) -> Vector:
     return (x, y, z)
 
 
-def chain_pose(steps: Sequence[Step], values: Values, f: Functions) -> Pose:
+def chain_pose(steps: Sequence[Step], values: Values, f: Backend) -> Pose:
     """The product of the steps' poses: top_from_bottom."""
     pose = se3.IDENTITY
     for number, step in enumerate(steps):
@@ -377,7 +377,7 @@ def chain_pose(steps: Sequence[Step], values: Values, f: Functions) -> Pose:
     return pose
 
 
-def chain_motion(steps: Sequence[Step], values: Values, rates: Values, f: Functions) -> Motion:
+def chain_motion(steps: Sequence[Step], values: Values, rates: Values, f: Backend) -> Motion:
     """The same with velocities."""
     motion = Motion(se3.IDENTITY, *_AT_REST)
     for step in steps:

@@ -311,7 +311,7 @@ class TransformPath:
         assert isinstance(failure, NotFinite)
         return failure
 
-    def _pose(self, values: Values, f: se3.Functions) -> se3.Pose:
+    def _pose(self, values: Values, f: se3.Backend) -> se3.Pose:
         target_from_top = chain_pose(self.steps_to_target, values, f)
         source_from_top = chain_pose(self.steps_to_source, values, f)
         if not self.steps_to_target:

@@ -21,7 +21,7 @@ from zstate.buffer.frame_tree import Edge, TreeSnapshot
 from zstate.buffer.history import HistoryView
 from zstate.buffer.interpolation import PoseInterpolator, bracket_of_edges
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
-from zstate.errors import InPast, InvalidInput, UnknownFrame, duration_text
+from zstate.errors import InPast, InvalidInput, UnknownFrame, format_duration
 
 Poses: TypeAlias = NDArray[np.float64]
 Rows: TypeAlias = NDArray[np.intp]
@@ -260,9 +260,9 @@ def _reason_against(track: Track, view: HistoryView, stamp: int | None, hold_ns:
     if stamp is None:
         return None
     if stamp < view.oldest:
-        return f"{duration_text(view.oldest - stamp)} before the oldest sample of {track.name!r}{by}"
+        return f"{format_duration(view.oldest - stamp)} before the oldest sample of {track.name!r}{by}"
     if stamp > view.newest + hold_ns:
-        return f"{duration_text(stamp - view.newest)} after the newest sample of {track.name!r}{by}"
+        return f"{format_duration(stamp - view.newest)} after the newest sample of {track.name!r}{by}"
     return None
 
 

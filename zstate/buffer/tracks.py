@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
 from zstate.errors import LookupFailed
-from zstate.model.edges import EdgeForm, EdgeTable
+from zstate.model.joint_transforms import JointTransform, JointTransforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
 
@@ -47,7 +47,7 @@ class JointTrack:
     ) -> None:
         self.model = model
         self.prefix = prefix
-        self._table = EdgeTable(model)
+        self._table = JointTransforms(model)
         self.forms = self._table.forms
         self.interpolation = interpolation
         self.writer: str | None = None
@@ -95,7 +95,7 @@ class JointTrack:
         """The name of a link's frame in the buffer."""
         return f"{self.prefix}/{link}" if self.prefix else link
 
-    def edge(self, form: EdgeForm) -> tuple[str, str]:
+    def edge(self, form: JointTransform) -> tuple[str, str]:
         """(parent, child) of one of ``forms``, as named in the buffer."""
         return (self.frame(form.parent), self.frame(form.child))
 

@@ -14,11 +14,11 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
 from zstate import se3
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.frame_tree import FrameTree, PathDependencies
 from zstate.buffer.tracks import Track
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, LookupFailed
-from zstate.locks import new_lock
 from zstate.transform import Transform
 
 RequiredStamps: TypeAlias = Mapping[Track, int | None]
@@ -86,7 +86,7 @@ class WaiterRegistry:
 
     def __init__(self, tree: FrameTree) -> None:
         self.tree = tree
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         # Tuples that are replaced, never changed: ``notify`` takes no lock.
         self._waiters: tuple[Waiter, ...] = ()
         self._by_track: dict[Track, tuple[Waiter, ...]] = {}
@@ -163,7 +163,7 @@ NewestLookup: TypeAlias = Callable[[Waiter], Transform | LookupFailed]
 """The newest transform, with the condition for a newer one set; or the reason why there is none."""
 
 
-class TransformWatch(Closing):
+class TransformWatch(Closeable):
     """Calls ``callback(transform)`` with each newest transform of a pair, until closed.
 
     With ``translation_m`` or ``rotation_rad``, only once the source has moved or rotated so far in the target
@@ -192,7 +192,7 @@ class TransformWatch(Closing):
         self._thresholds = (translation_m, rotation_rad)
         self._last: Transform | None = None
         self._is_pending = False
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._registration = ExitStack()
         self._waiter = self._registration.enter_context(waiters.register(self._on_insert))
         self._on_insert()

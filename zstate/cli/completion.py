@@ -28,7 +28,7 @@ class ModelName(click.types.StringParamType):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        from zstate.model.known import catalog
+        from zstate.model.catalog import catalog
 
         found = [CompletionItem(entry.name) for entry in catalog() if entry.name.startswith(incomplete)]
         return found or [CompletionItem(incomplete, type="file")]
@@ -84,13 +84,13 @@ def _kind(command: str, argument: click.Argument) -> Any:
 
 
 def _announced(ctx: click.Context) -> Iterator[str]:
-    from zstate.cli.network import Network
+    from zstate.cli.session import SessionOptions
     from zstate.errors import ZStateError
     from zstate.net.presence import discover
     from zstate.net.session import connect
 
     given = {name: ctx.params.get(name) for name in ("mode", "connect", "listen", "config")}
-    network = Network(given["mode"], given["connect"] or (), given["listen"] or (), given["config"])
+    network = SessionOptions(given["mode"], given["connect"] or (), given["listen"] or (), given["config"])
     # Errors are left to the command itself.
     with (
         suppress(ZStateError),

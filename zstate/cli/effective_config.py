@@ -17,18 +17,24 @@ import click
 from click.core import ParameterSource
 
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.logs import FORMAT_VARIABLE, FORMATS
-from zstate.cli.network import Network
 from zstate.cli.options import PASSWORD_VARIABLE, credentials_of
-from zstate.cli.words import is_ros
+from zstate.cli.output.logs import FORMAT_VARIABLE, FORMATS
+from zstate.cli.output.wire_text import is_ros
+from zstate.cli.session import SessionOptions
 from zstate.errors import InvalidInput, ZStateError
 from zstate.extension import VARIABLE as KERNEL_VARIABLE
 from zstate.extension import kernel
-from zstate.net.config import CONFIG_VARIABLE, endpoint_list, given_config, our_config
-from zstate.net.modes import check_mode, listening
+from zstate.net.config import (
+    CONFIG_VARIABLE,
+    check_mode,
+    default_config,
+    endpoint_list,
+    listen_endpoints,
+    user_config,
+)
 from zstate.net.rendezvous import RENDEZVOUS, RENDEZVOUS_VARIABLE, rendezvous_addresses
-from zstate.net.security import Credentials
-from zstate.net.wires import DOMAIN_VARIABLE, wire_named
+from zstate.net.security.credentials import Credentials
+from zstate.wire.registry import DOMAIN_VARIABLE, get_wire
 
 _PREFIX = "ZSTATE_"
 _VARIABLES = (RENDEZVOUS_VARIABLE, PASSWORD_VARIABLE, KERNEL_VARIABLE, FORMAT_VARIABLE, "ZSTATE_USERS")
@@ -78,11 +84,11 @@ def zenoh_settings(context: click.Context) -> dict[str, Any]:
     network = _network(context)
     mode = check_mode(network.joins_as)
     if network.config:
-        config = given_config(network.config, mode, network.connect, network.listen, network.credentials)
+        config = user_config(network.config, mode, network.connect, network.listen, network.credentials)
     else:
-        endpoints = listening(mode, network.listen, network.credentials)
-        config = our_config(mode, network.connect, endpoints, None, network.credentials)
-    default = given_config({}, "peer", (), ())
+        endpoints = listen_endpoints(mode, network.listen, network.credentials)
+        config = default_config(mode, network.connect, endpoints, None, network.credentials)
+    default = user_config({}, "peer", (), ())
     return dict(_differences("", json.loads(str(config)), json.loads(str(default))))
 
 
@@ -130,24 +136,24 @@ def _credentials(context: click.Context) -> Credentials | None:
     return credentials_of(params["certs"], params["identity"], params["user"], params["password_file"], None)
 
 
-def _network(context: click.Context) -> Network:
+def _network(context: click.Context) -> SessionOptions:
     """The session options in effect. Raises ConfigError, and UsageError for incomplete credentials."""
     params, config = context.params, _config_file(context).value
-    return Network(params["mode"], params["connect"], params["listen"], config, _credentials(context))
+    return SessionOptions(params["mode"], params["connect"], params["listen"], config, _credentials(context))
 
 
 def _option_settings(context: click.Context) -> Iterator[Setting]:
     """Mode and endpoints without a Zenoh configuration file."""
     params = context.params
     mode, connect, listen = (_option(context, name) for name in ("mode", "connect", "listen"))
-    effective = check_mode(Network(params["mode"], params["connect"], params["listen"]).joins_as)
+    effective = check_mode(SessionOptions(params["mode"], params["connect"], params["listen"]).joins_as)
     credentials = None
     with suppress(InvalidInput, click.UsageError):  # listed by problems()
         credentials = _credentials(context)
     implied = f"{connect.origin}, which alone means a router" if connect.value else "default"
     yield mode if mode.value else Setting("mode", effective, implied)
     yield connect
-    endpoints = listening(effective, params["listen"], credentials)
+    endpoints = listen_endpoints(effective, params["listen"], credentials)
     yield listen if listen.value else Setting("listen", list(endpoints), "default")
     if effective in ("peer", "loopback") and not (connect.value or listen.value):
         yield _variable("rendezvous", RENDEZVOUS_VARIABLE, RENDEZVOUS)
@@ -156,9 +162,9 @@ def _option_settings(context: click.Context) -> Iterator[Setting]:
 def _file_settings(context: click.Context) -> Iterator[Setting]:
     """Mode and endpoints with a Zenoh configuration file."""
     params, file = context.params, _config_file(context).value
-    network = Network(params["mode"], params["connect"], params["listen"], file)
-    config = given_config(file, check_mode(network.joins_as), network.connect, network.listen)
-    default = given_config({}, "peer", (), ())
+    network = SessionOptions(params["mode"], params["connect"], params["listen"], file)
+    config = user_config(file, check_mode(network.joins_as), network.connect, network.listen)
+    default = user_config({}, "peer", (), ())
     mode = json.loads(config.get_json("mode"))
     for name, path in (("mode", "mode"), ("connect", "connect/endpoints"), ("listen", "listen/endpoints")):
         option, text = _option(context, name), config.get_json(path)
@@ -173,7 +179,7 @@ def _file_settings(context: click.Context) -> Iterator[Setting]:
 def _ros_domain(wire: Setting) -> Setting:
     from zstate.wire.ros2.wire import Ros2Wire
 
-    ros_wire = wire_named(wire.value)
+    ros_wire = get_wire(wire.value)
     assert isinstance(ros_wire, Ros2Wire)
     variable = _variable("ros domain", DOMAIN_VARIABLE, 0)
     origin = wire.origin if re.search(r"\bdomain\s*=", wire.value) else variable.origin

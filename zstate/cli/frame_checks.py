@@ -9,15 +9,15 @@ from contextlib import ExitStack, suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING
 
-from zstate.clock import wait_in_slices
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
+from zstate.clock import wait_interruptible
 from zstate.errors import MessageError, ModelError, ZStateError
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.wires import wire_named
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, full_name
 from zstate.wire.messages import RobotDescription, StaticTransforms
+from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
@@ -67,12 +67,12 @@ def without_program_advice(text: str) -> str:
     return re.sub(r"; withdraw\('[^']*'\) first if it really moved", "", text)
 
 
-class KnownFrames(Closing):
+class KnownFrames(Closeable):
     """The links of ``robot`` and the frames of its static writers other than ``writer``."""
 
     def __init__(self, session: Session, robot: str, writer: str) -> None:
         self._robot, self._writer = robot, writer
-        self._wire = wire_named("native")
+        self._wire = get_wire("native")
         self._model: RobotModel | None = None
         self._described = threading.Event()
         self._statics: dict[str, frozenset[str]] = {}
@@ -105,7 +105,7 @@ class KnownFrames(Closing):
 
     def wait_for_model(self) -> None:
         """Wait until the model has arrived, at most 1.5 s."""
-        wait_in_slices(self._described, _MODEL_WITHIN_S)
+        wait_interruptible(self._described, _MODEL_WITHIN_S)
 
     def warnings(self, edges: Sequence[Transform], placed: Collection[str]) -> list[str]:
         """Warnings about ``edges``; frames that are ``placed`` with them count as known."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
-from zstate.cli import logs
+from zstate.cli.output import logs
 from zstate.errors import ZStateError
 
 if TYPE_CHECKING:
@@ -197,14 +197,14 @@ def main() -> NoReturn:
     except click.UsageError as error:
         code = _end_of_wrong_usage(error)
     except click.ClickException as error:
-        _complain(error.format_message())
+        _report_error(error.format_message())
         code = error.exit_code
     except ZStateError as error:
-        _complain(str(error))
+        _report_error(str(error))
         code = 1
     except SystemExit as leaving:
         code = leaving.code
-    _leave(code)
+    _exit(code)
 
 
 def _end_of_wrong_usage(error: click.UsageError) -> int:
@@ -213,11 +213,11 @@ def _end_of_wrong_usage(error: click.UsageError) -> int:
     if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):
         click.echo(error.format_message())
         return 0
-    _complain(_usage_text(error))
+    _report_error(_usage_text(error))
     return error.exit_code
 
 
-def _leave(code: str | int | None) -> NoReturn:
+def _exit(code: str | int | None) -> NoReturn:
     # A thread that is inside Zenoh as Python shuts down, such as one that still connects, aborts the process.
     code = code or 0
     if isinstance(code, int) and any(map(_is_at_work, threading.enumerate())):
@@ -252,5 +252,5 @@ def _usage_text(error: click.UsageError) -> str:
     return f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text
 
 
-def _complain(text: str) -> None:
+def _report_error(text: str) -> None:
     logs.write(text, level="error", event="failed")

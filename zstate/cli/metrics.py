@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from zstate.cli.output.console import print_status
 
 if TYPE_CHECKING:
-    from zstate.bridge import Bridge
+    from zstate.bridges.ros2 import Bridge
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.metrics.collectors import Listened
     from zstate.metrics.endpoint import BindAddress, MetricsCollector

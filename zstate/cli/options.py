@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from zstate.cli.network import Network
 from zstate.cli.output.console import GRACE_S, print_status
+from zstate.cli.session import SessionOptions
 from zstate.errors import InvalidInput, NoClock
 
 if TYPE_CHECKING:
     from zstate.clock import Clock
     from zstate.metrics.endpoint import BindAddress
     from zstate.model.robot import RobotModel
-    from zstate.net.security import Credentials
+    from zstate.net.security.credentials import Credentials
     from zstate.net.session import Session
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -117,7 +117,7 @@ def credentials_of(
         raise click.UsageError("--password-file is of no use without --user NAME")
     if certs is None and user is None and users is None:
         return None
-    from zstate.net.security import Credentials
+    from zstate.net.security.credentials import Credentials
 
     password = None if user is None else _password(user, password_file)
     if certs is None or identity is None:
@@ -134,7 +134,7 @@ def _password(user: str, file: str | None) -> str:
                 f"the password of {user!r} is missing; put it into {PASSWORD_VARIABLE} or a --password-file"
             )
         return password
-    from zstate.net.credential_files import password_in
+    from zstate.net.security.credential_files import password_in
 
     return password_in(file)
 
@@ -152,7 +152,7 @@ def session_options(command: Command) -> Command:
         credentials: Credentials | None,
         **options: Any,
     ) -> Any:
-        return command(network=Network(mode, connect, listen, config, credentials), **options)
+        return command(network=SessionOptions(mode, connect, listen, config, credentials), **options)
 
     for option in reversed((*_HOW_TO_JOIN, identity_options)):
         with_network = option(with_network)
@@ -202,11 +202,11 @@ _HOW_TO_JOIN = (
 
 
 def _checked_wire(_: click.Context, __: click.Parameter, wires: str | tuple[str, ...]) -> Any:
-    from zstate.net.wires import wire_named
+    from zstate.wire.registry import get_wire
 
     try:
         for wire in (wires,) if isinstance(wires, str) else wires:
-            wire_named(wire)
+            get_wire(wire)
     except InvalidInput as error:
         raise click.BadParameter(str(error)) from None
     return wires
@@ -294,10 +294,10 @@ def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Co
 
 def named_robot(session: Session, robot: str | None, wire: str) -> str:
     """The robot that a command was given, or the only one there is or that ``wire`` can mean."""
+    from zstate.cli.output.wire_text import is_ros, messages_for
     from zstate.cli.robot_directory import only_robot
-    from zstate.cli.words import is_ros, words_of
 
-    meant = robot or words_of(wire).robot
+    meant = robot or messages_for(wire).robot
     if meant is not None:
         return meant
     if is_ros(wire):
@@ -354,14 +354,14 @@ def load_robot(
 
     The name is ``name`` if given, else the catalog name that was asked for, else the model's own.
     """
-    from zstate.model.catalog import is_path, load_model
-    from zstate.model.known import find
+    from zstate.model.catalog import find_entry
+    from zstate.model.load import is_path, load_model
     from zstate.wire.keys import check_robot
 
     if ":=" in source and not is_path(source):
         raise click.UsageError(f"{source!r} is a xacro argument; name the model before it")
     model = load_model(source, xacro_args=xacro_args or None)
-    robot = name or (model.name if is_path(source) or "<" in source else find(source).name)
+    robot = name or (model.name if is_path(source) or "<" in source else find_entry(source).name)
     try:
         return model, check_robot(robot)
     except InvalidInput as error:
@@ -430,7 +430,7 @@ def open_clock(
     A simulated clock subscribes on ``wire`` and is yielded once it has received its first message.
     Raises NoClock if none arrives within ``timeout_s``.
     """
-    from zstate.clock import SYSTEM, SystemClock, stamp_text  # loads numpy, which helps do without
+    from zstate.clock import SYSTEM, SystemClock, format_stamp  # loads numpy, which helps do without
 
     if kind is None or kind == SYSTEM:
         yield None if kind is None else SystemClock()
@@ -443,5 +443,5 @@ def open_clock(
         except NoClock:
             print_status(f"waiting for the simulated time on {clock.key} ...")
             clock.wait(timeout_s)
-            print_status(f"heard {clock.key}: it is {stamp_text(clock.now())}")
+            print_status(f"heard {clock.key}: it is {format_stamp(clock.now())}")
         yield clock

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from zstate._util.suggestions import did_you_mean
 from zstate.cli.output.console import fail, print_status
 from zstate.cli.output.joint_state_text import DescribedJointStates, Document, JointStateFormatter, flatten
+from zstate.cli.output.wire_text import default_stream
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.stream_reader import StreamReader
 from zstate.cli.waiting import PoseWaiter
-from zstate.cli.words import followed
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.nodes.listener import TransformListener
 from zstate.recording.decode import DecodedRecording, first_descriptions
@@ -112,7 +112,7 @@ def path_series(
     Begins ``start_s`` after the first instant and lasts ``seconds``, or to the end. Raises LookupFailed, and
     InvalidInput if nothing is left.
     """
-    from zstate.cli.monitor.path import path_between
+    from zstate.cli.monitor import path_between
 
     newest = buffer.latest(target, source)
     _, legs = path_between(buffer.frames(), target, source)
@@ -156,7 +156,7 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
             session,
             robot,
             wire=wire,
-            follow=followed(wire),
+            follow=default_stream(wire),
             history_s=seconds + 1.0,
             history_on_join=False,
         ) as listener,

@@ -13,9 +13,9 @@ from concurrent.futures import Future
 from contextlib import suppress
 from typing import IO, Generic, TypeVar
 
-from zstate.cli.logs import text_in
-from zstate.clock import wait_in_slices
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
+from zstate.cli.output.logs import text_in
+from zstate.clock import wait_interruptible
 
 Result = TypeVar("Result")
 
@@ -85,12 +85,12 @@ class BackgroundCall(Generic[Result]):
 
     def result(self, timeout_s: float | None = None) -> Result:
         """The value that ``work`` returned, or its exception. Raises TimeoutError after ``timeout_s``."""
-        if not wait_in_slices(self._is_done, timeout_s):
+        if not wait_interruptible(self._is_done, timeout_s):
             raise TimeoutError(f"the work took longer than {timeout_s} s")
         return self._outcome.result()
 
 
-class ChildProcess(Closing):
+class ChildProcess(Closeable):
     """``zstate ARGUMENTS`` in a child process, which exits with this one, however this one exits.
 
     With ``is_program`` ARGUMENTS are a user's command instead, run in ``folder``. ``on_line(text, is_error)``

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from zstate._util.closeable import Closeable
 from zstate.cli.output.console import fail
-from zstate.cli.words import is_ros, words_of
-from zstate.closing import Closing
+from zstate.cli.output.wire_text import is_ros, messages_for
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.wire.identity import Announcement
     from zstate.wire.keys import Stream
-    from zstate.wire.writer import Announced
 
 
 def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
@@ -26,7 +26,7 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     robots = discover(session)
     selected = tuple(info for info in robots if robot in (ANY, info.name))
     if not selected:
-        words = words_of("native")
+        words = messages_for("native")
         fail(words.announced(robots) if robot == ANY else words.unknown(robot, robots))
     return selected
 
@@ -35,11 +35,11 @@ def only_robot(session: Session) -> str:
     """The name of the only announced robot. Fails with the candidates if there are several or none."""
     first, *others = announced_robots(session, "*")
     if others:
-        fail(f"which robot? {words_of('native').announced((first, *others))}")
+        fail(f"which robot? {messages_for('native').announced((first, *others))}")
     return first.name
 
 
-class RobotDirectory(Closing):
+class RobotDirectory(Closeable):
     """The robots that are announced now, kept up to date by liveliness tokens.
 
     On a ROS wire, which has topics only, it holds the robots that ``robot`` can mean there, by that name.
@@ -55,15 +55,15 @@ class RobotDirectory(Closing):
     ) -> None:
         from zstate.net.presence import watch
 
-        self.words = words_of(wire)
-        self._announced: set[Announced] = set()
+        self.words = messages_for(wire)
+        self._announced: set[Announcement] = set()
         self._on_change = on_change
         self._watch = watch(session, robot if is_ros(wire) else "*", self._update, wire)
 
     def close(self) -> None:
         self._watch.close()
 
-    def _update(self, announced: Announced, alive: bool) -> None:
+    def _update(self, announced: Announcement, alive: bool) -> None:
         change = self._announced.add if alive else self._announced.discard
         change(announced)
         self._on_change()
@@ -80,4 +80,4 @@ class RobotDirectory(Closing):
 
     def silence(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
-        return self.words.silence(robot, stream, self.robots(), ended=ended)
+        return self.words.no_sample_text(robot, stream, self.robots(), ended=ended)

@@ -16,30 +16,30 @@ import msgspec
 import tomli_w
 
 from zstate import __version__
-from zstate.cli.network import Network
+from zstate._util.closeable import Closeable
 from zstate.cli.output.console import count_text, fail, print_result, print_status
+from zstate.cli.output.wire_text import messages_for
 from zstate.cli.processes import BackgroundCall
+from zstate.cli.session import SessionOptions
 from zstate.cli.up.toml_file import TomlFile
 from zstate.cli.waiting import ConditionWaiter
-from zstate.cli.words import words_of
 from zstate.clock import SystemClock
-from zstate.closing import Closing
 from zstate.errors import ConfigError, InvalidInput, MessageError
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, JointType, RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo, discover
 from zstate.net.session import Session
-from zstate.net.wires import wire_named
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.rate import Rate
 from zstate.sources import JointReading, SubscribedSource
-from zstate.sources.descriptions import Descriptions
+from zstate.sources.subscribed import DescriptionSubscriber
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, check_robot
 from zstate.wire.messages import StaticTransforms, poses_from_block
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 
 FORMAT = 1
 _HEADING = "# Robots, by `zstate snapshot save`; `zstate snapshot load FILE` publishes them again.\n"
@@ -79,11 +79,11 @@ class Configuration(_Table, frozen=True):
         ]
         return shlex.join(words)
 
-    def network(self, options: Network) -> Network:
+    def network(self, options: SessionOptions) -> SessionOptions:
         """The saved session options; those in ``options`` take precedence."""
         # Without endpoints, "peer" is the default of native commands, but not of those on a ROS wire.
         mode = self.mode if self.mode != "peer" or self.connect or self.listen or self.config else None
-        return Network(
+        return SessionOptions(
             options.mode or mode,
             options.connect or self.connect,
             options.listen or self.listen,
@@ -206,13 +206,13 @@ def _json_document(path: Path) -> Any:
 
 
 def capture(
-    session: Session, network: Network, robots: Sequence[str], wire: str, timeout_s: float
+    session: Session, network: SessionOptions, robots: Sequence[str], wire: str, timeout_s: float
 ) -> Snapshot:
     """Capture the named robots, or all announced ones, as soon as everything announced has arrived.
 
     Fails if a robot is not announced; logs what does not arrive within ``timeout_s``.
     """
-    words = words_of(wire)
+    words = messages_for(wire)
     announced = discover(session, wire=wire)
     selected = [info for info in announced if info.name in robots or not robots]
     for name in robots:
@@ -244,7 +244,7 @@ def capture(
         )
 
 
-class _RobotCapture(Closing):
+class _RobotCapture(Closeable):
     """Collects the model, the newest joint state and the static edges of one robot."""
 
     def __init__(self, session: Session, info: RobotInfo, wire: str, waiter: ConditionWaiter) -> None:
@@ -252,13 +252,13 @@ class _RobotCapture(Closing):
         self._session = session
         self._waiter = waiter
         self._wire_name = wire
-        self._wire = wire_named(wire)
+        self._wire = get_wire(wire)
         self._model: RobotModel | None = None
         self._source: SubscribedSource | None = None
         self._reading: JointReading | None = None
         self._statics: dict[str, StaticTransforms] = {}
         self._opened = ExitStack()
-        self._opened.enter_context(Descriptions(session, info.name, self._on_model, wire))
+        self._opened.enter_context(DescriptionSubscriber(session, info.name, self._on_model, wire))
         key = self._wire.expression(info.name, "tf_static")
         self._opened.enter_context(LatchedSubscriber(session, key, self._on_statics))
 
@@ -352,7 +352,7 @@ def _by_joint(model: RobotModel, numbers: Any, counts: Mapping[JointType, int]) 
     return named
 
 
-class SnapshotPublisher(Closing):
+class SnapshotPublisher(Closeable):
     """Publishes the robots and static edges of a snapshot; ``run`` repeats the joint states."""
 
     def __init__(

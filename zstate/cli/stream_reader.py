@@ -7,18 +7,18 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from zstate._util.closeable import Closeable
 from zstate.cli.output.console import fail, print_status
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.waiting import ConditionWaiter
 from zstate.clock import LONGEST_WAIT_S
-from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.net.presence import announce_reader
 from zstate.net.streams import CAPACITY, StreamSubscriber
-from zstate.net.wires import wire_named
 from zstate.wire.keys import Stream, check_robot
 from zstate.wire.messages import Message, Sample
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -31,7 +31,7 @@ class TimedSample(NamedTuple):
     sample: Sample
 
 
-class StreamReader(Closing):
+class StreamReader(Closeable):
     """Samples of ``stream`` of ``robot`` in order of arrival, for one reading thread.
 
     Messages that cannot be decoded are skipped; the first of each kind is noted.
@@ -40,7 +40,7 @@ class StreamReader(Closing):
     def __init__(self, session: Session, robot: str, stream: Stream, wire: str = "native") -> None:
         self.robot = check_robot(robot)
         self._stream: Stream = stream
-        self._wire = wire_named(wire)
+        self._wire = get_wire(wire)
         self._refused: set[str] = set()
         self._samples: queue.SimpleQueue[TimedSample] = queue.SimpleQueue()
         self._waiter = ConditionWaiter()

@@ -11,11 +11,11 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, NoReturn
 
+from zstate._util.closeable import Closeable
 from zstate.cli.output.console import GRACE_S, fail, print_status
+from zstate.cli.output.wire_text import is_ros
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.cli.words import is_ros
-from zstate.clock import wait_in_slices
-from zstate.closing import Closing
+from zstate.clock import wait_interruptible
 from zstate.errors import (
     InFuture,
     InPast,
@@ -25,7 +25,7 @@ from zstate.errors import (
     NoData,
     UnknownFrame,
     WaitTimeout,
-    duration_text,
+    format_duration,
 )
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class ConditionWaiter:
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait for a notification since the last call, at least 20 ms; False after ``timeout_s``."""
         began = time.monotonic()
-        if not wait_in_slices(self._changed, timeout_s):
+        if not wait_interruptible(self._changed, timeout_s):
             return False
         time.sleep(max(0.0, began + _CHECK_INTERVAL_S - time.monotonic()))
         self._changed.clear()
@@ -122,16 +122,16 @@ class ConditionWaiter:
             self.wait((began + timeout_s if is_stable else min(began + timeout_s, changed + quiet_s)) - now)
 
 
-class RobotReadiness(Closing):
+class RobotReadiness(Closeable):
     """Readiness of ``robots``: a robot is ready when every moving edge has a sample."""
 
     def __init__(self, session: Session, robots: Sequence[str], wire: str) -> None:
         from zstate.net.latched import LatchedSubscriber
-        from zstate.net.wires import wire_named
+        from zstate.wire.registry import get_wire
 
         self._session, self._wire = session, wire
         self._robots = tuple(dict.fromkeys(robots))
-        self._format = wire_named(wire)
+        self._format = get_wire(wire)
         self._rigid: set[str] = set()
         self._listeners: dict[str, list[TransformListener]] = {}
         self._waiter = ConditionWaiter()
@@ -171,7 +171,7 @@ class RobotReadiness(Closing):
             return ""
         refused = "; ".join(text for one in self._listeners[robot] for text in one.refusals.values())
         stream = self._first_missing(streams)
-        return refused or words.silence(robot, stream, self._directory.robots(), ended=False)
+        return refused or words.no_sample_text(robot, stream, self._directory.robots(), ended=False)
 
     def _is_ready(self, robot: str) -> bool:
         for listener in self._listeners[robot]:
@@ -255,7 +255,7 @@ class PoseWaiter:
             edge = "" if reason.edge is None else f" of {' -> '.join(map(repr, reason.edge))}"
             writer = "" if reason.writer is None else f", which {reason.writer} wrote"
         age_s = self.age_s(transform)
-        old = "" if age_s is None else f": the newest is {duration_text(round(age_s * 1e9))} old"
+        old = "" if age_s is None else f": the newest is {format_duration(round(age_s * 1e9))} old"
         return self.explained(f"no new sample{edge}{writer}{old}")
 
     def age_s(self, transform: Transform) -> float | None:
@@ -269,7 +269,7 @@ class PoseWaiter:
 
     def explained(self, text: str) -> str:
         """A text of the library about these frames, with the names and commands of the wire."""
-        return self._words.explained(text)
+        return self._words.translate(text)
 
     def _note_once(self, reason: LookupFailed) -> None:
         hint = self._hint(reason)
@@ -289,7 +289,7 @@ class PoseWaiter:
 
     def _fail_in_past(self, reason: InPast) -> NoReturn:
         advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED
-        fail(f"{self.explained(reason.happening)}; {advice}")
+        fail(f"{self.explained(reason.what_happened)}; {advice}")
 
     def _fail_after(self, timeout_s: float, reason: WaitTimeout) -> NoReturn:
         advice = ""
@@ -305,14 +305,16 @@ class PoseWaiter:
         if isinstance(reason, UnknownFrame) and not reason.frame_count:
             return hint  # no frame at all is known: that is not about this one
         if isinstance(reason, InFuture | InPast):
-            return self.explained(reason.happening)  # without the advice for programs
-        return f"{self.explained(reason.explanation())}{f' ({hint})' if hint else ''}"
+            return self.explained(reason.what_happened)  # without the advice for programs
+        return f"{self.explained(reason.message())}{f' ({hint})' if hint else ''}"
 
     def _hint(self, reason: LookupFailed) -> str:
         """What the directory of robots adds to the buffer's reason."""
         robot, robots = self._listener.robot, self._directory.robots()
         if isinstance(reason, UnknownFrame) and not reason.near_misses:
-            return self._words.lacking(robot, "robot_description", robots, heard=bool(reason.frame_count))
+            return self._words.missing_text(
+                robot, "robot_description", robots, heard=bool(reason.frame_count)
+            )
         if isinstance(reason, NoData):
-            return self._words.lacking(robot, "joint_states", robots, heard=True)
+            return self._words.missing_text(robot, "joint_states", robots, heard=True)
         return ""

@@ -32,11 +32,12 @@ A wait that ran out raises the reason it was still waiting for, as a subclass th
 ``WaitTimeout`` (a TimeoutError): ``except InFuture`` and ``except TimeoutError`` both catch it.
 """
 
+from zstate._util.format import format_duration
 from zstate.errors.base import (
     AccessDenied,
     Closed,
     ConfigError,
-    Found,
+    FindingLike,
     FrameMismatch,
     InsertRefused,
     InvalidInput,
@@ -50,14 +51,24 @@ from zstate.errors.base import (
     SecondWriter,
     UnknownModel,
     Unreachable,
-    Who,
+    WriterLike,
     ZStateError,
     printable,
 )
-from zstate.errors.instants import InFuture, InPast, NoData, NotFinite, Stale
-from zstate.errors.lookup import AmbiguousFrame, ClockMismatch, Disconnected, LookupFailed, UnknownFrame
-from zstate.errors.timeouts import WaitTimeout, timed_out
-from zstate.errors.times import duration_text
+from zstate.errors.lookup import (
+    AmbiguousFrame,
+    ClockMismatch,
+    Disconnected,
+    InFuture,
+    InPast,
+    LookupFailed,
+    NoData,
+    NotFinite,
+    Stale,
+    UnknownFrame,
+    WaitTimeout,
+    as_timeout,
+)
 
 __all__ = [
     "AccessDenied",
@@ -66,7 +77,7 @@ __all__ = [
     "Closed",
     "ConfigError",
     "Disconnected",
-    "Found",
+    "FindingLike",
     "FrameMismatch",
     "InFuture",
     "InPast",
@@ -88,9 +99,9 @@ __all__ = [
     "UnknownModel",
     "Unreachable",
     "WaitTimeout",
-    "Who",
+    "WriterLike",
     "ZStateError",
-    "duration_text",
+    "as_timeout",
+    "format_duration",
     "printable",
-    "timed_out",
 ]

@@ -67,7 +67,7 @@ class ConfigError(InvalidInput):
         self.path = path
 
 
-class Found(Protocol):
+class FindingLike(Protocol):
     """What a ModelError needs to know of a finding (see ``zstate.model.urdf.Finding``)."""
 
     @property
@@ -87,7 +87,7 @@ class ModelError(ZStateError, ValueError):
     or text they were found in.
     """
 
-    def __init__(self, source: str, findings: Sequence[Found] = (), message: str = "") -> None:
+    def __init__(self, source: str, findings: Sequence[FindingLike] = (), message: str = "") -> None:
         self.source = source
         self.findings = tuple(findings)
         super().__init__(message or self._summary())
@@ -174,8 +174,8 @@ class Closed(NetworkError):
     """Used after ``close()``, or in a process forked from the one that opened it."""
 
 
-class Who(Protocol):
-    """What a SecondWriter tells of the first (see ``zstate.wire.writer.Writer``)."""
+class WriterLike(Protocol):
+    """What a SecondWriter tells of the first (see ``zstate.wire.identity.Writer``)."""
 
     @property
     def program(self) -> str: ...
@@ -195,7 +195,7 @@ class SecondWriter(ZStateError):
     """
 
     def __init__(
-        self, message: str, *, robot: str, stream: str, first: Who, edge: tuple[str, str] | None = None
+        self, message: str, *, robot: str, stream: str, first: WriterLike, edge: tuple[str, str] | None = None
     ) -> None:
         super().__init__(message)
         self.robot = robot

@@ -9,11 +9,11 @@ from typing import TypeAlias
 
 from zstate._util.bounded_dict import BoundedDict
 from zstate._util.bounded_queue import BoundedQueue
+from zstate._util.fork_safe import fork_safe
 from zstate.clock import SET_BACK_NS
-from zstate.errors import InsertRefused, InvalidInput, MessageError, duration_text
+from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.sequence import MissingSamples
-from zstate.locks import outlive_fork
 from zstate.wire.messages import RobotDescription, Sample
 from zstate.wire.sizes import size_of
 
@@ -59,7 +59,7 @@ class StreamIngest(ABC):
         self._domain: str | None = None
         self._has_joined_domain = False
         self._departed_session: int | None = None
-        self._lock = outlive_fork(threading.RLock())
+        self._lock = fork_safe(threading.RLock())
         self._buffer.name_robot(robot)
 
     @property
@@ -224,7 +224,7 @@ class StreamIngest(ABC):
         if not self._may_restart_epoch():
             return False
         newest = self._newest_of(sample)
-        size = "" if newest is None else f" by {duration_text(newest - before.stamp)}"
+        size = "" if newest is None else f" by {format_duration(newest - before.stamp)}"
         self._last_late = self._newest = None
         self._missing.stop_at(0)  # samples missing so far belong to the old epoch
         self._clear_early_history()

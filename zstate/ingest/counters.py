@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass
 
 from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.refusals import Refusals
-from zstate.locks import new_lock
 
 _LOG = logging.getLogger("zstate")
 
@@ -42,7 +42,7 @@ class Counters:
     """
 
     def __init__(self, parent: Counters | None = None) -> None:
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._parent = parent
         self._robots: dict[str, Counters] = {}
         self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)

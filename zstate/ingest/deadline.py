@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from zstate.locks import new_lock
+from zstate._util.fork_safe import fork_safe_lock
 
 FLOOR_S = 0.5
 PERIODS = 10
@@ -85,7 +85,7 @@ class DeadlineMonitor:
 
     def __init__(self) -> None:
         self._writers: dict[Writer, _Registered] = {}
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
 
     def register(self, writer: Writer) -> None:
         """Monitor a writer from now on. Counts its streams: one call for each."""

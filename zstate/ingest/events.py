@@ -10,12 +10,12 @@ from typing import Literal
 
 from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
 from zstate._util.callback_thread import CallbackThread
-from zstate.closing import Closing
-from zstate.errors import duration_text
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
+from zstate.errors import format_duration
 from zstate.ingest.deadline import DeadlineMonitor
-from zstate.locks import new_lock
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
-from zstate.wire.writer import Announced, Writer
 
 Kind = Literal["joined", "left", "restarted", "conflict", "stale", "resumed", "cut off", "back", "set back"]
 
@@ -42,7 +42,7 @@ class WriterEvent:
     kind: Kind
     robot: str
     stream: Stream
-    writer: Writer | None
+    writer: WriterId | None
     at: int
     text: str
 
@@ -80,7 +80,7 @@ class StaticEdgeOwners:
 _Place = tuple[str, Stream, str]
 
 
-class EventLog(Closing):
+class EventLog(Closeable):
     """The events of one listener, which receives ``streams`` and inserts the samples of ``followed``.
 
     ``on_event`` is called with each event on a thread of its own. Without it there are no "stale" events, and
@@ -99,12 +99,12 @@ class EventLog(Closing):
         # In ROS many programs publish parts of tf, but only one publishes a robot's joints.
         self._exclusive = self._streams - (frozenset(shared) - {"joint_states"})
         self._events: deque[WriterEvent] = deque(maxlen=KEPT)
-        self._alive: dict[_Place, dict[int, Announced]] = {}
-        self._former: BoundedDict[tuple[_Place, str, str], Writer] = BoundedDict()
+        self._alive: dict[_Place, dict[int, Announcement]] = {}
+        self._former: BoundedDict[tuple[_Place, str, str], WriterId] = BoundedDict()
         self._gone: BoundedDict[tuple[_Place, int], None] = BoundedDict()
         self._conflicts: BoundedDict[tuple[str, str, int, str], None] = BoundedDict()
         self._owners = StaticEdgeOwners()
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._deadlines = DeadlineMonitor()
         self._thread = None if on_event is None else CallbackThread(on_event, self._check_deadlines)
 
@@ -123,7 +123,7 @@ class EventLog(Closing):
         if self._thread is not None:
             self._thread.close()
 
-    def on_writer(self, announced: Announced, alive: bool) -> None:
+    def on_writer(self, announced: Announcement, alive: bool) -> None:
         """Add the event of a writer that is announced, or is not any more."""
         if announced.stream in self._streams:
             with self._lock:
@@ -132,7 +132,7 @@ class EventLog(Closing):
                 else:
                     self._on_left(announced, "left")
 
-    def on_cut_off(self, announced: Announced) -> None:
+    def on_cut_off(self, announced: Announcement) -> None:
         """Add the event of a writer that disappeared together with the router that connected it."""
         if announced.stream in self._streams:
             with self._lock:
@@ -182,12 +182,12 @@ class EventLog(Closing):
                     self._add_silence("stale", robot, session, silent_s)
         return next_s
 
-    def _on_joined(self, announced: Announced) -> None:
+    def _on_joined(self, announced: Announcement) -> None:
         place, writer = _place(announced), announced.writer
         others = self._alive.setdefault(place, {})
         if writer.session in others:
             return
-        rivals = [other.writer for other in others.values() if other.excludes(announced)]
+        rivals = [other.writer for other in others.values() if other.conflicts_with(announced)]
         others[writer.session] = announced
         text = f"{announced.robot!r}: {writer} writes {_what(announced)}"
         before = self._former.get((place, writer.program, writer.host))
@@ -204,7 +204,7 @@ class EventLog(Closing):
             self._add("conflict", announced.robot, announced.stream, writer, text)
         self._deadlines.register((announced.robot, writer.session))
 
-    def _on_left(self, announced: Announced, kind: Literal["left", "cut off"]) -> None:
+    def _on_left(self, announced: Announcement, kind: Literal["left", "cut off"]) -> None:
         place, writer = _place(announced), announced.writer
         others = self._alive.get(place, {})
         if others.pop(writer.session, None) is None:
@@ -231,7 +231,7 @@ class EventLog(Closing):
         announced = self._alive.get((robot, self._followed, ""), {}).get(session)
         if announced is None:
             return
-        lasting = duration_text(round(silent_s * 1e9))
+        lasting = format_duration(round(silent_s * 1e9))
         if kind == "stale":
             text = f"for {lasting}, though it is announced: it is frozen, or its source is"
         else:
@@ -239,16 +239,16 @@ class EventLog(Closing):
         text = f"{robot!r}: {announced.writer} published nothing on {self._followed} {text}"
         self._add(kind, robot, self._followed, announced.writer, text)
 
-    def _add(self, kind: Kind, robot: str, stream: Stream, writer: Writer | None, text: str) -> None:
+    def _add(self, kind: Kind, robot: str, stream: Stream, writer: WriterId | None, text: str) -> None:
         event = WriterEvent(kind, robot, stream, writer, time.time_ns(), text)
         self._events.append(event)
         if self._thread is not None:
             self._thread.submit(event)
 
 
-def _place(announced: Announced) -> _Place:
+def _place(announced: Announcement) -> _Place:
     return announced.robot, announced.stream, announced.name
 
 
-def _what(announced: Announced) -> str:
+def _what(announced: Announcement) -> str:
     return f"static edges as {announced.name!r}" if announced.name else announced.stream

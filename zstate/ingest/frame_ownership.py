@@ -26,6 +26,7 @@ from itertools import count
 from typing import NamedTuple
 
 from zstate._util.bounded_dict import BoundedDict
+from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
@@ -38,7 +39,6 @@ from zstate.ingest.edge_claims import (
     EdgeSource,
     is_same_pose,
 )
-from zstate.locks import outlive_fork
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 from zstate.wire.keys import FOREIGN, EdgeNames, foreign_objection, robot_in
@@ -94,7 +94,7 @@ class FrameOwnership:
         self._placed: dict[str, EdgeClaim] = {}
         self._is_resolved = True
         self._counter = count(1)
-        self._lock = outlive_fork(threading.RLock())
+        self._lock = fork_safe(threading.RLock())
 
     def add_robot(self, robot: str) -> None:
         """Add a robot on the network, which owns the frames ``robot/...``."""

@@ -8,8 +8,7 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused, ModelError
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.model.robot import RobotModel
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.messages import JointState, RobotDescription, Sample
@@ -53,7 +52,9 @@ class JointStateIngest(StreamIngest):
             self._insert_early()
 
     def _replace_model(self, model: RobotModel) -> None:
-        self._order = JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
+        self._order = JointOrder(
+            model.joint_names, coordinate_names(model), velocity_columns_by_position(model)
+        )
         before, self._track = self._track, None
         self._track = self._ownership.place_model(self.robot, model, before)
 

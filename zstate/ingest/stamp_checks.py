@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from zstate._util.bounded_dict import BoundedDict
+from zstate._util.format import counts_from_start, format_duration, guess_unit
 from zstate.buffer.buffer import TransformBuffer
-from zstate.clock import SYSTEM, stamp_text
-from zstate.errors.times import counts_from_start, duration_text, unit_mistaken
+from zstate.clock import SYSTEM, format_stamp
 from zstate.ingest.counters import Counters
 from zstate.wire.messages import Sample, TransformSample
 
@@ -64,8 +64,8 @@ class StampCheck:
             offset = sample.stamp - now
             self._counters.warn_once(
                 f"off clock {' '.join(key)}",
-                f"{_samples_text(robot, writer)} are stamped {duration_text(abs(offset))} "
-                f"{'after' if offset > 0 else 'before'} this machine's time ({stamp_text(sample.stamp)}): "
+                f"{_samples_text(robot, writer)} are stamped {format_duration(abs(offset))} "
+                f"{'after' if offset > 0 else 'before'} this machine's time ({format_stamp(sample.stamp)}): "
                 f"{likely_cause(sample.stamp, now)}; they are used and counted in off_clock",
             )
 
@@ -107,7 +107,7 @@ class LagDetector:
         backlog.least_ns = min(backlog.least_ns, age_ns) if is_same_backlog else age_ns
         if age_ns > backlog.least_ns + _LAG_GROWTH_NS and not backlog.is_reported:
             backlog.is_reported = True
-            age, before = duration_text(age_ns), duration_text(backlog.least_ns)
+            age, before = format_duration(age_ns), format_duration(backlog.least_ns)
             self._counters.warn_once(
                 f"lag {' '.join(key)}",
                 f"{_samples_text(robot, writer)} come {age} after their stamps, {before} shortly before: "
@@ -118,7 +118,7 @@ class LagDetector:
 
 def likely_cause(stamp: int, now: int) -> str:
     """The likely reason why a writer stamps a sample ``stamp`` at the time ``now`` [ns]."""
-    if unit := unit_mistaken(stamp, now):
+    if unit := guess_unit(stamp, now):
         return f"the writer gives {unit} where nanoseconds are meant"
     if counts_from_start(stamp):
         return (

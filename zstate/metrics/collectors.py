@@ -1,29 +1,79 @@
 """Collectors of metrics: publishers, listeners, writers, connections, recorders and bridges.
 
 Each reads counters that exist anyway, at each scrape.
+
+Paces: rates of what is only counted.
 """
 
 from __future__ import annotations
 
+import threading
+import time
+from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Protocol
 
+from zstate._util.bounded_dict import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import ListenerStats
 from zstate.metrics.buffer import Histogram, InstrumentedBuffer
-from zstate.metrics.pace import Paces
-from zstate.net.connections import connections
+from zstate.net.presence import connections
 from zstate.wire.keys import ANY
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-    from zstate.bridge import Bridge
+    from zstate.bridges.ros2 import Bridge
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
     from zstate.recording.recorder import Recorder
+
+WINDOW_S = 10.0
+EVERY_S = 1.0
+
+_Marks = deque[tuple[float, float]]
+
+
+class Paces:
+    """Rates [Hz] of counts over the last ten seconds, independent of when and how often they are read.
+
+    ``note`` is to be called about once a second; without that a rate is the one since the last reading that
+    is at least ten seconds old, or since the first. Any thread may call.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._marks: BoundedDict[Hashable, _Marks] = BoundedDict()
+        self._lock = threading.Lock()
+
+    def note(self, key: Hashable, count: float) -> None:
+        """What ``key`` counts has come to ``count``."""
+        with self._lock:
+            self._note(key, count, self._clock())
+
+    def rate_hz(self, key: Hashable, count: float) -> float:
+        """The rate of what ``key`` counts, which has come to ``count``; 0 at the first reading."""
+        with self._lock:
+            now = self._clock()
+            time_s, before = self._note(key, count, now)
+        return (count - before) / (now - time_s) if now > time_s else 0.0
+
+    def _note(self, key: Hashable, count: float, now: float) -> tuple[float, float]:
+        """Keep this reading if the last one is a second old. Returns the one at the window's beginning."""
+        marks = self._marks.get(key)
+        if marks is None:
+            marks = _Marks()
+            self._marks[key] = marks
+        if marks and count < marks[-1][1]:
+            marks.clear()  # it counts from the beginning again
+        if not marks or now - marks[-1][0] >= EVERY_S:
+            marks.append((now, count))
+        while len(marks) > 1 and now - marks[1][0] >= WINDOW_S:
+            marks.popleft()
+        return marks[0]
+
 
 MAX_ROBOTS = 500
 """Robots with rows of their own. Names come from the network, so further robots are only counted."""
@@ -265,7 +315,11 @@ class BridgeMetrics:
         for carrier in sorted(self._bridge.carriers, key=lambda carrier: carrier.robot)[:MAX_ROBOTS]:
             text = "Robots that are carried, by way."
             families.gauge(
-                "zstate_bridge_carried", text, carrier.has_begun, robot=carrier.robot, way=carrier.source.way
+                "zstate_bridge_carried",
+                text,
+                carrier.has_begun,
+                robot=carrier.robot,
+                way=carrier.source.direction,
             )
             for reason, count in carrier.refused.items():
                 text = "What could not be carried."

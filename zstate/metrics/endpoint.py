@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, cast
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from zstate import __version__, kernel
+from zstate._util.closeable import Closeable
 from zstate._util.endpoint import format_host, parse_host_port
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, LibraryMissing, PortBusy
-from zstate.metrics.pace import EVERY_S
+from zstate.metrics.collectors import EVERY_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -63,7 +63,7 @@ def check_library() -> None:
         ) from None
 
 
-class MetricsEndpoint(Closing):
+class MetricsEndpoint(Closeable):
     """Serves the metrics of ``collectors`` at ``url``; a context manager.
 
     It also serves CPU, memory and open files of this process, and the version of zstate. ``port`` 0 is a free

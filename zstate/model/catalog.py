@@ -1,87 +1,158 @@
-"""load_model: a path, URDF text or a catalog name to a RobotModel; the one place that reads model files."""
+"""Robots known by name, such as "panda", and the URDF files behind them. Never touches the network.
+
+Looked in, in this order: zstate's own models/, the example-robot-data package, and what
+robot_descriptions has cloned earlier.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import replace
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cache
+from importlib import metadata, util
 from pathlib import Path
 
-from zstate.errors import InvalidInput, ModelError
-from zstate.model import xacro
-from zstate.model.findings import Finding
-from zstate.model.known import CatalogEntry, catalog, find
-from zstate.model.robot import RobotModel
-from zstate.model.urdf import parse_document, xacro_elements
-from zstate.model.xml import MAX_BYTES, read_document
+from zstate._util.suggestions import suggestion_text
+from zstate.errors import UnknownModel
+from zstate.model.findings import quoted
 
-__all__ = ["CatalogEntry", "catalog", "is_path", "load_model"]
+_HERE = Path(__file__).resolve()
 
-_SUFFIXES = (".urdf", ".xacro", ".xml")
+# What people type, where the file is called otherwise; paths in example-robot-data/robots.
+_ALIASES = {
+    "alexander": "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf",
+    "allegro": "allegro_hand_description/urdf/allegro_right_hand.urdf",
+    "anymal": "anymal_b_simple_description/robots/anymal.urdf",
+    "anymal_b": "anymal_b_simple_description/robots/anymal.urdf",
+    "anymal_c": "anymal_c_simple_description/urdf/anymal.urdf",
+    "borinot": "borinot_description/urdf/borinot_flying_arm_2.urdf",
+    "g1": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    "g1_with_hands": "g1_description/urdf/g1_29dof_with_hand_rev_1_0.urdf",
+    "hector": "hector_description/robots/quadrotor_base.urdf",
+    "hextilt": "hextilt_description/urdf/hextilt_flying_arm_5.urdf",
+    "hyq": "hyq_description/robots/hyq_no_sensors.urdf",
+    "talos": "talos_data/robots/talos_reduced.urdf",
+    "talos_arm": "talos_data/robots/talos_left_arm.urdf",
+    "talos_full": "talos_data/robots/talos_full_v2.urdf",
+    "ur3": "ur_description/urdf/ur3_robot.urdf",  # ur3.urdf there is a stub without links
+}
 
 
-def load_model(
-    source: str | bytes | os.PathLike[str], *, xacro_args: Mapping[str, str] | None = None
-) -> RobotModel:
-    """The robot in a file, in URDF text, or behind a catalog name such as "panda".
+@dataclass(frozen=True, slots=True)
+class CatalogEntry:
+    """A robot that ``load_model`` knows by name, its file, and the collection the file belongs to."""
 
-    A str that contains ``<`` is text; one that is the path of a file, contains a slash or ends in .urdf,
-    .xacro or .xml is a path; any other is a name in ``zstate.model.catalog.catalog()``.
-    Xacro is expanded, with ``xacro_args``, when ``zstate[xacro]`` is installed; that runs the expressions
-    in the file.
+    name: str
+    path: Path
+    origin: str
 
-    Raises ModelError with all ``findings`` and their lines; UnknownModel with near misses; InvalidInput
-    when ``xacro_args`` are given for what is no xacro.
+
+def catalog() -> tuple[CatalogEntry, ...]:
+    """Every robot known by name, sorted by name; the first collection that has a name wins."""
+    entries: dict[str, CatalogEntry] = {}
+    for origin, collect in _COLLECTIONS.items():
+        for name, path in collect().items():
+            entries.setdefault(name, CatalogEntry(name, path, origin))
+    return tuple(entries[name] for name in sorted(entries))
+
+
+def find_entry(name: str) -> CatalogEntry:
+    """The entry of that name; case does not matter, nor do ``-`` for ``_`` and a final ``_description``.
+
+    Raises UnknownModel with near misses, where was looked, and what to install.
     """
-    if isinstance(source, bytes) or (isinstance(source, str) and ("<" in source or not source.strip())):
-        return _parse(source, "URDF text", None, xacro_args)
-    if isinstance(source, str) and not is_path(source):
-        path = find(source).path
-        return _parse(_read(path, str(path)), str(path), path, xacro_args)
-    path = Path(source)
-    return _parse(_read(path, os.fspath(source)), os.fspath(source), path, xacro_args)
+    wanted = _normal(name)
+    for origin, collect in _COLLECTIONS.items():
+        path = collect().get(wanted)
+        if path is not None:
+            return CatalogEntry(wanted, path, origin)
+    raise _unknown(name, wanted)
 
 
-def _parse(
-    data: str | bytes, source: str, path: Path | None, xacro_args: Mapping[str, str] | None
-) -> RobotModel:
-    document = read_document(data, source)
-    is_xacro = bool(xacro_elements(document.root)) or (path is not None and path.suffix == ".xacro")
-    if is_xacro:
-        urdf, warnings = xacro.expand(document.text, source, path=path, args=xacro_args or {})
-        model = parse_document(read_document(urdf, f"{source} (expanded)"), f"{source} (expanded)")
-        return replace(model, findings=(*warnings, *model.findings)) if warnings else model
-    if xacro_args:
-        given = " ".join(f"{name}:={value}" for name, value in xacro_args.items())
-        raise InvalidInput(f"{source!r} contains no xacro, so it takes no xacro arguments; got {given}")
-    return parse_document(document, source)
+def example_name() -> str:
+    """The robot of examples and advice: panda, or one of zstate's own where panda is not installed."""
+    return "panda" if any("panda" in collect() for collect in _COLLECTIONS.values()) else "rrbot"
 
 
-def is_path(source: str) -> bool:
-    """Whether ``load_model`` takes this for the path of a file rather than for a name or for text."""
-    if "/" in source or os.sep in source or source.endswith(_SUFFIXES):
-        return True
+def package_folders() -> tuple[Path, ...]:
+    """The folders in and below which the collections keep packages, whose meshes their robots name."""
+    folders = [folder.parents[1] for folder in _example_folders()] + list(_example_folders())
+    if util.find_spec("robot_descriptions") is not None:
+        folders.append(_cloned())
+    return tuple(folder for folder in folders if folder.is_dir())
+
+
+def _unknown(name: str, wanted: str) -> UnknownModel:
+    entries = catalog()
+    near = get_close_matches(wanted[:100], [entry.name for entry in entries], n=3)
+    parts = [f"no robot is called {quoted(name)}{suggestion_text(*near)}"]
+    counts = {origin: sum(entry.origin == origin for entry in entries) for origin in _COLLECTIONS}
+    looked = ", ".join(f"{origin} ({count} names)" for origin, count in counts.items())
+    parts.append(f"looked in {looked}; a path to a file works as well")
+    if not counts["example-robot-data"]:
+        parts.append("for many more robots, pip install 'zstate[robots]'")
+    return UnknownModel(name, near, "; ".join(parts))
+
+
+def _bundled() -> dict[str, Path]:
+    # Beside the package when installed, beside its folder in a checkout.
+    for folder in (_HERE.parents[1] / "models", _HERE.parents[2] / "models"):
+        if folder.is_dir():
+            return _by_stem(folder.glob("*.urdf"))
+    return {}
+
+
+@cache
+def _example_robot_data() -> dict[str, Path]:
+    robots = next((folder for folder in _example_folders() if folder.is_dir()), None)
+    if robots is None:
+        return {}
+    aliases = {name: robots / path for name, path in _ALIASES.items()}
+    found = _by_stem(robots.glob("*/*/*.urdf"))
+    return found | {name: path for name, path in aliases.items() if path.is_file()}
+
+
+def _example_folders() -> Iterator[Path]:
+    tail = Path("share", "example-robot-data", "robots")
     try:
-        return Path(source).is_file()
-    except (OSError, ValueError):
-        return False
+        package = metadata.distribution("example-robot-data")
+    except metadata.PackageNotFoundError:
+        pass
+    else:
+        yield Path(str(package.locate_file("cmeel.prefix"))) / tail
+    yield Path(sys.prefix) / tail
 
 
-def _read(path: Path, source: str) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except FileNotFoundError:
-        folder = "" if path.is_absolute() else f" in {Path.cwd()}"
-        raise _refusal(source, f"there is no such file{folder}") from None
-    except IsADirectoryError:
-        raise _refusal(source, "this is a directory; name the .urdf file in it") from None
-    except (OSError, ValueError) as error:
-        raise _refusal(source, f"the file cannot be read: {error}") from None
-    if len(data) > MAX_BYTES:
-        raise _refusal(source, f"the file has more than {MAX_BYTES} bytes, which is the limit")
-    return data
+@cache
+def _robot_descriptions() -> dict[str, Path]:
+    # Its modules clone repositories when imported, so only its cache is looked at.
+    if util.find_spec("robot_descriptions") is None:
+        return {}
+    return _by_stem(_cloned().rglob("*.urdf"))
 
 
-def _refusal(source: str, message: str) -> ModelError:
-    return ModelError(source, [Finding(None, message, "error")])
+def _cloned() -> Path:
+    default = "~/.cache/robot_descriptions"
+    return Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", default)).expanduser()
+
+
+_COLLECTIONS: dict[str, Callable[[], dict[str, Path]]] = {
+    "zstate": _bundled,
+    "example-robot-data": _example_robot_data,
+    "robot_descriptions": _robot_descriptions,
+}
+
+
+def _by_stem(paths: Iterable[Path]) -> dict[str, Path]:
+    """Files by name; of several with one name, that with the shortest path."""
+    named: dict[str, Path] = {}
+    for path in sorted(paths, key=lambda path: (len(str(path)), str(path))):
+        named.setdefault(_normal(path.stem), path)
+    return named
+
+
+def _normal(name: str) -> str:
+    return name.strip().lower().replace("-", "_").removesuffix("_description").removesuffix("_robot")

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.suggestions import did_you_mean
 from zstate.errors import InvalidInput, LibraryMissing
-from zstate.locks import new_lock
-from zstate.model.edges import EdgeForm, EdgeTable, Floats
+from zstate.model.joint_transforms import Floats, JointTransform, JointTransforms
 from zstate.model.robot import RobotModel
 
 
@@ -35,8 +35,8 @@ class Kinematics:
     def __init__(self, model: RobotModel) -> None:
         self.model = model
         self.edges = tuple((joint.parent, joint.child) for joint in model.joints)
-        self._table = EdgeTable(model)
-        self._lock = new_lock()
+        self._table = JointTransforms(model)
+        self._lock = fork_safe_lock()
 
     def __repr__(self) -> str:
         return f"<Kinematics of {self.model.name!r}, {len(self.model.links)} links>"
@@ -94,10 +94,10 @@ class _Solver:
     are ordinary hinges here: Pinocchio turns angles into cosine and sine itself, at any number of turns.
     """
 
-    def __init__(self, model: RobotModel, forms: tuple[EdgeForm, ...]) -> None:
+    def __init__(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
         self._pin = _pinocchio()
         self._model: Any = self._pin.Model()
-        self._joint_ids: dict[EdgeForm, int] = {}
+        self._joint_ids: dict[JointTransform, int] = {}
         self._add_links(model, forms)
         self._data: Any = self._model.createData()
         single = [form for form in self._joint_ids if form.kind in ("hinge", "slide")]
@@ -109,7 +109,7 @@ class _Solver:
         self._shift = np.array([form.shift for form in single])
         self._planar = [form for form in self._joint_ids if form.kind == "planar"]
         self._floating = [form for form in self._joint_ids if form.kind == "floating"]
-        self._frames = _rows_of(self._data.oMf, len(model.links) + 1)[1:]
+        self._frames = _placement_rows(self._data.oMf, len(model.links) + 1)[1:]
 
     def link_poses(self, positions: Floats, out: Floats) -> Floats:
         self._pin.framesForwardKinematics(self._model, self._data, self._configuration(positions))
@@ -163,8 +163,8 @@ class _Solver:
             v[row : row + 6] = (given.reshape(2, 3) @ pose.rotation).ravel()
         return v
 
-    def _add_links(self, model: RobotModel, forms: tuple[EdgeForm, ...]) -> None:
-        below: defaultdict[str, list[EdgeForm]] = defaultdict(list)
+    def _add_links(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
+        below: defaultdict[str, list[JointTransform]] = defaultdict(list)
         for form in forms:
             below[form.parent].append(form)
         placed: dict[str, tuple[int, Any]] = {model.root: (0, self._pin.SE3.Identity())}
@@ -177,7 +177,7 @@ class _Solver:
             joint_id, placement = placed[link]
             self._model.addFrame(self._pin.Frame(f"l{row}", joint_id, 0, placement, self._pin.FrameType.BODY))
 
-    def _place(self, form: EdgeForm, joint_id: int, placement: Any) -> tuple[int, Any]:
+    def _place(self, form: JointTransform, joint_id: int, placement: Any) -> tuple[int, Any]:
         """Pinocchio's joint that carries the child of an edge, and the child's pose in it."""
         joint_from_origin = placement * self._pin.XYZQUATToSE3(np.array(form.origin))
         if form.kind == "fixed":
@@ -187,17 +187,17 @@ class _Solver:
         self._joint_ids[form] = added
         return added, self._pin.SE3.Identity()
 
-    def _joint_of(self, form: EdgeForm) -> Any:
+    def _joint_of(self, form: JointTransform) -> Any:
         if form.kind == "hinge":
             return self._pin.JointModelRevoluteUnaligned(np.array(form.axis))
         if form.kind == "slide":
             return self._pin.JointModelPrismaticUnaligned(np.array(form.axis))
         return self._pin.JointModelPlanar() if form.kind == "planar" else self._pin.JointModelFreeFlyer()
 
-    def _q_row(self, form: EdgeForm) -> int:
+    def _q_row(self, form: JointTransform) -> int:
         return self._model.idx_qs[self._joint_ids[form]]
 
-    def _v_row(self, form: EdgeForm) -> int:
+    def _v_row(self, form: JointTransform) -> int:
         return self._model.idx_vs[self._joint_ids[form]]
 
 
@@ -209,7 +209,7 @@ def _destination(out: Floats | None, rows: int) -> Floats:
     return out
 
 
-def _rows_of(placements: Any, count: int) -> Floats:
+def _placement_rows(placements: Any, count: int) -> Floats:
     """A live view of Pinocchio's placements: (count, 12), the rotation by columns, then the translation.
 
     Pinocchio keeps them side by side, each as twelve doubles; reading them one by one from Python

@@ -16,6 +16,8 @@ fixed, mimic  0          -                                        0
 
 Velocities are the rates of these numbers; those of a floating joint are its linear velocity [m/s]
 and its angular velocity [rad/s], both in the axes of the joint's own (zero) frame.
+
+Coordinates: a name for each number of a robot's position vector.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.suggestions import suggestion_text
 from zstate.checks import real_numbers
-from zstate.errors import Found, InvalidInput
+from zstate.errors import FindingLike, InvalidInput
 
 JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 
@@ -110,7 +112,7 @@ class RobotModel:
     links: tuple[str, ...]
     joints: tuple[Joint, ...]
     urdf: str
-    findings: tuple[Found, ...] = ()
+    findings: tuple[FindingLike, ...] = ()
 
     def __repr__(self) -> str:
         return f"RobotModel({self.name!r}, {len(self.links)} links, {len(self.joint_names)} driven joints)"
@@ -143,12 +145,12 @@ class RobotModel:
     @cached_property
     def columns(self) -> dict[str, int]:
         """Where in the position vector each driven joint's numbers begin."""
-        return _starts(self.driven_joints, POSITION_COUNTS)
+        return _offsets(self.driven_joints, POSITION_COUNTS)
 
     @cached_property
     def velocity_columns(self) -> dict[str, int]:
         """Where in the velocity vector each driven joint's numbers begin."""
-        return _starts(self.driven_joints, VELOCITY_COUNTS)
+        return _offsets(self.driven_joints, VELOCITY_COUNTS)
 
     @cached_property
     def neutral(self) -> NDArray[np.float64]:
@@ -279,10 +281,38 @@ def _words(name: str) -> tuple[str, ...]:
     return tuple(word for word in _SEPARATORS.split(name.lower()) if word not in ("", "joint"))
 
 
-def _starts(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[str, int]:
+def _offsets(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[str, int]:
     starts: dict[str, int] = {}
     total = 0
     for joint in joints:
         starts[joint.name] = total
         total += counts[joint.type]
     return starts
+
+
+_PARTS = {
+    "floating": ("x", "y", "z", "qx", "qy", "qz", "qw"),
+    "planar": ("x", "y", "yaw"),
+}
+
+
+def coordinate_names(model: RobotModel) -> tuple[str, ...]:
+    """One name for each position: the joint's, or "base.x", "base.y" ... where a joint has several."""
+    return tuple(name for joint in model.driven_joints for name in _names(joint))
+
+
+def velocity_columns_by_position(model: RobotModel) -> tuple[int, ...]:
+    """The coordinate under which each number of a velocity or effort vector stands.
+
+    A floating joint has six velocities for seven positions: nothing stands under its last coordinate.
+    """
+    return tuple(
+        model.columns[joint.name] + number
+        for joint in model.driven_joints
+        for number in range(VELOCITY_COUNTS[joint.type])
+    )
+
+
+def _names(joint: Joint) -> tuple[str, ...]:
+    parts = _PARTS.get(joint.type)
+    return (joint.name,) if parts is None else tuple(f"{joint.name}.{part}" for part in parts)

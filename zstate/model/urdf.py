@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from zstate.model.findings import Findings, quoted, shortened
-from zstate.model.joints import JointReader
-from zstate.model.mimics import check_mimics
-from zstate.model.numbers import NumberFault, read_number
 from zstate.model.robot import VELOCITY_COUNTS, Joint, RobotModel
-from zstate.model.tree import check_tree
-from zstate.model.xml import Document, Element, read_document
+from zstate.model.urdf_checks import check_mimics, check_tree
+from zstate.model.urdf_joint import JointReader
+from zstate.model.xml import Document, Element, NumberError, read_document, read_number
 
 MAX_LINKS = 2000
 MAX_VELOCITIES = 200
@@ -169,7 +167,7 @@ def _read_links(findings: Findings, robot: Element) -> dict[str, int]:
 def _check_mass(findings: Findings, link: str, mass: Element) -> None:
     try:
         value = read_number(mass.attributes.get("value", ""))
-    except NumberFault as fault:
+    except NumberError as fault:
         findings.warning(mass.line, f"link {quoted(link)}: mass: {fault}", '<mass value="1.0"/> in kg')
         return
     if value < 0.0:

@@ -3,18 +3,103 @@
 Limits: 16 MiB, 200,000 elements, 100 levels. Entities are neither declared nor fetched: a DOCTYPE
 with declarations or a reference to a file is refused. Prefixes are kept as written (``xacro:macro``)
 and need no declaration, because URDF files in use lack it.
+
+Numbers as a URDF writes them: plain decimals, the same for every reader whatever its language.
+
+Bytes of an XML file to text: byte order mark, declared encoding, and clear words when neither fits.
 """
 
 from __future__ import annotations
 
+import codecs
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from zstate.errors import ModelError
-from zstate.model.encoding import TextFault, decode
 from zstate.model.findings import Finding, quoted
+
+_BYTE_ORDER_MARKS = (
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+)
+# Python knows codecs that are no text encodings of files (rot13, unicode_escape): a list, not a lookup.
+_ENCODINGS = {"utf-8", "us-ascii", "ascii", "iso-8859-1", "latin-1", "iso-8859-15", "windows-1252", "cp1252"}
+_DECLARED = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]*)["']""")
+
+
+class EncodingError(ValueError):
+    """Bytes that are not the text they should be; ``line`` is where, when that can be said.
+
+    ``fix`` is what to write instead.
+    """
+
+    def __init__(self, message: str, line: int | None = None, fix: str = "") -> None:
+        super().__init__(message)
+        self.line = line
+        self.fix = fix
+
+
+def decode(data: str | bytes) -> str:
+    """The text of ``data`` without its byte order mark. Raises TextFault.
+
+    Read are UTF-8, UTF-16 with a byte order mark, and, where the XML declaration says so, US-ASCII,
+    ISO-8859-1, ISO-8859-15 and windows-1252.
+    """
+    text = data.removeprefix("\ufeff") if isinstance(data, str) else _decode_bytes(data)
+    _check_is_text(text)
+    return text
+
+
+def _decode_bytes(data: bytes) -> str:
+    for mark, encoding in _BYTE_ORDER_MARKS:
+        if data.startswith(mark):
+            return _decode_as(data[len(mark) :], encoding)
+    if b"\0" in data:
+        line, column = _place(data, data.index(b"\0"))
+        raise EncodingError(f"column {column}: a zero byte; this is a binary file, not a URDF", line)
+    return _decode_as(data, _declared_encoding(data))
+
+
+def _declared_encoding(data: bytes) -> str:
+    declared = _DECLARED.match(data[:1000])
+    if declared is None:
+        return "utf-8"
+    encoding = declared[1].decode("latin-1")
+    if encoding.lower() not in _ENCODINGS:
+        raise EncodingError(f"the declared encoding {encoding[:40]!r} is not read; save the file as UTF-8", 1)
+    return encoding
+
+
+def _decode_as(data: bytes, encoding: str) -> str:
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        line, column = _place(data, error.start)
+        raise EncodingError(
+            f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file as "
+            'UTF-8, or declare its encoding in line 1 (<?xml version="1.0" encoding="ISO-8859-1"?>)',
+            line,
+        ) from None
+
+
+def _place(data: bytes, offset: int) -> tuple[int, int]:
+    """Line and column of a byte, both counted from 1."""
+    return data.count(b"\n", 0, offset) + 1, offset - data.rfind(b"\n", 0, offset)
+
+
+def _check_is_text(text: str) -> None:
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        line = text.count("\n", 0, error.start) + 1
+        raise EncodingError(
+            f"the character {text[error.start]!r} is half of a pair, not text", line
+        ) from None
+
 
 MAX_BYTES = 16 * 1024 * 1024
 MAX_ELEMENTS = 200_000
@@ -61,18 +146,18 @@ def read_document(data: str | bytes, source: str) -> Document:
     """The tree of ``data``. Raises ModelError saying where and why it is not (trustworthy) XML."""
     try:
         return _read(data)
-    except TextFault as fault:
+    except EncodingError as fault:
         raise ModelError(source, [Finding(fault.line, str(fault), "error", fault.fix)]) from None
 
 
 def _read(data: str | bytes) -> Document:
     if len(data) > MAX_BYTES:
-        raise TextFault(f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
+        raise EncodingError(f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
     text = decode(data)
     body = text.lstrip()
     if not body:
         whole = '<robot name="NAME"><link name="base_link"/></robot>'
-        raise TextFault('the text is empty; a URDF begins with <robot name="...">', fix=whole)
+        raise EncodingError('the text is empty; a URDF begins with <robot name="...">', fix=whole)
     lines_before = text.count("\n", 0, len(text) - len(body))
     return Document(body, _Reader(body, lines_before).read())
 
@@ -86,7 +171,7 @@ class _Reader:
         self._count = 0
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
+        self._parser.EndElementHandler = self._close_element
         self._parser.StartDoctypeDeclHandler = self._doctype
 
     def read(self) -> Element:
@@ -95,7 +180,7 @@ class _Reader:
         except expat.ExpatError as error:
             line = error.lineno + self._lines_before
             cause, fix = self._cause(error)
-            raise TextFault(f"column {error.offset + 1}: {cause}", line, fix) from None
+            raise EncodingError(f"column {error.offset + 1}: {cause}", line, fix) from None
         assert self._root is not None, "expat accepts no document without an element"
         return self._root
 
@@ -106,21 +191,21 @@ class _Reader:
         element = Element(tag, attributes, self._line())
         self._count += 1
         if self._count > MAX_ELEMENTS:
-            raise TextFault(f"more than {MAX_ELEMENTS} elements, which is the limit", element.line)
+            raise EncodingError(f"more than {MAX_ELEMENTS} elements, which is the limit", element.line)
         if len(self._open) == MAX_NESTING:
-            raise TextFault(f"<{_short(tag)}> is nested deeper than {MAX_NESTING} levels", element.line)
+            raise EncodingError(f"<{_short(tag)}> is nested deeper than {MAX_NESTING} levels", element.line)
         if self._open:
             self._open[-1].children.append(element)
         else:
             self._root = element
         self._open.append(element)
 
-    def _end(self, _tag: str) -> None:
+    def _close_element(self, _tag: str) -> None:
         self._open.pop()
 
     def _doctype(self, _name: str, system: str | None, public: str | None, has_declarations: int) -> None:
         if system or public or has_declarations:
-            raise TextFault(
+            raise EncodingError(
                 "a DOCTYPE with declarations (entities) or a reference to a file is refused: it can make "
                 "a small file huge or read others; remove it",
                 self._line(),
@@ -156,3 +241,52 @@ class _Reader:
 
 def _short(tag: str) -> str:
     return quoted(tag)[1:-1]
+
+
+_DECIMAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_BLANKS = re.compile(r"[ \t\r\n]+")
+
+
+class NumberError(ValueError):
+    """Text that is not the number or numbers it should be."""
+
+
+def read_numbers(text: str, count: int) -> tuple[float, ...]:
+    """``count`` finite numbers separated by blanks. Raises NumberFault saying which is wrong."""
+    _refuse_expression(text)
+    tokens = [token for token in _BLANKS.split(text) if token]
+    if len(tokens) != count:
+        commas = "; separate them by blanks, not commas" if "," in text else ""
+        raise NumberError(f"{quoted(text)} has {len(tokens)} of {count} number{'s'[: count - 1]}{commas}")
+    return tuple(read_number(token) for token in tokens)
+
+
+def read_number(text: str) -> float:
+    """One finite number. Raises NumberFault."""
+    _refuse_expression(text)
+    token = text.strip(" \t\r\n")
+    if not _DECIMAL.fullmatch(token):
+        raise NumberError(_complaint(token))
+    value = float(token)
+    if not math.isfinite(value):
+        raise NumberError(f"{quoted(token)} is too large to be a number here")
+    return value
+
+
+def _refuse_expression(text: str) -> None:
+    if "${" in text or "$(" in text:
+        raise NumberError(f"{quoted(text.strip())} is a xacro expression, not a number")
+
+
+def _complaint(token: str) -> str:
+    if not token:
+        return "an empty text is not a number"
+    if _DECIMAL.fullmatch(token.replace(",", ".")):
+        return f"{quoted(token)} has a decimal comma; write {quoted(token.replace(',', '.'))}"
+    try:
+        value = float(token)
+    except ValueError:
+        return f"{quoted(token)} is not a number"
+    if not math.isfinite(value):
+        return f"{quoted(token)} is not a finite number"
+    return f"{quoted(token)} is a number to Python only; write {value!r}"

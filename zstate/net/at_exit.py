@@ -13,11 +13,14 @@ session, started before the first of them because Python starts none at its end,
 A callback given to Zenoh itself (``session.zenoh.declare_subscriber(key, callback)``) has a thread that is no
 daemon: Python waits for it before ``atexit``. Once the main thread has ended, and nothing but such threads is
 left to be waited for, the sessions are closed then.
+
+What becomes, in a process forked from one with a session, of that session's belongings.
 """
 
 from __future__ import annotations
 
 import atexit
+import ctypes
 import os
 import sys
 import threading
@@ -30,9 +33,27 @@ from typing import Protocol
 
 import zenoh
 
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import Closed
-from zstate.locks import new_lock
-from zstate.net.forked import forked_text
+
+
+def leak(entity: object) -> None:
+    """Never free ``entity``, not even at the interpreter's end.
+
+    Freeing it would have Zenoh take it back from the network, with threads that fork left behind in
+    the parent: the child would wait for them until it is killed.
+    """
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(entity))
+
+
+def forked_text(what: str) -> str:
+    """``what`` does not work in a forked process, and the two ways out."""
+    return (
+        f"{what}; Zenoh does not work after a fork: call connect() in the child processes alone, once they "
+        "have started, or start them with the 'spawn' or 'forkserver' method (for instance "
+        "multiprocessing.get_context('spawn'), DataLoader(..., multiprocessing_context='spawn'))"
+    )
+
 
 WITHIN_S = 1.5
 THREAD_NAME = "zstate exit"
@@ -63,7 +84,7 @@ class _Process:
         self.threads: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
         self.opening = 0
         self.is_ending = False
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._leaving: list[Callable[[], None]] = []
         self._requested = threading.Event()
         self._done = threading.Event()
@@ -93,7 +114,7 @@ class _Process:
                 if not self.opening:
                     self._none_opening.set()
 
-    def end(self, leave: Callable[[], None] | None = None) -> None:
+    def close_all(self, leave: Callable[[], None] | None = None) -> None:
         if leave is not None:
             self._leaving.append(leave)
         self._requested.set()
@@ -138,12 +159,12 @@ class _Process:
 
 def _join_the_program() -> None:
     """Return when no thread runs that Python waits for, apart from those that call back for Zenoh."""
-    while threads := [one for one in threading.enumerate() if one.is_alive() and _is_of_the_program(one)]:
+    while threads := [one for one in threading.enumerate() if one.is_alive() and _is_program_thread(one)]:
         for thread in threads:
             thread.join()
 
 
-def _is_of_the_program(thread: threading.Thread) -> bool:
+def _is_program_thread(thread: threading.Thread) -> bool:
     return not thread.daemon and not _runs_callbacks(thread)
 
 
@@ -200,10 +221,10 @@ def session_opening() -> AbstractContextManager[None]:
 
 def end_sessions(leave: Callable[[], None] | None = None) -> None:
     """The process ends: ``leave()``, and close all sessions, within ``WITHIN_S``."""
-    _process.end(leave)
+    _process.close_all(leave)
 
 
-def _begin_anew() -> None:
+def _reset_after_fork() -> None:
     global _process  # noqa: PLW0603  # the one of the parent stays as it was
     for session in tuple(_process.sessions):
         session.keep_for_ever()
@@ -211,4 +232,4 @@ def _begin_anew() -> None:
 
 
 atexit.register(end_sessions)
-os.register_at_fork(after_in_child=_begin_anew)
+os.register_at_fork(after_in_child=_reset_after_fork)

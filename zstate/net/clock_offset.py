@@ -18,19 +18,18 @@ from dataclasses import dataclass
 
 import zenoh
 
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.clock import Clock, ClockOffset, SystemClock
-from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, MessageError
-from zstate.locks import new_lock
 from zstate.net.at_exit import join_at_exit
-from zstate.net.replies import query
-from zstate.net.service import Answer, Service
+from zstate.net.queryable import Queryable, Reply, query
+from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
-from zstate.net.turns import Turns
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
-from zstate.wire.messages import Clock as Time
+from zstate.wire.messages import ClockMessage as Time
 from zstate.wire.native import ENCODINGS, decode, encode
-from zstate.wire.writer import Writer
 
 AGAIN_S = 30.0
 """So old a measurement is repeated when it is asked for; sooner while there was no answer."""
@@ -51,18 +50,18 @@ class MeasuredOffset:
     """
 
     robot: str
-    writer: Writer
+    writer: WriterId
     offset_ns: int
     uncertainty_ns: int
     round_trip_ns: int
 
 
-class ClockService(Service):
+class ClockService(Queryable):
     """Tells whoever asks what time it is by the ``clock`` of one writer of ``robot``."""
 
-    def __init__(self, session: Session, robot: str, writer: Writer, clock: Clock) -> None:
-        def answer(_: object) -> Answer:
-            return Answer(encode(Time(clock.now(), self.answered, writer.session)), ENCODINGS[Time])
+    def __init__(self, session: Session, robot: str, writer: WriterId, clock: Clock) -> None:
+        def answer(_: object) -> Reply:
+            return Reply(encode(Time(clock.now(), self.answered, writer.session)), ENCODINGS[Time])
 
         super().__init__(session, clock_key(robot, writer.identity), answer)
 
@@ -118,25 +117,25 @@ def _round(session: Session, expression: str, clock: Clock, timeout_s: float) ->
     for reply in replies:
         round_trip_ns = time.monotonic_ns() - asked_ns
         if reply.ok is not None:
-            told = _told(reply.ok)
+            told = _parse_reply(reply.ok)
             if told is not None:
                 robot, writer, stamp = told
                 half = round_trip_ns // 2
                 yield MeasuredOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
 
 
-def _told(sample: zenoh.Sample) -> tuple[str, Writer, int] | None:
+def _parse_reply(sample: zenoh.Sample) -> tuple[str, WriterId, int] | None:
     """Who says what time it is; None for what is no answer of ours."""
     try:
         robot, identity = parse_clock_key(str(sample.key_expr))
-        writer = Writer.parse(identity)
+        writer = WriterId.parse(identity)
         time_there = decode(sample.payload.to_bytes(), str(sample.encoding), Time)
     except (InvalidInput, MessageError):
         return None
     return (robot, writer, time_there.stamp) if time_there.session == writer.session else None
 
 
-class OffsetMeter(Closing):
+class ClockOffsetMonitor(Closeable):
     """Measures the clocks of writers as often as somebody wants to know, in a thread of its own.
 
     The thread lives no longer than there is something to measure. Each robot has its turn: silent writers
@@ -146,12 +145,12 @@ class OffsetMeter(Closing):
     def __init__(self, session: Session, clock: Clock) -> None:
         self._session = session
         self._clock = clock
-        self._wanted: Turns[_Measured] = Turns()
-        self._lock = new_lock()
+        self._wanted: RoundRobinQueue[_Measured] = RoundRobinQueue()
+        self._lock = fork_safe_lock()
         self._is_running = False
         self._is_open = True
 
-    def follow(self, robot: str, writer: Writer) -> Callable[[], ClockOffset | None]:
+    def follow(self, robot: str, writer: WriterId) -> Callable[[], ClockOffset | None]:
         """What tells how far the clock of ``writer`` is ahead: measured now, and when asked after 30 s."""
         measured = _Measured(self, robot, clock_key(robot, writer.identity))
         measured()
@@ -180,13 +179,13 @@ class OffsetMeter(Closing):
     def _run(self) -> None:
         while True:
             with self._lock:
-                measured = self._wanted.take(0.0)
+                measured = self._wanted.pop(0.0)
                 if measured is None:
                     self._is_running = False
                     return
             try:
                 found = list(_best(self._session, measured.key, 8, self._clock, measured.timeout_s))
-                if measured.take(found):
+                if measured.add_reply(found):
                     self.want(measured)
             except (Closed, zenoh.ZError):
                 self.close()  # the session is gone
@@ -195,7 +194,7 @@ class OffsetMeter(Closing):
 class _Measured:
     """The offset of one writer's clock, as far as it is known."""
 
-    def __init__(self, meter: OffsetMeter, robot: str, key: str) -> None:
+    def __init__(self, meter: ClockOffsetMonitor, robot: str, key: str) -> None:
         self.robot = robot
         self.key = key
         self.offset: ClockOffset | None = None
@@ -208,7 +207,7 @@ class _Measured:
         """How long it may take the writer to answer: longer, when it has not answered before."""
         return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
 
-    def take(self, found: Sequence[MeasuredOffset]) -> bool:
+    def add_reply(self, found: Sequence[MeasuredOffset]) -> bool:
         """Keep what was measured; whether to try again, where the writer did not answer."""
         self._unanswered = 0 if found else self._unanswered + 1
         for one in found:

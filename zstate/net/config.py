@@ -1,22 +1,31 @@
-"""What a session is told: endpoints checked, settings chosen, one zenoh.Config out."""
+"""What a session is told: endpoints checked, settings chosen, one zenoh.Config out.
+
+The ways to join the network, and how open each of them is.
+
+What the environment says about joining the network: what zstate's commands go by, for other programs.
+"""
 
 # pyright: reportUnknownMemberType=false
 # zenoh's stubs leave the return types of some methods out
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+import socket
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import zenoh
 
 from zstate._util.endpoint import parse_endpoint, parse_host_port
-from zstate.errors import ConfigError, InvalidInput
-from zstate.net.security import Credentials
+from zstate.errors import ConfigError, InvalidInput, NetworkError, PortBusy
+from zstate.net.security.credentials import Credentials
 
 Mode = Literal["peer", "loopback", "lan", "client", "router"]
 ConfigSource: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | zenoh.Config"
@@ -97,7 +106,7 @@ def _advice(address: str, protocol: str = "tcp") -> str:
     return f"write '{protocol}/host:port', for instance 'tcp/192.168.1.10:7447'"
 
 
-def our_config(
+def default_config(
     mode: Mode,
     endpoints: Sequence[str],
     listen: Sequence[str],
@@ -105,13 +114,13 @@ def our_config(
     credentials: Credentials | None = None,
 ) -> zenoh.Config:
     """Our settings. Without ``timeout_s`` connecting is tried for ever and opening never fails."""
-    return _told(
+    return _apply(
         zenoh.Config(),
         {
             **SETTINGS,
             **_mode(mode),
             **_secured(credentials),
-            **_among_its_own(mode, credentials),
+            **_is_config_section(mode, credentials),
             "connect/endpoints": list(endpoints),
             "listen/endpoints": list(listen),
             "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
@@ -120,7 +129,7 @@ def our_config(
     )
 
 
-def given_config(
+def user_config(
     source: ConfigSource,
     mode: Mode,
     endpoints: Sequence[str],
@@ -133,7 +142,7 @@ def given_config(
         told["connect/endpoints"] = list(endpoints)
     if listen:
         told["listen/endpoints"] = list(listen)
-    return _told(_load(source), told)
+    return _apply(_load(source), told)
 
 
 def _mode(mode: Mode) -> dict[str, object]:
@@ -151,7 +160,7 @@ def _secured(credentials: Credentials | None) -> dict[str, object]:
     return {} if credentials is None else credentials.settings()
 
 
-def _among_its_own(mode: Mode, credentials: Credentials | None) -> dict[str, object]:
+def _is_config_section(mode: Mode, credentials: Credentials | None) -> dict[str, object]:
     # Whoever is found by multicast or gossip and speaks plain TCP would be spoken to, certificates or not.
     # Routers look for nobody, and may serve the programs of their host without.
     if mode == "router" or credentials is None or credentials.ca is None:
@@ -159,7 +168,7 @@ def _among_its_own(mode: Mode, credentials: Credentials | None) -> dict[str, obj
     return {"transport/link/protocols": ["tls", "quic"]}
 
 
-def _told(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:
+def _apply(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return config
@@ -206,3 +215,160 @@ def _parse(text: str, name: str) -> zenoh.Config:
         return zenoh.Config.from_json5(text)
     except zenoh.ZError as error:
         raise ConfigError(f"{name!r} is no Zenoh configuration: {error}", path=name) from None
+
+
+_WITHIN_A_HOST = ("unixsock-stream/", "unixpipe/")
+
+
+def check_mode(mode: str) -> Mode:
+    """``mode`` if it is one. Raises InvalidInput naming all of them."""
+    for known in get_args(Mode):
+        if mode == known:
+            return known
+    raise InvalidInput(f"{mode!r} is not a mode; the modes are {', '.join(map(repr, get_args(Mode)))}")
+
+
+def listen_endpoints(mode: Mode, listen: Sequence[str], credentials: Credentials | None) -> tuple[str, ...]:
+    """Where to listen: ``listen``, or where ``mode`` does unless told otherwise."""
+    if listen or mode == "client":
+        return tuple(listen)
+    default = {"router": ROUTER_ENDPOINT, "lan": _any_port()}.get(mode, ANY_LOOPBACK_PORT)
+    is_encrypted = credentials is not None and credentials.ca is not None
+    return (default.replace("tcp/", "tls/", 1) if is_encrypted else default,)
+
+
+def _any_port() -> str:
+    # Where IPv6 is switched off, Zenoh cannot listen at its own default.
+    return "tcp/[::]:0" if socket.has_dualstack_ipv6() else "tcp/0.0.0.0:0"
+
+
+def check_loopback_only(endpoints: Iterable[str]) -> None:
+    """Raise InvalidInput for an endpoint through which something could leave this host, or come in."""
+    for endpoint in endpoints:
+        if not endpoint.startswith(_WITHIN_A_HOST) and not _is_loopback(endpoint):
+            raise InvalidInput(
+                f"{endpoint!r} leaves this host, which mode 'loopback' forbids; write an address in "
+                "127.0.0.0/8, '[::1]' or 'localhost', or choose mode 'peer', 'lan' or 'client'"
+            )
+
+
+def _is_loopback(endpoint: str) -> bool:
+    parsed = parse_endpoint(endpoint)
+    host = parsed.host if parsed else ""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name may mean another address tomorrow
+
+
+def check_credentials(mode: Mode, credentials: Credentials | None, listen: Iterable[str]) -> None:
+    """Raise ConfigError for what would keep everybody out."""
+    if credentials is None:
+        for endpoint in listen:
+            if endpoint.startswith(("tls/", "quic/")):
+                raise ConfigError(
+                    f"listening at {endpoint!r} needs a certificate; give credentials= (--certs DIR "
+                    "--identity NAME); `zstate certs DIR --server NAME` makes one for tests",
+                    path=endpoint,
+                )
+    elif mode == "router" and credentials.user is not None and credentials.users is None:
+        raise ConfigError(
+            "a router with a user and no users would let nobody in; give users= (--users FILE), a file of "
+            "user:password lines",
+            path="users",
+        )
+
+
+MODE, CONNECT, LISTEN, FILE = "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG"
+CERTS, IDENTITY = "ZSTATE_CERTS", "ZSTATE_IDENTITY"
+USER, PASSWORD, PASSWORD_FILE = "ZSTATE_USER", "ZSTATE_PASSWORD", "ZSTATE_PASSWORD_FILE"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSettings:
+    """How to join, as ``connect`` takes it."""
+
+    mode: Mode
+    endpoints: tuple[str, ...]
+    listen: tuple[str, ...]
+    config: str | None
+    credentials: Credentials | None
+
+
+def said_in_environment() -> SessionSettings | None:
+    """What ZSTATE_MODE, _CONNECT, _LISTEN and _CONFIG say, and who this is; None where they say nothing.
+
+    Endpoints stand with blanks between them. Raises ConfigError naming the variable.
+    """
+    mode, config = os.environ.get(MODE), os.environ.get(FILE) or None
+    endpoints, listen = _endpoints(CONNECT), _endpoints(LISTEN)
+    if not (mode or endpoints or listen or config):
+        return None
+    checked: Mode = _checked(MODE, lambda: check_mode(mode or implied_mode(endpoints, listen, config)))
+    if checked == "loopback":
+        for variable, said in ((CONNECT, endpoints), (LISTEN, listen)):
+            _checked(variable, lambda said=said: check_loopback_only(said))
+    if checked == "client" and not (endpoints or config or os.environ.get(CONFIG_VARIABLE)):
+        raise ConfigError(
+            f"{MODE} is 'client', and {CONNECT} does not say where the router is, for instance "
+            "tcp/192.168.1.10:7447",
+            path=MODE,
+        )
+    return SessionSettings(checked, endpoints, listen, config, _credentials())
+
+
+def implied_mode(endpoints: object, listen: object, config: object) -> str:
+    """What is meant by whoever names places and no mode."""
+    # Whoever only says where to connect means a router, and peers do not pass on what others say.
+    return "client" if endpoints and not listen and not config else "peer"
+
+
+@contextmanager
+def blame_variable() -> Generator[None]:
+    """Let an error of the network name the variable that sent us there."""
+    try:
+        yield
+    except NetworkError as error:
+        variable = LISTEN if isinstance(error, PortBusy) else CONNECT
+        if os.environ.get(variable):
+            error.args = (f"{error} ({variable} in the environment says where)",)
+        raise
+
+
+def _endpoints(variable: str) -> tuple[str, ...]:
+    return _checked(variable, lambda: endpoint_list(os.environ.get(variable, "").split()))
+
+
+def _checked(variable: str, check: Callable[[], T]) -> T:
+    try:
+        return check()
+    except InvalidInput as error:
+        raise ConfigError(f"{variable} in the environment: {error}", path=variable) from None
+
+
+def _credentials() -> Credentials | None:
+    certs, identity, user = (os.environ.get(variable) for variable in (CERTS, IDENTITY, USER))
+    if bool(certs) != bool(identity):
+        has, lacks = (CERTS, IDENTITY) if certs else (IDENTITY, CERTS)
+        raise ConfigError(f"{has} in the environment is of no use without {lacks}", path=has)
+    password = _password(user) if user else None
+    if certs and identity:
+        return Credentials.from_folder(certs, identity, user=user or None, password=password)
+    return Credentials(user=user, password=password) if user else None
+
+
+def _password(user: str) -> str:
+    file, password = os.environ.get(PASSWORD_FILE), os.environ.get(PASSWORD)
+    if file:
+        from zstate.net.security.credential_files import password_in  # noqa: PLC0415  # loads ssl, which few need
+
+        return password_in(file)
+    if not password:
+        raise ConfigError(
+            f"the password of {user!r} ({USER} in the environment) is missing; put it into {PASSWORD}, or "
+            f"where it stands into {PASSWORD_FILE}",
+            path=PASSWORD,
+        )
+    return password

@@ -15,14 +15,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 from zstate.errors import NetworkError
-from zstate.net.presence import RobotInfo, discover, discover_readers, living_tokens
+from zstate.net.presence import RobotInfo, discover, discover_readers, discover_tokens
 from zstate.net.session import Session
 from zstate.net.status import watch_status
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream
 from zstate.wire.messages import Status
-from zstate.wire.writer import Announced, Writer
 
 if TYPE_CHECKING:
     from zstate.wire.ros2.graph import DdsToken, EndpointToken, NodeToken
@@ -90,12 +90,12 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-RateOf = Callable[[str, Stream, Writer], float | None]
+RateOf = Callable[[str, Stream, WriterId], float | None]
 """The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
 
 
 def graph_of(
-    robots: Sequence[RobotInfo], readers: Sequence[Announced], rate_of: RateOf | None = None
+    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateOf | None = None
 ) -> Graph:
     """The graph of discovered writers and readers.
 
@@ -106,7 +106,7 @@ def graph_of(
 
 
 def _stream_uses(
-    robots: Sequence[RobotInfo], readers: Sequence[Announced], rate_of: RateOf | None
+    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateOf | None
 ) -> Iterator[StreamUse]:
     written: set[tuple[str, Stream]] = {
         (robot.name, stream) for robot in robots for stream, _ in robot.writers
@@ -126,7 +126,7 @@ def _stream_uses(
             yield StreamUse(robot, shown, _programs(writers), _programs(reading), rate_hz)
 
 
-def _named_writers(robot: RobotInfo, stream: Stream) -> Iterator[tuple[str, Writer]]:
+def _named_writers(robot: RobotInfo, stream: Stream) -> Iterator[tuple[str, WriterId]]:
     """The writers of a stream, with the names under which they write static edges."""
     for written, writer in robot.writers:
         if written == stream:
@@ -134,7 +134,7 @@ def _named_writers(robot: RobotInfo, stream: Stream) -> Iterator[tuple[str, Writ
             yield from ((name, writer) for name in (names if stream == "tf_static" and names else [""]))
 
 
-def _programs(writers: Iterable[Writer]) -> tuple[str, ...]:
+def _programs(writers: Iterable[WriterId]) -> tuple[str, ...]:
     return tuple(sorted({str(writer) for writer in writers}))
 
 
@@ -147,7 +147,7 @@ class WriterState:
     age_s: float
 
 
-class GraphMonitor(Closing):
+class GraphMonitor(Closeable):
     """Keeps the graph and the status of all publishers up to date, from a thread of its own.
 
     Discovery runs every 2 s, and only if ``graph`` was called in the last 3 s.
@@ -247,17 +247,17 @@ def discover_ros_graph(session: Session, wire: Ros2Wire) -> RosGraph:
     A topic belongs to the stream that has its last name and its type; other topics are left out.
     """
     from zstate.wire.ros2.graph import NodeToken, parse_dds_token, parse_token  # noqa: PLC0415 - ROS only
-    from zstate.wire.ros2.topics import type_of  # noqa: PLC0415 - ROS only
+    from zstate.wire.ros2.topics import ros_type  # noqa: PLC0415 - ROS only
 
     parse = parse_dds_token if wire.name == "ros2dds" else parse_token
     nodes: list[NodeToken] = []
     ends: dict[tuple[str, Stream], list[RosEndpoint]] = {}
-    for token in map(parse, living_tokens(session, wire.writers_expression("*"))):
+    for token in map(parse, discover_tokens(session, wire.writers_expression("*"))):
         if isinstance(token, NodeToken):
             nodes.append(token)
         elif token is not None:
             for stream in ROS_STREAMS:
-                if token.topic.rpartition("/")[2] == stream and token.dds_type == type_of(stream).dds:
+                if token.topic.rpartition("/")[2] == stream and token.dds_type == ros_type(stream).dds:
                     ends.setdefault((f"/{token.topic.strip('/')}", stream), []).append(token)
     topics: list[Topic] = []
     for (name, stream), tokens in sorted(ends.items()):

@@ -9,18 +9,17 @@ from collections.abc import Callable
 
 import zenoh
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 from zstate.errors import Closed, InvalidInput
-from zstate.net.receiver import Receiver, Ring, take_each
 from zstate.net.session import Session
-from zstate.net.streams import arrival_of
+from zstate.net.streams import Receiver, Ring, call_for_each, to_serialized
 from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 4096
 HEARTBEAT_S = 0.5
 
 
-class LatchedPublisher(Closing):
+class LatchedPublisher(Closeable):
     """Keeps one value on one key for everybody, now and later, as long as this publisher lives.
 
     When it closes or dies, later joiners do not get the value any more; those who have it keep it,
@@ -65,7 +64,7 @@ class LatchedPublisher(Closing):
         self._session.release(self._publisher)
 
 
-class LatchedSubscriber(Closing):
+class LatchedSubscriber(Closeable):
     """Hears the present value of every matching key, then each change.
 
     ``on_value(arrival)`` is called from one thread of this subscriber; the payload is empty when the
@@ -75,7 +74,7 @@ class LatchedSubscriber(Closing):
     def __init__(self, session: Session, keyexpr: str, on_value: Callable[[SerializedSample], None]) -> None:
         def hand_over(batch: list[zenoh.Sample]) -> None:
             # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
-            take_each(batch, lambda sample: on_value(arrival_of(sample)))
+            call_for_each(batch, lambda sample: on_value(to_serialized(sample)))
 
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         subscriber = zenoh.ext.declare_advanced_subscriber(

@@ -8,6 +8,10 @@ session looks several times a second whether the lobby knows it, and is introduc
 A process that is stopped (Ctrl-Z) keeps its port and answers nobody. Where no lobby answers for a
 second, sessions meet at the next rendezvous address in the same way, and go on looking at the first: once it
 answers, they are introduced there, and so meet the process that was stopped.
+
+The lobby: where the processes of one host are told of each other. It carries no data.
+
+Membership: that the lobby knows of a session, whoever keeps the lobby.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -25,11 +29,93 @@ from contextlib import suppress
 import zenoh
 
 from zstate._util.endpoint import parse_host_port
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.errors import Closed, ConfigError
-from zstate.locks import new_lock, outlive_fork
 from zstate.net.at_exit import join_at_exit
-from zstate.net.lobby import Lobby, lobby_key
-from zstate.net.membership import Membership
+from zstate.net.config import default_config
+from zstate.net.open import open_zenoh
+
+# The @ keeps it out of what is asked for with wildcards.
+LOBBY_KEY = "@zstate/lobby"
+
+
+def lobby_key(number: int) -> str:
+    """What the lobby at the rendezvous address ``number`` subscribes to: each is told from the others."""
+    return f"{LOBBY_KEY}/{number}" if number else LOBBY_KEY
+
+
+class RendezvousPeer:
+    """A Zenoh peer that listens at ``endpoint``, and subscribes to ``key`` to show that it is open.
+
+    Raises ZError where somebody listens already.
+    """
+
+    def __init__(self, endpoint: str, key: str = LOBBY_KEY) -> None:
+        self._session = open_zenoh(default_config("peer", (), [endpoint]))
+        self._sign = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+
+    def close(self) -> None:
+        """Leave."""
+        # Closing undeclares nothing, and whoever connects at that moment would see the sign for ever.
+        self._sign.undeclare()
+        self._session.close()
+
+
+INTRODUCED_WITHIN_S = 1.0
+_FIRST_PAUSE_S = 0.2  # Zenoh connects again by itself within this time, if it has noticed
+_LONGEST_PAUSE_S = 5.0  # whoever has the port may be frozen, or keep no lobby
+_ROUND_S = 0.01
+
+
+class RendezvousRegistration:
+    """Sees to it that ``session``, which listens at ``endpoint``, is known in the lobby at another.
+
+    That there is a link to the lobby does not say so. One that is made while the lobby closes stays up
+    with nobody behind it until that process ends; and one that breaks in the moment in which it is made
+    is not tried again. Zenoh calls both connected. An open lobby is told by what it subscribes to.
+    """
+
+    def __init__(self, session: zenoh.Session, endpoint: str, lobby: str, key: str = LOBBY_KEY) -> None:
+        self._publisher = session.declare_publisher(key)
+        self._endpoints = (lobby, endpoint)
+        self._pause_s = _FIRST_PAUSE_S
+        self._due: float | None = None
+        self.is_silent = False
+        """Whether no lobby was found when the session was to be introduced there last."""
+
+    def refresh(self, stop: threading.Event) -> None:
+        """Look, and have the session introduced where it has seen no lobby for a while.
+
+        To be called several times a second. Takes up to a second, or until ``stop``. Raises ZError when
+        that is due and the session is closed.
+        """
+        if self.is_known:
+            self._pause_s, self._due, self.is_silent = _FIRST_PAUSE_S, None, False
+        elif self._due is None:
+            self._due = time.monotonic() + self._pause_s
+        elif time.monotonic() >= self._due:
+            self._register(stop)
+            self.is_silent = not self.is_known
+            self._pause_s = min(2.0 * self._pause_s, _LONGEST_PAUSE_S)
+            self._due = time.monotonic() + self._pause_s
+
+    @property
+    def is_known(self) -> bool:
+        """Whether a lobby is seen there now."""
+        # the stub says bool, but it is an object and always true
+        return bool(self._publisher.matching_status.matching)  # pyright: ignore
+
+    def _register(self, stop: threading.Event) -> None:
+        self._publisher.put(b"")  # reaches nobody, but fails where the session is closed
+        # A session cannot be told to connect once it is open. But the lobby connects to whomever it is
+        # told of, and it is told by a peer that is there for a moment and connects to both.
+        config = default_config("peer", self._endpoints, ())
+        config.insert_json5("scouting/gossip/autoconnect", '{"peer": []}')  # and to nobody else
+        deadline = time.monotonic() + INTRODUCED_WITHIN_S
+        with suppress(zenoh.ZError), open_zenoh(config):
+            while not self.is_known and time.monotonic() < deadline and not stop.wait(_ROUND_S):
+                pass
+
 
 RENDEZVOUS_VARIABLE = "ZSTATE_RENDEZVOUS"
 RENDEZVOUS = "127.0.0.1:7450 127.0.0.1:7451 127.0.0.1:7452"
@@ -37,7 +123,7 @@ PROBE_PERIOD_S = 0.2
 JOIN_WITHIN_S = 0.3
 
 _MET_WITHIN_S = 3.0
-_ROUND_S = 0.002
+_ROUND_S_RENDEZVOUS = 0.002
 
 
 def rendezvous_addresses() -> tuple[tuple[str, int], ...]:
@@ -63,9 +149,9 @@ class Rendezvous:
 
     def __init__(self, addresses: tuple[tuple[str, int], ...]) -> None:
         self._places = [_Place(address, lobby_key(number)) for number, address in enumerate(addresses)]
-        self._stop = outlive_fork(threading.Event())
+        self._stop = fork_safe(threading.Event())
         self._watcher: threading.Thread | None = None
-        self._places[0].take_over(self._stop)
+        self._places[0].open_peer(self._stop)
         _MEETING.add(self)
 
     @property
@@ -96,7 +182,7 @@ class Rendezvous:
         while not any(place.is_known for place in self._places) and time.monotonic() < deadline:
             if self._places[0].is_free or all(place.is_silent for place in self._places):
                 return  # the port is being taken over; or nobody answers
-            time.sleep(_ROUND_S)
+            time.sleep(_ROUND_S_RENDEZVOUS)
 
     def close(self) -> None:
         """Give the ports up that are ours; other processes take them over."""
@@ -105,23 +191,23 @@ class Rendezvous:
         if self._watcher not in (None, threading.current_thread()):
             self._watcher.join(JOIN_WITHIN_S)
         for place in self._places:
-            place.give_up()
+            place.leave()
 
     def _watch(self, session: zenoh.Session, endpoint: str) -> None:
         with suppress(zenoh.ZError, Closed):  # the session was closed, or the process ends
             while not self._stop.wait(PROBE_PERIOD_S):
-                self._look(session, endpoint)
+                self._check(session, endpoint)
 
-    def _look(self, session: zenoh.Session, endpoint: str) -> None:
+    def _check(self, session: zenoh.Session, endpoint: str) -> None:
         places = iter(self._places)
         for place in places:
-            place.take_over(self._stop)
+            place.open_peer(self._stop)
             place.join(session, endpoint)
             place.renew(self._stop)
             if not place.is_silent:
                 break
         for place in places:
-            place.give_up()
+            place.leave()
 
 
 _MEETING: weakref.WeakSet[Rendezvous] = weakref.WeakSet()
@@ -139,9 +225,9 @@ class _Place:
         self.endpoint = f"tcp/{address[0]}:{address[1]}"
         self.address = address
         self._key = key
-        self._lobby: Lobby | None = None
-        self._lock = new_lock()
-        self._membership: Membership | None = None
+        self._lobby: RendezvousPeer | None = None
+        self._lock = fork_safe_lock()
+        self._membership: RendezvousRegistration | None = None
 
     @property
     def is_free(self) -> bool:
@@ -154,12 +240,12 @@ class _Place:
         membership = self._membership
         return membership is not None and membership.is_known
 
-    def take_over(self, stop: threading.Event) -> None:
+    def open_peer(self, stop: threading.Event) -> None:
         """Keep the lobby, if nobody has the port."""
         if self._lobby is not None or not self.is_free:
             return
         try:
-            lobby = Lobby(self.endpoint, self._key)
+            lobby = RendezvousPeer(self.endpoint, self._key)
         except zenoh.ZError:
             return  # another process was quicker
         with self._lock:
@@ -171,13 +257,13 @@ class _Place:
     def join(self, session: zenoh.Session, endpoint: str) -> None:
         """Have ``session`` become known there."""
         if self._membership is None:
-            self._membership = Membership(session, endpoint, self.endpoint, self._key)
+            self._membership = RendezvousRegistration(session, endpoint, self.endpoint, self._key)
 
     def renew(self, stop: threading.Event) -> None:
         """Have the session introduced, if no lobby knows it."""
         membership = self._membership
         if membership is not None:
-            membership.renew(stop)
+            membership.refresh(stop)
 
     @property
     def is_silent(self) -> bool:
@@ -185,7 +271,7 @@ class _Place:
         membership = self._membership
         return membership is not None and membership.is_silent
 
-    def give_up(self) -> None:
+    def leave(self) -> None:
         """Keep no lobby here, and be no member."""
         with self._lock:
             lobby, self._lobby = self._lobby, None

@@ -1,4 +1,7 @@
-"""The connection to the network."""
+"""The connection to the network.
+
+Undeclaring: taking back what was declared on a Zenoh session, whoever uses it just then.
+"""
 
 # pyright: reportUnknownMemberType=false
 # zenoh's stubs leave the return types of some methods out
@@ -12,37 +15,60 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Any, Protocol
 
 import zenoh
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import Closed, ConfigError, InvalidInput, PortBusy
-from zstate.locks import new_lock
-from zstate.net.at_exit import close_at_exit, end_sessions, join_at_exit, session_opening
+from zstate.net.at_exit import close_at_exit, end_sessions, forked_text, join_at_exit, leak, session_opening
 from zstate.net.config import (
     CONFIG_VARIABLE,
     ConfigSource,
     Mode,
+    blame_variable,
+    check_credentials,
+    check_loopback_only,
+    check_mode,
     credentials_in,
+    default_config,
     endpoint_list,
     endpoints_in,
-    given_config,
-    our_config,
+    listen_endpoints,
+    said_in_environment,
+    user_config,
 )
-from zstate.net.environment import naming_the_variable, said_in_environment
-from zstate.net.forked import forked_text, keep_for_ever
-from zstate.net.modes import (
-    check_credentials,
-    check_mode,
-    check_stays_here,
-    listening,
-)
-from zstate.net.opening import open_within, patience_in
-from zstate.net.refusal_watch import RefusalWatch
+from zstate.net.open import connect_timeout, open_with_retry
 from zstate.net.rendezvous import Rendezvous, free_endpoint, rendezvous_addresses
-from zstate.net.security import Credentials
-from zstate.net.twin import Twin
-from zstate.net.undeclaring import Undeclarable, undeclare
+from zstate.net.security.connection_monitor import ConnectionMonitor, ProbeSession
+from zstate.net.security.credentials import Credentials
+
+_WITHIN_S = 0.5
+
+
+class Undeclarable(Protocol):
+    """Whatever was declared on a Zenoh session."""
+
+    def undeclare(self) -> Any: ...
+
+
+def undeclare(entity: Undeclarable) -> None:
+    """Take ``entity`` back, as soon as no other thread is using it."""
+    deadline = time.monotonic() + _WITHIN_S
+    while not _try_undeclare(entity) and time.monotonic() < deadline:
+        time.sleep(0.001)
+
+
+def _try_undeclare(entity: Undeclarable) -> bool:
+    try:
+        entity.undeclare()
+    except RuntimeError as error:
+        if "borrowed" not in str(error):
+            raise
+        return False  # another thread is using it at this very moment
+    return True
+
 
 CLOSE_WITHIN_S = 0.8
 
@@ -93,7 +119,7 @@ def connect(
     if config is None and mode is None and not endpoints and not listen:
         said = said_in_environment()
         if said is not None:
-            with naming_the_variable():
+            with blame_variable():
                 return connect(
                     said.config,
                     mode=said.mode,
@@ -125,9 +151,9 @@ def _connect_as_configured(
             f"configuration ({CONFIG_VARIABLE} names one, too), or the mode",
             path="mode",
         )
-    given = given_config(source, mode, endpoints, listen, credentials)
+    given = user_config(source, mode, endpoints, listen, credentials)
     where = endpoints or endpoints_in(given)
-    return _session(given, where, credentials or credentials_in(given), patience_in(given))
+    return _session(given, where, credentials or credentials_in(given), connect_timeout(given))
 
 
 def _check(
@@ -137,12 +163,12 @@ def _check(
         raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
     checked = check_mode(mode), endpoint_list(endpoints), endpoint_list(listen)
     if checked[0] == "loopback":
-        check_stays_here((*checked[1], *checked[2]))
+        check_loopback_only((*checked[1], *checked[2]))
     return checked
 
 
 def _check_credentials(credentials: Credentials, endpoints: Sequence[str], listen: Sequence[str]) -> None:
-    from zstate.net.credential_files import check_files  # noqa: PLC0415  # loads ssl, which few need
+    from zstate.net.security.credential_files import check_files  # noqa: PLC0415  # loads ssl, which few need
 
     credentials.check_endpoints(endpoints, listen)
     check_files(credentials)
@@ -159,19 +185,19 @@ def _connect(
         raise InvalidInput("mode 'client' needs endpoints=, for instance 'tcp/192.168.1.10:7447'")
     if mode in ("peer", "loopback") and not (endpoints or listen):
         return _connect_on_this_host(mode, credentials)
-    where = listening(mode, listen, credentials)
+    where = listen_endpoints(mode, listen, credentials)
     check_credentials(mode, credentials, where)
     # With time to wait, Zenoh spends all of it on the first endpoint; without, it asks each once.
-    config = our_config(mode, endpoints, where, 0.0 if mode == "client" else None, credentials)
+    config = default_config(mode, endpoints, where, 0.0 if mode == "client" else None, credentials)
     return _session(config, endpoints, credentials, timeout_s if mode == "client" else 0.0)
 
 
 def _session(
     config: zenoh.Config, endpoints: Sequence[str], credentials: Credentials | None, timeout_s: float
 ) -> Session:
-    raw = open_within(config, endpoints, credentials, timeout_s)
-    watch = RefusalWatch(raw, config, endpoints, credentials)
-    return Session(raw, watch, twin=Twin.of(config, credentials))
+    raw = open_with_retry(config, endpoints, credentials, timeout_s)
+    watch = ConnectionMonitor(raw, config, endpoints, credentials)
+    return Session(raw, watch, twin=ProbeSession.for_config(config, credentials))
 
 
 def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Session:
@@ -183,7 +209,7 @@ def _connect_on_this_host(mode: Mode, credentials: Credentials | None) -> Sessio
         )
     addresses = rendezvous_addresses()
     if mode == "loopback":
-        check_stays_here([f"tcp/{host}:{port}" for host, port in addresses])
+        check_loopback_only([f"tcp/{host}:{port}" for host, port in addresses])
     # The lobby first: while the rendezvous is silent, opening a session takes half a second longer.
     rendezvous = Rendezvous(addresses)
     try:
@@ -199,10 +225,10 @@ def _open_on_this_host(lobby: str) -> tuple[zenoh.Session, str]:
     while True:
         endpoint = free_endpoint()
         with suppress(PortBusy):  # somebody took it in between
-            return open_within(our_config("peer", [lobby], [endpoint]), ()), endpoint
+            return open_with_retry(default_config("peer", [lobby], [endpoint]), ()), endpoint
 
 
-class Session(Closing):
+class Session(Closeable):
     """A place on the network. Made by ``connect``; a context manager.
 
     Safe to use from any thread, but not in a process forked from the one that connected.
@@ -211,19 +237,19 @@ class Session(Closing):
     def __init__(
         self,
         raw: zenoh.Session,
-        companion: Rendezvous | RefusalWatch | None = None,
+        companion: Rendezvous | ConnectionMonitor | None = None,
         *,
-        twin: Twin | None = None,
+        twin: ProbeSession | None = None,
     ) -> None:
         self._raw = raw
         self._companion = companion
         self._pid = os.getpid()
         self._closed = False
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._numbers = itertools.count()
         self.zid = str(raw.zid())
         self.opened_at = time.monotonic()
-        self.twin = twin
+        self.probe = twin
         close_at_exit(self)
 
     def __del__(self) -> None:
@@ -252,7 +278,7 @@ class Session(Closing):
     def release(self, entity: Undeclarable) -> None:
         """Undeclare something of this session. Nothing happens if that, or the session, is gone."""
         if os.getpid() != self._pid:
-            keep_for_ever(entity)
+            leak(entity)
         elif not self._closed:
             with suppress(zenoh.ZError):
                 undeclare(entity)
@@ -269,7 +295,7 @@ class Session(Closing):
 
     def keep_for_ever(self) -> None:
         """Never free Zenoh's session, not even at the interpreter's end: in a forked process that hangs."""
-        keep_for_ever(self._raw)
+        leak(self._raw)
 
     def _is_last_call(self) -> bool:
         with self._lock:

@@ -10,17 +10,16 @@ from collections.abc import Callable
 
 import zenoh
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe
 from zstate.errors import Closed, InvalidInput, MessageError
-from zstate.locks import outlive_fork
-from zstate.net.receiver import take_each
 from zstate.net.session import Session
-from zstate.net.streams import StreamPublisher, StreamSubscriber
+from zstate.net.streams import StreamPublisher, StreamSubscriber, call_for_each
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import parse_status_key, status_expression, status_key
 from zstate.wire.messages import Status
 from zstate.wire.native import ENCODINGS, decode, encode
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.writer import Writer
 
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
@@ -28,7 +27,7 @@ MOST_BYTES = 65_536
 """A longer status is refused."""
 
 
-class StatusPublisher(Closing):
+class StatusPublisher(Closeable):
     """Asks ``status()`` once a second, from a thread of its own, and says it while somebody reads it.
 
     So it goes on when what it tells of stands still, and ends with the process.
@@ -37,7 +36,7 @@ class StatusPublisher(Closing):
     def __init__(self, session: Session, robot: str, identity: str, status: Callable[[], Status]) -> None:
         self._session = session
         self._status = status
-        self._stop = outlive_fork(threading.Event())
+        self._stop = fork_safe(threading.Event())
         self._publisher = StreamPublisher(session, status_key(robot, identity), ENCODINGS[Status])
         self._thread = threading.Thread(target=self._run, name="zstate status", daemon=True)
         self._thread.start()
@@ -53,31 +52,31 @@ class StatusPublisher(Closing):
         due = time.monotonic() + PERIOD_S
         while not self._stop.wait(max(0.0, due - time.monotonic())):
             try:
-                self._say()
+                self._publish()
             except (Closed, zenoh.ZError):
                 return
             # After a pause (a suspended laptop) one status is enough.
             due = max(due + PERIOD_S, time.monotonic())
 
-    def _say(self) -> None:
+    def _publish(self) -> None:
         self._session.check()
         status = self._status()
         if self._publisher.has_readers:
             self._publisher.put(encode(status))
 
 
-class StatusWatch(Closing):
+class StatusWatch(Closeable):
     """Hears every status of ``robot`` ("*": of all robots); ``refused`` counts what was none, by reason."""
 
     def __init__(self, session: Session, robot: str, callback: Callable[[str, Status], None]) -> None:
         self.refused: Counter[str] = Counter()
         self._callback = callback
-        self._subscriber = StreamSubscriber(session, status_expression(robot), self._take)
+        self._subscriber = StreamSubscriber(session, status_expression(robot), self._on_status)
 
-    def _take(self, arrivals: list[SerializedSample]) -> None:
-        take_each(arrivals, self._take_one)
+    def _on_status(self, arrivals: list[SerializedSample]) -> None:
+        call_for_each(arrivals, self._decode_status)
 
-    def _take_one(self, arrival: SerializedSample) -> None:
+    def _decode_status(self, arrival: SerializedSample) -> None:
         try:
             robot, status = _status_in(arrival)
         except (MessageError, InvalidInput) as error:
@@ -97,7 +96,7 @@ def _status_in(arrival: SerializedSample) -> tuple[str, Status]:
         raise MessageError(text, reason="too large")
     robot, identity = parse_status_key(arrival.key)
     status = decode(arrival.payload, arrival.encoding, Status)
-    if status.session != Writer.parse(identity).session:
+    if status.session != WriterId.parse(identity).session:
         raise MessageError(f"the Status of another writer on {arrival.key!r}", reason="foreign")
     if not math.isfinite(status.rate_hz):
         raise MessageError(f"a Status with the rate {status.rate_hz}", reason="malformed")

@@ -1,22 +1,111 @@
-"""Streams: each sample matters less than the next one. Newest wins, nobody waits."""
+"""Streams: each sample matters less than the next one. Newest wins, nobody waits.
+
+One daemon thread that drains a Zenoh channel in batches.
+"""
 
 # pyright: reportUnknownMemberType=false
 # zenoh's stubs leave the return types of some methods out
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+import threading
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import TypeAlias
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import zenoh
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 from zstate.errors import Closed
-from zstate.net.receiver import Receiver, Ring
-from zstate.net.session import Session
+from zstate.net.at_exit import join_at_exit
+from zstate.net.session import Session, Undeclarable
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.sizes import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
+
+JOIN_WITHIN_S = 0.8
+
+Ring: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Sample]"
+
+T = TypeVar("T")
+
+
+class Subscribed(Undeclarable, Protocol[T]):
+    """A Zenoh subscriber or queryable of any kind that delivers into a channel."""
+
+    @property
+    def handler(self) -> zenoh.Handler[T]: ...
+
+
+def call_for_each(batch: Iterable[T], take: Callable[[T], object]) -> None:
+    """Call ``take`` with each item of ``batch``; an exception of one is raised after the last item."""
+    failure: Exception | None = None
+    for item in batch:
+        try:
+            take(item)
+        except Exception as error:  # noqa: PERF203 - the other items are not to blame
+            failure = error
+    if failure is not None:
+        raise failure
+
+
+class Receiver(Generic[T]):
+    """Hands what arrives to ``on_batch``, everything that waits at once, oldest first.
+
+    A ring of ``capacity`` lies between: when it is full the oldest samples are lost. A batch that
+    fills it is counted in ``full_batches``, so that a gap in front of it, or in it, can be told from
+    one of the network. An exception of ``on_batch`` is counted in ``failures``; the first also goes to
+    ``threading.excepthook``. The thread goes on.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        subscribed: Subscribed[T],
+        on_batch: Callable[[list[T]], None],
+        capacity: int,
+    ) -> None:
+        self.full_batches = 0
+        self.failures = 0
+        self._session = session
+        self._subscribed = subscribed
+        self._on_batch = on_batch
+        self._capacity = capacity
+        self._closed = False
+        thread = threading.Thread(target=self._run, name="zstate receiver", daemon=True)
+        self._thread = join_at_exit(thread)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop within a second; nothing is handed over afterwards. May be called from ``on_batch``."""
+        self._closed = True
+        self._session.release(self._subscribed)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(JOIN_WITHIN_S)
+
+    def _run(self) -> None:
+        handler = self._subscribed.handler
+        while not self._closed:
+            try:
+                batch = [handler.recv()]
+                while len(batch) < self._capacity and (sample := handler.try_recv()) is not None:
+                    batch.append(sample)
+            except zenoh.ZError:
+                return  # undeclared, or the session was closed
+            self._hand_over(batch)
+
+    def _hand_over(self, batch: list[T]) -> None:
+        if len(batch) >= self._capacity:
+            self.full_batches += 1
+        if self._closed:
+            return
+        try:
+            self._on_batch(batch)
+        except Exception:
+            self.failures += 1
+            if self.failures == 1:
+                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
+
 
 CAPACITY = 1024
 """So many samples of one key wait for a reader that is held up: a second at 1 kHz."""
@@ -37,7 +126,7 @@ def capacity_for(keyexpr: str) -> int:
     return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
 
 
-def arrival_of(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> SerializedSample:
+def to_serialized(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> SerializedSample:
     """What came, as the wires read it; ``key`` is on which, where that is known.
 
     A payload of more than ``most_bytes`` is not copied: of such a one only the size is given.
@@ -52,7 +141,7 @@ def arrival_of(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BY
 
 
 def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[SerializedSample]:
-    arrivals = [arrival_of(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
+    arrivals = [to_serialized(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
     if all(arrival.payload for arrival in arrivals):
         return arrivals
     # What is deleted has no payload either; to ask every sample which kind it is costs as much as its key.
@@ -60,7 +149,7 @@ def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[SerializedSample]
     return [arrival for arrival, sample in zip(arrivals, batch, strict=True) if sample.kind == puts]
 
 
-class StreamPublisher(Closing):
+class StreamPublisher(Closeable):
     """Publishes samples on one key. Under congestion samples are dropped; the writer is never delayed."""
 
     def __init__(self, session: Session, key: str, encoding: str) -> None:
@@ -103,7 +192,7 @@ class StreamPublisher(Closing):
         self._session.release(self._publisher)
 
 
-class StreamSubscriber(Closing):
+class StreamSubscriber(Closeable):
     """Hears a key expression; ``on_samples`` gets all that waits as a list, oldest first.
 
     It is called from one thread of this subscriber. See ``Receiver`` for what happens when it is
@@ -117,13 +206,13 @@ class StreamSubscriber(Closing):
         on_samples: Callable[[list[SerializedSample]], None],
         capacity: int | None = None,
     ) -> None:
-        self._keys = keys = _Keys(session, keyexpr)
+        self._keys = keys = _DeclaredKeys(session, keyexpr)
         key = "" if "*" in keyexpr else keyexpr
 
         def hand_over(batch: list[zenoh.Sample]) -> None:
             arrivals = _arrivals(batch, key)
             if not key:
-                keys.learn({arrival.key for arrival in arrivals})
+                keys.declare({arrival.key for arrival in arrivals})
             on_samples(arrivals)
 
         capacity = capacity or capacity_for(keyexpr)
@@ -148,7 +237,7 @@ class StreamSubscriber(Closing):
         self._keys.close()
 
 
-class _Keys:
+class _DeclaredKeys:
     """The keys on which samples of an expression come, which are declared to Zenoh.
 
     It keeps the way of samples on keys that it knows. On others it searches all that was declared under
@@ -161,7 +250,7 @@ class _Keys:
         self._known: dict[str, _Key] = {}
         self._most = _MOST_KEYS
 
-    def learn(self, keys: set[str]) -> None:
+    def declare(self, keys: set[str]) -> None:
         """Samples have come on ``keys``."""
         if len(self._known) < self._most:
             for key in keys.difference(self._known):

@@ -18,8 +18,8 @@ from statistics import median, pstdev
 from typing import TYPE_CHECKING, NamedTuple
 
 from zstate._util.bounded_dict import BoundedDict
+from zstate._util.closeable import Closeable
 from zstate.clock import Clock, SystemClock
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
@@ -190,7 +190,7 @@ def by_writer(robot: str, stream: Stream, sample: Sample) -> Iterator[WriterKey]
     yield WriterKey(robot, stream, sample.session)
 
 
-class TopicStatistics(Closing):
+class TopicStatistics(Closeable):
     """Statistics of subscribed streams, by source. Messages that cannot be decoded are skipped.
 
     ``clock`` is the one of the stamps. ``on_sample`` is called with each sample, in the subscriber's thread.

@@ -6,18 +6,18 @@ import time
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 from zstate.errors import Closed
 from zstate.net.latched import LatchedPublisher
-from zstate.net.permission import check_may_write
 from zstate.net.presence import announce
+from zstate.net.security.write_permission import check_may_write
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
+from zstate.wire.identity import WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Message
 from zstate.wire.protocol import EntityId, StreamEncoder, Wire
-from zstate.wire.sample_names import SampleNames
-from zstate.wire.writer import Writer
 
 
 class SampleWriter(StreamPublisher):
@@ -66,7 +66,7 @@ def write_all(writers: Iterable[SampleWriter | LatchedWriter], message: Message)
         writer.write(payload)
 
 
-class WireWriter(Closing):
+class WireWriter(Closeable):
     """One writer of ``robot`` on ``wire``: opens and announces its streams, and closes them together."""
 
     def __init__(
@@ -74,14 +74,14 @@ class WireWriter(Closing):
         session: Session,
         wire: Wire,
         robot: str,
-        writer: Writer,
-        sample_names: SampleNames | None = None,
+        writer: WriterId,
+        sample_names: SampleLayout | None = None,
     ) -> None:
         self._session = session
         self._wire = wire
         self._robot = robot
         self._writer = writer
-        self._sample_names = sample_names or SampleNames()
+        self._sample_names = sample_names or SampleLayout()
         self._node = EntityId(session.zid, session.next_number())
         self._is_permitted = wire.name == "ros2dds"  # the permissions of these are the bridges' own
         self._opened = ExitStack()

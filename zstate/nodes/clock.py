@@ -9,17 +9,17 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
-from zstate.clock import SIMULATED, check_stamp, wait_in_slices
-from zstate.closing import Closing
-from zstate.errors import Closed, MessageError, NoClock, duration_text
-from zstate.locks import new_lock
-from zstate.net.presence import writer_here
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
+from zstate.clock import SIMULATED, check_stamp, wait_interruptible
+from zstate.errors import Closed, MessageError, NoClock, format_duration
+from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
-from zstate.net.wires import wire_named, wire_names
 from zstate.net.writer import WireWriter, write_all
-from zstate.wire.messages import Clock
+from zstate.wire.messages import ClockMessage
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import as_wire_names, get_wire
 from zstate.wire.ros2.topics import SHARED
 
 _LOG = logging.getLogger("zstate")
@@ -34,7 +34,7 @@ _SILENT_S = 2.0
 _STOP_WITHIN_S = 0.05
 
 
-class ClockPublisher(Closing):
+class ClockPublisher(Closeable):
     """Publishes simulated time on zstate/clock, or on /clock of a ROS wire.
 
     Time that goes back is a new start of the clock, and needs a new publisher. A context manager; safe
@@ -44,15 +44,15 @@ class ClockPublisher(Closing):
     def __init__(self, session: Session, wires: str | Sequence[str] = ("native",)) -> None:
         self._session_id = secrets.randbits(32)
         self._seq = 0
-        self._lock = new_lock()
-        writer = writer_here(self._session_id)
+        self._lock = fork_safe_lock()
+        writer = local_writer(self._session_id)
         with ExitStack() as opening:
             # Time belongs to no robot; on a ROS wire its topic is that of the shared namespace.
             self._writers = [
-                opening.enter_context(WireWriter(session, wire_named(wire), SHARED, writer)).open_stream(
+                opening.enter_context(WireWriter(session, get_wire(wire), SHARED, writer)).open_stream(
                     "clock"
                 )
-                for wire in wire_names(wires)
+                for wire in as_wire_names(wires)
             ]
             self._opened = opening.pop_all()
         self._is_open = True
@@ -62,7 +62,7 @@ class ClockPublisher(Closing):
         with self._lock:
             if not self._is_open:
                 raise Closed("the clock's publisher is closed")
-            write_all(self._writers, Clock(check_stamp(stamp), self._seq, self._session_id))
+            write_all(self._writers, ClockMessage(check_stamp(stamp), self._seq, self._session_id))
             self._seq += 1
 
     def close(self) -> None:
@@ -72,7 +72,7 @@ class ClockPublisher(Closing):
             self._opened.close()
 
 
-class SimulatedClock(Closing):
+class SimulatedClock(Closeable):
     """The newest time received on ``zstate/clock``, or on ``/clock`` of a ROS wire.
 
     It stands still between messages, and may jump. The first call of ``now`` waits until a time is
@@ -87,13 +87,13 @@ class SimulatedClock(Closing):
         self.epoch = 0
         """How often the time went back."""
         self.refused: dict[str, int] = {}
-        self._wire = wire_named(wire)
+        self._wire = get_wire(wire)
         self._now: int | None = None
         self._session: int | None = None
         self._ended_sessions: set[int] = set()
         self._received_s = 0.0
         self._has_time = threading.Event()
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._waits: list[tuple[int, threading.Event]] = []
         self._is_open = True
         self.key = self._wire.expression(SHARED, "clock")
@@ -107,7 +107,7 @@ class SimulatedClock(Closing):
 
     def wait(self, timeout_s: float | None = None) -> int:
         """The newest stamp [ns], waiting for the first; None waits for ever. Raises NoClock and Closed."""
-        if not wait_in_slices(self._has_time, timeout_s):
+        if not wait_interruptible(self._has_time, timeout_s):
             raise NoClock(
                 f"no time was received on {self.key!r} for {timeout_s:g} s; start the simulation or "
                 "`zstate replay`",
@@ -152,7 +152,7 @@ class SimulatedClock(Closing):
             except MessageError as error:
                 self._refuse(error.reason, str(error))
                 continue
-            assert isinstance(message, Clock)
+            assert isinstance(message, ClockMessage)
             if self._follows(message.session):
                 self._set(message.stamp)
             else:
@@ -180,7 +180,7 @@ class SimulatedClock(Closing):
             self.epoch += 1
             if self.epoch == 1:
                 text = "the time on %r went back by %s; further jumps are only counted, in epoch"
-                _LOG.warning(text, self.key, duration_text(before - stamp))
+                _LOG.warning(text, self.key, format_duration(before - stamp))
         with self._lock:
             self._now = stamp
             self._wake(lambda awaited: went_back or awaited <= stamp)

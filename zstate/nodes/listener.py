@@ -8,9 +8,9 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from typing import Literal, ParamSpec, TypeVar
 
+from zstate._util.closeable import Closeable
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import SYSTEM, Clock, ClockOffset
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters, ListenerStats
@@ -20,17 +20,17 @@ from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import StampCheck
 from zstate.ingest.static_transforms import StaticTransformIngest
 from zstate.ingest.transforms import TransformIngest
-from zstate.net.clock_offset import OffsetMeter
-from zstate.net.history import PastReader
+from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
+from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.net.wires import wire_named
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.writer import Announced, Writer
+from zstate.wire.registry import get_wire
 
 Follow = Literal["joint_states", "tf"]
 
@@ -38,7 +38,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class TransformListener(Closing):
+class TransformListener(Closeable):
     """Fills ``buffer`` with the transforms of one robot, or of all robots with ``robot="*"``.
 
     Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
@@ -84,7 +84,7 @@ class TransformListener(Closing):
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         if clock is not None:
             self.buffer.use_clock(clock)
-        self._wire = wire_named(wire)
+        self._wire = get_wire(wire)
         self._robot_from_key: Callable[[str], str] = self._wire.robot_of if robot == ANY else lambda _: robot
         self._follow: Follow = follow
         self._is_shared = follow in self._wire.shared
@@ -103,7 +103,7 @@ class TransformListener(Closing):
         self._ingests: dict[tuple[str, int], StreamIngest] = {}
         self._statics: dict[tuple[str, int], StaticTransformIngest] = {}
         self._overflowed: set[StreamIngest] = set()
-        self._history: PastReader | None = None
+        self._history: HistoryReader | None = None
         self._clock_offsets: _WriterClockOffsets | None = None
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
@@ -117,7 +117,9 @@ class TransformListener(Closing):
             self._capacity = capacity_for(key)
             opening.enter_context(StreamSubscriber(session, key, self._on_samples))
             if history_on_join and self._wire.name == "native":
-                self._history = PastReader(session, self._observed(self._on_history), self._count_undecodable)
+                self._history = HistoryReader(
+                    session, self._observed(self._on_history), self._count_undecodable
+                )
                 opening.enter_context(self._history)
             if not self._wire.shared:
                 self._clock_offsets = _WriterClockOffsets(session, self.buffer)
@@ -304,15 +306,15 @@ class TransformListener(Closing):
     def _count_foreign(self, key: str, error: InvalidInput) -> None:
         self._counters.count_refusal("foreign", f"{shortened(key)}: {error}")
 
-    def _on_writer(self, announced: Announced, alive: bool) -> None:
+    def _on_writer(self, announced: Announcement, alive: bool) -> None:
         self._events.on_writer(announced, alive)
         self._set_writer(announced, alive=alive)
 
-    def _on_cut_off(self, announced: Announced) -> None:
+    def _on_cut_off(self, announced: Announcement) -> None:
         self._events.on_cut_off(announced)
         self._set_writer(announced, alive=False)
 
-    def _set_writer(self, announced: Announced, *, alive: bool) -> None:
+    def _set_writer(self, announced: Announcement, *, alive: bool) -> None:
         robot, session, stream = announced.robot, announced.writer.session, announced.stream
         name = str(announced.writer)
         if alive:
@@ -332,7 +334,7 @@ class TransformListener(Closing):
         elif stream == self._follow:
             self._set_followed_writer(announced, alive=alive)
 
-    def _set_followed_writer(self, announced: Announced, *, alive: bool) -> None:
+    def _set_followed_writer(self, announced: Announcement, *, alive: bool) -> None:
         robot, session = announced.robot, announced.writer.session
         if self._clock_offsets is not None:
             self._clock_offsets.on_writer(announced, alive=alive)
@@ -349,16 +351,16 @@ class TransformListener(Closing):
             del self._ingests[robot, session]
 
 
-class _WriterClockOffsets(Closing):
+class _WriterClockOffsets(Closeable):
     """Measures the clock offset of each writer of the native wire, for the error texts of ``buffer``."""
 
     def __init__(self, session: Session, buffer: TransformBuffer) -> None:
         self._offsets = buffer.clock_offsets
         self._is_enabled = buffer.clock.domain == SYSTEM
-        self._meter = OffsetMeter(session, buffer.clock)
-        self._measured: dict[Writer, Callable[[], ClockOffset | None]] = {}
+        self._meter = ClockOffsetMonitor(session, buffer.clock)
+        self._measured: dict[WriterId, Callable[[], ClockOffset | None]] = {}
 
-    def on_writer(self, announced: Announced, *, alive: bool) -> None:
+    def on_writer(self, announced: Announcement, *, alive: bool) -> None:
         """Start or stop measuring the clock of a writer."""
         writer = announced.writer
         if not alive:

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack
-from zstate.closing import Closing
 from zstate.errors import AmbiguousFrame, ZStateError
-from zstate.locks import new_lock
 from zstate.model.robot import RobotModel
-from zstate.net.history import Memory
-from zstate.net.service import Answer, Service
+from zstate.net.queryable import Queryable, Reply
+from zstate.net.sample_history import SampleCache
 from zstate.net.session import Session
 from zstate.transform import Transform
-from zstate.wire.json import to_json
 from zstate.wire.keys import full_name, lookup_key
+from zstate.wire.lookup_request import LookupRequest, error_to_json, to_json
 from zstate.wire.messages import from_block
-from zstate.wire.questions import LookupQuestion, error_to_json
 
 _JSON = "application/json"
 
 
-class LookupService(Closing):
+class LookupService(Closeable):
     """Answers ``zstate/<robot>/lookup?target=..;source=..;at=..`` with one transform in JSON.
 
     Without ``at`` [ns] the newest instant is used. Ambiguous bare frame names are those of ``robot``.
@@ -35,7 +34,7 @@ class LookupService(Closing):
     ) -> None:
         self._get_buffer = (lambda: buffer) if isinstance(buffer, TransformBuffer) else buffer
         self._robot = robot
-        self._service = Service(session, lookup_key(robot), self._answer)
+        self._service = Queryable(session, lookup_key(robot), self._answer)
 
     @property
     def answered(self) -> int:
@@ -47,13 +46,13 @@ class LookupService(Closing):
         """How often the queue of queries was full, so that some may have been lost."""
         return self._service.overflows
 
-    def _answer(self, parameters: Mapping[str, str]) -> Answer:
+    def _answer(self, parameters: Mapping[str, str]) -> Reply:
         try:
-            return Answer(to_json(self._lookup(LookupQuestion.parse(parameters))), _JSON)
+            return Reply(to_json(self._lookup(LookupRequest.parse(parameters))), _JSON)
         except ZStateError as error:
-            return Answer(error_to_json(error), _JSON, is_error=True)
+            return Reply(error_to_json(error), _JSON, is_error=True)
 
-    def _lookup(self, question: LookupQuestion) -> Transform:
+    def _lookup(self, question: LookupRequest) -> Transform:
         buffer = self._get_buffer()
         try:
             return buffer.lookup(question.target, question.source, question.at)
@@ -72,12 +71,12 @@ class RecentBuffer:
     Created at the first query, so that a publisher without queries pays nothing.
     """
 
-    def __init__(self, model: RobotModel, robot: str, memory: Memory) -> None:
+    def __init__(self, model: RobotModel, robot: str, memory: SampleCache) -> None:
         self._model, self._robot = model, robot
         self._memory = memory
         self._state: tuple[TransformBuffer, JointTrack] | None = None
         self._next_seq = 0
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
 
     def buffer(self) -> TransformBuffer:
         """The buffer with every sample until now."""

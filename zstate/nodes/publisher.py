@@ -9,26 +9,26 @@ from contextlib import ExitStack
 
 from numpy.typing import ArrayLike
 
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
-from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.locks import new_lock, outlive_fork
-from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.model.limits import JointLimits
-from zstate.model.robot import RobotModel
-from zstate.net.claims import Claim
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.model.urdf_joint import JointLimits
 from zstate.net.clock_offset import ClockService
-from zstate.net.history import Memory, answer_past
-from zstate.net.presence import writer_here
+from zstate.net.ownership import WriterClaim
+from zstate.net.presence import local_writer
+from zstate.net.sample_history import SampleCache, serve_history
 from zstate.net.session import Session
 from zstate.net.status import StatusPublisher
-from zstate.net.wires import wire_named, wire_names
 from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
 from zstate.nodes.robot_encoder import Positions, RobotEncoder
 from zstate.rate import Rate, RateReport
-from zstate.sources.source import JointSource
+from zstate.sources.joint_source import JointSource
+from zstate.wire.identity import Announcement
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import MODEL_WRITER, Stream, check_robot
 from zstate.wire.messages import (
     JointState,
@@ -37,8 +37,7 @@ from zstate.wire.messages import (
     order_digest,
     to_block,
 )
-from zstate.wire.sample_names import SampleNames
-from zstate.wire.writer import Announced
+from zstate.wire.registry import as_wire_names, get_wire
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """The streams of a robot's state."""
@@ -49,7 +48,7 @@ _NEWEST_ONLY_S = 1e-9
 """Span of the cache that serves lookups when there is no cache for joining listeners."""
 
 
-class StatePublisher(Closing):
+class StatePublisher(Closeable):
     """Publishes the state of one robot: each sample is the whole robot at one instant.
 
     Samples go out on ``joint_states``; the moving edges also on ``tf``, while that stream has a reader.
@@ -64,7 +63,7 @@ class StatePublisher(Closing):
 
     On the native wire it publishes its status once a second while that has a reader
     (``zstate.net.status``), caches the last ``cache_s`` seconds of samples for joining listeners
-    (``zstate.net.history``; 0 for none), and answers lookups of its own frames on
+    (``zstate.net.sample_history``; 0 for none), and answers lookups of its own frames on
     ``zstate/<robot>/lookup`` from that cache, or from the newest sample without one
     (``zstate.nodes.lookup_service``). A context manager; safe from any thread.
     """
@@ -85,8 +84,8 @@ class StatePublisher(Closing):
         self.model = model
         self.robot = check_robot(robot or model.name)
         self._clock: Clock = clock or SystemClock()
-        self._lock = new_lock()
-        self._stop = outlive_fork(threading.Event())
+        self._lock = fork_safe_lock()
+        self._stop = fork_safe(threading.Event())
         self._opened = ExitStack()
         self._encoder = RobotEncoder(model, self.robot)
         self._session_id = secrets.randbits(32)
@@ -94,27 +93,29 @@ class StatePublisher(Closing):
         self._refused = 0
         self._last_refusal = ""
         self._rate: Rate | None = None
-        self._wires = wires = wire_names(wires)
+        self._wires = wires = as_wire_names(wires)
         self._joint_order = order_digest(model.joint_names)
         _check_streams(streams)
         limits = JointLimits(model)
         self._limits = LimitWatch(limits, self.robot) if limits and wires else None
-        sample_names = SampleNames(coordinate_names(model), velocity_slots(model), self._encoder.names)
-        writer = writer_here(self._session_id, program)
+        sample_names = SampleLayout(
+            coordinate_names(model), velocity_columns_by_position(model), self._encoder.names
+        )
+        writer = local_writer(self._session_id, program)
         with ExitStack() as opening:
             # ROS topics may have several writers, so ownership is checked on the native wire only.
             self._claim = None
             if "native" in wires and streams and not takeover:
                 announced = [
-                    Announced(self.robot, stream, writer, MODEL_WRITER if stream == "tf_static" else "")
+                    Announcement(self.robot, stream, writer, MODEL_WRITER if stream == "tf_static" else "")
                     for stream in streams
                 ]
-                self._claim = opening.enter_context(Claim(session, announced))
+                self._claim = opening.enter_context(WriterClaim(session, announced))
             if "native" in wires and self._clock.domain == SYSTEM:
                 # Before this writer is announced: readers that see its token measure its clock at once.
                 opening.enter_context(ClockService(session, self.robot, writer, self._clock))
             wire_writers = [
-                opening.enter_context(WireWriter(session, wire_named(wire), self.robot, writer, sample_names))
+                opening.enter_context(WireWriter(session, get_wire(wire), self.robot, writer, sample_names))
                 for wire in wires
             ]
             self._writers: dict[tuple[str, Stream], SampleWriter] = {}
@@ -143,19 +144,21 @@ class StatePublisher(Closing):
         closed = ", closed" if self._stop.is_set() else ""
         return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._seq} samples{closed}>"
 
-    def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> Memory | None:
+    def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> SampleCache | None:
         if "native" not in self._wires:
             return None
         numbers = self.model.position_count + 2 * self.model.velocity_count
-        cache = Memory(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        cache = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
         if cache_s:
             encoders = {key: writer.encoder for key, writer in self._writers.items()}
             joints, transforms = encoders.get(("native", "joint_states")), encoders.get(("native", "tf"))
             if joints is not None:
-                opening.enter_context(answer_past(session, self.robot, "joint_states", cache, joints.encode))
+                opening.enter_context(
+                    serve_history(session, self.robot, "joint_states", cache, joints.encode)
+                )
             if transforms is not None:
                 robot, encode = self._encoder, transforms.encode
-                service = answer_past(
+                service = serve_history(
                     session, self.robot, "tf", cache, lambda state: encode(robot.transform_sample(state))
                 )
                 opening.enter_context(service)

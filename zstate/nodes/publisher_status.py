@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zstate.errors import duration_text
-from zstate.model.limits import JointLimits
+from zstate.errors import format_duration
+from zstate.model.urdf_joint import JointLimits
 from zstate.rate import RateReport
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Level, Status
-from zstate.wire.writer import Writer
 
 _LOG = logging.getLogger("zstate")
 
@@ -102,7 +102,7 @@ class Health(NamedTuple):
 class StatusReporter:
     """Derives a ``Status`` from a publisher's counts, each time from their change since the last one."""
 
-    def __init__(self, writer: Writer, stats: Callable[[], PublisherStats]) -> None:
+    def __init__(self, writer: WriterId, stats: Callable[[], PublisherStats]) -> None:
         self._writer = writer
         self._read = stats
         self._stats = stats()
@@ -128,7 +128,7 @@ def assess_health(before: PublisherStats, now: PublisherStats, *, quiet_ns: int)
         text = f"{refused} of {sent + refused} samples cannot be published: {now.last_refusal}"
         return Health("warn" if sent else "error", text)
     if quiet_ns > _longest_pause_ns(now.rate):
-        what = "since this publisher opened" if not now.sent else f"for {duration_text(quiet_ns)}"
+        what = "since this publisher opened" if not now.sent else f"for {format_duration(quiet_ns)}"
         return Health("stale", f"nothing was published {what}")
     outside = now.outside_limits - before.outside_limits
     if outside:

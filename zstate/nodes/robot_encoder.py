@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate.extension import kernel
-from zstate.model.edges import EdgeTable
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel
 from zstate.wire.keys import wire_name
 from zstate.wire.messages import (
@@ -42,7 +42,7 @@ class RobotEncoder:
     def __init__(self, model: RobotModel, robot: str) -> None:
         self._model = model
         self._count = model.position_count
-        self._table = EdgeTable(model)
+        self._table = JointTransforms(model)
         forms = self._table.forms
         names = [(wire_name(robot, form.parent), wire_name(robot, form.child)) for form in forms]
         fixed = [form.kind == "fixed" for form in forms]

@@ -7,24 +7,23 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from urllib.parse import quote
 
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import TransformBuffer
 from zstate.checks import check_names
-from zstate.closing import Closing
 from zstate.errors import Closed, InvalidInput, SecondWriter
-from zstate.locks import new_lock
-from zstate.net.claims import Claim
-from zstate.net.placing import check_readers, placing
-from zstate.net.presence import writer_here
+from zstate.net.ownership import WriterClaim, check_readers, claim_edges
+from zstate.net.presence import local_writer
 from zstate.net.session import Session
-from zstate.net.wires import wire_named, wire_names
 from zstate.net.writer import WireWriter, write_all
 from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
-from zstate.wire.writer import Announced, Writer
+from zstate.wire.registry import as_wire_names, get_wire
 
 
-class StaticPublisher(Closing):
+class StaticPublisher(Closeable):
     """Publishes static edges under one writer's name; a robot may have several such writers.
 
     Bare frame names are the robot's own; other frames have full names, ``robot/frame``. All edges of a
@@ -49,7 +48,7 @@ class StaticPublisher(Closing):
         program: str = "",
         takeover: bool = False,
     ) -> None:
-        identity = writer_here(secrets.randbits(32), program)
+        identity = local_writer(secrets.randbits(32), program)
         self.robot = check_robot(robot)
         self.writer = check_writer(_default_writer(identity) if writer is None else writer)
         if self.writer == MODEL_WRITER:
@@ -58,22 +57,22 @@ class StaticPublisher(Closing):
         self._edges: dict[str, Transform] = {}
         # Raises here, where the mistake is made, what every listener would refuse.
         self._check = TransformBuffer()
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._closed = False
         self._session = session
-        self._announced = Announced(self.robot, "tf_static", identity, self.writer)
-        self._claim: Claim | None = None
+        self._announced = Announcement(self.robot, "tf_static", identity, self.writer)
+        self._claim: WriterClaim | None = None
         with ExitStack() as opening:
-            if "native" in wire_names(wires) and not takeover:  # in ROS any node may write them
-                self._claim = opening.enter_context(Claim(session, [self._announced]))
+            if "native" in as_wire_names(wires) and not takeover:  # in ROS any node may write them
+                self._claim = opening.enter_context(WriterClaim(session, [self._announced]))
             self._latched = [
-                opening.enter_context(WireWriter(session, wire_named(wire), robot, identity)).open_latched(
+                opening.enter_context(WireWriter(session, get_wire(wire), robot, identity)).open_latched(
                     "tf_static", self.writer
                 )
-                for wire in wire_names(wires)
+                for wire in as_wire_names(wires)
             ]
             if self._claim is not None:
-                self._claim.settle()
+                self._claim.confirm()
             self._opened = opening.pop_all()
 
     def __repr__(self) -> str:
@@ -95,7 +94,7 @@ class StaticPublisher(Closing):
             if self._claim is not None:
                 if child not in self._edges:
                     check_readers(self._session, self._announced, [(parent, child)])
-                    placed.enter_context(placing(self._session, self._announced, [(parent, child)]))
+                    placed.enter_context(claim_edges(self._session, self._announced, [(parent, child)]))
                 # Last: an earlier writer that answered above has announced itself by now.
                 try:
                     self._claim.check()
@@ -143,6 +142,6 @@ class StaticPublisher(Closing):
             self._opened.close()
 
 
-def _default_writer(identity: Writer) -> str:
+def _default_writer(identity: WriterId) -> str:
     # A script name may have blanks, which a key cannot.
     return f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"

@@ -10,8 +10,7 @@ from itertools import islice
 from typing import NamedTuple
 
 from zstate.errors import MessageError, ModelError
-from zstate.model.coordinates import coordinate_names, velocity_slots
-from zstate.model.robot import RobotModel
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
 from zstate.recording.encode import StaticAccumulator
 from zstate.recording.reader import RecordingReader
@@ -19,10 +18,10 @@ from zstate.recording.storage import ROBOT, Channel, Record
 from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms
+from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.hearing import RosHearing
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED, robot_of_topic, type_of
+from zstate.wire.ros2.topics import SHARED, robot_from_topic, ros_type
 
 STREAMS: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states", "tf", "clock")
 """The streams that are decoded."""
@@ -58,13 +57,13 @@ class RecordedWriter:
         """The writer of ``channel``; None if it is no stream of a robot."""
         name = channel.topic.rpartition("/")[2]
         for stream in STREAMS:
-            if name == stream and channel.type_name == type_of(stream).name:
+            if name == stream and channel.type_name == ros_type(stream).name:
                 break
         else:
             return None
         facts = channel.metadata
         foreign = _SESSION not in facts
-        robot = robot_of_topic(channel.topic) if foreign else facts.get(ROBOT, "")
+        robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
         return cls(
             robot="" if stream == "clock" else robot,
             stream=stream,
@@ -164,7 +163,7 @@ class DecodedRecording:
             decoder = None
             if writer is not None:
                 options = Ros2Options(frame_prefix=channel.metadata.get(_PREFIX, ""))
-                decoder = _ChannelDecoder(writer, FrameNames(options, writer.robot or SHARED), RosHearing())
+                decoder = _ChannelDecoder(writer, FrameNames(options, writer.robot or SHARED), RosDecoder())
             self._known[channel] = decoder
         return self._known[channel]
 
@@ -174,7 +173,7 @@ class _ChannelDecoder(NamedTuple):
 
     writer: RecordedWriter
     names: FrameNames
-    hearing: RosHearing
+    hearing: RosDecoder
 
 
 class LatchedState:
@@ -229,7 +228,7 @@ def static_key(writer: RecordedWriter) -> tuple[str, str]:
 
 def joint_order(model: RobotModel) -> JointOrder:
     """Reader of the joint states of a robot with this model."""
-    return JointOrder(model.joint_names, coordinate_names(model), velocity_slots(model))
+    return JointOrder(model.joint_names, coordinate_names(model), velocity_columns_by_position(model))
 
 
 def first_descriptions(

@@ -8,16 +8,17 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
 from zstate._util.bounded_queue import BoundedQueue
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
-from zstate.locks import new_lock
-from zstate.model.coordinates import coordinate_names, velocity_slots
+from zstate.model.robot import coordinate_names, velocity_columns_by_position
 from zstate.model.urdf import parse_urdf
 from zstate.recording.mcap.writer import ChannelId, RecordingWriter
 from zstate.recording.storage import ROBOT
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     POSE_BYTES,
-    Clock,
+    ClockMessage,
     JointState,
     Message,
     RobotDescription,
@@ -26,13 +27,12 @@ from zstate.wire.messages import (
     TransformSample,
     order_digest,
 )
+from zstate.wire.ros2.cdr import to_time
 from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.times import to_time
-from zstate.wire.ros2.topics import SHARED, RmwKeys, type_of
-from zstate.wire.sample_names import SampleNames
+from zstate.wire.ros2.topics import SHARED, RmwKeys, ros_type
 
 MAX_LATCHED = 256
 """Descriptions and sets of static edges of one robot that are latched, one of each static writer."""
@@ -53,10 +53,10 @@ _STREAMS: dict[type[Message], Stream] = {
     TransformSample: "tf",
     StaticTransforms: "tf_static",
     RobotDescription: "robot_description",
-    Clock: "clock",
+    ClockMessage: "clock",
 }
 _NO_ADDRESS = TopicAddress("", "", None)
-_NAMED = SampleNames()
+_NAMED = SampleLayout()
 
 
 class RecordingEncoder:
@@ -84,7 +84,7 @@ class RecordingEncoder:
         self._refuse = refuse
         self._namespaces = RosNamespaces(alone)
         self._programs = programs
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
         self._latched: dict[str, dict[str, ChannelWriter]] = {}
         self._statics: dict[tuple[str, int], StaticAccumulator] = {}
@@ -120,7 +120,7 @@ class RecordingEncoder:
                 self._latch(robot, message, log_time, f"{robot}/{static_writer}", static_writer)
             elif isinstance(message, RobotDescription):
                 self._write_description(robot, message, log_time)
-            elif isinstance(message, Sample | Clock):
+            elif isinstance(message, Sample | ClockMessage):
                 with self._lock:
                     self._write_sample(robot, message, log_time)
         except _TooManyWriters as error:
@@ -140,7 +140,7 @@ class RecordingEncoder:
                 channel.unlatch(key)
                 self._counts[robot, "tf_static"] += 1
 
-    def _write_sample(self, robot: str, message: Sample | Clock, log_time: int) -> None:
+    def _write_sample(self, robot: str, message: Sample | ClockMessage, log_time: int) -> None:
         sample_names = self._orders_of(robot).sample_names(message)
         if sample_names is None:
             self._pending.append(robot, message, log_time)
@@ -208,7 +208,7 @@ class RecordingEncoder:
         if session in self._programs:
             metadata["zstate.program"] = self._programs[session]
         topic = RmwKeys(options).topic(robot, stream)
-        number = self._writer.channel(topic, type_of(stream), STREAM_QOS[stream], metadata)
+        number = self._writer.channel(topic, ros_type(stream), STREAM_QOS[stream], metadata)
         channel = ChannelWriter(self._writer, number, stream, FrameNames(options, robot))
         opened.add(key, channel, self._latched.get(robot, {}).values())
         return channel
@@ -227,7 +227,7 @@ class ChannelWriter:
         self._sample_names = _NAMED
         self._encoder = RosStreamEncoder(stream, _NO_ADDRESS, names, _NAMED)
 
-    def write(self, message: Sample | Clock, sample_names: SampleNames, log_time: int) -> None:
+    def write(self, message: Sample | ClockMessage, sample_names: SampleLayout, log_time: int) -> None:
         """Write one sample; ``sample_names`` names its numbers."""
         payload = self.encode(message, sample_names)
         # MCAP begins in 1970; the payload keeps an earlier stamp.
@@ -246,7 +246,7 @@ class ChannelWriter:
         """Leave the channel out of the files that follow."""
         self._writer.release(self._channel)
 
-    def encode(self, message: Message, sample_names: SampleNames = _NAMED) -> bytes:
+    def encode(self, message: Message, sample_names: SampleLayout = _NAMED) -> bytes:
         """The payload of ``message``; slow for a large latched one."""
         if sample_names is not self._sample_names:
             self._sample_names = sample_names
@@ -295,19 +295,19 @@ class OrderRegistry:
     """Joint and edge orders of one robot by digest; older ones are kept."""
 
     def __init__(self) -> None:
-        self._joints: dict[bytes, SampleNames] = {}
-        self._edges: dict[bytes, SampleNames] = {}
+        self._joints: dict[bytes, SampleLayout] = {}
+        self._edges: dict[bytes, SampleLayout] = {}
 
     def add(self, description: RobotDescription, robot: str) -> None:
         """Add the orders of a description. Raises ModelError if its joints cannot be parsed."""
         edges = description.moving_edges
-        self._edges.setdefault(order_digest(edges), SampleNames(moving_edges=edges))
+        self._edges.setdefault(order_digest(edges), SampleLayout(moving_edges=edges))
         order = order_digest(description.joint_names)
         if description.joint_names and order not in self._joints:
             model = parse_urdf(description.urdf, f"the description of {robot!r}")
-            self._joints[order] = SampleNames(coordinate_names(model), velocity_slots(model))
+            self._joints[order] = SampleLayout(coordinate_names(model), velocity_columns_by_position(model))
 
-    def sample_names(self, sample: Sample | Clock) -> SampleNames | None:
+    def sample_names(self, sample: Sample | ClockMessage) -> SampleLayout | None:
         """The names of the numbers in ``sample``, or None before a description with its order."""
         if isinstance(sample, JointState):
             return self._joints.get(sample.order) if sample.names is None else _NAMED
@@ -324,19 +324,19 @@ class PendingSamples:
 
     def __init__(self) -> None:
         self.dropped = 0
-        self._robots: dict[str, BoundedQueue[tuple[Sample | Clock, int]]] = {}
+        self._robots: dict[str, BoundedQueue[tuple[Sample | ClockMessage, int]]] = {}
 
     @property
     def waiting(self) -> int:
         """Number of samples held."""
         return sum(len(pending) for pending in list(self._robots.values()))
 
-    def append(self, robot: str, sample: Sample | Clock, log_time: int) -> None:
+    def append(self, robot: str, sample: Sample | ClockMessage, log_time: int) -> None:
         """Hold a sample received at ``log_time``, unless it alone exceeds the limit."""
         pending = self._robots.setdefault(robot, BoundedQueue(MAX_PENDING, MAX_PENDING_BYTES))
         self.dropped += pending.append((sample, log_time), _size(sample))
 
-    def pop(self, robot: str) -> Iterable[tuple[Sample | Clock, int]]:
+    def pop(self, robot: str) -> Iterable[tuple[Sample | ClockMessage, int]]:
         """Remove the samples of ``robot``, and return them with their log times."""
         return self._robots.pop(robot, ())
 
@@ -385,7 +385,7 @@ class _TooManyWriters(InvalidInput):
 
 
 def _reason(message: Message) -> str:
-    stamp = message.stamp if isinstance(message, Sample | Clock) else 1
+    stamp = message.stamp if isinstance(message, Sample | ClockMessage) else 1
     if not stamp:
         return "no stamp"
     try:
@@ -395,7 +395,7 @@ def _reason(message: Message) -> str:
     return "not sayable"
 
 
-def _size(sample: Sample | Clock) -> int:
+def _size(sample: Sample | ClockMessage) -> int:
     if isinstance(sample, JointState):
         return sum(len(block or b"") for block in (sample.positions, sample.velocities, sample.efforts))
     return len(sample.poses) if isinstance(sample, TransformSample) else 0

@@ -7,21 +7,20 @@ from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 
+from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.ingest.model_filter import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
-from zstate.net.claims import Claim
-from zstate.net.placing import Edge, named_edges, placing
-from zstate.net.presence import writer_here
+from zstate.net.ownership import Edge, WriterClaim, claim_edges, named_edges
+from zstate.net.presence import local_writer
 from zstate.net.session import Session
-from zstate.net.wires import wire_named
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, joint_order, static_key
+from zstate.wire.identity import Announcement
 from zstate.wire.keys import MODEL_WRITER, Stream
 from zstate.wire.messages import (
     JointState,
@@ -30,10 +29,10 @@ from zstate.wire.messages import (
     StaticTransforms,
     TransformSample,
 )
-from zstate.wire.writer import Announced
+from zstate.wire.registry import get_wire
 
 
-class PlaybackPublishers(Closing):
+class PlaybackPublishers(Closeable):
     """Publishes recorded messages as new writers.
 
     Robots with one of ``models`` get a StatePublisher, which recomputes their transforms if their own
@@ -155,7 +154,7 @@ class PlaybackPublishers(Closing):
             robot.close()
 
 
-class _RobotPublisher(Closing):
+class _RobotPublisher(Closeable):
     """StatePublisher of a robot with a known model."""
 
     def __init__(  # noqa: PLR0917 - one use, just above
@@ -197,7 +196,7 @@ class _RobotPublisher(Closing):
         self._publisher.close()
 
 
-class PassthroughPublisher(Closing):
+class PassthroughPublisher(Closeable):
     """Publishes messages of ``robot`` unchanged on all ``wires``, with its own session and sequence numbers.
 
     ``streams`` are announced at once, latched values with the first of their name. A message that one of
@@ -224,12 +223,12 @@ class PassthroughPublisher(Closing):
         self._seqs: Counter[Stream] = Counter()
         self._latched: dict[tuple[Stream, str], list[LatchedWriter]] = {}
         self._placed: dict[str, set[Edge]] = {}
-        self._writer = writer = writer_here(self._session_id)
+        self._writer = writer = local_writer(self._session_id)
         sessions.add(self._session_id)
         with ExitStack() as opening:
-            self._claim = self._claimed(opening, [Announced(robot, stream, writer) for stream in streams])
+            self._claim = self._claimed(opening, [Announcement(robot, stream, writer) for stream in streams])
             self._wire_writers = [
-                opening.enter_context(WireWriter(session, wire_named(wire), robot, writer)) for wire in wires
+                opening.enter_context(WireWriter(session, get_wire(wire), robot, writer)) for wire in wires
             ]
             self._streams: dict[Stream, list[SampleWriter]] = {
                 stream: [one.open_stream(stream) for one in self._wire_writers] for stream in streams
@@ -281,16 +280,18 @@ class PassthroughPublisher(Closing):
                 claim = self._claimed(opening, [announced])
                 opened = [one.open_latched(stream, writer) for one in self._wire_writers]
                 if claim is not None:
-                    claim.settle()
+                    claim.confirm()
                 self._opened.push(opening.pop_all())
             self._latched[stream, writer] = opened
         return self._latched[stream, writer]
 
-    def _announced(self, stream: Stream, writer: str) -> Announced:
-        return Announced(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
+    def _announced(self, stream: Stream, writer: str) -> Announcement:
+        return Announcement(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
 
-    def _claimed(self, opening: ExitStack, wanted: Sequence[Announced]) -> Claim | None:
-        return opening.enter_context(Claim(self._session, wanted)) if self._is_alone and wanted else None
+    def _claimed(self, opening: ExitStack, wanted: Sequence[Announcement]) -> WriterClaim | None:
+        return (
+            opening.enter_context(WriterClaim(self._session, wanted)) if self._is_alone and wanted else None
+        )
 
     @contextmanager
     def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:
@@ -300,7 +301,7 @@ class PassthroughPublisher(Closing):
         with ExitStack() as placed:
             if new:
                 announced = self._announced("tf_static", writer)
-                placed.enter_context(placing(self._session, announced, new, beside=self._sessions))
+                placed.enter_context(claim_edges(self._session, announced, new, beside=self._sessions))
             yield
         self._placed[writer] = edges
 

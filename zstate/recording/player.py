@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import Clock, SystemClock
-from zstate.closing import Closing
 from zstate.errors import InvalidInput
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
-from zstate.net.wires import wire_names
 from zstate.nodes.clock import ClockPublisher
 from zstate.recording.decode import (
     LATCHED,
@@ -28,8 +27,8 @@ from zstate.recording.load import check_has_robot
 from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
-from zstate.wire.messages import Clock as ClockMessage
-from zstate.wire.messages import Sample
+from zstate.wire.messages import ClockMessage, Sample
+from zstate.wire.registry import as_wire_names
 
 CLOCK_HZ = 100.0
 """Rate at which the player publishes the clock if the recording has no clock messages."""
@@ -57,7 +56,7 @@ class PlayerReport:
     refused: Mapping[str, int]
 
 
-class Player(Closing):
+class Player(Closeable):
     """Publishes the recorded messages of ``robots``, or of all robots, as when they were recorded.
 
     Stamps are those of the recording, and so is the spacing, divided by ``rate`` (inf: as fast as possible).
@@ -87,7 +86,7 @@ class Player(Closing):
     ) -> None:
         self.rate = rate
         self._session = session
-        self._wires = wire_names(wires)
+        self._wires = as_wire_names(wires)
         self._loop = loop
         self._takeover = takeover
         self._player_clock = PlayerClock(clock or SystemClock(), rate)

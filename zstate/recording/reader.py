@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 from zstate.errors import RecordingError
 from zstate.recording.bag_metadata import bag_files
 from zstate.recording.file_signatures import explain_unreadable
@@ -27,7 +27,7 @@ from zstate.recording.storage import (
 _SQLITE_MAGIC = b"SQLite format 3\0"
 
 
-class RecordingReader(Closing):
+class RecordingReader(Closeable):
     """A recording, opened read-only.
 
     ``path`` is an MCAP file, the first file of a split recording (the others are found in its folder), a

@@ -15,26 +15,26 @@ from pathlib import Path
 from typing import NamedTuple
 
 from zstate._util.bounded_dict import BoundedDict
-from zstate.clock import SystemClock, wait_in_slices
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate.clock import SystemClock, wait_interruptible
 from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
 from zstate.ingest.counters import Counters
 from zstate.ingest.sequence import GapCounter
-from zstate.locks import new_lock, outlive_fork
-from zstate.net.forked import forked_text
+from zstate.net.at_exit import forked_text
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
-from zstate.net.wires import wire_named
 from zstate.rate import Rate
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
+from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, Stream, check_robot
-from zstate.wire.messages import Clock, Message, Sample
+from zstate.wire.messages import ClockMessage, Message, Sample
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 from zstate.wire.ros2.topics import SHARED
-from zstate.wire.writer import Announced
 
 FLUSH_NS = 500_000_000
 """Interval at which everything received goes to the file, where ``kill -9`` cannot reach it."""
@@ -72,14 +72,14 @@ class Batch(NamedTuple):
     overflowed: bool
 
 
-class MessageQueue(Closing):
+class MessageQueue(Closeable):
     """Samples of several subscriptions, with their time of reception, in one queue for one thread."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._batches: list[Batch] = []
         self._waiting = self._bytes = 0
-        self._has_room = outlive_fork(threading.Condition())
+        self._has_room = fork_safe(threading.Condition())
         self._is_open = True
         self._opened = ExitStack()
 
@@ -145,7 +145,7 @@ class RecorderStats:
     unwritten: int
 
 
-class Recorder(Closing):
+class Recorder(Closeable):
     """Records ``robots``, or all robots, on ``wire`` into ``path``; a context manager.
 
     Subscribes to all of their streams, /tf too, which makes their publishers compute it. A single selected
@@ -171,7 +171,7 @@ class Recorder(Closing):
         self.failure: Exception | None = None
         selected = (robots,) if isinstance(robots, str) else tuple(dict.fromkeys(robots))
         self._selected = tuple(map(check_robot, selected))
-        self._wire = wire_named(wire)
+        self._wire = get_wire(wire)
         self._counters = Counters()
         self._gaps = GapCounter(self._counters)
         self._programs: BoundedDict[int, str] = BoundedDict()
@@ -180,9 +180,9 @@ class Recorder(Closing):
         self._ends_at = math.inf
         self._starts_at: int | None = None
         self._encoder: RecordingEncoder | None = None
-        self._closing = new_lock()
-        self._stop = outlive_fork(threading.Event())
-        self._ended = outlive_fork(threading.Event())
+        self._closing = fork_safe_lock()
+        self._stop = fork_safe(threading.Event())
+        self._ended = fork_safe(threading.Event())
         self._large = _LargeValues(self._write_arrival, self._counters)
         with ExitStack() as opening:
             self._queue = opening.enter_context(MessageQueue(session))
@@ -235,7 +235,7 @@ class Recorder(Closing):
         """
         if os.getpid() != self._pid:
             raise Closed(forked_text(f"this recorder belongs to process {self._pid}"))
-        return wait_in_slices(self._ended, timeout_s)
+        return wait_interruptible(self._ended, timeout_s)
 
     def close(self) -> None:
         """End the recording within a second: write what was received, and finish the file."""
@@ -249,7 +249,7 @@ class Recorder(Closing):
         with self._closing:
             self._opened.close()
 
-    def _on_writer(self, announced: Announced, alive: bool) -> None:
+    def _on_writer(self, announced: Announcement, alive: bool) -> None:
         if alive:
             self._programs[announced.writer.session] = str(announced.writer)
             if not self._selected:
@@ -337,7 +337,7 @@ class Recorder(Closing):
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
         for message in messages:
             is_known = encoder.write_message(robot, message, stamp, static_writer)
-            if is_known and isinstance(message, Sample | Clock):
+            if is_known and isinstance(message, Sample | ClockMessage):
                 self._gaps.add((robot, stream, message.session), message.seq)
 
     def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:
@@ -364,7 +364,7 @@ class _LargeValues:
         self._waiting: deque[tuple[str, Batch, SerializedSample]] = deque()
         self._bytes = 0
         self._behind: Counter[str] = Counter()
-        self._changed = outlive_fork(threading.Condition())
+        self._changed = fork_safe(threading.Condition())
         self._is_open = True
         self._thread: threading.Thread | None = None
 

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import check_stamps
-from zstate.closing import Closing
 from zstate.recording.decode import DecodedRecording
 from zstate.recording.info import RecordingInfo, read_info
 from zstate.recording.load import HISTORY_S, check_has_robot, load_into
 from zstate.recording.reader import RecordingReader
 
 
-class Recording(Closing):
+class Recording(Closeable):
     """A recorded MCAP file or bag, restricted to ``robot`` if one is given.
 
     ``robots`` are the names of the robots in it, ``info`` describes the file. Raises RecordingError if it

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, MessageError
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedMessage, DecodedRecording
 from zstate.recording.reader import RecordingReader
-from zstate.sources.source import JointReading
-from zstate.sources.states import StateReader
+from zstate.sources.joint_source import JointReading, JointStateValidator
 from zstate.wire.joint_order import JointNumbers
 from zstate.wire.messages import JointState
 
@@ -19,7 +18,7 @@ from zstate.wire.messages import JointState
 _LATE_NS = 10_000_000_000
 
 
-class RecordedSource(Closing):
+class RecordedSource(Closeable):
     """The recorded motion of ``robot``, shifted to the present: it starts with the first ``read``.
 
     ``robot`` may be None if the file has joint states of one robot only. ``read`` returns the newest reading
@@ -33,7 +32,7 @@ class RecordedSource(Closing):
     def __init__(self, path: str | Path, robot: str | None, model: RobotModel) -> None:
         self._refusals = Refusals("recorded joint_states")
         self.refused = self._refusals.counts
-        self._states = StateReader(model)
+        self._states = JointStateValidator(model)
         self._reader = RecordingReader(path)
         try:
             recording = DecodedRecording(self._reader, self._refusals.count)

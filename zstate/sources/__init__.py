@@ -1,7 +1,7 @@
 """Where joint states come from."""
 
+from zstate.sources.joint_source import JointReading, JointSource
 from zstate.sources.sine import SineSource
-from zstate.sources.source import JointReading, JointSource
 from zstate.sources.subscribed import SubscribedSource
 
 __all__ = ["JointReading", "JointSource", "SineSource", "SubscribedSource"]

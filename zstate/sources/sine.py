@@ -8,7 +8,7 @@ import numpy as np
 
 from zstate.errors import InvalidInput
 from zstate.model.robot import Joint, RobotModel
-from zstate.sources.source import JointReading
+from zstate.sources.joint_source import JointReading
 
 _LARGEST_SWING = {"revolute": 1.2, "continuous": math.pi, "prismatic": 0.5, "planar": 0.5, "floating": 0.0}
 # Joints side by side move a little apart, so that each can be told from its neighbour.

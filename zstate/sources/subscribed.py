@@ -1,4 +1,7 @@
-"""Joint states of another publisher."""
+"""Joint states of another publisher.
+
+Robot models from descriptions on the network.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +9,24 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 
+from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import LONGEST_WAIT_S
-from zstate.closing import Closing
-from zstate.errors import InvalidInput, MessageError
+from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
 from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
-from zstate.net.wires import wire_named
-from zstate.sources.source import JointReading
-from zstate.sources.states import StateReader
-from zstate.wire.messages import JointState, Message
+from zstate.sources.joint_source import JointReading, JointStateValidator
+from zstate.wire.messages import JointState, Message, RobotDescription
+from zstate.wire.registry import get_wire
 
 # Readings that wait for a slow reader; of more the oldest are dropped.
 _CAPACITY = 1024
 
 
-class SubscribedSource(Closing):
+class SubscribedSource(Closeable):
     """The ``joint_states`` of ``robot`` as they arrive: ``for reading in source: ...``
 
     ``read`` returns the newest one that has not been read. Iteration ends with ``close()``. Samples that
@@ -42,9 +45,9 @@ class SubscribedSource(Closing):
     ) -> None:
         self._refusals = Refusals("joint_states")
         self.refused: dict[str, int] = self._refusals.counts
-        self._states = StateReader(model)
+        self._states = JointStateValidator(model)
         self._robot = robot or model.name
-        named = wire_named(wire)
+        named = get_wire(wire)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
         self._changed = threading.Condition()
         self._closed = False
@@ -97,3 +100,50 @@ class SubscribedSource(Closing):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+
+class DescriptionSubscriber(Closeable):
+    """Subscribes to the ``robot_description`` of ``robot`` ("*": of all robots), earlier ones included.
+
+    ``on_description(robot, model)`` is called from one thread with the first model of a robot, and
+    with each one that replaces it. Descriptions that cannot be used are counted in ``refused``, by
+    reason; the first of each is also logged.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        on_description: Callable[[str, RobotModel], object],
+        wire: str = "native",
+    ) -> None:
+        self._refusals = Refusals("robot_description")
+        self.refused = self._refusals.counts
+        self._on_description = on_description
+        self._urdfs: dict[str, str] = {}
+        self._subscriber = subscribe(
+            session,
+            get_wire(wire),
+            robot,
+            "robot_description",
+            self._on_messages,
+            on_error=self._refusals.count,
+        )
+
+    def _on_messages(self, received: list[Received]) -> None:
+        for robot, _, description in received:
+            assert isinstance(description, RobotDescription)
+            if description.urdf == self._urdfs.get(robot):
+                continue
+            try:
+                # Plain URDF text: input from the network opens no files and runs no xacro.
+                model = parse_urdf(description.urdf, f"the URDF of {robot!r}")
+            except ModelError as error:
+                self._refusals.count("model", error)
+                continue
+            self._urdfs[robot] = description.urdf
+            self._on_description(robot, model)
+
+    def close(self) -> None:
+        """Stop listening within a second. A second call does nothing."""
+        self._subscriber.close()

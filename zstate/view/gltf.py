@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.model.shapes import Color
+from zstate.model.geometry import Color
 from zstate.view.mesh_geometry import Material, Mesh
 
 GREY: Color = (0.74, 0.75, 0.77, 1.0)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.model.shapes import Box, Color, Cylinder, Sphere
+from zstate.model.geometry import Box, Color, Cylinder, Sphere
 
 _SMOOTHEST_EDGE = np.cos(np.radians(35.0))
 _MAX_COMPARED = 256  # a point with more triangles is the middle of a disc

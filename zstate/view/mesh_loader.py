@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from zstate.model.shapes import Color, Shape
+from zstate.model.geometry import Color, Shape
 from zstate.view.mesh_paths import MissingFile
 from zstate.view.meshes import MeshAsset, Meshes
 

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from zstate.model.known import package_folders
+from zstate.model.catalog import package_folders
 
 _DEEPEST = 4  # repositories hold packages in folders of folders
 _NOT_PACKAGES = {"meshes", "urdf"}  # inside one, and large

@@ -19,7 +19,7 @@ from PIL import Image
 from trimesh.resolvers import FilePathResolver
 from trimesh.units import unit_conversion
 
-from zstate.model.shapes import Box, Color, Cylinder, MeshFile, Shape, Sphere
+from zstate.model.geometry import Box, Color, Cylinder, MeshFile, Shape, Sphere
 from zstate.view.gltf import GREY, Corner, Glb, MaterialOverride
 from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
 from zstate.view.mesh_paths import MeshPaths, MissingFile

@@ -1,31 +1,126 @@
-"""Sliders: a robot moved by hand, published at an exact rate."""
+"""Sliders: a robot moved by hand, published at an exact rate.
+
+Dials: one number for each thing that a slider moves, and what they make of a robot's positions.
+"""
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate._util.suggestions import did_you_mean
 from zstate.clock import Clock
-from zstate.closing import Closing
 from zstate.errors import InvalidInput, SecondWriter
-from zstate.locks import new_lock
-from zstate.model.robot import RobotModel
+from zstate.model.robot import Joint, RobotModel
 from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.rate import check_rate
+from zstate.se3 import quaternion_from_rpy, rpy_from_quaternion
+from zstate.sources.joint_source import JointReading
 from zstate.sources.sine import SineSource
-from zstate.sources.source import JointReading
-from zstate.view.dials import Dials, Values
 from zstate.wire.keys import Stream
+
+Unit = Literal["rad", "m"]
+Values = NDArray[np.float64]
+
+_REACH_M = 2.0
+"""How far what has no limits may be moved, each way."""
+
+_PLANAR: tuple[tuple[str, Unit, float], ...] = (
+    ("x", "m", _REACH_M),
+    ("y", "m", _REACH_M),
+    ("yaw", "rad", math.pi),
+)
+_FLOATING: tuple[tuple[str, Unit, float], ...] = (
+    ("x", "m", _REACH_M),
+    ("y", "m", _REACH_M),
+    ("z", "m", _REACH_M),
+    ("roll", "rad", math.pi),
+    ("pitch", "rad", math.pi / 2),
+    ("yaw", "rad", math.pi),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class SliderSpec:
+    """A number between ``lower`` and ``upper`` [rad] or [m]: a joint's, or one of several of a joint.
+
+    Where the model states no limit it is a turn each way, or 2 m.
+    """
+
+    name: str
+    unit: Unit
+    lower: float
+    upper: float
+
+
+class SliderMapping:
+    """The dials of a robot; a floating joint has six, of which three are roll, pitch and yaw."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self.dials = tuple(dial for joint in model.driven_joints for dial in _dials(joint))
+        self.lower = np.array([dial.lower for dial in self.dials])
+        self.upper = np.array([dial.upper for dial in self.dials])
+        self._model = model
+        plain: list[tuple[int, int]] = []
+        self._floating: list[tuple[int, int]] = []
+        row = 0
+        for joint in model.driven_joints:
+            column, count = model.columns[joint.name], len(list(_dials(joint)))
+            if joint.type == "floating":
+                self._floating.append((row, column))
+            else:
+                plain += [(row + step, column + step) for step in range(count)]
+            row += count
+        self._rows, self._columns = np.array(plain, dtype=np.intp).reshape(-1, 2).T
+
+    def positions(self, values: Values) -> Values:
+        """The robot's positions, in the order of its ``joint_names``, for one value per dial."""
+        positions = np.empty(self._model.position_count)
+        positions[self._columns] = values[self._rows]
+        for row, column in self._floating:
+            x, y, z, roll, pitch, yaw = values[row : row + 6].tolist()
+            positions[column : column + 7] = (x, y, z, *quaternion_from_rpy(roll, pitch, yaw))
+        return positions
+
+    def values(self, positions: Values) -> Values:
+        """What the dials show of ``positions``, whether or not that is within their limits."""
+        values = np.empty(len(self.dials))
+        values[self._rows] = positions[self._columns]
+        for row, column in self._floating:
+            x, y, z, qx, qy, qz, qw = positions[column : column + 7].tolist()
+            values[row : row + 6] = (x, y, z, *rpy_from_quaternion((qx, qy, qz, qw)))
+        return values
+
+
+def _dials(joint: Joint) -> Iterator[SliderSpec]:
+    if joint.type in ("planar", "floating"):
+        for part, unit, reach in _PLANAR if joint.type == "planar" else _FLOATING:
+            yield SliderSpec(f"{joint.name}.{part}", unit, -reach, reach)
+        return
+    unit: Unit = "m" if joint.type == "prismatic" else "rad"
+    reach = _REACH_M if unit == "m" else math.pi
+    lower, upper = joint.limits.lower, joint.limits.upper
+    if joint.type == "continuous":
+        lower, upper = -math.inf, math.inf
+    if not math.isfinite(lower):
+        lower = -reach if not math.isfinite(upper) else upper - 2.0 * reach
+    yield SliderSpec(joint.name, unit, lower, upper if math.isfinite(upper) else lower + 2.0 * reach)
+
 
 _JOIN_WITHIN_S = 1.0
 
 
-class Sliders(Closing):
+class SliderPublisher(Closeable):
     """Publishes ``robot`` as its dials stand, and its model where nobody else does.
 
     It says so exactly ``rate_hz`` times a second. It begins at home: see ``home``. Where somebody else
@@ -45,14 +140,14 @@ class Sliders(Closing):
     ) -> None:
         self.model = model
         self.robot = robot or model.name
-        self.dials = Dials(model)
+        self.dials = SliderMapping(model)
         self.refusal = ""
         """Why nothing is published; empty while it is."""
         self._session = session
         self._wires = wires
         self._clock = clock
         self._rate_hz = check_rate(rate_hz)
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._values = self.dials.values(model.neutral)
         self._motion: SineSource | None = None
         self._publisher: StatePublisher | None = None
@@ -96,7 +191,7 @@ class Sliders(Closing):
         while True:
             try:
                 publisher.run(_Readings(self, self._rate_hz), self._rate_hz)
-            except _AnotherRate:
+            except _RateChanged:
                 continue
             except SecondWriter as error:
                 refusal = _refusal(error)
@@ -212,20 +307,20 @@ class Sliders(Closing):
             thread.join(_JOIN_WITHIN_S)
 
 
-class _AnotherRate(Exception):
+class _RateChanged(Exception):
     """The rate was changed."""
 
 
 class _Readings:
     """What the sliders read, until their rate is another one."""
 
-    def __init__(self, sliders: Sliders, rate_hz: float) -> None:
+    def __init__(self, sliders: SliderPublisher, rate_hz: float) -> None:
         self._sliders = sliders
         self._rate_hz = rate_hz
 
     def read(self, stamp: int) -> JointReading:
         if self._sliders.rate_hz != self._rate_hz:
-            raise _AnotherRate
+            raise _RateChanged
         return self._sliders.read(stamp)
 
 

@@ -12,17 +12,17 @@ from pathlib import Path
 import numpy as np
 import viser
 
+from zstate._util.closeable import Closeable
 from zstate.buffer.snapshot import FramePoses, Poses
-from zstate.clock import SystemClock, wait_in_slices
-from zstate.closing import Closing
+from zstate.clock import SystemClock, wait_interruptible
 from zstate.model.robot import RobotModel
 from zstate.rate import Rate
-from zstate.view.framing import FIELD_OF_VIEW, Camera, Framing, Sight, framing_of, sights
-from zstate.view.page import Page
-from zstate.view.panels.board import Board
+from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Sight, fit_camera, sights
+from zstate.view.data_source import ViewSource
+from zstate.view.panels.layout import PanelLayout
 from zstate.view.scene.scene import Scene
-from zstate.view.sliders import Sliders
-from zstate.view.world import World
+from zstate.view.server import ViewServer
+from zstate.view.sliders import SliderPublisher
 
 _LOG = logging.getLogger("zstate")
 
@@ -31,7 +31,7 @@ _PANELS_PERIOD_S = 0.2
 _IDLE_S = 0.5
 
 
-class View(Closing):
+class View(Closeable):
     """Draws ``world`` on ``page`` at most ``rate_hz`` times a second; twice a second while nobody looks.
 
     ``sliders`` are of robots that are moved from the page; they and the world are the caller's to close.
@@ -44,10 +44,10 @@ class View(Closing):
 
     def __init__(
         self,
-        world: World,
-        page: Page,
+        world: ViewSource,
+        page: ViewServer,
         *,
-        sliders: Sequence[Sliders] = (),
+        sliders: Sequence[SliderPublisher] = (),
         rate_hz: float = 30.0,
         folders: Mapping[str, Path] | None = None,
         fixed_frame: str = "",
@@ -59,7 +59,7 @@ class View(Closing):
         self._rate_hz = rate_hz
         self._folders = dict(folders or {})
         self.scene = Scene(page.server)
-        self._board = Board(page.server, world, self.scene, sliders, fixed_frame)
+        self._board = PanelLayout(page.server, world, self.scene, sliders, fixed_frame)
         self._camera = camera
         self._aspect = aspect
         self._version = -1
@@ -67,7 +67,7 @@ class View(Closing):
         self._framed: tuple[str, tuple[str, ...], int] | None = None
         self._framed_without = 0  # so many frames had no pose then
         self._framed_busy = False  # and meshes were still to come
-        self._framing: Framing | None = None
+        self._framing: CameraPose | None = None
         self._is_to_hold = False
         self._held: FramePoses | None = None
         self._placed: Poses | None = None
@@ -134,7 +134,7 @@ class View(Closing):
         Returns when all of it is drawn, or after ``timeout_s``; False if nothing of it is.
         """
         self._is_to_hold = True
-        return wait_in_slices(self._holds, timeout_s) or self._placed is not None
+        return wait_interruptible(self._holds, timeout_s) or self._placed is not None
 
     def sights(self) -> tuple[Sight, ...]:
         """Which robots are in the picture that is held, and why others are not."""
@@ -191,7 +191,7 @@ class View(Closing):
         had_less = unknown < self._framed_without or (self._framed_busy and not self.scene.busy)
         if not self._drawn or (subject == self._framed and not had_less):
             return
-        framing = framing_of(moment, placed, self._aspect, self.scene.corners(moment.tree, placed))
+        framing = fit_camera(moment, placed, self._aspect, self.scene.corners(moment.tree, placed))
         if framing is None:
             return
         self._framed, self._framed_without, self._framed_busy = subject, unknown, self.scene.busy
@@ -202,7 +202,7 @@ class View(Closing):
         self._framing = framing
         self._aim(framing, moves=moves)
 
-    def _aim(self, framing: Framing, *, moves: bool) -> None:
+    def _aim(self, framing: CameraPose, *, moves: bool) -> None:
         """Put the floor, and unless the user has put it the camera, where the framing says."""
         server = self._page.server
         self._floor.position = (0.0, 0.0, framing.floor)

@@ -1,15 +1,19 @@
-"""JointOrder: reading JointState messages into the order of a model."""
+"""JointOrder: reading JointState messages into the order of a model.
+
+SampleNames: what the numbers in the samples of one robot are called.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate.errors import MessageError
-from zstate.wire.messages import JointState, from_block, order_digest
+from zstate.wire.messages import Edges, JointState, from_block, order_digest
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +42,7 @@ class JointOrder:
         self.digest = order_digest(tuple(names))
         self._coordinates = tuple(coordinates or names)
         self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
-        self._picks: dict[tuple[str, ...], _Pick] = {}
+        self._picks: dict[tuple[str, ...], _Permutation] = {}
 
     def is_plain(self, state: JointState) -> bool:
         """Whether ``state`` is a block of positions in our order and nothing else, as nearly always."""
@@ -51,10 +55,10 @@ class JointOrder:
             from_block(state.positions), _numbers(state.velocities), _numbers(state.efforts)
         )
         if pick is not None:
-            numbers = pick.of(numbers)
+            numbers = pick.apply(numbers)
         return numbers if state.names is None else _known(numbers)
 
-    def _pick(self, names: tuple[str, ...] | None) -> _Pick:
+    def _pick(self, names: tuple[str, ...] | None) -> _Permutation:
         if names is None:
             raise MessageError(
                 "a joint state in an order of another model; do both sides use the same URDF?",
@@ -69,18 +73,18 @@ class JointOrder:
                 )
             # One order per writer is usual; a writer that shuffles must not fill the memory.
             positions = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
-            pick = _Pick(positions, positions[self._slots])
+            pick = _Permutation(positions, positions[self._slots])
             self._picks = {names: pick}
         return pick
 
 
-class _Pick(NamedTuple):
+class _Permutation(NamedTuple):
     """Where our numbers stand in what a writer sends."""
 
     positions: NDArray[np.intp]
     velocities: NDArray[np.intp]
 
-    def of(self, numbers: JointNumbers) -> JointNumbers:
+    def apply(self, numbers: JointNumbers) -> JointNumbers:
         positions, velocities, efforts = numbers
         return JointNumbers(
             positions[self.positions],
@@ -100,3 +104,16 @@ def _without_nan(numbers: Floats | None) -> Floats | None:
 
 def _numbers(block: bytes | None) -> Floats | None:
     return None if block is None else from_block(block)
+
+
+@dataclass(frozen=True, slots=True)
+class SampleLayout:
+    """The names behind the numbers of a writer's samples, for wires that name each of them.
+
+    ``coordinates`` names each number of a position vector; ``velocity_slots`` says under which of them
+    each number of a velocity or effort vector stands; ``moving_edges`` is the order of poses.
+    """
+
+    coordinates: tuple[str, ...] = ()
+    velocity_slots: tuple[int, ...] = ()
+    moving_edges: Edges = ()

@@ -201,7 +201,7 @@ def parse_edge_key(key: str) -> tuple[str, tuple[str, str], str]:
 
 
 @lru_cache(4096)  # of each sample that comes
-def robot_of(key: str) -> str:
+def robot_from_key(key: str) -> str:
     """The robot whose key this is.
 
     InvalidInput for a key that is not under ``zstate/<robot>/``, or has a wildcard: then it is several keys.

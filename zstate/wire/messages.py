@@ -148,7 +148,7 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
     clock: str = "system"
 
 
-class Clock(Message, frozen=True, array_like=True, gc=False):
+class ClockMessage(Message, frozen=True, array_like=True, gc=False):
     """What time it is: simulated, or by the clock of a writer that was asked."""
 
     stamp: Stamp
@@ -179,7 +179,7 @@ class Status(Message, frozen=True, array_like=True, gc=False):
     values: dict[str, str] = {}
 
 
-class Past(Message, frozen=True, array_like=True, gc=False):
+class HistoryPage(Message, frozen=True, array_like=True, gc=False):
     """Samples that were sent before, oldest first, each as it was sent under ``encoding``.
 
     ``before`` is the ``seq`` of the first of them: what to ask for next; None when nothing older is kept.

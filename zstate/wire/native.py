@@ -10,32 +10,32 @@ from typing import TypeVar
 import msgspec
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import (
     Stream,
     check_writer,
     parse_writer_key,
     reader_key,
-    robot_of,
+    robot_from_key,
     stream_expression,
     stream_key,
     writer_expression,
     writer_key,
 )
 from zstate.wire.messages import (
-    Clock,
+    ClockMessage,
+    HistoryPage,
     JointCommand,
     JointState,
     Message,
-    Past,
     RobotDescription,
     StaticTransforms,
     Status,
     TransformSample,
 )
 from zstate.wire.protocol import EntityId, SerializedSample
-from zstate.wire.sample_names import SampleNames
 from zstate.wire.sizes import LATCHED_BYTES, SAMPLE_BYTES, check_edges, check_size
-from zstate.wire.writer import Announced, Writer
 
 VERSION = 1
 
@@ -48,9 +48,9 @@ ENCODINGS: dict[type[Message], str] = {
     JointCommand: "zstate/JointCommand;v=1",
     StaticTransforms: "zstate/StaticTransforms;v=1",
     RobotDescription: "zstate/RobotDescription;v=1",
-    Clock: "zstate/Clock;v=1",
+    ClockMessage: "zstate/Clock;v=1",
     Status: "zstate/Status;v=1",
-    Past: "zstate/Past;v=1",
+    HistoryPage: "zstate/Past;v=1",
 }
 STREAM_TYPES: dict[Stream, type[Message]] = {
     "joint_states": JointState,
@@ -58,14 +58,14 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "tf_static": StaticTransforms,
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
-    "clock": Clock,
+    "clock": ClockMessage,
 }
 
 # No limit is smaller, so that most payloads pass with one comparison.
 _LEAST_BYTES = 1_000
 
 # Messages that have no stream.
-_MOST_BYTES: dict[type[Message], int] = {Status: 64_000, Past: 4 * SAMPLE_BYTES}
+_MOST_BYTES: dict[type[Message], int] = {Status: 64_000, HistoryPage: 4 * SAMPLE_BYTES}
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
@@ -98,10 +98,10 @@ class NativeStreamEncoder:
 
     can_withdraw = True
 
-    def __init__(self, robot: str, writer: Writer, stream: Stream, name: str) -> None:
+    def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
         self.key = stream_key(robot, stream, name)
         self.encoding = ENCODINGS[STREAM_TYPES[stream]]
-        announced = Announced(robot, stream, writer, name if stream == "tf_static" else "")
+        announced = Announcement(robot, stream, writer, name if stream == "tf_static" else "")
         self.token = None if stream == "clock" else writer_key(robot, stream, announced.identity)
 
     def encode(self, message: Message) -> bytes:
@@ -117,24 +117,24 @@ class NativeWire:
     name = "native"
     shared: frozenset[Stream] = frozenset()
 
-    def node_token(self, robot: str, writer: Writer, node: EntityId) -> None:
+    def node_token(self, robot: str, writer: WriterId, node: EntityId) -> None:
         return None
 
     def stream_encoder(
         self,
         robot: str,
-        writer: Writer,
+        writer: WriterId,
         stream: Stream,
         *,
         node: EntityId,
         number: int,
-        sample_names: SampleNames,
+        sample_names: SampleLayout,
         name: str = "",
     ) -> NativeStreamEncoder:
         return NativeStreamEncoder(robot, writer, stream, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         identity = replace(reader, session=number()).identity
         return tuple(reader_key(robot, stream, identity) for stream in streams)
@@ -142,7 +142,7 @@ class NativeWire:
     def expression(self, robot: str, stream: Stream) -> str:
         return stream_expression(robot, stream)
 
-    robot_of = staticmethod(robot_of)
+    robot_of = staticmethod(robot_from_key)
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
         if arrival.size or len(arrival.payload) > _LEAST_BYTES:
@@ -153,15 +153,15 @@ class NativeWire:
         return (message,)
 
     def statics_writer(self, key: str) -> str:
-        robot_of(key)
+        robot_from_key(key)
         return check_writer(key.rpartition("/")[2])
 
     def writers_expression(self, robot: str) -> str:
         return writer_expression(robot)
 
-    def announced(self, token: str, robot: str) -> Announced | None:
+    def announced(self, token: str, robot: str) -> Announcement | None:
         try:
-            return Announced.parse(*parse_writer_key(token))
+            return Announcement.parse(*parse_writer_key(token))
         except InvalidInput:
             return None
 

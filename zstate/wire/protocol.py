@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol
 
 from msgspec import Struct
 
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Message
-from zstate.wire.sample_names import SampleNames
-from zstate.wire.writer import Announced, Writer
 
 
 class SerializedSample(Struct, frozen=True, gc=False):
@@ -84,19 +84,19 @@ class Wire(Protocol):
         """The streams of a robot that several writers publish, each a part."""
         ...
 
-    def node_token(self, robot: str, writer: Writer, node: EntityId) -> str | None:
+    def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
         """The liveliness token of ``writer`` as a node of the ROS graph; None if there is no such graph."""
         ...
 
     def stream_encoder(
         self,
         robot: str,
-        writer: Writer,
+        writer: WriterId,
         stream: Stream,
         *,
         node: EntityId,
         number: int,
-        sample_names: SampleNames,
+        sample_names: SampleLayout,
         name: str = "",
     ) -> StreamEncoder:
         """The encoder of ``stream`` of ``robot`` for ``writer``.
@@ -107,7 +107,7 @@ class Wire(Protocol):
         ...
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         """The liveliness tokens of ``reader`` for ``streams`` of ``robot``, or of all robots for ``"*"``.
 
@@ -138,6 +138,6 @@ class Wire(Protocol):
         """The key expression of the tokens of all writers of ``robot``, or of all robots for ``"*"``."""
         ...
 
-    def announced(self, token: str, robot: str) -> Announced | None:
+    def announced(self, token: str, robot: str) -> Announcement | None:
         """The writer and stream of a token under that expression; None for any other token."""
         ...

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zstate import RobotModel, load_model
-from zstate.model.edges import EdgeTable
+from zstate.model.joint_transforms import JointTransforms
 
 FIRST = 1_790_000_000_000_000_000
 
@@ -54,7 +54,7 @@ class World:
         edges = [(joint.parent, joint.child) for joint in self.model.joints]
         fixed = np.array([joint.type == "fixed" for joint in self.model.joints])
         positions = self.positions()
-        poses = EdgeTable(self.model).poses(positions)
+        poses = JointTransforms(self.model).poses(positions)
         head = {
             "target": self.target,
             "source": self.source,

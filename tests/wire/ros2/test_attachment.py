@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import MessageError
-from zstate.wire.ros2.attachment import Attachment, pack, session_of, unpack
+from zstate.wire.ros2.attachment import Attachment, pack, session_from_gid, unpack
 
 GID = bytes(range(16))
 INT64 = st.integers(-(2**63), 2**63 - 1)
@@ -58,5 +58,5 @@ def test_no_bytes_raise_anything_else(data: bytes):
 
 
 def test_the_session_is_the_first_half_of_the_gid():
-    assert session_of(GID) == sum(byte << (8 * place) for place, byte in enumerate(range(8)))
-    assert session_of(GID) == session_of(GID[:8] + bytes(8))
+    assert session_from_gid(GID) == sum(byte << (8 * place) for place, byte in enumerate(range(8)))
+    assert session_from_gid(GID) == session_from_gid(GID[:8] + bytes(8))

@@ -6,32 +6,32 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block
-from zstate.wire.ros2.cdr import Reader, Writer
+from zstate.wire.ros2.cdr import CdrReader, CdrWriter
 
 LITTLE, BIG = b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
 BLOCKS = st.lists(st.floats(), max_size=4).map(to_block)
 
 
-def reader(payload: bytes) -> Reader:
-    return Reader(payload, "test/msg/Thing")
+def reader(payload: bytes) -> CdrReader:
+    return CdrReader(payload, "test/msg/Thing")
 
 
 def test_a_string_counts_its_nul_and_the_next_count_stands_at_a_multiple_of_four():
-    writer = Writer()
+    writer = CdrWriter()
     writer.text("ab")
     writer.count(9)
     assert writer.payload() == LITTLE + struct.pack("<I3sxI", 3, b"ab\0", 9)
 
 
 def test_doubles_stand_at_a_multiple_of_eight_from_the_fifth_byte():
-    writer = Writer()
+    writer = CdrWriter()
     writer.sequence(to_block([0.5]))
     assert writer.payload() == LITTLE + struct.pack("<I4xd", 1, 0.5)
 
 
 def test_an_empty_sequence_leaves_no_gap():
-    writer = Writer()
+    writer = CdrWriter()
     writer.sequence(b"")
     writer.count(9)
     assert writer.payload() == LITTLE + struct.pack("<2I", 0, 9)
@@ -49,7 +49,7 @@ VALUES = st.one_of(
 def test_whatever_is_written_is_read_again_and_what_follows_is_passed_over(
     values: list[tuple[str, object]], trailing: bytes
 ):
-    writer = Writer()
+    writer = CdrWriter()
     for kind, value in values:
         getattr(writer, kind)(value)
     payload = writer.payload()
@@ -60,7 +60,7 @@ def test_whatever_is_written_is_read_again_and_what_follows_is_passed_over(
 
 @given(st.lists(VALUES, max_size=8), st.data())
 def test_a_message_cut_off_anywhere_is_truncated(values: list[tuple[str, object]], data: st.DataObject):
-    writer = Writer()
+    writer = CdrWriter()
     for kind, value in values:
         getattr(writer, kind)(value)
     whole = writer.payload()
@@ -115,7 +115,7 @@ def test_a_string_that_is_not_one_is_malformed(data: bytes):
     assert caught.value.reason == "malformed"
 
 
-@pytest.mark.parametrize("take", [Reader.text, Reader.sequence])
+@pytest.mark.parametrize("take", [CdrReader.text, CdrReader.sequence])
 @pytest.mark.parametrize("count", [2, 2**31, 2**32 - 1])
 def test_a_count_beyond_the_end_is_truncated_before_anything_is_made_of_it(take, count: int):
     with pytest.raises(MessageError, match="more were to come") as caught:
@@ -126,4 +126,4 @@ def test_a_count_beyond_the_end_is_truncated_before_anything_is_made_of_it(take,
 @pytest.mark.parametrize("text", ["a\0b", "\0", "\ud800"])
 def test_a_text_that_cannot_travel_is_not_written(text: str):
     with pytest.raises(InvalidInput):
-        Writer().text(text)
+        CdrWriter().text(text)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.ros2.times import from_time, pack_stamp, to_time, unpack_stamps
+from zstate.wire.ros2.cdr import from_time, pack_stamp, to_time, unpack_stamps
 
 SECOND = 10**9
 FIRST, LAST = -(2**31) * SECOND, (2**31) * SECOND - 1

@@ -6,7 +6,7 @@ from wire.ros2.by_hand import rosbags_cdr, rosbags_joint_state, rosbags_tf_messa
 
 from zstate.errors import MessageError
 from zstate.wire.messages import (
-    Clock,
+    ClockMessage,
     JointState,
     RobotDescription,
     StaticTransforms,
@@ -15,8 +15,8 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
 )
+from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.frame_names import FrameNames
-from zstate.wire.ros2.hearing import RosHearing
 from zstate.wire.ros2.options import Ros2Options
 
 STAMP = 1_700_000_000_123_456_789
@@ -27,7 +27,7 @@ PREFIXED = FrameNames(Ros2Options(frame_prefix="r1/"), "r1")
 
 
 def heard(stream, payload: bytes, names: FrameNames = PLAIN):
-    return RosHearing().messages(stream, payload, 77, 5, names)
+    return RosDecoder().messages(stream, payload, 77, 5, names)
 
 
 def test_a_joint_state_keeps_its_stamp_names_and_numbers_and_is_signed_by_its_writer():
@@ -91,7 +91,9 @@ def test_a_description_is_known_by_its_text():
 
 
 def test_a_clock_may_stand_at_zero():
-    assert heard("clock", rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(0))) == (Clock(0, 5, 77),)
+    assert heard("clock", rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(0))) == (
+        ClockMessage(0, 5, 77),
+    )
 
 
 @pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description", "clock"])

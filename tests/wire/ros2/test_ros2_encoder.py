@@ -14,8 +14,9 @@ from wire.ros2.by_hand import (
 )
 
 from zstate.errors import InvalidInput
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import (
-    Clock,
+    ClockMessage,
     JointCommand,
     JointState,
     RobotDescription,
@@ -27,7 +28,6 @@ from zstate.wire.messages import (
 from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.sample_names import SampleNames
 
 STAMP = 1_700_000_000_123_456_789
 DIGEST = b"8 bytes."
@@ -35,12 +35,12 @@ EDGES = (("base", "arm"), ("arm", "fleet/tool"))
 POSES = np.random.default_rng(3).normal(size=(2, 7))
 # A floating joint "body" before a hinge: seven and one positions, six and one velocities.
 BODY = tuple(f"body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw"))
-DRONE = SampleNames((*BODY, "hinge"), (0, 1, 2, 3, 4, 5, 7), EDGES)
-ARM = SampleNames(("a", "b"), (0, 1), EDGES)
+DRONE = SampleLayout((*BODY, "hinge"), (0, 1, 2, 3, 4, 5, 7), EDGES)
+ARM = SampleLayout(("a", "b"), (0, 1), EDGES)
 GID = bytes(range(16))
 
 
-def encoder(sample_names: SampleNames = ARM, gid: bytes | None = GID, prefix: str = "") -> RosStreamEncoder:
+def encoder(sample_names: SampleLayout = ARM, gid: bytes | None = GID, prefix: str = "") -> RosStreamEncoder:
     names = FrameNames(Ros2Options(frame_prefix=prefix), "r1")
     return RosStreamEncoder("joint_states", TopicAddress("key", "token", gid), names, sample_names)
 
@@ -99,7 +99,7 @@ def test_a_description_is_its_text_and_a_clock_its_time():
     assert encoder().encode(description) == rosbags_cdr("std_msgs/msg/String", "<robot name='ä'/>")
     for stamp in (0, STAMP):
         expected = rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(stamp))
-        assert encoder().encode(Clock(stamp, 0, 1)) == expected
+        assert encoder().encode(ClockMessage(stamp, 0, 1)) == expected
 
 
 @pytest.mark.parametrize("stamp", [0, 2**31 * 10**9, -(2**31) * 10**9 - 1])

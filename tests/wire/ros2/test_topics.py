@@ -2,7 +2,7 @@ import pytest
 
 from zstate.errors import InvalidInput
 from zstate.wire.ros2.options import Ros2Options
-from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, type_of
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, ros_type
 
 STREAMS = ("joint_states", "robot_description", "tf", "tf_static", "clock")
 # `ros2 topic info -v` of a genuine ROS 2 names these hashes.
@@ -101,7 +101,7 @@ def test_ros_has_no_topic_for_joint_commands(layout):
         ):
             use("panda", "joint_commands")
     with pytest.raises(InvalidInput):
-        type_of("joint_commands")
+        ros_type("joint_commands")
 
 
 @pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])

@@ -19,18 +19,18 @@ from wire.ros2.raw_nodes import (
 )
 
 from zstate.errors import MessageError
+from zstate.wire.identity import WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire
-from zstate.wire.sample_names import SampleNames
-from zstate.wire.writer import Writer
 
 STAMP = 1_700_000_000_123_456_789
 GOOD = rosbags_joint_state(STAMP, "", ("a",), [1.0], [], [])
 GID = bytes(range(16))
 ZID = "aac3178e146ba6f1fc6e6a4085e77f21"
-WRITER = Writer("arm driver", "host", 4, 5, 6)
+WRITER = WriterId("arm driver", "host", 4, 5, 6)
 DDS_TOPICS = {
     "joint_states": "sensor_msgs§msg§JointState",
     "tf": "tf2_msgs§msg§TFMessage",
@@ -57,7 +57,7 @@ def arrival(
 
 def encoder_of(wire: Ros2Wire, stream: Stream, number: int) -> StreamEncoder:
     node = EntityId(ZID, 3)
-    return wire.stream_encoder("r1", WRITER, stream, node=node, number=number, sample_names=SampleNames())
+    return wire.stream_encoder("r1", WRITER, stream, node=node, number=number, sample_names=SampleLayout())
 
 
 def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():

@@ -1,4 +1,4 @@
-/* Edges: all edges of a robot from its positions, for EdgeTable in zstate/model/edges.py. */
+/* Edges: all edges of a robot from its positions, for EdgeTable in zstate/model/joint_transforms.py. */
 
 typedef struct {
     PyObject_HEAD

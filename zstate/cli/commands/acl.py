@@ -62,11 +62,11 @@ def acl_command(
     zstate acl --robot r1 --robot r2 --viewer rviz --wire 'ros2:namespace=*,tf=namespace' >acl.json5
     zstate router --listen tls/0.0.0.0:7447 --certs certs --identity router --acl acl.json5
     """
-    from zstate.net.access import Fleet, access_text
+    from zstate.net.security.acl import AclRoles, access_text
 
     if not any((robot, viewer, operator, timekeeper, placer)):
         raise click.UsageError(
             "name somebody: --robot NAME, --viewer NAME, --operator NAME, --timekeeper NAME or --placer NAME"
         )
-    fleet = Fleet(robot, viewer, operator, timekeeper, namespace, wires, placer)
+    fleet = AclRoles(robot, viewer, operator, timekeeper, namespace, wires, placer)
     print_result(access_text(fleet).rstrip("\n"))

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.metrics import of_bridge, served
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import metrics_option, session_options
 from zstate.cli.output.console import fail, print_status, print_wrapped
+from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import Unreachable
 
 if TYPE_CHECKING:
-    from zstate.bridge import Way
+    from zstate.bridges.ros2 import Way
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.session import Session
 
@@ -42,7 +42,7 @@ _ROS_ROUTER = "tcp/127.0.0.1:7447"
 @metrics_option
 @session_options
 def bridge_command(
-    *, network: Network, robot: str | None, wire: str, ros: str, metrics: BindAddress | None
+    *, network: SessionOptions, robot: str | None, wire: str, ros: str, metrics: BindAddress | None
 ) -> None:
     """Carry ROBOT between zstate's native wire and ROS 2 nodes that run rmw_zenoh, both ways.
 
@@ -54,8 +54,8 @@ def bridge_command(
     out while one robot alone is announced natively, and with namespace=*, where each robot has a
     namespace of its name.
     """
-    from zstate.bridge import Bridge
-    from zstate.clock import wait_in_slices
+    from zstate.bridges.ros2 import Bridge
+    from zstate.clock import wait_interruptible
 
     has_room = _has_room_for_all(wire)
     with open_session(network) as native, _ros_session(ros) as session:
@@ -67,15 +67,15 @@ def bridge_command(
             named = " and ".join(map(repr, robots)) if robots else "every robot"
             print_wrapped(f"bridging {named} between native and {wire} at {ros}")
             print_status("a robot is carried as soon as its robot_description is heard")
-            wait_in_slices(threading.Event())
+            wait_interruptible(threading.Event())
 
 
 def _has_room_for_all(wire: str) -> bool:
-    from zstate.net.wires import wire_named
     from zstate.wire.keys import ANY
+    from zstate.wire.registry import get_wire
     from zstate.wire.ros2.wire import Ros2Wire
 
-    spoken = wire_named(wire)
+    spoken = get_wire(wire)
     return isinstance(spoken, Ros2Wire) and spoken.options.namespace == ANY
 
 

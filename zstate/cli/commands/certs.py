@@ -45,10 +45,10 @@ def certs_command(
     zstate ls --connect tls/192.168.1.10:7447 --certs fleet --identity viewer
     zstate certs fleet --server peer1 --server peer2   # for direct links, without a router
     """
-    from zstate.net.certificates import issue_identities
-    from zstate.net.security import AUTHORITY, CertificateFiles
+    from zstate.net.security.certificates import issue_identities
+    from zstate.net.security.credentials import AUTHORITY, CertificateFiles
 
-    authority = CertificateFiles.of(folder, AUTHORITY)
+    authority = CertificateFiles.for_name(folder, AUTHORITY)
     names = (*identities, *(name for name in servers if name not in identities))
     if not names:
         raise click.UsageError("say whom: --identity NAME, or --server NAME for whoever listens")

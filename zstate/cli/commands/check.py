@@ -13,7 +13,7 @@ import click
 from zstate.cli.options import json_option, xacro_arguments
 from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped
 from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, in_columns, tree_lines
-from zstate.errors import Found, ModelError
+from zstate.errors import FindingLike, ModelError
 
 if TYPE_CHECKING:
     from zstate.model.robot import Joint, RobotModel
@@ -45,7 +45,7 @@ def check_command(
     zstate check arm.urdf.xacro prefix:=left_
     xacro arm.xacro | zstate check -
     """
-    from zstate.model.catalog import load_model
+    from zstate.model.load import load_model
 
     name = _STDIN if file == "-" else file
     model, findings = None, ()
@@ -64,7 +64,12 @@ def check_command(
 
 
 def _report(
-    name: str, model: RobotModel | None, findings: Sequence[Found], *, fix_hints: bool, joint_table: bool
+    name: str,
+    model: RobotModel | None,
+    findings: Sequence[FindingLike],
+    *,
+    fix_hints: bool,
+    joint_table: bool,
 ) -> str:
     if model is None:
         errors = sum(finding.severity == "error" for finding in findings)
@@ -153,7 +158,7 @@ def _limits_text(joint: Joint) -> str:
     return f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}"
 
 
-def _facts(name: str, model: RobotModel | None, findings: Sequence[Found]) -> dict[str, Any]:
+def _facts(name: str, model: RobotModel | None, findings: Sequence[FindingLike]) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "source": name,
         "usable": model is not None,

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import load_robot, rate_option, seconds_option, xacro_arguments
 from zstate.cli.output.console import count_text, fail, print_status, print_wrapped
+from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import UnknownModel
 
 if TYPE_CHECKING:
-    from zstate.cli.metered_buffer import MeteredBuffer
+    from zstate.metrics.buffer import MeteredBuffer
     from zstate.model.robot import RobotModel
 
 _DEFAULT = "panda"
@@ -75,7 +75,7 @@ def demo_command(
 
 
 def _default_robot() -> str:
-    from zstate.model.known import example_name
+    from zstate.model.catalog import example_name
 
     robot = example_name()
     if robot != _DEFAULT:
@@ -84,13 +84,13 @@ def _default_robot() -> str:
 
 
 def _load(robot: str, xacro_args: dict[str, str]) -> tuple[RobotModel, str]:
-    from zstate.cli.telling_links import telling_links
+    from zstate.model.representative_links import representative_links
 
     try:
         model, called = load_robot(robot, None, xacro_args)
     except UnknownModel as error:
         fail(f"{error}; `zstate demo rrbot` works with what is here")
-    if not telling_links(model):
+    if not representative_links(model):
         fail(f"no link of {called!r} moves: there is nothing to show; `zstate check` shows its links")
     return model, called
 
@@ -104,21 +104,21 @@ def _free_port() -> int:
 def _look(
     endpoint: str, model: RobotModel, robot: str, ended: threading.Event, seconds: float | None
 ) -> None:
-    from zstate.cli.metered_buffer import MeteredBuffer
     from zstate.cli.output.demo_table import DemoTable
-    from zstate.cli.telling_links import telling_links
+    from zstate.metrics.buffer import MeteredBuffer
+    from zstate.model.representative_links import representative_links
     from zstate.nodes.listener import TransformListener
 
     buffer = MeteredBuffer()
     with (
-        open_session(Network(listen=(endpoint,))) as session,
+        open_session(SessionOptions(listen=(endpoint,))) as session,
         TransformListener(session, robot, buffer, history_on_join=False) as listener,
     ):
         print_status(f"waiting for {robot!r} ...")
         if not _has_begun(buffer, ended):
             return
         print_status(f"heard {robot!r} over {endpoint}; Ctrl-C ends this")
-        table = DemoTable(listener, buffer, robot, model.root, telling_links(model))
+        table = DemoTable(listener, buffer, robot, model.root, representative_links(model))
         try:
             table.show(ended, seconds)
         finally:

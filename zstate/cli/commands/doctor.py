@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.network import Network
 from zstate.cli.options import json_option, session_options, timeout_option, wire_option
 from zstate.cli.output.console import print_json, print_result
+from zstate.cli.session import SessionOptions
 
 if TYPE_CHECKING:
     from zstate.cli.doctor.check import Check
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @wire_option
 @session_options
 def doctor_command(
-    *, network: Network, robot: str, timeout: float, in_full: bool, as_json: bool, wire: str
+    *, network: SessionOptions, robot: str, timeout: float, in_full: bool, as_json: bool, wire: str
 ) -> None:
     """Say what is wrong with ROBOT, or with all robots, and what to do next.
 
@@ -42,7 +42,7 @@ def doctor_command(
     """
     from zstate.cli.doctor.check import first_broken
     from zstate.cli.doctor.diagnosis import conclusion_text, diagnosis, diagnosis_json
-    from zstate.cli.logs import keep_warnings_back
+    from zstate.cli.output.logs import keep_warnings_back
     from zstate.wire.keys import ANY, check_robot
 
     if robot != ANY:

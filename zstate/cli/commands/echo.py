@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import named_robot, refuse_topic, session_options, timeout_option, wire_option
 from zstate.cli.output.console import print_json, print_result
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.output.joint_state_text import ChangeFilter
@@ -43,7 +43,7 @@ def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> flo
 @session_options
 def echo_command(
     *,
-    network: Network,
+    network: SessionOptions,
     robot: str | None,
     once: bool,
     timeout: float,

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.output.console import fail, print_json, print_result, print_status, print_wrapped
-from zstate.cli.words import is_ros, words_of
+from zstate.cli.output.wire_text import is_ros, messages_for
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.net.graph import Graph
     from zstate.net.session import Session
+    from zstate.wire.identity import WriterId
     from zstate.wire.keys import Stream
-    from zstate.wire.writer import Writer
 
 _MEASURED_WITHIN_S = 0.4
 _READERS_WITHIN_S = 0.15
@@ -28,7 +28,7 @@ _READERS_WITHIN_S = 0.15
 @form_options("One JSON object: programs and streams.", "A picture, from left to right.")
 @wire_option
 @session_options
-def graph_command(network: Network, robot: str, form: str | None, wire: str) -> None:
+def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show who writes and who reads the streams of ROBOT, or of all robots.
 
     Programs that use zstate announce themselves; whoever subscribes to keys on its own does not. What is
@@ -53,7 +53,7 @@ def graph_command(network: Network, robot: str, form: str | None, wire: str) -> 
         title = "Who writes and reads what" if robot == "*" else f"Who writes and reads what of {robot}"
         _print(graph, form, title)
     else:
-        print_status(words_of(wire).announced(()))
+        print_status(messages_for(wire).announced(()))
 
 
 def _measured_graph(session: Session) -> Graph:
@@ -61,10 +61,10 @@ def _measured_graph(session: Session) -> Graph:
     from zstate.net.graph import graph_of
     from zstate.net.presence import discover, discover_readers
     from zstate.net.topic_statistics import FEW, TopicStatistics, WriterKey
-    from zstate.net.wires import wire_named
     from zstate.wire.keys import ANY
+    from zstate.wire.registry import get_wire
 
-    with TopicStatistics(session, wire_named("native"), window=FEW) as statistics:
+    with TopicStatistics(session, get_wire("native"), window=FEW) as statistics:
         statistics.subscribe("joint_states")
         robots = discover(session)
         readers = discover_readers(session, _READERS_WITHIN_S)
@@ -83,7 +83,7 @@ def _measured_graph(session: Session) -> Graph:
         ]
         statistics.wait(expected, _MEASURED_WITHIN_S)
 
-        def rate_of(robot: str, stream: Stream, writer: Writer) -> float | None:
+        def rate_of(robot: str, stream: Stream, writer: WriterId) -> float | None:
             source = statistics.get(WriterKey(robot, stream, writer.session))
             return None if source is None else source.published_hz()
 
@@ -92,10 +92,10 @@ def _measured_graph(session: Session) -> Graph:
 
 def _ros_graph(session: Session, wire: str) -> Graph:
     from zstate.net.graph import discover_ros_graph
-    from zstate.net.wires import wire_named
+    from zstate.wire.registry import get_wire
     from zstate.wire.ros2.wire import Ros2Wire
 
-    wire_format = wire_named(wire)
+    wire_format = get_wire(wire)
     assert isinstance(wire_format, Ros2Wire)
     return discover_ros_graph(session, wire_format).graph
 

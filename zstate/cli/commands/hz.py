@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     json_option,
     named_robot,
@@ -18,7 +17,8 @@ from zstate.cli.options import (
     wire_option,
 )
 from zstate.cli.output.console import fail, print_json, print_status, print_wrapped
-from zstate.cli.words import is_ros
+from zstate.cli.output.wire_text import is_ros
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.stream_reader import StreamReader, TimedSample
@@ -47,7 +47,7 @@ _SETTLING_S = 0.1
 @session_options
 def hz_command(
     *,
-    network: Network,
+    network: SessionOptions,
     robot: str | None,
     stream: Stream,
     window: int,

@@ -13,8 +13,7 @@ from zstate.cli.output.console import count_text, output_width, print_json, prin
 from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
-    from zstate.cli.recording_facts import RecordedRobot
-    from zstate.recording.info import RecordingInfo
+    from zstate.recording.info import RecordedRobot, RecordingInfo
 
 _HEADINGS = ("stream", "topic", "type", "count", "rate", "writer")
 _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of what can be read"
@@ -30,8 +29,7 @@ def info_command(file: str, as_json: bool) -> None:
     over the whole recording. What holds until further notice (robot_description, tf_static) is written
     again every 10 s, which is counted.
     """
-    from zstate.cli.recording_facts import recorded_robots
-    from zstate.recording.info import read_info
+    from zstate.recording.info import read_info, recorded_robots
 
     info = read_info(file)
     robots = recorded_robots(info)
@@ -89,7 +87,7 @@ def _robot_lines(robot: RecordedRobot) -> list[str]:
 
 
 def _other_lines(info: RecordingInfo) -> list[str]:
-    from zstate.cli.recording_facts import mean_rate, other_channels
+    from zstate.recording.info import mean_rate, other_channels
 
     rows = [
         ("  " + one.topic, one.type_name, str(one.count), rate_text(mean_rate(one, info.duration_s)))
@@ -102,7 +100,7 @@ def _other_lines(info: RecordingInfo) -> list[str]:
 
 
 def _facts(info: RecordingInfo, robots: Sequence[RecordedRobot]) -> dict[str, Any]:
-    from zstate.cli.recording_facts import other_channels
+    from zstate.recording.info import other_channels
 
     return {
         "path": str(info.path),

@@ -39,7 +39,7 @@ def init_command(
     zstate init arm.urdf -o cell.toml
     zstate init arm.urdf.xacro prefix:=left_
     """
-    from zstate.model.catalog import is_path
+    from zstate.model.load import is_path
 
     model, called = load_robot(robot, name, xacro_args)
     file = Path(output if output not in (None, "-") else f"{called}.toml")
@@ -75,7 +75,7 @@ def _cell_file_text(
 
 
 def _joint_rows(model: RobotModel) -> Sequence[str]:
-    from zstate.model.coordinates import coordinate_names
+    from zstate.model.robot import coordinate_names
 
     joints = {joint.name: joint for joint in model.joints}
     rows: list[tuple[str, ...]] = []

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.metrics import of_publishers, served
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     clock_option,
     load_robot,
@@ -21,7 +20,8 @@ from zstate.cli.options import (
     xacro_arguments,
 )
 from zstate.cli.output.console import count_text, print_wrapped
-from zstate.cli.words import words_of
+from zstate.cli.output.wire_text import messages_for
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
@@ -49,7 +49,7 @@ def joints_command(
     clock: str,
     takeover: bool,
     metrics: BindAddress | None,
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
 
@@ -76,6 +76,6 @@ def joints_command(
         served(metrics, of_publishers(publisher)),
     ):
         joints = count_text(len(model.joint_names), "joint")
-        place = words_of(wire).place(called, ("joint_states",))
+        place = messages_for(wire).place(called, ("joint_states",))
         print_wrapped(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
         run_publisher(publisher, SineSource(model), rate, seconds)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.output.console import (
     is_terminal,
@@ -19,7 +18,8 @@ from zstate.cli.output.console import (
     print_status,
     print_wrapped,
 )
-from zstate.cli.words import is_ros, words_of
+from zstate.cli.output.wire_text import is_ros, messages_for
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
@@ -38,7 +38,7 @@ _MEETING_S = 0.5
 @json_option("One JSON array; on ROS's side one object.")
 @wire_option
 @session_options
-def ls_command(network: Network, *, watch: bool, as_json: bool, wire: str) -> None:
+def ls_command(network: SessionOptions, *, watch: bool, as_json: bool, wire: str) -> None:
     """List the announced robots and, for each stream, who writes it since when.
 
     Of joint states also the rate, by their own stamps, and how long ago the last one came. On ROS's side:
@@ -67,10 +67,10 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
         ros_graph_text,
     )
     from zstate.net.graph import RosGraph, discover_ros_graph
-    from zstate.net.wires import wire_named
+    from zstate.wire.registry import get_wire
     from zstate.wire.ros2.wire import Ros2Wire
 
-    wire_format = wire_named(wire)
+    wire_format = get_wire(wire)
     assert isinstance(wire_format, Ros2Wire)
 
     def discover() -> RosGraph:
@@ -99,14 +99,14 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.net.presence import discover
     from zstate.net.topic_statistics import FEW, TopicStatistics
-    from zstate.net.wires import wire_named
+    from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:
         if not robots:
-            return words_of("native").announced(robots)
+            return messages_for("native").announced(robots)
         return robots_text(robots, statistics, width=output_width())
 
-    with TopicStatistics(session, wire_named("native"), window=FEW) as statistics:
+    with TopicStatistics(session, get_wire("native"), window=FEW) as statistics:
         statistics.subscribe("joint_states")
         if watch:
             with RobotDirectory(session) as roster:

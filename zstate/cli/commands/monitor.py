@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.metrics import of_listeners, of_writers, served
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     heard_robot_option,
     json_option,
@@ -22,12 +21,12 @@ from zstate.cli.options import (
     wire_option,
 )
 from zstate.cli.output.console import fail, is_terminal
+from zstate.cli.output.wire_text import default_stream
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.cli.words import followed
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
-    from zstate.cli.monitor.monitored import Monitored
-    from zstate.cli.robot_monitor import RobotMonitor
+    from zstate.cli.monitor import Monitored, RobotMonitor
     from zstate.metrics.endpoint import BindAddress
 
 _FIRST_AFTER_S = 1.0
@@ -49,7 +48,7 @@ _MEETING_S = 0.3
 @session_options
 def monitor_command(
     *,
-    network: Network,
+    network: SessionOptions,
     target: str | None,
     source: str | None,
     robots: bool,
@@ -82,9 +81,7 @@ def monitor_command(
     zstate monitor --robots
     zstate monitor --robots --robot panda --json --metrics 9100
     """
-    from zstate.cli.monitor.meter import EdgeStatistics
-    from zstate.cli.monitor.monitored import MonitoredEdges, MonitoredPose
-    from zstate.cli.robot_monitor import RobotMonitor
+    from zstate.cli.monitor import EdgeStatistics, MonitoredEdges, MonitoredPose, RobotMonitor
     from zstate.nodes.listener import TransformListener
 
     if robots and target is not None:
@@ -93,7 +90,7 @@ def monitor_command(
         raise click.UsageError("--metrics needs --robots")
     if target is not None and source is None:
         raise click.UsageError(f"{target!r} is one frame; give two of them, or none for all that are heard")
-    follow, once_s = followed(wire), timeout if once else None
+    follow, once_s = default_stream(wire), timeout if once else None
     with (
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as roster,

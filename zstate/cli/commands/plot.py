@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, wire_option
 from zstate.cli.output.console import count_text, fail, print_wrapped
+from zstate.cli.output.wire_text import messages_for
 from zstate.cli.robot_directory import only_robot
-from zstate.cli.words import words_of
+from zstate.cli.session import SessionOptions, open_session
 
 _LIVE_S = 5.0
 _FORMATS = (".png", ".svg", ".pdf")
@@ -50,7 +50,7 @@ def _checked_output(_: click.Context, __: click.Parameter, file: str | None) -> 
 @session_options
 def plot_command(
     *,
-    network: Network,
+    network: SessionOptions,
     robot: str | None,
     joints: tuple[str, ...],
     frames: tuple[str, str] | None,
@@ -86,7 +86,7 @@ def plot_command(
             series = plot.recorded_joints(file, robot, start_s, seconds)
     else:
         with open_session(network, (wire,)) as session:
-            name = robot or words_of(wire).robot or ("*" if frames else only_robot(session))
+            name = robot or messages_for(wire).robot or ("*" if frames else only_robot(session))
             if frames:
                 series = plot.live_path(session, name, wire, frames, seconds or _LIVE_S)
             else:

@@ -1,15 +1,18 @@
-"""zstate publish: the state publisher."""
+"""zstate publish: the state publisher.
+
+Joint states of somebody else, with a word when they begin.
+"""
 
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from zstate.cli.metrics import of_publishers, served
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
     clock_option,
@@ -23,16 +26,21 @@ from zstate.cli.options import (
     xacro_arguments,
 )
 from zstate.cli.output.console import count_text, fail, print_status, print_wrapped, report_text
+from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.processes import BackgroundCall
-from zstate.cli.words import is_ros, words_of
+from zstate.cli.session import SessionOptions, open_session
+from zstate.model.robot import RobotModel
+from zstate.net.session import Session
+from zstate.net.topic_statistics import mean_rate_hz
+from zstate.nodes.publisher import StatePublisher
+from zstate.sources import JointReading, SubscribedSource
 
 if TYPE_CHECKING:
-    from zstate.cli.heard_source import HeardSource
     from zstate.metrics.endpoint import BindAddress
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
-    from zstate.sources.source import JointSource
+    from zstate.sources.joint_source import JointSource
     from zstate.wire.keys import Stream
 
 _RATE_HZ = 100.0
@@ -84,7 +92,7 @@ def publish_command(
     name: str | None,
     takeover: bool,
     metrics: BindAddress | None,
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Publish the state of ROBOT: its model, its fixed edges, and transforms.
 
@@ -125,8 +133,8 @@ def publish_command(
         ) as whole,
         served(metrics, of_publishers(derived, whole)),
     ):
-        places = [words_of(wire).place(called, _DERIVED) for wire in followed]
-        places += [words_of(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]
+        places = [messages_for(wire).place(called, _DERIVED) for wire in followed]
+        places += [messages_for(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]
         _introduce(whole, places)
         _mention_router(network, wires)
         if followed:
@@ -144,7 +152,7 @@ def _introduce(publisher: StatePublisher, places: list[str]) -> None:
     _mention_warnings(model)
 
 
-def _mention_router(network: Network, wires: tuple[str, ...]) -> None:
+def _mention_router(network: SessionOptions, wires: tuple[str, ...]) -> None:
     if not network.is_given and len(set(map(is_ros, wires))) == 2:
         print_status("ROS 2 nodes are met at their router: say --connect, for instance tcp/127.0.0.1:7447")
 
@@ -164,9 +172,8 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
     rate_hz: float | None,
     seconds: float | None,
 ) -> None:
-    from zstate.cli.heard_source import HeardSource
 
-    words, robot = words_of(wire), derived.robot
+    words, robot = messages_for(wire), derived.robot
     place = words.place(robot, ("joint_states",))
     print_status(f"waiting for {place} ...")
     with HeardSource(session, derived.model, robot, wire, further=whole) as source:
@@ -175,7 +182,7 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
         else:
             _publish_every_sample(derived, source, seconds)
         if not source.count:
-            who = words.explained("`zstate ls` shows who writes what")
+            who = words.translate("`zstate ls` shows who writes what")
             fail(f"heard nothing on {place} in {seconds:g} s; {who}")
 
 
@@ -216,3 +223,50 @@ def _publish_every_sample(publisher: StatePublisher, source: HeardSource, second
     finally:
         if source.count:
             print_wrapped(f"{count_text(source.count, 'sample')} published, {source.rate_hz:.2f} Hz")
+
+
+class HeardSource(SubscribedSource):
+    """A SubscribedSource that announces the first reading and counts them all.
+
+    Each one is published by ``further`` as well.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        model: RobotModel,
+        robot: str,
+        wire: str,
+        *,
+        further: StatePublisher,
+    ) -> None:
+        super().__init__(session, model, robot, wire=wire)
+        self.count = 0
+        self._further = further
+        self._place = messages_for(wire).place(robot, ("joint_states",))
+        self._first = self._last = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """The rate of the readings so far, by their stamps; 0 for fewer than two."""
+        return mean_rate_hz(self.count, self._last - self._first) or 0.0
+
+    def read(self, stamp: int) -> JointReading | None:
+        reading = super().read(stamp)
+        if reading is not None:
+            self._note(reading)
+        return reading
+
+    def __iter__(self) -> Iterator[JointReading]:
+        for reading in super().__iter__():
+            self._note(reading)
+            yield reading
+
+    def _note(self, reading: JointReading) -> None:
+        assert reading.stamp is not None
+        if not self.count:
+            self._first = reading.stamp
+            print_status(f"heard {self._place}: {len(reading.positions)} positions")
+        self._last = reading.stamp
+        self.count += 1
+        self._further.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)

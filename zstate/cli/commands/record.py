@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.metrics import of_recorder, of_writers, served
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
 from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.output.recording_text import RecordProgress
@@ -62,7 +62,7 @@ def record_command(
     split_seconds: float | None,
     overwrite: bool,
     metrics: BindAddress | None,
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Record ROBOTs, or all there are, into the MCAP file FILE, until Ctrl-C.
 

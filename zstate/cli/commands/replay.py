@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
 from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
+from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def replay_command(
     loop: bool,
     wires: tuple[str, ...],
     takeover: bool,
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Publish what FILE holds of ROBOTs, or of all there are, with the stamps it was recorded with.
 

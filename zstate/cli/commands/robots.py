@@ -24,7 +24,7 @@ def robots_command(name: str, *, as_json: bool) -> None:
     zstate robots --json
     """
     from zstate.cli.output.text_layout import in_columns
-    from zstate.model.catalog import catalog
+    from zstate.model.load import catalog
 
     everything = catalog()
     entries = [entry for entry in everything if name.lower() in entry.name]

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import session_options
 from zstate.cli.output.console import count_text, print_result, print_status
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
+    from zstate.bridges.ros1.bridge import Ros1Bridge
+    from zstate.bridges.ros1.node import Node
     from zstate.model.robot import RobotModel
-    from zstate.ros1.bridge import Ros1Bridge
-    from zstate.ros1.node import Node
 
 _CHECK_HZ = 2.0
 
@@ -40,7 +40,7 @@ def ros1_command(
     source: str | None,
     frame_prefix: str,
     no_description: bool,
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Carry the joint states and transforms of ROBOT between zstate and ROS 1.
 
@@ -57,8 +57,8 @@ def ros1_command(
     /usr/bin/python3 -m venv --system-site-packages .venv
     .venv/bin/pip install zstate
     """
-    from zstate.ros1.bridge import Ros1Bridge
-    from zstate.ros1.node import Node
+    from zstate.bridges.ros1.bridge import Ros1Bridge
+    from zstate.bridges.ros1.node import Node
     from zstate.wire.keys import check_robot
 
     if not (to_ros or from_ros):
@@ -88,7 +88,7 @@ def ros1_command(
 
 
 def _model(source: str | None, *, from_ros: bool) -> RobotModel | None:
-    from zstate.model.catalog import load_model
+    from zstate.model.load import load_model
 
     if source is not None and not from_ros:
         raise click.UsageError("--model is the robot that comes --from-ros; zstate's own is known in zstate")

@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 import click
 
 from zstate.cli.metrics import of_connections, of_writers, served
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import config_option, metrics_option, router_identity_options
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
-    from zstate.net.router_config import RouterConfig
-    from zstate.net.security import Credentials
-    from zstate.net.thinning import Thinning
+    from zstate.net.security.credentials import Credentials
+    from zstate.net.security.router_config import Downsampling, RouterConfig
 
 
 @click.command("router")
@@ -96,7 +95,7 @@ def router_command(
             "--output": output,
         }
         _refuse_beside(file, [option for option, is_given in made.items() if is_given])
-        _run(Network("router", connect, listen, config, credentials), listen, metrics, file)
+        _run(SessionOptions("router", connect, listen, config, credentials), listen, metrics, file)
         return
     thinning = _thinning(downsample, robot, wan, namespace)
     router = _router(listen, connect, credentials, acl, thinning, ros2=ros2)
@@ -105,7 +104,7 @@ def router_command(
     if output is not None:
         _write_private(output, router.text())
     if not only_print and output is None:
-        network = Network("router", config=router.settings(), credentials=credentials)
+        network = SessionOptions("router", config=router.settings(), credentials=credentials)
         _run(network, router.listen, metrics)
 
 
@@ -130,15 +129,15 @@ def _router(
     connect: tuple[str, ...],
     credentials: Credentials | None,
     acl: str | None,
-    thinning: Thinning | None,
+    thinning: Downsampling | None,
     *,
     ros2: bool,
 ) -> RouterConfig:
-    from zstate.net.access_file import read_access_control
-    from zstate.net.modes import check_credentials, listening
-    from zstate.net.router_config import RouterConfig
+    from zstate.net.config import check_credentials, listen_endpoints
+    from zstate.net.security.acl import read_access_control
+    from zstate.net.security.router_config import RouterConfig
 
-    where = listening("router", listen, credentials)
+    where = listen_endpoints("router", listen, credentials)
     check_credentials("router", credentials, where)
     access = read_access_control(acl) if acl else {}
     return RouterConfig(where, connect, credentials, thinning, access, ros2)
@@ -146,14 +145,14 @@ def _router(
 
 def _thinning(
     downsample: tuple[str, ...], robots: tuple[str, ...], interfaces: tuple[str, ...], namespace: str
-) -> Thinning | None:
-    from zstate.net.thinning import Thinning
+) -> Downsampling | None:
+    from zstate.net.security.router_config import Downsampling
 
     if not downsample:
         if robots or interfaces or namespace:
             raise click.UsageError("--robot, --wan and --namespace say what --downsample STREAM=HZ is for")
         return None
-    return Thinning(dict(map(_stream_rate, downsample)), robots, interfaces, namespace)
+    return Downsampling(dict(map(_stream_rate, downsample)), robots, interfaces, namespace)
 
 
 def _stream_rate(text: str) -> tuple[str, float]:
@@ -164,9 +163,11 @@ def _stream_rate(text: str) -> tuple[str, float]:
         raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
 
 
-def _run(network: Network, listen: tuple[str, ...], metrics: BindAddress | None, file: str = "") -> None:
-    from zstate.clock import wait_in_slices
-    from zstate.net.modes import listening
+def _run(
+    network: SessionOptions, listen: tuple[str, ...], metrics: BindAddress | None, file: str = ""
+) -> None:
+    from zstate.clock import wait_interruptible
+    from zstate.net.config import listen_endpoints
 
     with (
         open_session(network) as session,
@@ -174,7 +175,7 @@ def _run(network: Network, listen: tuple[str, ...], metrics: BindAddress | None,
         served(metrics, of_connections(session), of_writers(roster)),
     ):
         print_wrapped(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
-        if listen == (default := listening("router", (), network.credentials)):
+        if listen == (default := listen_endpoints("router", (), network.credentials)):
             opened = default[0].replace("127.0.0.1", "0.0.0.0")
             print_status(f"it serves this host alone; --listen {opened} opens it to the network")
-        wait_in_slices(threading.Event())
+        wait_interruptible(threading.Event())

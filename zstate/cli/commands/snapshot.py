@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from zstate.cli import logs
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
     seconds_option,
@@ -20,7 +18,9 @@ from zstate.cli.options import (
     wire_option,
     wires_option,
 )
+from zstate.cli.output import logs
 from zstate.cli.output.console import count_text, fail, print_result, print_status
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.snapshot import Configuration
@@ -47,7 +47,7 @@ def snapshot_command() -> None:
 @wire_option
 @session_options
 def save_command(
-    *, file: str, robots: tuple[str, ...], force: bool, timeout: float, wire: str, network: Network
+    *, file: str, robots: tuple[str, ...], force: bool, timeout: float, wire: str, network: SessionOptions
 ) -> None:
     """Write the announced robots, or the named ones, to FILE: TOML, or JSON for a name in .json.
 
@@ -107,7 +107,7 @@ def load_command(
     seconds: float | None,
     takeover: bool,
     wires: tuple[str, ...],
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Publish the robots of FILE, or the named ones, until Ctrl-C, with the saved joint positions.
 
@@ -134,8 +134,8 @@ def load_command(
 
 
 def _joining(
-    saved: Configuration, network: Network, wires: tuple[str, ...], *, as_saved: bool
-) -> tuple[Network, tuple[str, ...]]:
+    saved: Configuration, network: SessionOptions, wires: tuple[str, ...], *, as_saved: bool
+) -> tuple[SessionOptions, tuple[str, ...]]:
     """The session options and wires to use. Logs a note if they differ from the saved ones or repeat them."""
     is_wire_given = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
     if as_saved:

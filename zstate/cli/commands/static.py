@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import session_options, takeover_option, wire_option
 from zstate.cli.output.console import fail, print_status, print_wrapped
-from zstate.cli.words import is_ros, words_of
+from zstate.cli.output.wire_text import is_ros, messages_for
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.up.schema import Quaternion, Vector3
@@ -69,7 +69,7 @@ def static_command(
     new: bool,
     takeover: bool,
     wire: str,
-    network: Network,
+    network: SessionOptions,
 ) -> None:
     """Publish the pose of SOURCE in TARGET until Ctrl-C; then it is withdrawn.
 
@@ -90,7 +90,7 @@ def static_command(
     zstate static base_link laser --xyz 0.2 0 0.1 --wire ros2      # on /tf_static
     """
     from zstate.cli.frame_checks import unknown_target_warnings
-    from zstate.clock import wait_in_slices
+    from zstate.clock import wait_interruptible
     from zstate.nodes.static_publisher import StaticPublisher
 
     if file is not None:
@@ -118,7 +118,7 @@ def static_command(
         for publisher, owned in published:
             for text in unknown_target_warnings(session, publisher, owned):
                 print_status(f"warning: {text}", event="warning", robot=publisher.robot)
-        wait_in_slices(threading.Event())
+        wait_interruptible(threading.Event())
 
 
 def _edges_of_file(
@@ -165,7 +165,7 @@ def _owner_by_name(edge: Transform, wires: tuple[str, ...]) -> str | None:
 
 
 def _robot_of_wire(wire: str) -> str:
-    robot = words_of(wire).robot
+    robot = messages_for(wire).robot
     if robot is None:
         raise click.UsageError("say --robot NAME; on this wire each robot has a namespace of its name")
     return robot
@@ -177,7 +177,7 @@ def _only_robot(session: Session) -> str:
     print_status("looking for the robot this belongs to ...")
     robots = discover(session)
     if len(robots) != 1:
-        fail(f"whose edge is this? Say --robot NAME ({words_of('native').announced(robots)})")
+        fail(f"whose edge is this? Say --robot NAME ({messages_for('native').announced(robots)})")
     return robots[0].name
 
 
@@ -190,7 +190,7 @@ def _sentence(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...
         f"rpy [{roll:g}, {pitch:g}, {yaw:g}] deg"
     )
     places = " and ".join(
-        words_of(wire).place(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
+        messages_for(wire).place(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
     )
     if "native" not in wires:
         return f"{pose}, on {places}; Ctrl-C ends it for those who join later"

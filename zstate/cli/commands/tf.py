@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import (
     checked_rate,
     heard_robot_option,
@@ -21,8 +20,9 @@ from zstate.cli.options import (
     wire_option,
 )
 from zstate.cli.output.console import print_json, print_result, print_status
+from zstate.cli.output.wire_text import default_stream
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.cli.words import followed
+from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
 @session_options
 def tf_command(
     *,
-    network: Network,
+    network: SessionOptions,
     target: str,
     source: str,
     once: bool,
@@ -117,7 +117,9 @@ def tf_command(
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as directory,
         open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
-        TransformListener(session, robot, wire=wire, follow=followed(wire), clock=time_kept) as listener,
+        TransformListener(
+            session, robot, wire=wire, follow=default_stream(wire), clock=time_kept
+        ) as listener,
     ):
         waiter = PoseWaiter(listener, directory, target, source)
 
@@ -185,10 +187,10 @@ def transform_text(transform: Transform, precision: int = 3) -> str:
     """A transform as tf2_echo prints it, with all nine digits of the stamp."""
     from math import degrees
 
-    from zstate.clock import stamp_text
+    from zstate.clock import format_stamp
 
     pose, rpy = transform.pose7.tolist(), transform.rpy.tolist()
-    when = "At any time (static)" if transform.stamp is None else f"At time {stamp_text(transform.stamp)}"
+    when = "At any time (static)" if transform.stamp is None else f"At time {format_stamp(transform.stamp)}"
     rows = [[_digits(value, precision) for value in row] for row in transform.matrix.tolist()]
     lines = [
         when,

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.output.console import output_width, print_json, print_result
-from zstate.cli.words import is_ros, words_of
+from zstate.cli.output.wire_text import is_ros, messages_for
+from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
-    from zstate.cli.words import Words
+    from zstate.cli.output.wire_text import WireMessages
 
 
 @click.command("tree")
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @form_options("One JSON array of frames.", "A picture, from the top down.")
 @wire_option
 @session_options
-def tree_command(network: Network, robot: str, form: str | None, wire: str) -> None:
+def tree_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 
     For each edge: its kind, the rate of its samples, the age of the newest one, and who writes it. In a
@@ -47,14 +47,14 @@ def tree_command(network: Network, robot: str, form: str | None, wire: str) -> N
         print_json([_facts(frame, now) for frame in frames])
     elif frames:
         title = "Frames" if robot == "*" else f"Frames of {robot}"
-        named = [_named(frame, words_of(wire)) for frame in frames]
+        named = [_named(frame, messages_for(wire)) for frame in frames]
         print_result(_drawn(named, now, form, in_full=not is_native, title=title))
 
 
-def _named(frame: FrameInfo, words: Words) -> FrameInfo:
+def _named(frame: FrameInfo, words: WireMessages) -> FrameInfo:
     """The frame with the names that its wire format uses."""
-    parent = None if frame.parent is None else words.explained(frame.parent)
-    return replace(frame, name=words.explained(frame.name), parent=parent)
+    parent = None if frame.parent is None else words.translate(frame.parent)
+    return replace(frame, name=words.translate(frame.name), parent=parent)
 
 
 def _drawn(frames: Sequence[FrameInfo], now: int, form: str | None, *, in_full: bool, title: str) -> str:

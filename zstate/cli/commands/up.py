@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli import logs
+from zstate.cli.output import logs
 from zstate.cli.output.console import fail, print_result
 from zstate.cli.output.text_layout import in_columns
 
@@ -109,7 +109,7 @@ def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:
 
     def show(name: str, line: str, is_error: bool) -> None:
         if logs.is_json():
-            logs.pass_on(line, is_error=is_error, part=name)
+            logs.forward_line(line, is_error=is_error, part=name)
         else:
             print_result(prefixes[name] + line)
 

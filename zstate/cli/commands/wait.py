@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import click
 
-from zstate.cli.network import Network, open_session
 from zstate.cli.options import json_option, session_options, timeout_option, wire_option
 from zstate.cli.output.console import GRACE_S, count_text, fail, print_json, print_result, print_status
+from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import Unreachable, ZStateError
 
 
@@ -21,7 +21,7 @@ from zstate.errors import Unreachable, ZStateError
 @wire_option
 @session_options
 def wait_command(
-    *, network: Network, what: str, names: tuple[str, ...], timeout: float, as_json: bool, wire: str
+    *, network: SessionOptions, what: str, names: tuple[str, ...], timeout: float, as_json: bool, wire: str
 ) -> None:
     """Wait until something is there, and end.
 
@@ -67,7 +67,7 @@ def _print_outcome(what: str, names: tuple[str, ...], began: float, reason: str 
     )
 
 
-def _wait_for_robots(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+def _wait_for_robots(network: SessionOptions, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
     from zstate.cli.waiting import RobotReadiness
     from zstate.wire.keys import check_robot
 
@@ -85,10 +85,10 @@ def _wait_for_robots(network: Network, names: tuple[str, ...], wire: str, timeou
         return f"ready: {', '.join(ready)}"
 
 
-def _wait_for_pose(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+def _wait_for_pose(network: SessionOptions, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+    from zstate.cli.output.wire_text import default_stream
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.cli.waiting import PoseWaiter
-    from zstate.cli.words import followed
     from zstate.nodes.listener import TransformListener
 
     target, source = names
@@ -96,7 +96,7 @@ def _wait_for_pose(network: Network, names: tuple[str, ...], wire: str, timeout_
     with (
         open_session(network, (wire,), timeout_s=timeout_s) as session,
         RobotDirectory(session, "*", wire) as directory,
-        TransformListener(session, wire=wire, follow=followed(wire)) as listener,
+        TransformListener(session, wire=wire, follow=default_stream(wire)) as listener,
     ):
         PoseWaiter(listener, directory, target, source).answer(
             timeout_s=max(round(deadline - time.monotonic(), 1), 0.1)
@@ -104,7 +104,7 @@ def _wait_for_pose(network: Network, names: tuple[str, ...], wire: str, timeout_
     return f"ready: the pose of {source!r} in {target!r} is known"
 
 
-def _wait_for_router(network: Network, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
+def _wait_for_router(network: SessionOptions, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
     from zstate.cli.processes import BackgroundCall
     from zstate.net.config import ROUTER_ENDPOINT
 

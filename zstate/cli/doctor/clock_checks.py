@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.ear import Ear
-from zstate.clock import SYSTEM, stamp_text
-from zstate.errors import NoClock, duration_text
+from zstate.clock import SYSTEM, format_stamp
+from zstate.errors import NoClock, format_duration
 from zstate.ingest.stamp_checks import FAR_NS, likely_cause
 from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.session import Session
@@ -36,7 +36,7 @@ def clocks_check(ear: Ear) -> Check:
 
 def _offset_text(one: MeasuredOffset) -> str:
     side = "ahead of" if one.offset_ns > 0 else "behind"
-    size, bound = duration_text(abs(one.offset_ns)), duration_text(one.uncertainty_ns)
+    size, bound = format_duration(abs(one.offset_ns)), format_duration(one.uncertainty_ns)
     return f"that of {one.writer} is {size} {side} this one (± {bound})"
 
 
@@ -63,26 +63,26 @@ def stamps_check(ear: Ear, session: Session) -> Check:
         return skipped("stamps", "there is no sample")
     if ear.description is not None and ear.description.clock not in ("", SYSTEM):
         return _simulated_check(ear.description.clock, session)
-    return _far_check(ear, window) or _standing_check(ear, window) or _near_check(ear, window)
+    return _far_check(ear, window) or _frozen_stamp_check(ear, window) or _near_check(ear, window)
 
 
 def _far_check(ear: Ear, window: Window) -> Check | None:
     least, stamp = window.delays[0], window.received[-1].stamp
     if abs(least) <= FAR_NS:
         return None
-    size = f"{duration_text(abs(least))} {'before' if least > 0 else 'after'}"
+    size = f"{format_duration(abs(least))} {'before' if least > 0 else 'after'}"
     text = (
-        f"{ear.samples_writer} stamps samples {size} the time here ({stamp_text(stamp)}): "
+        f"{ear.samples_writer} stamps samples {size} the time here ({format_stamp(stamp)}): "
         f"{likely_cause(stamp, stamp + least)}"
     )
     return broken("stamps", text, _STAMPS)
 
 
-def _standing_check(ear: Ear, window: Window) -> Check | None:
+def _frozen_stamp_check(ear: Ear, window: Window) -> Check | None:
     stamps = {one.stamp for one in window.received}
     if len(window.received) < 3 or len(stamps) > 1:
         return None
-    stamp = stamp_text(stamps.pop())
+    stamp = format_stamp(stamps.pop())
     text = f"{ear.samples_writer} gives every sample the same stamp, {stamp}: what it reads stands still"
     return broken("stamps", text, f"zstate echo {ear.info.name}")
 
@@ -91,11 +91,11 @@ def _near_check(ear: Ear, window: Window) -> Check:
     least, greatest = window.delays
     if least < -_DISTURBS_NS:
         text, then = _cause(ear)
-        text = f"{ear.samples_writer} stamps samples up to {duration_text(-least)} in the future{text}"
+        text = f"{ear.samples_writer} stamps samples up to {format_duration(-least)} in the future{text}"
         return (broken if least < -_BREAKS_NS else warning)("stamps", text, then)
     if least > _BREAKS_NS:
         text, then = _cause(ear)
-        text = f"samples of {ear.samples_writer} come {duration_text(least)} after their stamps{text}"
+        text = f"samples of {ear.samples_writer} come {format_duration(least)} after their stamps{text}"
         return warning("stamps", text, then)
     return ok("stamps", f"{_delay_text(least)} to {_delay_text(greatest)} old as they come")
 
@@ -120,8 +120,8 @@ def _simulated_check(domain: str, session: Session) -> Check:
             return broken(
                 "stamps", f"of the simulated time {domain!r}: {error}", "zstate replay FILE --clock"
             )
-    return ok("stamps", f"of the simulated time {domain!r}, where it is {stamp_text(now)}")
+    return ok("stamps", f"of the simulated time {domain!r}, where it is {format_stamp(now)}")
 
 
 def _delay_text(nanoseconds: int) -> str:
-    return duration_text(max(nanoseconds, 0))
+    return format_duration(max(nanoseconds, 0))

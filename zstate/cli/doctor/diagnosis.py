@@ -18,16 +18,16 @@ import click
 from zstate.cli.doctor.check import Check, broken, first_broken, ok, warning
 from zstate.cli.doctor.network_checks import (
     access_check,
-    elsewhere,
+    find_elsewhere,
     installation_check,
     network_check,
     refused_check,
     with_options,
 )
-from zstate.cli.network import Network, open_session
 from zstate.cli.output.console import colored, count_text, is_terminal
+from zstate.cli.output.wire_text import RosWords, is_ros, messages_for, publish_command_for
+from zstate.cli.session import SessionOptions, open_session
 from zstate.cli.waiting import ConditionWaiter
-from zstate.cli.words import RosWords, is_ros, words_of, writing
 from zstate.errors import ZStateError
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import ANY
@@ -49,7 +49,7 @@ _COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
 _STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
 
 
-def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
+def diagnosis(network: SessionOptions, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
     """The links to ``robot``, or to every robot for "*".
 
     What is behind a broken link of all robots is not looked at.
@@ -69,13 +69,13 @@ def diagnosis(network: Network, robot: str, wire: str, timeout_s: float) -> Iter
         yield from _after_connecting(session, network, robot, wire, timeout_s)
 
 
-def effective_network(network: Network, wire: str) -> Network:
+def effective_network(network: SessionOptions, wire: str) -> SessionOptions:
     """The options that ``open_session`` uses, with its default on a ROS wire."""
-    return Network("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_given else network
+    return SessionOptions("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_given else network
 
 
 def _after_connecting(
-    session: Session, network: Network, robot: str, wire: str, timeout_s: float
+    session: Session, network: SessionOptions, robot: str, wire: str, timeout_s: float
 ) -> Iterator[Check]:
     from zstate.net.presence import discover
 
@@ -88,13 +88,13 @@ def _after_connecting(
     if access is not None:
         yield access
     wanted = [info for info in robots if robot in (ANY, info.name)]
-    if is_ros(wire) and words_of(wire).robot:
+    if is_ros(wire) and messages_for(wire).robot:
         wanted = list(robots)  # there is one at most, and ROS has no name for it
     if not wanted:
         yield _absent_check(session, network, robot, robots, wire)
         return
     names = ", ".join(repr(info.name) for info in robots)
-    yield ok("robots", words_of(wire).announced(robots) if is_ros(wire) else f"{names} announced")
+    yield ok("robots", messages_for(wire).announced(robots) if is_ros(wire) else f"{names} announced")
     for found in _of_robots(session, wanted, robots, wire, timeout_s, called=robot):
         yield replace(found, next=with_same_options(found.next, network, wire)) if found.next else found
 
@@ -114,7 +114,7 @@ def _of_robots(
     from zstate.cli.doctor.ros_checks import ros_checks
     from zstate.net.clock_offset import measure_offsets
 
-    words = words_of(wire)
+    words = messages_for(wire)
     offsets = measure_offsets(session, ANY) if wire == "native" else ()
     tops: list[FrameInfo] = []
     clocks: dict[str, str] = {}
@@ -154,28 +154,28 @@ def _of_robots(
 
 
 def _absent_check(
-    session: Session, network: Network, robot: str, robots: tuple[RobotInfo, ...], wire: str
+    session: Session, network: SessionOptions, robot: str, robots: tuple[RobotInfo, ...], wire: str
 ) -> Check:
     names = [info.name for info in robots]
     near = get_close_matches(robot, names, n=1)
     what = "no robot is announced" if robot == ANY else f"nobody announces the robot {robot!r}"
     if is_ros(wire) and not names:
-        text = words_of(wire).announced(robots).partition(";")[0]
+        text = messages_for(wire).announced(robots).partition(";")[0]
         then = f"zstate ls --wire {wire}{_connecting(network)}  # are the domain and the router right?"
         return broken("robots", text, then)
     if names:
         text = f"{what}; announced: {', '.join(map(repr, names))}"
         then = f"zstate doctor {(near or names)[0]}"
         return broken("robots", text, with_same_options(then, network, wire))
-    for options, others in elsewhere(network) if wire == "native" else ():
+    for options, others in find_elsewhere(network) if wire == "native" else ():
         found = next((name for name in others if name == robot), others[0])
         text = f"{what} here; {with_options(options)}: {', '.join(map(repr, others))}"
         return broken("robots", text, f"zstate doctor {found}{options}")
     if wire == "native" and session.zenoh.info.routers_zid() and _has_ros(session):
         text = f"{what} on the native wire; ROS 2 nodes are behind this router, too"
         return broken("robots", text, f"zstate doctor --wire ros2{_connecting(network)}")
-    if session.twin is not None:
-        what += f", or the router shows none to {session.twin.identity}"
+    if session.probe is not None:
+        what += f", or the router shows none to {session.probe.identity}"
     text = f"{what}: its publisher is not running" if robot != ANY else what
     return broken("robots", text, f"{_start(robot)}{_connecting(network)}")
 
@@ -189,18 +189,18 @@ def _has_ros(session: Session) -> bool:
 def _start(robot: str) -> str:
     """What would put ``robot`` there."""
     if robot == ANY:
-        from zstate.model.known import example_name
+        from zstate.model.catalog import example_name
 
         return f"zstate publish {example_name()} --source sine"
-    command = writing("publish", robot)
+    command = publish_command_for("publish", robot)
     return command if "FILE" in command else f"{command} --source sine"
 
 
-def _connecting(network: Network) -> str:
+def _connecting(network: SessionOptions) -> str:
     return "".join(f" --connect {endpoint}" for endpoint in network.connect)
 
 
-def with_same_options(command: str, network: Network, wire: str) -> str:
+def with_same_options(command: str, network: SessionOptions, wire: str) -> str:
     """``command`` with the wire and endpoints of doctor, if it accepts them and sets none of its own."""
     text, mark, comment = command.partition("  #")
     program, *words = text.split()

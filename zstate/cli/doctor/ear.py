@@ -6,23 +6,23 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 
+from zstate._util.closeable import Closeable
 from zstate.cli.doctor.samples import StreamSamples
 from zstate.cli.waiting import ConditionWaiter
-from zstate.closing import Closing
 from zstate.errors import MessageError
 from zstate.ingest.events import WriterEvent
 from zstate.net.clock_offset import MeasuredOffset
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
-from zstate.net.replies import query
+from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.status import watch_status
-from zstate.net.wires import wire_named
 from zstate.nodes.listener import Follow, TransformListener
+from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream, clock_key
 from zstate.wire.messages import RobotDescription, Status
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.writer import Writer
+from zstate.wire.registry import get_wire
 
 AT_LEAST_S = 1.2
 """Writers say once a second how they do."""
@@ -31,7 +31,7 @@ _OF_NODES: tuple[Stream, ...] = ("joint_states", "tf")
 _ANSWERS_WITHIN_S = 0.4
 
 
-class Ear(Closing):
+class Ear(Closeable):
     """Hears the robot ``info``, and how its writers do."""
 
     def __init__(
@@ -53,8 +53,8 @@ class Ear(Closing):
         self.statuses: dict[int, Status] = {}
         self.events: list[WriterEvent] = []
         self.offsets: tuple[MeasuredOffset, ...] = ()
-        self.stuck: set[Writer] = set()
-        self._session, self._wire = session, wire_named(wire)
+        self.stuck: set[WriterId] = set()
+        self._session, self._wire = session, get_wire(wire)
         self._on_change = on_change
         with ExitStack() as opening:
             key = self._wire.expression(info.name, "robot_description")
@@ -95,7 +95,7 @@ class Ear(Closing):
     def _take_status(self, _: str, status: Status) -> None:
         self.statuses[status.session] = status
 
-    def writers(self, stream: Stream) -> list[Writer]:
+    def writers(self, stream: Stream) -> list[WriterId]:
         """Who is announced to write ``stream``, the newest last."""
         found = [writer for said, writer in self.info.writers if said == stream]
         return sorted(found, key=lambda writer: writer.since)

@@ -9,17 +9,21 @@ from importlib import metadata
 
 from zstate import __version__
 from zstate.cli.doctor.check import Check, broken, ok, warning
-from zstate.cli.network import Network
 from zstate.cli.output.console import count_text
+from zstate.cli.session import SessionOptions
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
-from zstate.net.connections import connections
-from zstate.net.lobby import lobby_key
-from zstate.net.presence import announce, discover
-from zstate.net.refusal import accepts_tcp, check_all_tcp, check_rendezvous, check_tcp, knock
-from zstate.net.rendezvous import rendezvous_addresses
+from zstate.net.presence import announce, connections, discover
+from zstate.net.rendezvous import lobby_key, rendezvous_addresses, silent_addresses
+from zstate.net.security.connection_check import (
+    accepts_tcp,
+    check_all_tcp,
+    check_endpoints,
+    check_rendezvous,
+    check_tcp,
+)
 from zstate.net.session import Session, connect
 
 _MET_WITHIN_S = 1.0
@@ -45,11 +49,11 @@ def installation_check() -> Check:
     )
 
 
-def refused_check(error: ZStateError, network: Network) -> Check:
+def refused_check(error: ZStateError, network: SessionOptions) -> Check:
     """There is no session, and ``error`` says why."""
     if isinstance(error, Unreachable) and error.endpoints:
         text, then = check_all_tcp(error.endpoints)
-        for options, robots in elsewhere(network):
+        for options, robots in find_elsewhere(network):
             text += f"; {with_options(options)}: {', '.join(map(repr, robots))}"
         return broken("network", text, then or f"zstate config{_options(network)}")
     if isinstance(error, AccessDenied):
@@ -63,7 +67,7 @@ def refused_check(error: ZStateError, network: Network) -> Check:
     return broken("network", str(error), f"zstate config{_options(network)}")
 
 
-def network_check(session: Session, network: Network) -> Check:
+def network_check(session: Session, network: SessionOptions) -> Check:
     """Whom the session has links to."""
     if not network.is_given:
         return _host_check(session)
@@ -76,7 +80,7 @@ def network_check(session: Session, network: Network) -> Check:
         if why is not None:
             text = f"nothing answers at {endpoint!r} ({why.text}); a peer goes on trying"
             return broken("network", text, why.next)
-        answers = knock([endpoint], network.credentials)
+        answers = check_endpoints([endpoint], network.credentials)
         if answers.are_refusals and not parts:
             return broken("network", str(answers.error), f"zstate config{_options(network)}")
     return ok("network", text)
@@ -88,7 +92,7 @@ def _host_check(session: Session) -> Check:
     if met == 0:
         count = connections(session).sessions["peer"] - 1
         return ok("network", f"programs of this host, which meet at {addresses[0]}: {count} besides this one")
-    silent = check_rendezvous()
+    silent = check_rendezvous(silent_addresses())
     if silent is None:
         return broken(
             "network", f"programs of this host meet at {addresses[0]}, and none of them is found", ""
@@ -115,12 +119,12 @@ def _met_at(session: Session, count: int) -> int | None:
         return next(iter(met()), None)
 
 
-def access_check(session: Session, network: Network, robot: str) -> Check | None:
+def access_check(session: Session, network: SessionOptions, robot: str) -> Check | None:
     """Whether whoever is called like ``robot`` may write as it; None for others, and where nobody asks."""
-    from zstate.net.permission import check_may_write
+    from zstate.net.security.write_permission import check_may_write
 
     credentials = network.credentials
-    if session.twin is None or credentials is None or robot not in _names(network):
+    if session.probe is None or credentials is None or robot not in _names(network):
         return None
     # Among the keys of its writers, and none that a reader could take for a writer's.
     token = f"zstate/{robot}/@writer/doctor/{session.zid}"
@@ -132,7 +136,7 @@ def access_check(session: Session, network: Network, robot: str) -> Check | None
     return ok("access", f"the router lets {credentials.identity} write as {robot!r}")
 
 
-def _names(network: Network) -> set[str]:
+def _names(network: SessionOptions) -> set[str]:
     from pathlib import Path
 
     credentials = network.credentials
@@ -142,10 +146,10 @@ def _names(network: Network) -> set[str]:
     return {credentials.user or "", certificate} - {""}
 
 
-def elsewhere(network: Network) -> Iterator[tuple[str, tuple[str, ...]]]:
+def find_elsewhere(network: SessionOptions) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Options with which other robots than now would be seen, and which."""
-    router = Network("client", (ROUTER_ENDPOINT,))
-    others = [("", Network())] if network.is_given else []
+    router = SessionOptions("client", (ROUTER_ENDPOINT,))
+    others = [("", SessionOptions())] if network.is_given else []
     if ROUTER_ENDPOINT not in network.connect and accepts_tcp(ROUTER_ENDPOINT):
         others.append((f" --connect {ROUTER_ENDPOINT}", router))
     for options, other in others:
@@ -166,5 +170,5 @@ def with_options(options: str) -> str:
     return f"with{options}" if options else "without --connect, among the programs of this host"
 
 
-def _options(network: Network) -> str:
+def _options(network: SessionOptions) -> str:
     return "".join(f" --connect {endpoint}" for endpoint in network.connect)

@@ -11,12 +11,12 @@ from zstate.cli.doctor.ear import Ear
 from zstate.cli.doctor.samples import Ranges
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
-from zstate.cli.telling_links import telling_links
-from zstate.cli.words import writing
-from zstate.errors import LookupFailed, ModelError, duration_text
-from zstate.model.limits import JointLimits
+from zstate.cli.output.wire_text import publish_command_for
+from zstate.errors import LookupFailed, ModelError, format_duration
+from zstate.model.representative_links import representative_links
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
+from zstate.model.urdf_joint import JointLimits
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
@@ -96,7 +96,7 @@ def _mute_check(ear: Ear, session: Session) -> Check:
         text = f"{writer} is announced and answers nothing: it is stopped, frozen, or behind a dead link"
         return broken("writers", text, f"ps -o stat= -p {writer.pid}  # on {writer.host}; T: it is stopped")
     if session.zenoh.info.routers_zid():
-        who = "to this identity" if session.twin is None else f"to {session.twin.identity}"
+        who = "to this identity" if session.probe is None else f"to {session.probe.identity}"
         text = (
             f"{robot!r} is alive, and nothing it says arrives: the router denies zstate/{robot}/** {who}; "
             "its access control lets those read whom it names as viewers"
@@ -148,7 +148,7 @@ def _no_model_check(ear: Ear) -> Check:
         return broken("model", text, f"zstate doctor {robot} --timeout 10")
     if ear.followed == "tf":
         return ok("model", "nobody publishes one, and none is needed: poses come ready made on tf")
-    return broken("model", f"nobody publishes the model of {robot!r}", writing("publish", robot))
+    return broken("model", f"nobody publishes the model of {robot!r}", publish_command_for("publish", robot))
 
 
 def _samples_check(ear: Ear) -> Check:
@@ -175,21 +175,23 @@ def _samples_check(ear: Ear) -> Check:
 
 
 def _silence_text(ear: Ear) -> str:
-    return duration_text(round(ear.samples.statistics.silent_s() * 1e9))
+    return format_duration(round(ear.samples.statistics.silent_s() * 1e9))
 
 
 def _nobody_check(ear: Ear) -> Check:
     robot, waiting = ear.info.name, ear.writers("tf")
     if "robot_description" not in ear.streams and not waiting:
         text = f"nobody writes joint_states of {robot!r}, nor tf: it stands still"
-        return warning("joint_states", text, f"{writing('joints', robot)}  # moves it, for a try")
+        return warning("joint_states", text, f"{publish_command_for('joints', robot)}  # moves it, for a try")
     waits = f", for which {waiting[-1]} waits" if waiting else ""
     text = f"nobody writes joint_states of {robot!r}{waits}: its driver is not running (any more)"
     others = [info.name for info in ear.neighbours if _streams(info) == {"joint_states"}]
     if others:
         text += f", or calls the robot {others[0]!r}, of which there are joint_states and no model"
-        return broken("joint_states", text, writing("publish", others[0]))
-    return broken("joint_states", text, f"{writing('joints', robot)}  # moves it, until the driver runs")
+        return broken("joint_states", text, publish_command_for("publish", others[0]))
+    return broken(
+        "joint_states", text, f"{publish_command_for('joints', robot)}  # moves it, until the driver runs"
+    )
 
 
 def _streams(info: RobotInfo) -> set[str]:
@@ -291,7 +293,7 @@ def poses_check(ear: Ear, model: RobotModel | None) -> Check:
         return skipped("poses", "no joint positions")
     if not frames:
         return skipped("poses", "no frame is known")
-    ends = telling_links(model, 1) if model is not None else ()
+    ends = representative_links(model, 1) if model is not None else ()
     target, source = roots[0], f"{robot}/{ends[0]}" if ends else frames[-1].name
     try:
         ear.listener.buffer.lookup(target, source)

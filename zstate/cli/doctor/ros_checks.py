@@ -18,8 +18,8 @@ from zstate.cli.doctor.robot_checks import (
 )
 from zstate.cli.doctor.samples import StreamSamples, WriterSamples
 from zstate.cli.output.console import count_text, rate_text
-from zstate.cli.words import RosWords
-from zstate.errors import duration_text
+from zstate.cli.output.wire_text import RosWords
+from zstate.errors import format_duration
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
 
@@ -29,7 +29,7 @@ _FEW = 6
 def ros_checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterator[Check]:
     """Every link of what ``ear`` has heard for a while; ``called`` is the model that is meant, "*" any."""
     for check in _checks(ear, session, words, called):
-        yield replace(check, text=words.explained(check.text), next=words.explained(check.next))
+        yield replace(check, text=words.translate(check.text), next=words.translate(check.next))
 
 
 def _checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterator[Check]:
@@ -181,7 +181,7 @@ def _silent_node(ear: Ear, heard: Mapping[int, WriterSamples]) -> str:
     for session, node in heard.items():
         if node.statistics.is_stale():
             silent_ns = round(node.statistics.silent_s() * 1e9)
-            return f"{_node(ear, session)} has said nothing for {duration_text(silent_ns)}"
+            return f"{_node(ear, session)} has said nothing for {format_duration(silent_ns)}"
     return ""
 
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate.closing import Closing
-from zstate.model.coordinates import coordinate_names
-from zstate.model.robot import RobotModel
+from zstate._util.closeable import Closeable
+from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.session import Session
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics, Window
 from zstate.wire.keys import Stream
@@ -68,7 +67,7 @@ class WriterSamples:
         return None if window is None else window.rate_hz
 
 
-class StreamSamples(Closing):
+class StreamSamples(Closeable):
     """Subscribes to ``stream`` of ``robot``. ROS nodes share a stream; else the newest writer counts."""
 
     def __init__(

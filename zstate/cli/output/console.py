@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from zstate.cli import logs
-from zstate.errors import duration_text
+from zstate.cli.output import logs
+from zstate.errors import format_duration
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
@@ -84,7 +84,7 @@ def output_width() -> int | None:
 
 def duration_or_dash(nanoseconds: int | None) -> str:
     """A duration as text; "-" for None."""
-    return "-" if nanoseconds is None else duration_text(nanoseconds)
+    return "-" if nanoseconds is None else format_duration(nanoseconds)
 
 
 def age_text(stamp: int | None, now: int) -> str:

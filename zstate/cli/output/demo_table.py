@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from math import degrees
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate.cli.metered_buffer import MeteredBuffer
 from zstate.cli.output.console import (
     count_text,
     duration_or_dash,
@@ -17,8 +16,9 @@ from zstate.cli.output.console import (
     rate_text,
     terminal_width,
 )
-from zstate.clock import wait_in_slices
-from zstate.errors import LookupFailed, duration_text
+from zstate.clock import wait_interruptible
+from zstate.errors import LookupFailed, format_duration
+from zstate.metrics.buffer import MeteredBuffer
 from zstate.nodes.listener import TransformListener
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class DemoTable:
         for row in self.rows():
             xyz = " ".join(f"{value:7.3f}" for value in row.transform.translation)
             rpy = (" ".join(f"{degrees(angle):6.1f}" for angle in row.transform.rpy),) if with_angles else ()
-            table.add_row(_link(row), xyz, *rpy, duration_text(row.age))
+            table.add_row(_link(row), xyz, *rpy, format_duration(row.age))
         return table
 
     def line(self) -> str:
@@ -144,4 +144,4 @@ def _link(row: _TransformRow) -> str:
 def _is_over(ended: threading.Event, until: float, pause_s: float) -> bool:
     """Wait ``pause_s``, then return whether the table has ended."""
     pause_s = min(pause_s, max(0.0, until - time.monotonic()))
-    return wait_in_slices(ended, pause_s) or time.monotonic() >= until
+    return wait_interruptible(ended, pause_s) or time.monotonic() >= until

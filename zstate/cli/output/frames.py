@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from zstate.cli.output.console import count_text, fail, print_status, rate_text, sample_age_text
 from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, tree_lines
+from zstate.cli.output.wire_text import messages_for
 from zstate.cli.processes import BackgroundCall
 from zstate.cli.robot_directory import RobotDirectory, announced_robots
 from zstate.cli.waiting import ConditionWaiter
-from zstate.cli.words import words_of
 from zstate.ingest.deadline import is_stale
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
         listener.add_observer(waiter.notify)
         robots = discovery.result()
         if not robots:
-            print_status(words_of("native").announced(()))
+            print_status(messages_for("native").announced(()))
             return ()
 
         def has_models(stable: bool) -> bool:
@@ -134,7 +134,7 @@ def collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameIn
             return nodes() - {one.writer for one in frames if one.kind == "pose" and one.count >= least}
 
         if not waiter.wait_for(lambda: listener.buffer.frames() or nodes(), _NODES_WITHIN_S):
-            fail(roster.words.silence(robot, "tf", roster.robots(), ended=False))
+            fail(roster.words.no_sample_text(robot, "tf", roster.robots(), ended=False))
         waiter.wait_until_stable(
             lambda: len(listener.buffer.frames()),
             lambda stable: stable and not without_samples(listener.buffer.frames(), 2),

@@ -75,7 +75,7 @@ def graph_facts(graph: Graph) -> dict[str, Any]:
 
 def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
     """Nodes, then topics with their publishers and subscribers."""
-    from zstate.wire.ros2.topics import type_of
+    from zstate.wire.ros2.topics import ros_type
 
     lines: list[str] = []
     if wire.name == "ros2":
@@ -85,7 +85,7 @@ def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
         ends = [("  publisher", end) for end in topic.publishers]
         ends += [("  subscriber", end) for end in topic.subscribers]
         rows = [(role, end.full_name, _qos_text(end), _hash_text(end, topic)) for role, end in ends]
-        lines += [f"{topic.name}  {type_of(topic.stream).name}", *in_columns(rows)]
+        lines += [f"{topic.name}  {ros_type(topic.stream).name}", *in_columns(rows)]
     return "\n".join(lines)
 
 
@@ -97,11 +97,11 @@ def _qos_text(end: RosEndpoint) -> str:
 
 def _hash_text(end: RosEndpoint, topic: Topic) -> str:
     """A type hash other than the usual one."""
-    from zstate.wire.ros2.topics import HUMBLE_HASH, type_of
+    from zstate.wire.ros2.topics import HUMBLE_HASH, ros_type
 
     if end.hash == HUMBLE_HASH:
         return "humble"
-    return "" if end.hash in ("", type_of(topic.stream).hash) else "another version of the type"
+    return "" if end.hash in ("", ros_type(topic.stream).hash) else "another version of the type"
 
 
 def namespaces_hint(graph: RosGraph, wire: Ros2Wire) -> str:
@@ -128,7 +128,7 @@ def empty_ros_graph_text(wire: Ros2Wire) -> str:
 
 def ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
     """The ROS graph as JSON."""
-    from zstate.wire.ros2.topics import type_of
+    from zstate.wire.ros2.topics import ros_type
 
     return {
         "wire": wire.name,
@@ -137,7 +137,7 @@ def ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
         "topics": [
             {
                 "topic": topic.name,
-                "type": type_of(topic.stream).name,
+                "type": ros_type(topic.stream).name,
                 "publishers": _ends_facts(topic.publishers),
                 "subscribers": _ends_facts(topic.subscribers),
             }

@@ -11,16 +11,16 @@ from math import isnan
 from threading import Event
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+from zstate._util.closeable import Closeable
 from zstate._util.suggestions import did_you_mean
 from zstate.cli.output.console import print_status
-from zstate.clock import wait_in_slices
-from zstate.closing import Closing
+from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, MessageError, ModelError
 from zstate.model.urdf import parse_urdf
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.wires import wire_named
 from zstate.wire.messages import JointState, RobotDescription, from_block, order_digest
 from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
 
 if TYPE_CHECKING:
     from zstate.model.robot import RobotModel
@@ -97,12 +97,12 @@ class JointStateFormatter:
         }
 
 
-class DescribedJointStates(Closing):
+class DescribedJointStates(Closeable):
     """Formats the joint states of ``robot`` with the joint names of its published description."""
 
     def __init__(self, session: Session, robot: str, wire: str = "native") -> None:
         self._robot = robot
-        self._wire = wire_named(wire)
+        self._wire = get_wire(wire)
         self._formatter = JointStateFormatter()
         self._described = Event()
         self._warned = False
@@ -120,7 +120,7 @@ class DescribedJointStates(Closing):
     def document(self, state: JointState) -> Document:
         """``state`` as a document. Waits up to 1 s for the description if the names are unknown, once."""
         if not self._formatter.has_names(state) and not self._warned:
-            wait_in_slices(self._described, _DESCRIPTION_WITHIN_S)
+            wait_interruptible(self._described, _DESCRIPTION_WITHIN_S)
             if not self._formatter.has_names(state):
                 self._warned = True
                 reason = "is of another model" if self._described.is_set() else "is missing"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from zstate.cli.output.console import count_text
 from zstate.cli.robot_directory import RobotDirectory
-from zstate.errors import duration_text
+from zstate.errors import format_duration
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -114,11 +114,11 @@ def _lost(stats: RecorderStats) -> str:
 def conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
     """Writers on the network of streams that a replay of ``robots`` would publish."""
     from zstate.net.presence import discover
-    from zstate.net.wires import wire_named
+    from zstate.wire.registry import get_wire
 
     conflicts: list[str] = []
     for name in wires:
-        wire = wire_named(name)
+        wire = get_wire(name)
         # The name of a replayed robot on this wire: ROS has only namespaces.
         names = {wire.robot_of(wire.expression(robot, "joint_states")): robot for robot in robots}
         replayed = {"joint_states", "robot_description", "tf"} - wire.shared
@@ -131,31 +131,33 @@ def conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence
 
 def replay_heading(replayer: Player, file: str) -> str:
     """Robots, time span and rate of a replay."""
-    from zstate.clock import stamp_text
+    from zstate.clock import format_stamp
 
     first, last = replayer.span
     robots = ", ".join(map(repr, replayer.robots))
     rate = "as fast as it can" if replayer.rate == float("inf") else f"at {replayer.rate:g} times its speed"
     duration = f"{(last - first) / 1e9:.1f} s"
-    return f"replaying {robots} from {file}: {duration}, {stamp_text(first)} to {stamp_text(last)}, {rate}"
+    return (
+        f"replaying {robots} from {file}: {duration}, {format_stamp(first)} to {format_stamp(last)}, {rate}"
+    )
 
 
 def replay_line(replayer: Player) -> str:
     """Position, rate and lateness of a running replay."""
-    from zstate.clock import stamp_text
+    from zstate.clock import format_stamp
 
     first, last = replayer.span
     now, report = replayer.position, replayer.report()
     position = f"{(now - first) / 1e9:.1f} of {(last - first) / 1e9:.1f} s"
-    late = duration_text(report.lateness_p99)
-    return f"{position}  {stamp_text(now)}  {report.samples} samples  {report.rate:.2f}x  late {late}"
+    late = format_duration(report.lateness_p99)
+    return f"{position}  {format_stamp(now)}  {report.samples} samples  {report.rate:.2f}x  late {late}"
 
 
 def replay_summary(report: PlayerReport) -> str:
     """Samples, rate, lateness and refusals at the end of a replay."""
     late = (
-        f"late by {duration_text(report.lateness_p50)} (median), {duration_text(report.lateness_p99)} "
-        f"(99 of 100), {duration_text(report.lateness_max)} (at most)"
+        f"late by {format_duration(report.lateness_p50)} (median), {format_duration(report.lateness_p99)} "
+        f"(99 of 100), {format_duration(report.lateness_max)} (at most)"
     )
     passes = f" in {report.passes} passes" if report.passes > 1 else ""
     delays = f"; fell {count_text(report.delays, 'time')} more than a second behind" if report.delays else ""

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from zstate.cli.output.console import rate_text
 from zstate.cli.output.text_layout import Table, first_fitting
-from zstate.errors import duration_text
+from zstate.errors import format_duration
 from zstate.net.topic_statistics import TopicStatistics, WriterKey
 
 if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
+    from zstate.wire.identity import WriterId
     from zstate.wire.keys import Stream
-    from zstate.wire.writer import Writer
 
 _HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
 _OPTIONAL = ("since", "age")
@@ -53,7 +53,7 @@ def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, wid
     return "\n".join(first_fitting(tables, width))
 
 
-def _row(robot: RobotInfo, stream: Stream, writer: Writer, statistics: TopicStatistics) -> tuple[str, ...]:
+def _row(robot: RobotInfo, stream: Stream, writer: WriterId, statistics: TopicStatistics) -> tuple[str, ...]:
     from zstate.wire.keys import MODEL_WRITER
 
     names = [name for name in robot.names_of(writer) if stream == "tf_static" and name != MODEL_WRITER]
@@ -62,15 +62,15 @@ def _row(robot: RobotInfo, stream: Stream, writer: Writer, statistics: TopicStat
     if source is None:
         return shown, "", "", str(writer), _since(writer)
     rate = "silent" if source.is_stale() else rate_text(source.published_hz())
-    return shown, rate, duration_text(round(source.silent_s() * 1e9)), str(writer), _since(writer)
+    return shown, rate, format_duration(round(source.silent_s() * 1e9)), str(writer), _since(writer)
 
 
-def _since(writer: Writer) -> str:
+def _since(writer: WriterId) -> str:
     start = datetime.fromtimestamp(writer.since // 1_000_000_000).astimezone()
     nanoseconds = time.time_ns() - writer.since
     minutes, seconds = divmod(nanoseconds // 1_000_000_000, 60)
     hours, minutes = divmod(minutes, 60)
-    lasting = f"{minutes} min {seconds:02d} s" if minutes else duration_text(nanoseconds)
+    lasting = f"{minutes} min {seconds:02d} s" if minutes else format_duration(nanoseconds)
     return f"since {start:%Y-%m-%d %H:%M:%S}, {f'{hours} h {minutes:02d} min' if hours else lasting}"
 
 
@@ -82,7 +82,7 @@ def robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> li
     ]
 
 
-def _facts(robot: RobotInfo, stream: Stream, writer: Writer, statistics: TopicStatistics) -> dict[str, Any]:
+def _facts(robot: RobotInfo, stream: Stream, writer: WriterId, statistics: TopicStatistics) -> dict[str, Any]:
     source = statistics.get(WriterKey(robot.name, stream, writer.session))
     return {
         "stream": stream,

@@ -25,7 +25,7 @@ from zstate.cli.up.schema import (
 from zstate.cli.up.static_edges import check_edges
 from zstate.cli.up.template import Located
 from zstate.errors import ConfigError, InvalidInput, ModelError
-from zstate.model.catalog import is_path
+from zstate.model.load import is_path
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.wire.keys import check_robot
 

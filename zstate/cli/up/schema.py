@@ -9,9 +9,9 @@ import msgspec
 
 from zstate.errors import InvalidInput
 from zstate.net.config import endpoint_list
-from zstate.net.wires import wire_named
 from zstate.rate import check_rate
 from zstate.transform import Transform
+from zstate.wire.registry import get_wire
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -167,7 +167,7 @@ def _check_wires(wires: tuple[str, ...]) -> None:
     if not wires:
         raise InvalidInput("wires is empty; write for instance ['native', 'ros2']")
     for wire in wires:
-        wire_named(wire)
+        get_wire(wire)
 
 
 def _check_metrics(metrics: str | int | None) -> None:

@@ -25,7 +25,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -49,7 +49,7 @@ class CorruptData(Exception):
     """Bytes that violate the format."""
 
 
-class BoundedFile(Closing):
+class BoundedFile(Closeable):
     """Random access to a file, bounded by its size at opening. Raises CorruptData and OSError."""
 
     def __init__(self, path: Path) -> None:

@@ -15,9 +15,9 @@ from typing import NamedTuple, NewType, TypeAlias
 
 from mcap.writer import CompressionType, Writer
 
-from zstate.closing import Closing
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, RecordingError
-from zstate.locks import new_lock
 from zstate.recording.mcap.split_files import IDENTITY, later_splits, split_path
 from zstate.recording.storage import CDR
 from zstate.wire.ros2.qos import Qos
@@ -243,7 +243,7 @@ class SplitFile:
         self._output.finish()
 
 
-class RecordingWriter(Closing):
+class RecordingWriter(Closeable):
     """Writes CDR messages into ``path``, and into path_1, path_2 ... when it splits. Any thread may write.
 
     A file ends once it has grown by ``max_bytes`` (the chunk in progress counted without compression, the
@@ -278,7 +278,7 @@ class RecordingWriter(Closing):
                     f"{str(file)!r} exists, and this recording may need the name; move it, or choose another"
                 )
                 raise RecordingError(f"{text} (or overwrite=True)", path=str(file))
-        self._lock = new_lock()
+        self._lock = fork_safe_lock()
         self._recording = uuid.uuid4().hex
         self._declared: dict[ChannelId, ChannelDeclaration] = {}
         self._ids: dict[ChannelKey, ChannelId] = {}

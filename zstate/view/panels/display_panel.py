@@ -7,15 +7,15 @@ from typing import Protocol
 import viser
 
 from zstate.buffer.snapshot import FrameTable
-from zstate.view.fixed_frame import FixedFrame
+from zstate.view.data_source import FixedFrame
 from zstate.view.panels import html
-from zstate.view.panels.choice import FrameChoice
-from zstate.view.panels.look import Look
+from zstate.view.panels.context import PanelContext
+from zstate.view.panels.widgets import FrameChoice
 
 _NO_FRAME = "(no frame yet)"
 
 
-class Switches(Protocol):
+class DisplayOptions(Protocol):
     """What of a scene is shown."""
 
     visuals: bool
@@ -28,7 +28,7 @@ class Switches(Protocol):
 class DisplayPanel:
     """The fixed frame, chosen from a list, and a box to tick for each thing that may be shown."""
 
-    def __init__(self, gui: viser.GuiApi, scene: Switches, fixed: FixedFrame) -> None:
+    def __init__(self, gui: viser.GuiApi, scene: DisplayOptions, fixed: FixedFrame) -> None:
         self._scene = scene
         self._fixed = fixed
         self._tree: FrameTable | None = None
@@ -41,12 +41,12 @@ class DisplayPanel:
         self._names = gui.add_checkbox("Names", scene.names)
         self._parent_lines = gui.add_checkbox("Parent lines", scene.parent_lines)
 
-    def update(self, look: Look) -> None:
+    def update(self, look: PanelContext) -> None:
         tree = look.moment.tree
-        chosen = self._frames.taken()
+        chosen = self._frames.poll_change()
         if chosen is not None:
             self._fixed.chosen = chosen
-        fixed = self._fixed.of(tree)
+        fixed = self._fixed.choose(tree)
         if tree is not self._tree:
             self._tree = tree
             self._frames.offer(tree.names, fixed or None)
@@ -57,7 +57,7 @@ class DisplayPanel:
         self._unknown.content = html.paragraph(said, color=html.WARNING) if wanted not in ("", fixed) else ""
         self._switch(self._scene)
 
-    def _switch(self, scene: Switches) -> None:
+    def _switch(self, scene: DisplayOptions) -> None:
         scene.visuals = self._visuals.value
         scene.collisions = self._collisions.value
         scene.axes = self._axes.value

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import viser
 
-from zstate.errors import duration_text
+from zstate.errors import format_duration
 from zstate.net.graph import Graph, GraphMonitor, StreamGroup, WriterState
 from zstate.view.panels import html
-from zstate.view.panels.look import Look
+from zstate.view.panels.context import PanelContext
 
 _LATE_S = 3.0
 """Publishers send a status once a second; an older one is not valid any more."""
@@ -22,7 +22,7 @@ class GraphPanel:
         self._monitor = monitor
         self._text = gui.add_html("")
 
-    def update(self, look: Look) -> None:
+    def update(self, look: PanelContext) -> None:
         self._text.content = graph_html(self._monitor.states(), self._monitor.graph())
 
 
@@ -38,7 +38,7 @@ def _state_html(state: WriterState) -> str:
     color = {"ok": "", "warn": html.WARNING}.get(status.level, html.ALARM)
     text = status.text or status.level
     if state.age_s >= _LATE_S:
-        color, text = html.ALARM, f"has said nothing for {duration_text(round(state.age_s * 1e9))}"
+        color, text = html.ALARM, f"has said nothing for {format_duration(round(state.age_s * 1e9))}"
     head = f"{state.robot} at {status.rate_hz:.1f} Hz"
     return html.heading(head, color=color) + html.paragraph(f"{status.program} pid {status.pid}: {text}")
 

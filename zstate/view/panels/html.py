@@ -1,9 +1,15 @@
-"""Text of panels as HTML. What comes out of the network is escaped, for a browser would run it."""
+"""Text of panels as HTML. What comes out of the network is escaped, for a browser would run it.
+
+Poses in numbers that a person reads.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from html import escape
+
+from zstate.se3 import rpy_from_quaternion
 
 _BOX = "padding:0.1em 0.75em 0.4em 0.75em"  # as far from the edge as what the page itself puts there
 _TABLE = "width:100%;border-collapse:collapse;font-size:0.8em;line-height:1.45"
@@ -52,3 +58,29 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], colors: Sequen
 
 def _boxed(text: str) -> str:
     return f'<div style="{_BOX}">{text}</div>'
+
+
+Rows = list[tuple[str, str]]
+
+
+def pose_rows(pose7: Sequence[float]) -> Rows:
+    """What there is to say of a pose, with the names of the numbers and their units."""
+    x, y, z, qx, qy, qz, qw = pose7
+    rpy = rpy_from_quaternion((qx, qy, qz, qw))
+    return [
+        ("xyz [m]", listed((x, y, z), 4)),
+        ("distance [m]", digits(math.hypot(x, y, z), 4)),
+        ("rpy [deg]", listed([math.degrees(angle) for angle in rpy], 2, width=7)),
+        ("rpy [rad]", listed(rpy, 4)),
+        ("quat xyzw", listed((qx, qy, qz, qw), 3)),
+    ]
+
+
+def listed(values: Sequence[float], precision: int, *, width: int = 0) -> str:
+    """Numbers side by side, as wide whether or not they are negative; ``width`` is for larger ones."""
+    return " ".join(f"{digits(value, precision):>{max(width, precision + 3)}}" for value in values)
+
+
+def digits(value: float, precision: int) -> str:
+    """A number with so many digits behind the point, and no negative zero."""
+    return f"{round(value, precision) + 0.0:.{precision}f}"

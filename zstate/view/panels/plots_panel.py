@@ -7,10 +7,10 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
-from zstate.model.coordinates import coordinate_names
-from zstate.view.panels.choice import Choice
-from zstate.view.panels.look import Look
-from zstate.view.world import World
+from zstate.model.robot import coordinate_names
+from zstate.view.data_source import ViewSource
+from zstate.view.panels.context import PanelContext
+from zstate.view.panels.widgets import BoundWidget
 
 _OFF = "(none)"
 _ALL = "all joints"
@@ -26,21 +26,21 @@ _COLORS = ("#1971c2", "#e8590c", "#2f9e44", "#c2255c", "#6741d9", "#0c8599", "#f
 class PlotsPanel:
     """The last ten seconds of one joint of a robot, or of all of them."""
 
-    def __init__(self, gui: viser.GuiApi, world: World) -> None:
+    def __init__(self, gui: viser.GuiApi, world: ViewSource) -> None:
         self._gui = gui
         self._world = world
         self._robots: tuple[str, ...] = ()
         self._robot: viser.GuiDropdownHandle[str] = gui.add_dropdown("Robot", _NOTHING)
         hint = "The last ten seconds, in rad or m."
         self._joint: viser.GuiDropdownHandle[str] = gui.add_dropdown("Joint", _NOTHING, hint=hint)
-        self._joint_choice = Choice[str](self._joint)
+        self._joint_choice = BoundWidget[str](self._joint)
         self._offered = ""
         self._place = gui.add_folder(None)
         self._plot: viser.GuiUplotHandle | None = None
         self._drawn: tuple[str, ...] = ()
         self._round = 0
 
-    def update(self, look: Look) -> None:
+    def update(self, look: PanelContext) -> None:
         self._offer(tuple(self._world.models))
         robot, joint = self._robot.value, self._joint.value
         track = look.moment.tree.robots.get(robot)

@@ -12,15 +12,15 @@ import viser
 
 from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.ingest.deadline import is_stale
-from zstate.model.known import example_name
+from zstate.model.catalog import example_name
+from zstate.view.data_source import ViewSource
 from zstate.view.panels import html
-from zstate.view.panels.look import Look
-from zstate.view.world import World
+from zstate.view.panels.context import PanelContext
 
 _MOST_LINES = 12
 
 
-class Painter(Protocol):
+class RobotStyler(Protocol):
     """What a scene does with robots."""
 
     def grey(self, robot: str, since: str | None) -> None: ...
@@ -30,29 +30,29 @@ class Painter(Protocol):
 class RobotsPanel:
     """A line for each robot. One that is silent is drawn grey, with the time since when."""
 
-    def __init__(self, gui: viser.GuiApi, world: World, scene: Painter) -> None:
+    def __init__(self, gui: viser.GuiApi, world: ViewSource, scene: RobotStyler) -> None:
         self._world = world
         self._scene = scene
         self._robots = gui.add_html("")
         self._missing = gui.add_html("")
 
-    def update(self, look: Look) -> None:
+    def update(self, look: PanelContext) -> None:
         robots = self._world.robots()
         silences = {robot: self._silence(robot, look) for robot in robots}
         for robot, silence in silences.items():
             self._scene.grey(robot, silence)
         self._robots.content = self._table(look, silences)
-        apart = apart_html(look.moment.tree, look.fixed)
+        apart = disconnected_html(look.moment.tree, look.fixed)
         self._missing.content = apart + unplaced_html(look.moment) + self._meshes(robots)
 
-    def _silence(self, robot: str, look: Look) -> str | None:
+    def _silence(self, robot: str, look: PanelContext) -> str | None:
         # Who is silent now was not when what is shown happened.
         silent_s = self._world.silent_s(robot) if look.is_present else None
         if silent_s is None or not is_stale(silent_s, _rate_hz(robot, look)):
             return None
         return silence_text(silent_s)
 
-    def _table(self, look: Look, silences: Mapping[str, str | None]) -> str:
+    def _table(self, look: PanelContext, silences: Mapping[str, str | None]) -> str:
         if not silences:
             start = f"zstate publish {example_name()} --source sine"
             text = f"No robot is announced. Start one, for instance with: {start}"
@@ -61,7 +61,7 @@ class RobotsPanel:
         colors = [html.ALARM if silence else "" for silence in silences.values()]
         return html.table(("Robot", "State"), rows, colors)
 
-    def _state(self, robot: str, look: Look) -> str:
+    def _state(self, robot: str, look: PanelContext) -> str:
         rate_hz = _rate_hz(robot, look)
         if rate_hz is None:
             return "no sample yet" if robot in look.moment.tree.robots else "no model yet"
@@ -85,12 +85,12 @@ def silence_text(silent_s: float, now_s: float | None = None) -> str:
     return f"silent for {duration}, since {since:%H:%M:%S}"
 
 
-def _rate_hz(robot: str, look: Look) -> float | None:
+def _rate_hz(robot: str, look: PanelContext) -> float | None:
     track = look.moment.tree.robots.get(robot)
     return None if track is None else track.rate_hz
 
 
-def apart_html(tree: FrameTable, fixed: str) -> str:
+def disconnected_html(tree: FrameTable, fixed: str) -> str:
     """The roots that nothing joins to the fixed frame, so that they are drawn beside it, anywhere."""
     if fixed not in tree.index:
         return ""

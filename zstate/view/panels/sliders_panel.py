@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import viser
 
-from zstate.view.dials import Dial
 from zstate.view.panels import html
-from zstate.view.panels.choice import Choice
-from zstate.view.panels.look import Look
-from zstate.view.pose_text import digits
-from zstate.view.sliders import Sliders
+from zstate.view.panels.context import PanelContext
+from zstate.view.panels.html import digits
+from zstate.view.panels.widgets import BoundWidget
+from zstate.view.sliders import SliderPublisher, SliderSpec
 
 _UNITS: tuple[str, ...] = ("rad", "deg")
 
@@ -24,7 +23,7 @@ class SlidersPanel:
     Where another program writes the robot's joints the page says who that is, and offers to try again.
     """
 
-    def __init__(self, gui: viser.GuiApi, sliders: Sliders) -> None:
+    def __init__(self, gui: viser.GuiApi, sliders: SliderPublisher) -> None:
         self._gui = gui
         self._sliders = sliders
         self._state = gui.add_html("")
@@ -33,8 +32,8 @@ class SlidersPanel:
             "All joints", ("Home", "Zero", "Random", "Sine")
         )
         units: viser.GuiDropdownHandle[str] = gui.add_dropdown("Angles in", _UNITS)
-        self._unit = Choice[str](units)
-        self._rate = Choice[float](
+        self._unit = BoundWidget[str](units)
+        self._rate = BoundWidget[float](
             gui.add_number("Rate [Hz]", sliders.rate_hz, min=0.1, max=1000.0, step=0.1)
         )
         self._folder = gui.add_folder(None)
@@ -59,11 +58,11 @@ class SlidersPanel:
     def _swing(self) -> None:
         self._sliders.is_swinging = not self._sliders.is_swinging
 
-    def update(self, look: Look) -> None:
-        rate_hz = self._rate.taken()
+    def update(self, look: PanelContext) -> None:
+        rate_hz = self._rate.poll_change()
         if rate_hz is not None:
             self._sliders.rate_hz = rate_hz
-        if self._unit.taken() is not None:
+        if self._unit.poll_change() is not None:
             for knob in self._knobs:
                 knob.remove()
             self._knobs = self._new_knobs()
@@ -73,11 +72,13 @@ class SlidersPanel:
         self._again.visible = bool(self._sliders.refusal)
         self._mimics.content = html.pairs(self._mimic_rows()) if self._sliders.mimics else ""
 
-    def _new_knobs(self) -> list[_Knob]:
+    def _new_knobs(self) -> list[_JointSlider]:
         with self._folder:
             values = self._sliders.values.tolist()
             pairs = zip(self._sliders.dials.dials, values, strict=True)
-            return [_Knob(self._gui, self._sliders, dial, value, self._unit.value) for dial, value in pairs]
+            return [
+                _JointSlider(self._gui, self._sliders, dial, value, self._unit.value) for dial, value in pairs
+            ]
 
     def _state_html(self) -> str:
         robot, refusal = self._sliders.robot, self._sliders.refusal
@@ -95,11 +96,11 @@ class SlidersPanel:
             yield f"{name} follows", f"{digits(scale * position, 3)} {unit}"
 
 
-class _Knob:
+class _JointSlider:
     """One slider, in the unit that is shown."""
 
     def __init__(
-        self, gui: viser.GuiApi, sliders: Sliders, dial: Dial, value: float, angle_unit: str
+        self, gui: viser.GuiApi, sliders: SliderPublisher, dial: SliderSpec, value: float, angle_unit: str
     ) -> None:
         self._sliders = sliders
         self._dial = dial
@@ -111,7 +112,7 @@ class _Knob:
         value = min(max(self._shown(value), lower), upper)
         label = f"{dial.name} [m]" if unit == "m" else dial.name
         self._slider = gui.add_slider(label, lower, max(upper, lower + step), step, value, hint=hint)
-        self._choice = Choice[float](self._slider)
+        self._choice = BoundWidget[float](self._slider)
         self._slider.on_update(self._turn)
 
     def _shown(self, value: float) -> float:
@@ -128,7 +129,7 @@ class _Knob:
     def show(self, value: float, *, held: bool) -> None:
         """Stand where the sliders stand, unless a person has just moved this one; ``held``: let nobody."""
         self._slider.disabled = held
-        if self._choice.taken() is None:
+        if self._choice.poll_change() is None:
             self._choice.show(min(max(self._shown(value), self._slider.min), self._slider.max))
 
     def remove(self) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from zstate import se3
 from zstate.buffer.snapshot import FrameTable, Mask, Poses, Rows
-from zstate.model.shapes import Shape
+from zstate.model.geometry import Shape
 from zstate.view.mesh_loader import MeshLoader
 from zstate.view.meshes import MeshAsset
 from zstate.view.scene.frame_nodes import set_instances, wxyzs
@@ -103,7 +103,7 @@ class InstancedMeshes:
     def _show_style(self, style: RenderStyle, placed: Poses, shown: Mask) -> None:
         nodes, rows = self.meshes.nodes[style], self._rows[style]
         links = np.where((rows >= 0)[:, :, None], placed[rows], np.nan)
-        both = se3.compose(se3.columns(links), se3.columns(self._origins[style]))
+        both = se3.compose(se3.unstack(links), se3.unstack(self._origins[style]))
         poses = np.stack(np.broadcast_arrays(*both), axis=-1)
         visible = shown[:, None] & np.isfinite(poses[:, :, 0])
         poses[~visible] = se3.IDENTITY

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.model.shapes import Color, Shape
+from zstate.model.geometry import Color, Shape
 from zstate.view.mesh_loader import LoadedMesh, MeshLoader, MeshRequest
 from zstate.view.mesh_paths import MissingFile
 from zstate.view.meshes import MeshAsset

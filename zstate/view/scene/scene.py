@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
 from zstate.model.findings import Finding
+from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
-from zstate.model.shapes import Shape, read_shapes
 from zstate.view.mesh_loader import MeshLoader
 from zstate.view.mesh_paths import MissingFile
 from zstate.view.meshes import Meshes

@@ -50,7 +50,7 @@ def unpack(data: bytes | None) -> Attachment:
     return Attachment(seq, source_time, gid)
 
 
-def session_of(gid: bytes) -> int:
+def session_from_gid(gid: bytes) -> int:
     """The number that tells this start of a writer from others, made of its ``gid``."""
     return int.from_bytes(gid[:8], "little")
 

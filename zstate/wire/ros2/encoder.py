@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from zstate.errors import InvalidInput
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
-    Clock,
+    ClockMessage,
     Edges,
     JointState,
     Message,
@@ -22,9 +23,8 @@ from zstate.wire.messages import (
 from zstate.wire.ros2.attachment import pack
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.joint_state import JointStateEncoder
-from zstate.wire.ros2.plain import encode_clock, encode_string
+from zstate.wire.ros2.simple_messages import encode_clock, encode_string
 from zstate.wire.ros2.tf_message import TfMessageEncoder
-from zstate.wire.sample_names import SampleNames
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class RosStreamEncoder:
     can_withdraw = False  # ROS nodes log a Zenoh delete as a malformed message
 
     def __init__(
-        self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleNames
+        self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleLayout
     ) -> None:
         self.key = address.key
         self.token = address.token
@@ -76,7 +76,7 @@ class RosStreamEncoder:
             return self._encode_edges(message.edges, 0, message.poses)
         if isinstance(message, RobotDescription):
             return encode_string(message.urdf)
-        if isinstance(message, Clock):
+        if isinstance(message, ClockMessage):
             return encode_clock(message.stamp)
         raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
 

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.ros2.cdr import Reader, Writer
-from zstate.wire.ros2.layout import Layouts
-from zstate.wire.ros2.times import STAMP_BYTES, pack_stamp, unpack_stamps
+from zstate.wire.ros2.cdr import STAMP_BYTES, CdrReader, CdrWriter, pack_stamp, unpack_stamps
+from zstate.wire.ros2.cdr_template import TemplateCache
 from zstate.wire.ros2.types import JOINT_STATE
 
 
@@ -42,7 +41,7 @@ class JointStateEncoder:
         choices = [
             (has_velocities, has_efforts) for has_velocities in (False, True) for has_efforts in (False, True)
         ]
-        self._pieces = {choice: _pieces(empty, *choice) for choice in choices}
+        self._prefix_blocks = {choice: _prefix_blocks(empty, *choice) for choice in choices}
 
     def encode(
         self, stamp: int, positions: bytes, velocities: bytes | None = None, efforts: bytes | None = None
@@ -59,7 +58,7 @@ class JointStateEncoder:
             or (efforts is not None and len(efforts) != size)
         ):
             raise self._misfit(positions, velocities, efforts)
-        head, names, second, third = self._pieces[velocities is not None, efforts is not None]
+        head, names, second, third = self._prefix_blocks[velocities is not None, efforts is not None]
         time = pack_stamp(stamp)
         return b"".join((head, time, names, positions, second, velocities or b"", third, efforts or b""))
 
@@ -75,7 +74,7 @@ class JointStateDecoder:
     """Reads the payloads of any number of writers; those it has seen the like of, in one step."""
 
     def __init__(self) -> None:
-        self._layouts: Layouts[RosJointState] = Layouts()
+        self._layouts: TemplateCache[RosJointState] = TemplateCache()
 
     def decode(self, payload: bytes) -> RosJointState:
         """The message in ``payload``.
@@ -90,9 +89,9 @@ class JointStateDecoder:
         return _with_numbers(known, numbers)
 
     def _decode_new(self, payload: bytes) -> RosJointState:
-        reader = Reader(payload, JOINT_STATE.name)
+        reader = CdrReader(payload, JOINT_STATE.name)
         state = _read(reader)
-        self._layouts.learn(reader, state)
+        self._layouts.add(reader, state)
         return state
 
 
@@ -110,7 +109,7 @@ def _with_numbers(known: RosJointState, numbers: bytes) -> RosJointState:
     return RosJointState(stamp, frame_id, names, positions, velocities, efforts)
 
 
-def _read(reader: Reader) -> RosJointState:
+def _read(reader: CdrReader) -> RosJointState:
     stamp, frame_id = reader.stamp(), reader.text()
     names = tuple(reader.text() for _ in range(reader.count()))
     positions, velocities, efforts = reader.sequence(), reader.sequence(), reader.sequence()
@@ -130,7 +129,7 @@ def _without_positions(names: Sequence[str]) -> MessageError:
     )
 
 
-def _check_counts(reader: Reader, names: int, positions: int, velocities: int, efforts: int) -> None:
+def _check_counts(reader: CdrReader, names: int, positions: int, velocities: int, efforts: int) -> None:
     counts = f"{names} names, {positions} positions, {velocities} velocities, {efforts} efforts"
     if names != positions or velocities not in (0, names) or efforts not in (0, names):
         raise reader.malformed(f"its counts do not agree: {counts}")
@@ -142,20 +141,20 @@ def _twice(names: Sequence[str]) -> str:
     return f"the joint {name!r} comes {counts[name]} times among {len(names)} names"
 
 
-def _pieces(
+def _prefix_blocks(
     state: RosJointState, has_velocities: bool, has_efforts: bool
 ) -> tuple[bytes, bytes, bytes, bytes]:
     """What stands before the stamp, the positions, the velocities and the efforts."""
     zeros = state.positions
     payload = _write(state, zeros if has_velocities else b"", zeros if has_efforts else b"")
-    reader = Reader(payload, JOINT_STATE.name)
+    reader = CdrReader(payload, JOINT_STATE.name)
     _read(reader)
     (stamp, stamp_end), (first, first_end), (second, second_end), (third, _) = *reader.stamps, *reader.blocks
     return payload[:stamp], payload[stamp_end:first], payload[first_end:second], payload[second_end:third]
 
 
 def _write(state: RosJointState, velocities: bytes, efforts: bytes) -> bytes:
-    writer = Writer()
+    writer = CdrWriter()
     writer.stamp(state.stamp)
     writer.text(state.frame_id)
     writer.count(len(state.names))

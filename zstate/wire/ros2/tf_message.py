@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 from zstate.errors import InvalidInput
 from zstate.wire.messages import POSE_BYTES, Edges
-from zstate.wire.ros2.cdr import Reader, Writer
-from zstate.wire.ros2.layout import Layout, Layouts
-from zstate.wire.ros2.times import STAMP_BYTES, pack_stamp, unpack_stamps
+from zstate.wire.ros2.cdr import STAMP_BYTES, CdrReader, CdrWriter, pack_stamp, unpack_stamps
+from zstate.wire.ros2.cdr_template import CdrTemplate, TemplateCache
 from zstate.wire.ros2.types import TF_MESSAGE
 
 _POSE_NUMBERS = 7
@@ -37,9 +36,9 @@ class TfMessageEncoder:
     def __init__(self, edges: Edges) -> None:
         self._count = len(edges)
         payload = _write(edges)
-        reader = Reader(payload, TF_MESSAGE.name)
+        reader = CdrReader(payload, TF_MESSAGE.name)
         _read(reader)
-        self._layout = Layout(reader)
+        self._layout = CdrTemplate(reader)
         self._fixed, _ = self._layout.split(payload)
 
     def encode(self, stamp: int, poses: bytes) -> bytes:
@@ -61,7 +60,7 @@ class TfMessageDecoder:
     """Reads the payloads of any number of writers; those it has seen the like of, in one step."""
 
     def __init__(self) -> None:
-        self._layouts: Layouts[Edges] = Layouts()
+        self._layouts: TemplateCache[Edges] = TemplateCache()
 
     def decode(self, payload: bytes) -> RosTransforms:
         """The message in ``payload``.
@@ -77,9 +76,9 @@ class TfMessageDecoder:
         return _transforms(edges, numbers[:end], numbers[end:])
 
     def _decode_new(self, payload: bytes) -> RosTransforms:
-        reader = Reader(payload, TF_MESSAGE.name)
+        reader = CdrReader(payload, TF_MESSAGE.name)
         transforms = _read(reader)
-        self._layouts.learn(reader, transforms.edges)
+        self._layouts.add(reader, transforms.edges)
         return transforms
 
 
@@ -92,7 +91,7 @@ def _transforms(edges: Edges, times: bytes, poses: bytes) -> RosTransforms:
     return RosTransforms(stamp, (stamp,) * count, edges, poses)
 
 
-def _read(reader: Reader) -> RosTransforms:
+def _read(reader: CdrReader) -> RosTransforms:
     stamps: list[int] = []
     edges: list[tuple[str, str]] = []
     poses: list[bytes] = []
@@ -105,7 +104,7 @@ def _read(reader: Reader) -> RosTransforms:
 
 
 def _write(edges: Edges) -> bytes:
-    writer = Writer()
+    writer = CdrWriter()
     writer.count(len(edges))
     for parent, child in edges:
         writer.stamp(0)

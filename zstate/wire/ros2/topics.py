@@ -34,7 +34,7 @@ _TYPES: dict[Stream, RosType] = {
 }
 
 
-def type_of(stream: Stream) -> RosType:
+def ros_type(stream: Stream) -> RosType:
     """The ROS type that carries ``stream``. InvalidInput for one that ROS has no topic for."""
     if stream not in _TYPES:
         raise InvalidInput(
@@ -79,22 +79,22 @@ class RmwKeys:
         return f"/{self._path(self._options.namespace_of(robot), stream)}"
 
     def key(self, robot: str, stream: Stream) -> str:
-        kind = type_of(stream)
+        kind = ros_type(stream)
         written = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
         return f"{self._options.domain}{self.topic(robot, stream)}/{kind.dds}/{written}"
 
     def expression(self, robot: str, stream: Stream) -> str:
-        path = self._path(_heard_namespace(self._options, robot), stream)
-        return f"{self._options.domain}/{path}/{type_of(stream).dds}/*"
+        path = self._path(_namespace_pattern(self._options, robot), stream)
+        return f"{self._options.domain}/{path}/{ros_type(stream).dds}/*"
 
     def robot_of(self, key: str) -> str:
         _domain, *path = key.split("/")
         if len(path) < 3:
             raise InvalidInput(f"the key {key!r} is not of the form '<domain>/<topic>/<type>/<hash>'")
-        return robot_of_topic("/".join(path[:-2]))
+        return robot_from_topic("/".join(path[:-2]))
 
     def _path(self, namespace: str, stream: Stream) -> str:
-        type_of(stream)
+        ros_type(stream)
         is_global = stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
         return stream if is_global else _joined(namespace, stream)
 
@@ -113,18 +113,18 @@ class DdsKeys:
         return f"/{self.key(robot, stream)}"
 
     def key(self, robot: str, stream: Stream) -> str:
-        type_of(stream)
+        ros_type(stream)
         return _joined(self._options.namespace_of(robot), stream)
 
     def expression(self, robot: str, stream: Stream) -> str:
-        type_of(stream)
-        return _joined(_heard_namespace(self._options, robot), stream)
+        ros_type(stream)
+        return _joined(_namespace_pattern(self._options, robot), stream)
 
     def robot_of(self, key: str) -> str:
-        return robot_of_topic(key)
+        return robot_from_topic(key)
 
 
-def _heard_namespace(options: Ros2Options, robot: str) -> str:
+def _namespace_pattern(options: Ros2Options, robot: str) -> str:
     return options.namespace if robot == ANY else options.namespace_of(robot)
 
 
@@ -132,7 +132,7 @@ def _joined(namespace: str, name: str) -> str:
     return f"{namespace}/{name}" if namespace else name
 
 
-def robot_of_topic(topic: str) -> str:
+def robot_from_topic(topic: str) -> str:
     """The robot that a topic speaks of: the last token of its namespace, SHARED in the root."""
     tokens = topic.strip("/").split("/")
     return tokens[-2] if len(tokens) > 1 else SHARED

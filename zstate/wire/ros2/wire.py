@@ -9,10 +9,13 @@ from functools import lru_cache, partial
 from typing import Literal
 
 from zstate.errors import InvalidInput, MessageError
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.messages import Message
 from zstate.wire.protocol import EntityId, SerializedSample
-from zstate.wire.ros2.attachment import session_of, unpack
+from zstate.wire.ros2.attachment import session_from_gid, unpack
+from zstate.wire.ros2.decoder import RosDecoder
 from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.graph import (
@@ -25,13 +28,10 @@ from zstate.wire.ros2.graph import (
     parse_dds_token,
     parse_token,
 )
-from zstate.wire.ros2.hearing import RosHearing
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
-from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_of_topic, type_of
-from zstate.wire.sample_names import SampleNames
+from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_from_topic, ros_type
 from zstate.wire.sizes import check_edges, check_size
-from zstate.wire.writer import Announced, Writer
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 
@@ -49,25 +49,25 @@ class Ros2Wire:
     def __init__(self, options: Ros2Options | None = None) -> None:
         self.options = options or Ros2Options()
         self._keys = self._key_layout(self.options)
-        self._hearing = RosHearing()
+        self._hearing = RosDecoder()
         self._frame_names = lru_cache(64)(partial(FrameNames, self.options))
 
     def _key_layout(self, options: Ros2Options) -> TopicKeys:
         return RmwKeys(options)
 
-    def node_token(self, robot: str, writer: Writer, node: EntityId) -> str | None:
+    def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
         self._frame_names(robot)  # raises InvalidInput before anything is declared
         return self._node_token(self._node(robot, writer.program, node))
 
     def stream_encoder(
         self,
         robot: str,
-        writer: Writer,
+        writer: WriterId,
         stream: Stream,
         *,
         node: EntityId,
         number: int,
-        sample_names: SampleNames,
+        sample_names: SampleLayout,
         name: str = "",
     ) -> RosStreamEncoder:
         token = self._endpoint_token(self._node(robot, writer.program, node), robot, stream, "MP", number)
@@ -80,7 +80,7 @@ class Ros2Wire:
         return NodeToken(self.options.domain, node.zid, node.number, "/", namespace, name)
 
     def reader_tokens(
-        self, robot: str, streams: Sequence[Stream], reader: Writer, zid: str, number: Callable[[], int]
+        self, robot: str, streams: Sequence[Stream], reader: WriterId, zid: str, number: Callable[[], int]
     ) -> tuple[str, ...]:
         if robot == ANY:
             if self.options.namespace == ANY:
@@ -107,7 +107,7 @@ class Ros2Wire:
             namespace=node.namespace,
             node=node.name,
             topic=self._keys.topic(robot, stream),
-            dds_type=type_of(stream).dds,
+            dds_type=ros_type(stream).dds,
             hash=self._keys.key(robot, stream).rpartition("/")[2],
             qos=STREAM_QOS[stream],
         ).key
@@ -141,23 +141,23 @@ class Ros2Wire:
     def _origin(self, arrival: SerializedSample) -> tuple[int, int]:
         """The writer's session and the sequence number."""
         attachment = unpack(arrival.attachment)
-        return session_of(attachment.gid), attachment.seq
+        return session_from_gid(attachment.gid), attachment.seq
 
     def writers_expression(self, robot: str) -> str:
         return graph_expression(self.options.domain)
 
-    def announced(self, token: str, robot: str) -> Announced | None:
+    def announced(self, token: str, robot: str) -> Announcement | None:
         parsed = parse_token(token)
         if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
             return None
-        writer = Writer(parsed.full_name, host="", pid=0, since=0, session=session_of(gid(token)))
+        writer = WriterId(parsed.full_name, host="", pid=0, since=0, session=session_from_gid(gid(token)))
         return self._announced(parsed.topic, parsed.dds_type, robot, writer)
 
-    def _announced(self, topic: str, dds_type: str, robot: str, writer: Writer) -> Announced | None:
-        named = robot_of_topic(topic) if robot == ANY else robot
+    def _announced(self, topic: str, dds_type: str, robot: str, writer: WriterId) -> Announcement | None:
+        named = robot_from_topic(topic) if robot == ANY else robot
         for stream in STREAMS:
-            if dds_type == type_of(stream).dds and self._is_topic_of(topic, named, stream):
-                return Announced(named, stream, writer)
+            if dds_type == ros_type(stream).dds and self._is_topic_of(topic, named, stream):
+                return Announcement(named, stream, writer)
         return None
 
     def _is_topic_of(self, topic: str, robot: str, stream: Stream) -> bool:
@@ -188,7 +188,7 @@ class Ros2DdsWire(Ros2Wire):
     def _endpoint_token(
         self, node: NodeToken, robot: str, stream: Stream, kind: Literal["MP", "MS"], number: int
     ) -> str:
-        ros = type_of(stream)
+        ros = ros_type(stream)
         return DdsToken(
             node.zid, kind, self._keys.key(robot, stream), ros.name, STREAM_QOS[stream], ros.hash
         ).key
@@ -203,9 +203,9 @@ class Ros2DdsWire(Ros2Wire):
     def writers_expression(self, robot: str) -> str:
         return DDS_GRAPH_EXPRESSION
 
-    def announced(self, token: str, robot: str) -> Announced | None:
+    def announced(self, token: str, robot: str) -> Announcement | None:
         parsed = parse_dds_token(token)
         if parsed is None or parsed.kind != "MP":
             return None
-        writer = Writer(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
+        writer = WriterId(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
         return self._announced(f"/{parsed.topic}", parsed.dds_type, robot, writer)

@@ -1,0 +1,1 @@
+"""Bridges: robots carried between the native wire, ROS 2 and ROS 1."""

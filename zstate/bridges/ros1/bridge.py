@@ -1,0 +1,146 @@
+"""Ros1Bridge: one robot, in zstate and in ROS 1."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+
+from zstate._util.closeable import Closeable
+from zstate._util.refusals import Refusals
+from zstate.bridges.ros1.from_ros import Ros1ToNative
+from zstate.bridges.ros1.messages import Ros1FrameNames
+from zstate.bridges.ros1.node import Node
+from zstate.bridges.ros1.to_ros import NativeToRos1
+from zstate.errors import InvalidInput, NetworkError, Unreachable
+from zstate.model.robot import RobotModel
+from zstate.model.urdf import parse_urdf
+from zstate.net.session import Session
+from zstate.wire.keys import check_robot
+
+_LOG = logging.getLogger("zstate")
+
+
+class Ros1Bridge(Closeable):
+    """Carries the joint states and transforms of ``robot`` between zstate and the ROS 1 of ``node``.
+
+    ``to_ros`` and ``from_ros`` say which way. The robot that comes from ROS is ``model``, or what the
+    parameter ``robot_description`` says as soon as it is set; ``with_description`` sets it for a robot that
+    goes there. ``frame_prefix`` is put before the robot's own frames in ROS, and taken off on the way back.
+    Call ``check`` now and then. A context manager.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        node: Node,
+        robot: str,
+        *,
+        to_ros: bool = False,
+        from_ros: bool = False,
+        model: RobotModel | None = None,
+        frame_prefix: str = "",
+        with_description: bool = True,
+    ) -> None:
+        if not (to_ros or from_ros):
+            raise InvalidInput("a bridge carries something: to_ros, from_ros, or both")
+        self.robot = check_robot(robot)
+        self._session = session
+        self._node = node
+        self._model = model
+        self._names = Ros1FrameNames(robot, frame_prefix)
+        self._refusals = Refusals()
+        self._wants_from_ros = from_ros
+        self._lost_master = False
+        self._from_ros: Ros1ToNative | None = None
+        self._to_ros: NativeToRos1 | None = None
+        self._opened = ExitStack()
+        try:
+            if to_ros:
+                self._open_to_ros(with_description)
+            self._find_model()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open_to_ros(self, with_description: bool) -> None:
+        self._to_ros = self._opened.enter_context(
+            NativeToRos1(
+                self._session,
+                self._node,
+                self._names,
+                self._refusals,
+                is_ours=self._is_ours,
+                with_description=with_description,
+            )
+        )
+
+    @property
+    def carried(self) -> tuple[int, int]:
+        """How many samples went to ROS, and how many came from there."""
+        return (
+            0 if self._to_ros is None else self._to_ros.carried,
+            0 if self._from_ros is None else self._from_ros.carried,
+        )
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """What was not carried, by reason; the first of each is also logged."""
+        return dict(self._refusals.counts)
+
+    def waits_for(self) -> str:
+        """What must come before anything is carried; empty when nothing is missing."""
+        if self._to_ros is not None and self._to_ros.robot is None:
+            return f"the robot_description of {self.robot!r} in zstate"
+        if self._wants_from_ros and self._from_ros is None:
+            return f"the parameter {self._node.resolved('robot_description')} in ROS"
+        if any(self.carried):
+            return ""
+        places = ["in zstate"] * (self._to_ros is not None) + ["in ROS"] * self._wants_from_ros
+        return f"joint_states of {self.robot!r} {' or '.join(places)}"
+
+    def check(self) -> None:
+        """See whether ROS is still there. Raises NetworkError once this bridge is of no use any more."""
+        if self._node.has_ended:
+            raise NetworkError("ROS has ended the node of this bridge (`rosnode kill` does that)")
+        try:
+            self._check_master()
+            self._find_model()
+        except Unreachable as error:
+            if not self._lost_master:
+                self._lost_master = True
+                _LOG.warning("%s. What is connected goes on; nobody new finds this bridge", error)
+
+    def _check_master(self) -> None:
+        if self._node.master.pid() != self._node.master_pid:
+            raise NetworkError(
+                "the ROS master was started anew and does not know this bridge; start the bridge again"
+            )
+        self._lost_master = False
+
+    def _find_model(self) -> None:
+        if not self._wants_from_ros or self._from_ros is not None:
+            return
+        model = self._model or self._described_in_ros()
+        if model is not None:
+            self._from_ros = self._opened.enter_context(
+                Ros1ToNative(
+                    self._session,
+                    self._node,
+                    model,
+                    self._names,
+                    self._refusals,
+                    at_once=self._to_ros is None,
+                )
+            )
+
+    def _described_in_ros(self) -> RobotModel | None:
+        name = self._node.resolved("robot_description")
+        urdf = self._node.master.parameter(name)
+        return None if urdf is None else parse_urdf(str(urdf), f"the ROS parameter {name}")
+
+    def _is_ours(self, session: int, writer: str) -> bool:
+        return self._from_ros is not None and self._from_ros.wrote(session, writer)
+
+    def close(self) -> None:
+        """Stop carrying; the node stays. A second call does nothing."""
+        self._opened.close()

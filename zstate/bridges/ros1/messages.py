@@ -1,0 +1,188 @@
+"""What ROS 1 says, and what of it can be said: stamps, JointState, TFMessage.
+
+Frame names: ROS 1 has one name space for all robots, zstate has one for each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate.bridges.ros1.node import RospyModules
+from zstate.errors import MessageError
+from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
+from zstate.wire.joint_order import JointNumbers
+from zstate.wire.keys import wire_name
+
+Floats = NDArray[np.float64]
+
+_SECOND = 1_000_000_000
+# A ROS 1 time is two unsigned numbers of 32 bits.
+_END_OF_TIME = 2**32 * _SECOND
+
+
+def set_stamp(header: Any, stamp: int) -> None:
+    """Write a stamp [ns] into a ROS header, exactly. Raises MessageError for what a ROS time cannot be."""
+    if not 0 < stamp < _END_OF_TIME:
+        raise MessageError(
+            f"the stamp {stamp} cannot be said in ROS 1: its times begin after 1970, end in 2106, and zero "
+            "means that there is none",
+            reason="stamp",
+        )
+    header.stamp.secs, header.stamp.nsecs = divmod(stamp, _SECOND)
+
+
+def get_stamp(header: Any) -> int:
+    """The stamp of a ROS header [ns], exactly. Raises MessageError for zero, which means none."""
+    stamp = header.stamp.secs * _SECOND + header.stamp.nsecs
+    if not stamp:
+        raise MessageError(
+            "a JointState without a stamp; when was it? Set header.stamp where it is published, for "
+            "instance to rospy.Time.now()",
+            reason="zero stamp",
+        )
+    return stamp
+
+
+class JointStateWriter:
+    """Writes the joints of ``model`` into one JointState, again and again.
+
+    ROS has one number for each name: planar and floating joints stand there as "base.x", "base.y" ...
+    """
+
+    def __init__(self, ros: RospyModules, model: RobotModel) -> None:
+        names = coordinate_names(model)
+        self._count = len(names)
+        # None where the velocities stand under the positions one by one, which is nearly always.
+        slots = velocity_columns_by_position(model)
+        self._slots = None if slots == tuple(range(self._count)) else list(slots)
+        self._message = ros.JointState(name=list(names))
+
+    def message(self, stamp: int, numbers: JointNumbers) -> Any:
+        """The message; the next one takes its place. Raises MessageError as ``set_stamp``."""
+        message = self._message
+        set_stamp(message.header, stamp)
+        message.position = numbers.positions.tolist()
+        message.velocity = self._rates(numbers.velocities)
+        message.effort = self._rates(numbers.efforts)
+        return message
+
+    def _rates(self, values: Floats | None) -> list[float]:
+        if values is None:
+            return []
+        if self._slots is not None:
+            padded = np.full(self._count, np.nan)
+            padded[self._slots] = values
+            values = padded
+        return values.tolist()
+
+
+class TransformsWriter:
+    """Writes the poses of ``edges`` (parent and child, as ROS calls them) into one TFMessage."""
+
+    def __init__(self, ros: RospyModules, edges: Sequence[tuple[str, str]]) -> None:
+        self._message = ros.TFMessage()
+        for parent, child in edges:
+            transform = ros.TransformStamped(child_frame_id=child)
+            transform.header.frame_id = parent
+            self._message.transforms.append(transform)
+
+    def message(self, stamp: int | None, poses: Floats) -> Any:
+        """The message; the next one takes its place. Raises MessageError as ``set_stamp``.
+
+        Row i of ``poses`` (n, 7) is ``parent_from_child``. Static edges have no stamp.
+        """
+        for transform, pose in zip(self._message.transforms, poses.tolist(), strict=True):
+            if stamp is not None:
+                set_stamp(transform.header, stamp)
+            place, turn = transform.transform.translation, transform.transform.rotation
+            place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = pose
+        return self._message
+
+
+def pose_from_ros(transform: Any) -> tuple[float, ...]:
+    """pose7 of a ROS Transform: x y z [m], qx qy qz qw."""
+    place, turn = transform.translation, transform.rotation
+    return (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
+
+
+class JointStateReader:
+    """Reads the JointState of ROS in the order of ``model``, whatever order they come in."""
+
+    def __init__(self, model: RobotModel) -> None:
+        self._wanted = coordinate_names(model)
+        self._slots = np.array(velocity_columns_by_position(model), dtype=np.intp)
+        self._known = frozenset(self._wanted) | {joint.name for joint in model.joints}
+        self._picks: dict[tuple[str, ...], NDArray[np.intp]] = {}
+
+    def read(self, message: Any) -> JointNumbers:
+        """The numbers of all joints of the model. Raises MessageError when they are not all there."""
+        pick = self._pick(tuple(message.name))
+        count = len(message.name)
+        positions = _picked("position", message.position, count, pick)
+        if positions is None:
+            raise MessageError("a JointState without positions", reason="sizes")
+        velocities = _picked("velocity", message.velocity, count, pick[self._slots])
+        return JointNumbers(
+            positions, velocities, _picked("effort", message.effort, count, pick[self._slots])
+        )
+
+    def unknown(self, message: Any) -> tuple[str, ...]:
+        """The joints in ``message`` that the model does not have."""
+        return tuple(name for name in message.name if name not in self._known)
+
+    def _pick(self, names: tuple[str, ...]) -> NDArray[np.intp]:
+        pick = self._picks.get(names)
+        if pick is None:
+            if len(set(names)) < len(names):
+                raise MessageError(f"a JointState that names a joint twice: {names}", reason="names")
+            missing = [name for name in self._wanted if name not in names]
+            if missing:
+                raise MessageError(
+                    f"a JointState without {', '.join(map(repr, missing))}, and a sample of zstate is the "
+                    "whole robot; let joint_state_publisher merge the parts (its parameter source_list)",
+                    reason="missing joints",
+                )
+            pick = np.array([names.index(name) for name in self._wanted], dtype=np.intp)
+            # One order per writer is usual; a writer that shuffles must not fill the memory.
+            self._picks = {names: pick}
+        return pick
+
+
+def _picked(what: str, values: Sequence[float], count: int, pick: NDArray[np.intp]) -> Floats | None:
+    if not values:
+        return None
+    if len(values) != count:
+        raise MessageError(
+            f"a JointState with {count} names and {len(values)} numbers of {what}", reason="sizes"
+        )
+    return np.array(values, dtype=np.float64)[pick]
+
+
+@dataclass(frozen=True, slots=True)
+class Ros1FrameNames:
+    """How the frames of ``robot`` are called in ROS: ``prefix`` and the bare name.
+
+    Frames of other robots have their full name, ``robot/frame``, on both sides.
+    """
+
+    robot: str
+    prefix: str = ""
+
+    def in_ros(self, frame: str) -> str:
+        """What ROS calls a frame of a message of this robot."""
+        bare = frame.removeprefix(f"{self.robot}/")
+        return frame if bare == frame and "/" in frame else f"{self.prefix}{bare}"
+
+    def bare(self, frame_id: str) -> str:
+        """A ``frame_id`` without the prefix, and without the slash that old programs put before it."""
+        return frame_id.removeprefix("/").removeprefix(self.prefix)
+
+    def in_zstate(self, frame_id: str, links: frozenset[str]) -> str:
+        """What zstate calls a ``frame_id`` in messages of this robot, whose model has ``links``."""
+        bare = self.bare(frame_id)
+        return wire_name(self.robot, bare) if bare in links else bare

@@ -1,0 +1,335 @@
+"""Bridge: whole robots between the native wire and a ROS wire, both ways, and nothing in a circle.
+
+Carrier: one robot, one way.
+
+StaticCarrier: the static edges around a robot, from one wire to another.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import Literal, NamedTuple
+
+from zstate._util.closeable import Closeable
+from zstate.buffer.buffer import TransformBuffer
+from zstate.errors import Closed, InvalidInput, MessageError, ZStateError
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.static_transforms import StaticTransformIngest
+from zstate.model.robot import RobotModel
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.presence import watch
+from zstate.net.session import Session
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.sources.joint_source import JointReading
+from zstate.sources.subscribed import DescriptionSubscriber, SubscribedSource
+from zstate.transform import Transform
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot
+from zstate.wire.messages import StaticTransforms, poses_from_block, to_block
+from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
+from zstate.wire.ros2.wire import Ros2Wire
+
+
+class StaticBridge(Closeable):
+    """Publishes with ``publisher`` the static edges of its robot that ``model`` does not place.
+
+    Where a key tells whose edges are on it, they are also withdrawn with it. Where all robots share
+    one, those are taken that place a frame of this robot.
+    """
+
+    def __init__(
+        self, session: Session, model: RobotModel, publisher: StaticPublisher, counters: Counters, wire: str
+    ) -> None:
+        self._robot = publisher.robot
+        self._counters = counters
+        self._buffer = _PublishedBuffer(publisher)
+        self._buffer.add_robot(model, self._robot)
+        self._ownership = FrameOwnership(self._buffer, counters, is_shared=True)
+        self._ingests: dict[str, StaticTransformIngest] = {}
+        self._wire = get_wire(wire)
+        key = self._wire.expression(self._robot, "tf_static")
+        self._subscriber = LatchedSubscriber(session, key, self._on_static)
+
+    def close(self) -> None:
+        """Follow the edges no more; those that were published stay. A second call does nothing."""
+        self._subscriber.close()
+
+    def _on_static(self, arrival: SerializedSample) -> None:
+        try:
+            writer = self._wire.statics_writer(arrival.key)
+        except InvalidInput as error:
+            self._counters.count_refusal("foreign", str(error))
+            return
+        if writer == MODEL_WRITER:
+            return
+        make = StaticTransformIngest(self._robot, writer or self._wire.name, self._ownership)
+        ingest = self._ingests.setdefault(arrival.key, make)
+        try:
+            messages = self._wire.decode("tf_static", arrival, self._robot) if arrival.payload else ()
+        except MessageError as error:
+            self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
+            return
+        # The publisher may have gone with its session.
+        with suppress(Closed):
+            if not arrival.payload:
+                ingest.withdraw()
+            for message in messages:
+                assert isinstance(message, StaticTransforms)
+                ingest.add(self._ours(message)) if writer is None else ingest.replace(message)
+
+    def _ours(self, message: StaticTransforms) -> StaticTransforms:
+        is_ours = [child.partition("/")[0] == self._robot or "/" not in child for _, child in message.edges]
+        edges = tuple(edge for edge, ours in zip(message.edges, is_ours, strict=True) if ours)
+        return StaticTransforms(message.session, edges, to_block(poses_from_block(message.poses)[is_ours]))
+
+
+class _PublishedBuffer(TransformBuffer):
+    """A buffer whose static edges are published."""
+
+    def __init__(self, publisher: StaticPublisher) -> None:
+        super().__init__()
+        self._publisher = publisher
+
+    def insert_static(self, transform: Transform, *, writer: str | None = None) -> None:
+        super().insert_static(transform, writer=writer)
+        self._publisher.set(transform)
+
+    def withdraw(self, child: str) -> None:
+        super().withdraw(child)
+        self._publisher.withdraw(child)
+
+
+PROGRAM = "zstate_bridge"
+"""As whom a bridge writes, on both wires: by this name bridges know what was carried already."""
+
+Way = Literal["native to ROS", "ROS to native"]
+
+
+class BridgeSide(NamedTuple):
+    """One of two networks: a place on it, what is spoken there, and where that is carried."""
+
+    session: Session
+    wire: str
+    direction: Way
+
+
+class RobotBridge(Closeable):
+    """Writes on ``target`` what others write of ``robot`` on ``source``, from its first model on.
+
+    Every joint state keeps its stamp and its numbers; model and static edges are there for late
+    joiners, too. ``on_begin()`` is called with each model. What ``target`` cannot say is counted in
+    ``refused``, and the first of each kind is logged.
+    """
+
+    def __init__(
+        self, robot: str, source: BridgeSide, target: BridgeSide, on_begin: Callable[[], object]
+    ) -> None:
+        self.robot = robot
+        self.source = source
+        self.target = target
+        self.has_begun = False
+        self._on_begin = on_begin
+        self._counters = Counters()
+        self._lock = threading.Lock()
+        self._closed = False
+        self._carrying = ExitStack()
+        self._descriptions = DescriptionSubscriber(source.session, robot, self._carry, source.wire)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many joint states, static edges and models could not be carried."""
+        return self._counters.stats().refused
+
+    def _carry(self, robot: str, model: RobotModel) -> None:
+        with self._lock:
+            self._carrying.close()
+            if self._closed:
+                return
+            try:
+                self._open_publisher(model)
+            except ZStateError as error:
+                self._counters.count_refusal("model", f"{robot!r} is not carried: {error}")
+                return
+        self.has_begun = True
+        self._on_begin()
+
+    def _open_publisher(self, model: RobotModel) -> None:
+        robot, source, target = self.robot, self.source, self.target
+        with ExitStack() as opening:
+            publisher = opening.enter_context(
+                # Beside other bridges, too; which way a robot is carried was decided before.
+                StatePublisher(target.session, model, robot, (target.wire,), program=PROGRAM, takeover=True)
+            )
+            statics = opening.enter_context(
+                StaticPublisher(target.session, robot, wires=(target.wire,), program=PROGRAM, takeover=True)
+            )
+            opening.enter_context(StaticBridge(source.session, model, statics, self._counters, source.wire))
+            readings = opening.enter_context(SubscribedSource(source.session, model, robot, wire=source.wire))
+            self._carrying = opening.pop_all()
+        threading.Thread(
+            target=self._publish, args=(readings, publisher), name=f"zstate bridge {robot}", daemon=True
+        ).start()
+
+    def _publish(self, readings: SubscribedSource, publisher: StatePublisher) -> None:
+        with suppress(Closed):
+            for reading in readings:
+                self._publish_one(reading, publisher)
+
+    def _publish_one(self, reading: JointReading, publisher: StatePublisher) -> None:
+        try:
+            publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
+        except InvalidInput as error:
+            self._counters.count_refusal("joint state", f"{self.robot!r}: {error}")
+
+    def close(self) -> None:
+        """Carry no more, and withdraw what was written. A second call does nothing."""
+        self._descriptions.close()
+        with self._lock:
+            self._closed = True
+            self._carrying.close()
+
+
+_LOG = logging.getLogger("zstate")
+
+# Whoever writes these writes the robot. All robots may stand in one /tf, which tells nothing of one.
+_TELLING: tuple[Stream, ...] = ("joint_states", "robot_description")
+
+_ADVICE = (
+    "name one, as `zstate bridge panda` does, or give each its own namespace with the wire 'ros2:namespace=*'"
+)
+
+
+class Bridge(Closeable):
+    """Carries each robot that is written on one side to the other: joint states, model, static edges.
+
+    Its moving transforms are derived again over there; those of ROS's /tf that belong to no model are
+    not carried. ``robots`` names the robots; None is all, which needs a namespace for each: the
+    ``ros_wire`` "ros2:namespace=*". What a bridge has written, this one or another, is
+    never carried back, and a robot that others write on both sides is not carried, which is logged.
+
+    ``on_change(robot, way)`` is called when a robot begins to be carried, or to have another model, and
+    with None when it is carried no more; from threads of the bridge. Raises InvalidInput for robots
+    that would share a namespace, and for a wire that does not tell who writes.
+    """
+
+    def __init__(
+        self,
+        native: Session,
+        ros: Session,
+        ros_wire: str = "ros2",
+        robots: Sequence[str] | None = None,
+        *,
+        on_change: Callable[[str, Way | None], object] | None = None,
+    ) -> None:
+        _check(ros_wire, robots)
+        self._sides = (
+            BridgeSide(native, "native", "native to ROS"),
+            BridgeSide(ros, ros_wire, "ROS to native"),
+        )
+        self._on_change = on_change or _ignore
+        self._writers: defaultdict[str, tuple[set[Announcement], ...]] = defaultdict(lambda: (set(), set()))
+        self._carriers: dict[str, RobotBridge] = {}
+        self._conflicts: set[str] = set()
+        self._lock = threading.RLock()  # on_change may ask for the carriers
+        with ExitStack() as opening:
+            opening.callback(self._end_all)
+            for number, side in enumerate(self._sides):
+                for robot in robots or (ANY,):
+                    note = partial(self._on_writer, number)
+                    opening.enter_context(watch(side.session, robot, note, side.wire))
+            self._opened = opening.pop_all()
+
+    @property
+    def carriers(self) -> tuple[RobotBridge, ...]:
+        """Those at work, also for robots that nobody has described yet."""
+        with self._lock:
+            return tuple(self._carriers.values())
+
+    def close(self) -> None:
+        """Carry nothing any more. A second call does nothing."""
+        self._opened.close()
+
+    def _on_writer(self, side: int, announced: Announcement, alive: bool) -> None:
+        # A ROS node is called with its namespace.
+        if announced.stream in _TELLING and announced.writer.program.rpartition("/")[2] != PROGRAM:
+            with self._lock:
+                writers = self._writers[announced.robot]
+                (writers[side].add if alive else writers[side].discard)(announced)
+                self._decide(announced.robot, *writers)
+
+    def _decide(self, robot: str, native: set[Announcement], ros: set[Announcement]) -> None:
+        source, target = self._sides if native else reversed(self._sides)
+        is_wanted = bool(native) != bool(ros)
+        carrier = self._carriers.get(robot)
+        if carrier is not None and not (is_wanted and carrier.source is source):
+            self._close_robot(robot)
+        if is_wanted and robot not in self._carriers:
+            begin = partial(self._on_change, robot, source.direction)
+            self._carriers[robot] = RobotBridge(robot, source, target, begin)
+        self._report_conflict(robot, native, ros)
+
+    def _report_conflict(self, robot: str, native: set[Announcement], ros: set[Announcement]) -> None:
+        if not (native and ros):
+            self._conflicts.discard(robot)
+        elif robot not in self._conflicts:
+            self._conflicts.add(robot)
+            _LOG.warning(
+                "%r is written natively by %s and on ROS by %s, so it is not carried; stop one of them, "
+                "or give them different names",
+                robot,
+                _named(native),
+                _named(ros),
+                extra={"event": "conflict", "robot": robot},
+            )
+
+    def _close_robot(self, robot: str) -> None:
+        carrier = self._carriers.pop(robot)
+        carrier.close()
+        if carrier.has_begun:
+            self._on_change(robot, None)
+
+    def _end_all(self) -> None:
+        with self._lock:
+            for robot in list(self._carriers):
+                self._close_robot(robot)
+
+
+def _ignore(robot: str, way: Way | None) -> None:
+    pass
+
+
+def _named(writers: set[Announcement]) -> str:
+    return " and ".join(sorted({repr(str(announced.writer)) for announced in writers}))
+
+
+def _check(ros_wire: str, robots: Sequence[str] | None) -> None:
+    wire = get_wire(ros_wire)
+    if not isinstance(wire, Ros2Wire) or wire.name != "ros2":
+        raise InvalidInput(
+            f"a bridge leads to the wire 'ros2', not {wire.name!r}, on which it could not tell what it "
+            "wrote itself"
+        )
+    options = wire.options
+    if options.node:
+        raise InvalidInput(
+            f"the ros2 option node is {options.node!r}, but the nodes of a bridge are called "
+            f"{PROGRAM!r}: by that bridges know each other; leave it out"
+        )
+    names = [check_robot(robot) for robot in robots or ()]
+    if len(names) == 1:
+        return
+    if options.namespace != ANY:
+        raise InvalidInput(
+            f"the namespace '/{options.namespace}' of ROS has room for one robot, "
+            f"not for {' and '.join(map(repr, names)) or 'all'}; {_ADVICE}"
+        )
+    if ANY not in (options.frame_prefix or ANY) and options.tf == "global":
+        raise InvalidInput(f"the frames of several robots would be mixed up in /tf of ROS; {_ADVICE}")

@@ -1,1 +1,0 @@
-"""zstate monitor: how the samples behind one pose come in."""

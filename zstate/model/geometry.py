@@ -1,0 +1,223 @@
+"""Shapes: what the links of a robot look like, and what they are for collisions.
+
+Read as rviz and urdfdom read it: a material defined directly in <robot> wins over one of the same name
+inside a link; one that is only named means the first of that name; and a mesh that brings its own
+materials keeps them, so that the URDF's colour is for meshes without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from zstate._util.suggestions import suggestion_text
+from zstate.model.findings import Finding, Findings, quoted
+from zstate.model.robot import RobotModel
+from zstate.model.xml import Element, NumberError, read_document, read_number, read_numbers
+from zstate.se3 import IDENTITY, quaternion_from_rpy
+
+Role = Literal["visual", "collision"]
+Color = tuple[float, float, float, float]
+Pose7 = tuple[float, float, float, float, float, float, float]
+
+_ROLES: tuple[Role, ...] = ("visual", "collision")
+_GEOMETRIES = ("box", "cylinder", "sphere", "mesh")
+_SOME_GEOMETRY = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box about its middle; ``size`` along x, y, z [m]."""
+
+    size: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """A cylinder about its middle, along z [m]."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A sphere about its middle [m]."""
+
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFile:
+    """A mesh in a file, whose name is as the URDF writes it; ``scale`` along x, y, z."""
+
+    uri: str
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+Geometry: TypeAlias = Box | Cylinder | Sphere | MeshFile
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """What a surface looks like: red, green, blue, opacity in 0..1 (sRGB), and the name of an image."""
+
+    color: Color | None = None
+    texture: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """One <visual> or <collision> of a link; ``origin`` is ``link_from_shape`` as pose7."""
+
+    link: str
+    role: Role
+    origin: Pose7
+    geometry: Geometry
+    color: Color | None = None
+    texture: str | None = None
+
+
+def parse_shapes(model: RobotModel) -> tuple[Shape, ...]:
+    """Every shape of the robot that can be drawn, in the order of the URDF."""
+    return read_shapes(model)[0]
+
+
+def read_shapes(model: RobotModel) -> tuple[tuple[Shape, ...], tuple[Finding, ...]]:
+    """The shapes that can be drawn, and what is wrong with those that cannot, by line."""
+    reader = _Reader(model)
+    return tuple(reader.shapes()), reader.findings.sorted()
+
+
+class _Fault(ValueError):
+    """Why a shape cannot be drawn, and what to write instead."""
+
+    def __init__(self, element: Element, message: str, fix: str = "") -> None:
+        super().__init__(message)
+        self.line = element.line
+        self.fix = fix
+
+
+class _Reader:
+    def __init__(self, model: RobotModel) -> None:
+        self.findings = Findings(model.name)
+        self._robot = read_document(model.urdf, model.name).root
+        self._links = frozenset(model.links)
+        self._materials: dict[str, Material] = {}
+        visuals = [visual for link in self._robot.all("link") for visual in link.all("visual")]
+        inside = [material for visual in visuals for material in visual.all("material")]
+        for element in _defined([*self._robot.all("material"), *inside]):
+            name = element.attributes.get("name", "")
+            if name and name not in self._materials:
+                self._materials[name] = self._material(element)
+
+    def shapes(self) -> Iterator[Shape]:
+        for link in self._robot.all("link"):
+            name = link.attributes.get("name", "")
+            for child in link.children:
+                for role in _ROLES:
+                    if child.tag == role and name in self._links:
+                        yield from self._shape(name, role, child)
+
+    def _shape(self, link: str, role: Role, element: Element) -> Iterator[Shape]:
+        try:
+            origin, geometry = _origin(element), _geometry(element)
+        except _Fault as fault:
+            message = f"link {quoted(link)}: a <{role}> is not drawn: {fault}"
+            self.findings.warning(fault.line, message, fault.fix)
+            return
+        material = self._material_of(link, element)
+        yield Shape(link, role, origin, geometry, material.color, material.texture)
+
+    def _material_of(self, link: str, element: Element) -> Material:
+        materials = element.all("material")
+        if not materials:
+            return Material()
+        name = materials[0].attributes.get("name", "")
+        if name and name in self._materials:
+            return self._materials[name]
+        if next(_defined(materials[:1]), None) is not None:
+            return self._material(materials[0])
+        near = suggestion_text(self.findings.did_you_mean(name, self._materials))
+        message = f"link {quoted(link)}: the material {quoted(name)} is defined nowhere{near}"
+        self.findings.warning(materials[0].line, message, '<color rgba="0.7 0.7 0.7 1"/> inside it')
+        return Material()
+
+    def _material(self, element: Element) -> Material:
+        files = (texture.attributes.get("filename", "") for texture in element.all("texture"))
+        colors = (self._color(element, color) for color in element.all("color"))
+        return Material(next(colors, None), next(filter(None, files), None))
+
+    def _color(self, material: Element, element: Element) -> Color | None:
+        try:
+            numbers = read_numbers(element.attributes.get("rgba", ""), 4)
+        except NumberError as fault:
+            name = quoted(material.attributes.get("name", ""))
+            self.findings.warning(element.line, f"material {name}: rgba: {fault}", 'rgba="0.7 0.7 0.7 1"')
+            return None
+        red, green, blue, opacity = (min(max(number, 0.0), 1.0) for number in numbers)
+        return red, green, blue, opacity
+
+
+def _defined(materials: Iterable[Element]) -> Iterator[Element]:
+    """Those that say what they look like, where others only name it."""
+    return (one for one in materials if one.all("color") or one.all("texture"))
+
+
+def _origin(element: Element) -> Pose7:
+    for origin in element.all("origin"):
+        x, y, z = _vector(origin, "xyz", (0.0, 0.0, 0.0))
+        return (x, y, z, *quaternion_from_rpy(*_vector(origin, "rpy", (0.0, 0.0, 0.0))))
+    return IDENTITY
+
+
+def _geometry(element: Element) -> Geometry:
+    given = [child for geometry in element.all("geometry") for child in geometry.children]
+    if not given:
+        raise _Fault(element, "it has no <geometry> with something inside", _SOME_GEOMETRY)
+    shape = given[0]
+    if shape.tag == "box":
+        x, y, z = _vector(shape, "size")
+        return Box((_length(shape, x), _length(shape, y), _length(shape, z)))
+    if shape.tag == "cylinder":
+        return Cylinder(_length(shape, _number(shape, "radius")), _length(shape, _number(shape, "length")))
+    if shape.tag == "sphere":
+        return Sphere(_length(shape, _number(shape, "radius")))
+    if shape.tag == "mesh":
+        return _mesh(shape)
+    message = f"<{quoted(shape.tag)[1:-1]}> is none of {', '.join(_GEOMETRIES)}"
+    raise _Fault(shape, message, _SOME_GEOMETRY)
+
+
+def _mesh(element: Element) -> MeshFile:
+    uri = element.attributes.get("filename", "").strip()
+    if not uri:
+        fix = '<mesh filename="package://PACKAGE/meshes/FILE.stl"/>'
+        raise _Fault(element, "its <mesh> names no file", fix)
+    return MeshFile(uri, _vector(element, "scale", (1.0, 1.0, 1.0)))
+
+
+def _length(element: Element, length: float) -> float:
+    if length < 0.0:
+        raise _Fault(element, f"its <{element.tag}> has the negative length {length:g} m")
+    return length
+
+
+def _vector(
+    element: Element, name: str, default: tuple[float, float, float] | None = None
+) -> tuple[float, float, float]:
+    if default is not None and name not in element.attributes:
+        return default
+    try:
+        x, y, z = read_numbers(element.attributes.get(name, ""), 3)
+    except NumberError as fault:
+        raise _Fault(element, f"{element.tag} {name}: {fault}", f'{name}="0 0 0"') from None
+    return x, y, z
+
+
+def _number(element: Element, name: str) -> float:
+    try:
+        return read_number(element.attributes.get(name, ""))
+    except NumberError as fault:
+        raise _Fault(element, f"{element.tag} {name}: {fault}", f'{name}="0.1"') from None

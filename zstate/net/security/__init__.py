@@ -1,0 +1,1 @@
+"""Credentials, access control and the reasons why a router refuses."""

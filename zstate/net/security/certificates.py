@@ -1,0 +1,259 @@
+"""Identities for tests: a certificate and a key for each, as files of one folder.
+
+The certificate authority behind `zstate certs`: a key that signs, kept as files.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+from zstate.errors import ConfigError, InvalidInput, LibraryMissing
+from zstate.net.security.credentials import AUTHORITY, CertificateFiles
+
+THIS_HOST = ("localhost", "127.0.0.1", "::1")
+
+_CLOCKS_DIFFER_BY = timedelta(hours=1)  # a machine whose clock is behind takes a new certificate, too
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # a common name has 64 characters at most
+_HOST_NAME = re.compile(r"(\*\.)?[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?")
+
+
+def issue_identities(
+    folder: str | os.PathLike[str],
+    names: Sequence[str],
+    *,
+    hosts: Sequence[str] = (),
+    servers: Collection[str] | None = None,
+    days: int = 365,
+    valid_from: datetime | None = None,
+) -> dict[str, CertificateFiles]:
+    """Certificates for ``names``, by the authority in ``folder``, which is made if there is none.
+
+    The common name of each is its name, which is how access control knows it. Those of ``servers``
+    (all unless given) serve to listen, too, at this host's loopback addresses and at ``hosts`` (names
+    or IP addresses); the others serve to connect and cannot pose as a router. All are valid for
+    ``days`` from ``valid_from`` (an aware time; now unless given). Keys are readable by their owner
+    only. No file is ever overwritten.
+
+    Raises InvalidInput before anything is written, ConfigError for an authority that cannot be used
+    and files that cannot be written, LibraryMissing without ``cryptography``.
+    """
+    _check(names, hosts, days)
+    issued = {name: CertificateFiles.for_name(folder, name) for name in names}
+    for name, files in issued.items():
+        _refuse_existing(name, files)
+
+    start = valid_from or datetime.now(timezone.utc)
+    first, last = start - (timedelta() if valid_from else _CLOCKS_DIFFER_BY), start + timedelta(days=days)
+    authority = CertificateAuthority.in_folder(Path(folder))
+    authority.check_outlives(last)
+    for name, files in issued.items():
+        is_server = servers is None or name in servers
+        authority.issue(name, files, (*THIS_HOST, *hosts) if is_server else (), (first, last))
+    return issued
+
+
+def _check(names: Sequence[str], hosts: Sequence[str], days: int) -> None:
+    for name in names:
+        if not _NAME.fullmatch(name) or name == AUTHORITY:
+            raise InvalidInput(
+                f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, beginning "
+                f"with a letter or digit, and not {AUTHORITY!r}"
+            )
+        if names.count(name) > 1:
+            raise InvalidInput(f"the identity {name!r} is named twice")
+    for host in hosts:
+        if not _is_address(host) and not _HOST_NAME.fullmatch(host):
+            raise InvalidInput(
+                f"{host!r} is neither a host name nor an IP address; give it without protocol and port"
+            )
+    if days < 1:
+        raise InvalidInput(f"days is {days}; a certificate is valid for one day at least")
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _refuse_existing(name: str, files: CertificateFiles) -> None:
+    if files.existing:
+        there = " and ".join(repr(str(path)) for path in files.existing)
+        raise InvalidInput(
+            f"there is an identity {name!r} already: {there}; nothing is overwritten: choose another name, "
+            "or remove what is there to replace it"
+        )
+
+
+try:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import (
+        Encoding,
+        NoEncryption,
+        PrivateFormat,
+        load_pem_private_key,
+    )
+    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+except ImportError as error:
+    raise LibraryMissing(
+        f"making certificates needs the cryptography library ({error}): pip install 'zstate[certs]'"
+    ) from None
+
+AUTHORITY_DAYS = 3650
+Validity = tuple[datetime, datetime]
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateAuthority:
+    """Who vouches for identities: whoever trusts ``certificate`` trusts what ``key`` has signed."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+    @classmethod
+    def in_folder(cls, folder: Path) -> CertificateAuthority:
+        """The one that the folder holds, or a new one. Raises ConfigError if it is there in part."""
+        files = CertificateFiles.for_name(folder, AUTHORITY)
+        if not files.existing:
+            return cls._made(folder, files)
+        if len(files.existing) == 1:
+            missing = files.key if files.certificate.exists() else files.certificate
+            raise ConfigError(
+                f"{str(missing)!r} is missing beside {str(files.existing[0])!r}; identities are added where "
+                "the authority is whole: work in the folder in which it was made, or begin a new one",
+                path=str(missing),
+            )
+        return cls._read(files)
+
+    @classmethod
+    def _made(cls, folder: Path, files: CertificateFiles) -> CertificateAuthority:
+        # A name of its own: two authorities of one name look as one with a bad signature.
+        name = f"zstate test authority {os.urandom(4).hex()}"
+        key = _new_key()
+        now = datetime.now(timezone.utc)
+        # From long ago, so that certificates of the past can be made for tests.
+        valid = (now - timedelta(days=AUTHORITY_DAYS), now + timedelta(days=AUTHORITY_DAYS))
+        builder = (
+            _builder(name, key, valid)
+            .issuer_name(_named(name))
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_usage(signs_certificates=True), critical=True)
+        )
+        authority = cls(builder.sign(key, hashes.SHA256()), key)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _write(files, key, authority.certificate)
+        return authority
+
+    @classmethod
+    def _read(cls, files: CertificateFiles) -> CertificateAuthority:
+        try:
+            certificate = x509.load_pem_x509_certificate(files.certificate.read_bytes())
+            key = load_pem_private_key(files.key.read_bytes(), None)
+        except (OSError, ValueError, TypeError) as error:
+            raise ConfigError(
+                f"the authority in {str(files.key.parent)!r} cannot be read: {error}", path=str(files.key)
+            ) from None
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise ConfigError(
+                f"{str(files.key)!r} is not the key that `zstate certs` made for {str(files.certificate)!r}",
+                path=str(files.key),
+            )
+        return cls(certificate, key)
+
+    def check_outlives(self, last: datetime) -> None:
+        """Raise InvalidInput if a certificate valid until ``last`` were valid longer than this authority."""
+        until = self.certificate.not_valid_after_utc
+        if last > until:
+            raise InvalidInput(
+                f"the authority is valid until {until:%Y-%m-%d}, which is before {last:%Y-%m-%d}; ask for "
+                "fewer days, or begin a new folder"
+            )
+
+    def issue(self, name: str, files: CertificateFiles, hosts: Iterable[str], valid: Validity) -> None:
+        """Write a key and a certificate for ``name``: to connect, and to listen at ``hosts``, if any."""
+        key = _new_key()
+        issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
+        names = _alternatives(hosts)
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        if names:
+            purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
+        builder = (
+            _builder(name, key, valid)
+            .issuer_name(self.certificate.subject)
+            .add_extension(issuer, critical=False)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(signs_certificates=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        )
+        if names:
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        _write(files, key, builder.sign(self.key, hashes.SHA256()))
+
+
+def _new_key() -> ec.EllipticCurvePrivateKey:
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def _named(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _builder(name: str, key: ec.EllipticCurvePrivateKey, valid: Validity) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(_named(name))
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(valid[0])
+        .not_valid_after(valid[1])
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _alternatives(hosts: Iterable[str]) -> list[x509.GeneralName]:
+    return [_alternative(host) for host in dict.fromkeys(hosts)]
+
+
+def _alternative(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _write(files: CertificateFiles, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    _write_new(files.key, pem, 0o600)
+    _write_new(files.certificate, certificate.public_bytes(Encoding.PEM), 0o644)
+
+
+def _write_new(path: Path, content: bytes, mode: int) -> None:
+    try:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
+    except OSError as error:
+        raise ConfigError(f"{str(path)!r} cannot be written: {error.strerror}", path=str(path)) from None

@@ -1,1 +1,0 @@
-"""The bridge to ROS 1, for whoever has rospy: joint states and transforms, in either direction."""

@@ -1,0 +1,103 @@
+"""Writer identity, and what a writer's liveliness token announces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from urllib.parse import quote, unquote
+
+from zstate.errors import InvalidInput, printable
+from zstate.wire.keys import MOST_CHARACTERS, Stream, check_writer, shortened
+
+_MOST_DIGITS = 20
+_MOST_OF_AN_IDENTITY = 4 * 12 * MOST_CHARACTERS
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class WriterId:
+    """One writer: its program, host, process, start time ``since`` [ns], and the ``session`` of its samples.
+
+    On wires without them ``host`` is empty, and ``pid`` and ``since`` are zero.
+    ``pid`` and ``since`` are below 2^63, ``session`` is below 2^64.
+    """
+
+    program: str
+    host: str
+    pid: int
+    since: int
+    session: int
+
+    def __str__(self) -> str:
+        program, host = printable(self.program), printable(self.host)
+        return f"{program}@{host} pid {self.pid}" if host else program
+
+    @property
+    def identity(self) -> str:
+        """All fields in one chunk of a key."""
+        fields = (self.program, self.host, self.pid, self.since, self.session)
+        return ",".join(_quoted(str(field)) for field in fields)
+
+    @classmethod
+    def parse(cls, identity: str) -> WriterId:
+        """The writer with this ``identity``. Raises InvalidInput if it is not one."""
+        fields = identity.split(",") if len(identity) <= _MOST_OF_AN_IDENTITY else []
+        if len(fields) == 5 and all(map(_is_number, fields[2:])):
+            program, host = unquote(fields[0]), unquote(fields[1])
+            pid, since, session = map(int, fields[2:])
+            found = cls(program, host, pid, since, session)
+            in_range = max(pid, since) < 2**63 and session < 2**64
+            # One canonical form: two tokens of one writer would count as two writers.
+            if in_range and max(len(program), len(host)) <= MOST_CHARACTERS and found.identity == identity:
+                return found
+        raise InvalidInput(
+            f"{shortened(identity)!r} is not 'program,host,pid,since,session', names of at most "
+            f"{MOST_CHARACTERS} characters and 64-bit numbers"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
+
+    ``name`` is the one under which it writes static edges; empty for other streams, and on wires without
+    such names.
+    """
+
+    robot: str
+    stream: Stream
+    writer: WriterId
+    name: str = ""
+
+    @property
+    def identity(self) -> str:
+        """Writer and name in one chunk of a key."""
+        named = f",{_quoted(self.name)}" if self.name else ""
+        return self.writer.identity + named
+
+    @classmethod
+    def parse(cls, robot: str, stream: Stream, identity: str) -> Announcement:
+        """The content of a token with this ``identity``. Raises InvalidInput if it is not one."""
+        fields = identity.split(",", 6)
+        is_named = len(fields) == 6 and stream == "tf_static"
+        name = check_writer(unquote(fields.pop())) if is_named else ""
+        found = cls(robot, stream, WriterId.parse(",".join(fields)), name)
+        if found.identity != identity:
+            raise InvalidInput(f"{shortened(identity)!r} is not the identity of a writer and a name")
+        return found
+
+    def conflicts_with(self, other: Announcement) -> bool:
+        """Whether the two are different writers of the same stream, of which only one may be active.
+
+        Writers of static edges conflict if their names are equal; without a name they never do.
+        """
+        same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
+        is_one = self.stream != "tf_static" or bool(self.name)
+        return same and is_one and self.writer.session != other.writer.session
+
+
+def _quoted(text: str) -> str:
+    # A script name may have bytes that are not text.
+    return quote(text, safe="", errors="replace")
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS
