@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from support import Child, a_free_port
+from helpers.processes import Child, a_free_port
 
 from zstate.net.session import Session, connect
 

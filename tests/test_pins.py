@@ -22,7 +22,7 @@ from urllib.request import urlopen
 import click
 import pytest
 import zenoh
-from support import Child, again_and_again, until
+from helpers.processes import Child, again_and_again, until
 
 import zstate.errors
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model

@@ -6,9 +6,9 @@ import sys
 from importlib import metadata, resources
 
 import pytest
-from live import settle
-from support import DEADLINE_S
-from tales import START, S, Tale, swing
+from helpers.processes import DEADLINE_S
+from helpers.recording_builder import START, S, Tale, swing
+from helpers.robots import settle
 
 import zstate
 

@@ -1,7 +1,7 @@
 import threading
 
 import pytest
-from support import Stepping
+from helpers.processes import Stepping
 
 from zstate.clock import SystemClock
 from zstate.errors import InvalidInput

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from support import DEADLINE_S, Child
+from helpers.processes import DEADLINE_S, Child
 
 from zstate import TransformListener, connect
 

@@ -60,7 +60,7 @@ SUBJECT = Subject(
     ),
     install=(
         "apt-get install -y --no-install-recommends g++",
-        f"python tests/ros2/oracles.py kilted {place('ros2')}",
+        f"python tests/helpers/ros2/oracles.py kilted {place('ros2')}",
     ),
     python=_python,
     versions=_versions,

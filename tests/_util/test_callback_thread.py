@@ -6,7 +6,7 @@ import math
 import threading
 
 import pytest
-from support import until
+from helpers.processes import until
 
 from zstate._util.callback_thread import QUEUE_SIZE, CallbackThread
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from made_up import SCENARIOS, TITLES, write_results
+from helpers.fake_results import SCENARIOS, TITLES, write_results
 
 import bench
 from bench.markdown import dash, number

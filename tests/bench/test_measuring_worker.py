@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import until
+from helpers.processes import until
 
 from bench.job import Job
 from bench.subjects.subject import Answered

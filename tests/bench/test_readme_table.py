@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from made_up import TITLES, write_results
+from helpers.fake_results import TITLES, write_results
 
 from bench.readme import END, renewed, short_table
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from support import Child, until
+from helpers.processes import Child, until
 
 from bench.measure import Traffic, cpu_ns, family, peak_memory_kb
 from bench.process import Process, RunFailed

@@ -16,7 +16,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tf2_worlds import Answer, S, a_scenario, ask_tf2, ask_us, kind_of_ours, kind_of_theirs, why_no_tf2
+from helpers.tf2_scenarios import (
+    Answer,
+    S,
+    a_scenario,
+    ask_tf2,
+    ask_us,
+    kind_of_ours,
+    kind_of_theirs,
+    why_no_tf2,
+)
 
 from zstate.errors import NoData
 from zstate.transform import Transform

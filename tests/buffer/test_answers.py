@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from support import until
-from worlds import MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
+from helpers.buffers import MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
+from helpers.processes import until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock

@@ -7,9 +7,9 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from helpers.buffers import NOW, S, filled
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import NOW, S, filled
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InvalidInput, LookupFailed, ZStateError

@@ -6,10 +6,10 @@ import random
 from collections.abc import Callable
 from fractions import Fraction
 
-import exact_poses as exact
+import helpers.exact_poses as exact
 import numpy as np
 import pytest
-from worlds import EVERY_JOINT, NOW, S
+from helpers.buffers import EVERY_JOINT, NOW, S
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack

@@ -7,7 +7,19 @@ import math
 
 import numpy as np
 import pytest
-from worlds import EVERY_JOINT, MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
+from helpers.buffers import (
+    EVERY_JOINT,
+    MS,
+    NOW,
+    S,
+    every_joint,
+    failure,
+    filled,
+    moving,
+    pose_of_every,
+    static,
+    x_of,
+)
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InFuture, InPast, InsertRefused, InvalidInput, NoData, UnknownFrame

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from worlds import EVERY_JOINT, NOW, S, every_joint, failure, pose_of_every
+from helpers.buffers import EVERY_JOINT, NOW, S, every_joint, failure, pose_of_every
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack

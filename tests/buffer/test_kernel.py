@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from helpers.buffers import EVERY_JOINT, NOW, S, every_joint, filled, moving
+from helpers.processes import DEADLINE_S
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import DEADLINE_S
-from worlds import EVERY_JOINT, NOW, S, every_joint, filled, moving
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.history import History, ReferenceHistory, insert_together

@@ -7,7 +7,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from worlds import MS, NOW, S, moving
+from helpers.buffers import MS, NOW, S, moving
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from worlds import MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
+from helpers.buffers import MS, NOW, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
 
 from zstate import se3
 from zstate.buffer.buffer import TransformBuffer

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worlds import NOW, S, every_joint, failure, filled, moving, static, x_of
+from helpers.buffers import NOW, S, every_joint, failure, filled, moving, static, x_of
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.robots import RRBOT, SECOND
 from hypothesis import given
 from hypothesis import strategies as st
-from live import RRBOT, SECOND
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses, FrameTable, TimeSpan

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import until
-from worlds import NOW, S, every_joint, moving, pose_of_every, static
+from helpers.buffers import NOW, S, every_joint, moving, pose_of_every, static
+from helpers.processes import until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Disconnected, InFuture, InPast, LookupFailed, NoData, Stale

@@ -7,8 +7,8 @@ import threading
 from collections.abc import Callable
 
 import pytest
-from support import until
-from worlds import MS, S, every_joint, filled, moving, pose_of_every, static, x_of
+from helpers.buffers import MS, S, every_joint, filled, moving, pose_of_every, static, x_of
+from helpers.processes import until
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock

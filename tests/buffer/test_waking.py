@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 import pytest
-from worlds import MS, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
+from helpers.buffers import MS, S, every_joint, failure, filled, moving, pose_of_every, static, x_of
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frame_tree import FrameTree

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from looking import Spawn, started
+from helpers.cli_runner import Spawn, started
 
 
 @pytest.fixture

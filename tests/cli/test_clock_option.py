@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from looking import RRBOT, Spawn, failure, interrupted, standing, started, zstate
-from support import again_and_again, until
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import again_and_again, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.clock import ManualClock

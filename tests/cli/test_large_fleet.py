@@ -9,8 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from looking import RRBOT, Spawn, started, zstate
-from support import again_and_again
+from helpers.cli_runner import RRBOT, Spawn, started, zstate
+from helpers.processes import again_and_again
 
 from zstate import StatePublisher, connect, load_model
 from zstate.net.presence import local_writer

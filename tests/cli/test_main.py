@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from looking import RRBOT, Spawn, failure, interrupted, started, zstate
-from support import SOON_S
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.processes import SOON_S
 
 from zstate import connect, load_model
 from zstate.cli import main, usage_hints

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from looking import RRBOT, Spawn, failure, interrupted, standing, started
-from metrics.scrape import Row, row, scraped
-from support import Child, until
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started
+from helpers.processes import Child, until
+from helpers.prometheus_text import Row, row, scraped
 
 pytestmark = pytest.mark.processes
 

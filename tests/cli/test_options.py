@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from looking import RRBOT, Spawn, failure, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, started, zstate
 
 from zstate import TransformListener, connect
 from zstate.cli.options import load_robot, named_models

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from looking import RRBOT, failure, standing, zstate
+from helpers.cli_runner import RRBOT, failure, standing, zstate
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
 from zstate.cli.plot import joint_series, path_series

@@ -5,8 +5,8 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from looking import Spawn, failure, interrupted, standing, started, zstate
-from support import until
+from helpers.cli_runner import Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import until
 
 pytestmark = pytest.mark.processes
 

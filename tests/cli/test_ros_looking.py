@@ -4,9 +4,9 @@ import json
 import math
 
 import pytest
-from live import await_reader
-from looking import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
-from support import until
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import until
+from helpers.robots import await_reader
 
 from zstate import StaticPublisher, Transform, connect
 from zstate.wire.identity import WriterId
@@ -18,7 +18,7 @@ from zstate.wire.ros2.wire import Ros2Wire
 pytestmark = pytest.mark.processes
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-# From the model: see tests/cli/test_tf.py.
+# From the model: see tests/cli/commands/test_tf.py.
 BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(SHOULDER))
 
 

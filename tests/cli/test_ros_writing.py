@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 
 import pytest
-from looking import RRBOT, Spawn, interrupted, standing, started, zstate
-from support import until
+from helpers.cli_runner import RRBOT, Spawn, interrupted, standing, started, zstate
+from helpers.processes import until
 
 from zstate import TransformListener, connect, discover, load_model
 from zstate.net.latched import LatchedSubscriber

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from looking import RRBOT, Spawn, started
-from support import a_free_port, until
+from helpers.cli_runner import RRBOT, Spawn, started
+from helpers.processes import a_free_port, until
 
 pytestmark = pytest.mark.processes
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from looking import Spawn, failure, started, zstate
-from support import Child
-from tutorial import FILES, FOLDER, blocks, masked, terminal, told
+from helpers.cli_runner import Spawn, failure, started, zstate
+from helpers.processes import Child
+from helpers.tutorial_terminal import FILES, FOLDER, blocks, masked, terminal, told
 
 pytestmark = pytest.mark.processes
 

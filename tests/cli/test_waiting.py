@@ -4,7 +4,7 @@ import threading
 import time
 
 import pytest
-from support import DEADLINE_S
+from helpers.processes import DEADLINE_S
 
 from zstate.cli import waiting
 from zstate.cli.waiting import ConditionWaiter

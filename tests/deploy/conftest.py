@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from parts import Deployment
+from helpers.deployment import Deployment
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 import zenoh
-from parts import DEPLOY, Deployment
-from support import until
+from helpers.deployment import DEPLOY, Deployment
+from helpers.processes import until
 
 from zstate import StatePublisher, connect, discover, load_model
 from zstate.errors import AccessDenied

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from parts import DEPLOY
-from support import DEADLINE_S
+from helpers.deployment import DEPLOY
+from helpers.processes import DEADLINE_S
 
 pytestmark = pytest.mark.processes
 

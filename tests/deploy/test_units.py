@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from parts import DEPLOY
-from support import a_free_port
+from helpers.deployment import DEPLOY
+from helpers.processes import a_free_port
 
 UNITS = sorted(path.name for path in DEPLOY.glob("*.service"))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from live import RRBOT, assert_pose, kinematic_pose
+from helpers.robots import RRBOT, assert_pose, kinematic_pose
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import LookupFailed

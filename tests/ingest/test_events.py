@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from support import until
+from helpers.processes import until
 
 from zstate._util.bounded_dict import MAX_ENTRIES
 from zstate.ingest.events import KEPT, EventLog, StaticEdgeOwners, WriterEvent

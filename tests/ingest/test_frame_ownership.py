@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from itertools import permutations
 
 import pytest
-from live import RRBOT
+from helpers.robots import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InsertRefused

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from live import RRBOT, STAMP
+from helpers.robots import RRBOT, STAMP
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import Counters

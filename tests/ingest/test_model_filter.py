@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from live import RRBOT
-from tales import START, pose
+from helpers.recording_builder import START, pose
+from helpers.robots import RRBOT
 
 from zstate.ingest.model_filter import ModelEdgeFilter
 from zstate.wire.messages import (

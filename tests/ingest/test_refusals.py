@@ -6,8 +6,8 @@ import logging
 
 import numpy as np
 import pytest
-from live import RRBOT, STAMP, assert_pose, kinematic_pose, settle
-from support import until
+from helpers.processes import until
+from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, settle
 
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher

@@ -1,5 +1,5 @@
 import pytest
-from live import RRBOT
+from helpers.robots import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import Counters

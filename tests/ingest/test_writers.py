@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 
 import pytest
-from live import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, settle
-from support import until
+from helpers.processes import until
+from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, settle
 
 from zstate.errors import InFuture
 from zstate.model.load import load_model

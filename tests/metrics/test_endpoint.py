@@ -6,10 +6,10 @@ import sys
 import threading
 
 import pytest
-from metrics.scrape import row, scraped
+from helpers.processes import until
+from helpers.prometheus_text import row, scraped
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
-from support import until
 
 import zstate
 from zstate.errors import InvalidInput, PortBusy

@@ -3,7 +3,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from live import RRBOT, SECOND, STAMP, UPRIGHT
+from helpers.robots import RRBOT, SECOND, STAMP, UPRIGHT
 
 from zstate.errors import Disconnected, InFuture, UnknownFrame
 from zstate.metrics.buffer import InstrumentedBuffer

@@ -6,10 +6,10 @@ import time
 from dataclasses import replace
 
 import pytest
-from live import RRBOT, settle
-from metrics.scrape import collected, row
+from helpers.processes import until
+from helpers.prometheus_text import collected, row
+from helpers.robots import RRBOT, settle
 from prometheus_client.core import CounterMetricFamily
-from support import until
 
 from zstate.errors import InFuture, InvalidInput
 from zstate.metrics.buffer import InstrumentedBuffer

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinds_of_robot import every_joint, own, random_positions
-from matrix_kinematics import MatrixKinematics, matrices
+from helpers.matrix_kinematics import MatrixKinematics, matrices
+from helpers.model_samples import every_joint, own, random_positions
 
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.model.kinematics import Kinematics

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from urdf_text import ARM, errors, joint, refusal, robot, tip, warnings
+from helpers.urdf_text import ARM, errors, joint, refusal, robot, tip, warnings
 
 from zstate.model.urdf import parse_urdf
 

@@ -2,7 +2,7 @@
 
 import time
 
-from urdf_text import ARM, errors, joint, robot
+from helpers.urdf_text import ARM, errors, joint, robot
 
 from zstate.model.urdf import MAX_LINKS, MAX_VELOCITIES, parse_urdf
 from zstate.model.xml import MAX_BYTES, MAX_NESTING

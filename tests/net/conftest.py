@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 
 import pytest
-from refusing import ROUTERS, Fleet
-from support import Child, a_free_port
+from helpers.access_routers import ROUTERS, Fleet
+from helpers.processes import Child, a_free_port
 
 from zstate.net.security.certificates import issue_identities
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support import DEADLINE_S, SOON_S, Child
+from helpers.processes import DEADLINE_S, SOON_S, Child
 
 from zstate import Recording, SineSource, StatePublisher, connect, load_model
 from zstate.net.at_exit import WITHIN_S

@@ -6,8 +6,8 @@ import time
 
 import pytest
 import zenoh
-from live import RRBOT, STAMP, settle
-from support import SOON_S, a_free_port, until
+from helpers.processes import SOON_S, a_free_port, until
+from helpers.robots import RRBOT, STAMP, settle
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale

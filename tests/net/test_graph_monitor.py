@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 
-from live import RRBOT
-from support import until
+from helpers.processes import until
+from helpers.robots import RRBOT
 
 from zstate.net.graph import GraphMonitor, StreamUse, graph_of
 from zstate.net.presence import RobotInfo

@@ -1,5 +1,5 @@
 import pytest
-from support import Child, until
+from helpers.processes import Child, until
 
 from zstate.errors import Closed, InvalidInput
 from zstate.net.latched import LatchedPublisher, LatchedSubscriber

@@ -3,9 +3,9 @@ import time
 from contextlib import ExitStack
 
 import pytest
+from helpers.processes import Child, until
 from hypothesis import given
 from hypothesis import strategies as st
-from support import Child, until
 
 from zstate.errors import InvalidInput
 from zstate.net.presence import (

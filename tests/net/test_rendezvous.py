@@ -5,7 +5,7 @@ import threading
 import time
 
 import pytest
-from support import SOON_S, Child, until
+from helpers.processes import SOON_S, Child, until
 
 from zstate.errors import ConfigError
 from zstate.net.rendezvous import RENDEZVOUS, rendezvous_addresses, silent_addresses

@@ -5,7 +5,7 @@ import time
 
 import pytest
 import zenoh
-from support import SOON_S, Child, until
+from helpers.processes import SOON_S, Child, until
 
 from zstate.errors import Closed, ConfigError, InvalidInput, NetworkError, PortBusy, Unreachable
 from zstate.net.session import connect

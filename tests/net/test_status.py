@@ -8,9 +8,9 @@ from contextlib import ExitStack, suppress
 
 import numpy as np
 import pytest
-from live import RRBOT, await_reader
+from helpers.processes import Child, until
+from helpers.robots import RRBOT, await_reader
 from msgspec.structs import replace
-from support import Child, until
 
 from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover

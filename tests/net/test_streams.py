@@ -2,7 +2,7 @@ import threading
 import time
 
 import pytest
-from support import SOON_S, until
+from helpers.processes import SOON_S, until
 
 from zstate.errors import Closed
 from zstate.net.session import connect

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support import until
+from helpers.processes import until
 
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher

@@ -1,9 +1,9 @@
 """Writers of one robot on one wire, from announcement to close."""
 
 import pytest
-from live import STAMP, await_reader
-from support import until
-from wire.ros2.raw_nodes import DESCRIPTION, JOINT_STATES, Ear, key_of, tokens
+from helpers.processes import until
+from helpers.raw_ros_nodes import DESCRIPTION, JOINT_STATES, Ear, key_of, tokens
+from helpers.robots import STAMP, await_reader
 
 from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover, local_writer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recordings import joint_states, write_run
+from helpers.recording_files import joint_states, write_run
 
 from zstate.errors import RecordingError
 from zstate.recording.bag_metadata import bag_files

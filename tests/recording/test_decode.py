@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.recording_builder import LATENCY, MS, RRBOT, START, STORE, Bag, S, Tale, pose, swing
 from rosbags.rosbag2 import StoragePlugin
-from tales import LATENCY, MS, RRBOT, START, STORE, Bag, S, Tale, pose, swing
 
 from zstate.recording.decode import DecodedMessage, DecodedRecording
 from zstate.recording.mcap.recover import recover

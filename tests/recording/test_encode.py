@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import STORE, S
+from helpers.recording_files import STORE, S
 
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf

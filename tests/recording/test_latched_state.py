@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from live import RRBOT
-from tales import START, pose
+from helpers.recording_builder import START, pose
+from helpers.robots import RRBOT
 
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter
 from zstate.wire.messages import JointState, RobotDescription, StaticTransforms, order_digest, to_block

@@ -6,8 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.recording_builder import (
+    LATENCY,
+    MS,
+    RRBOT,
+    START,
+    Bag,
+    S,
+    Tale,
+    pose,
+    recorded_buffer,
+    swing,
+    swing_rates,
+)
 from rosbags.rosbag2 import StoragePlugin
-from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, recorded_buffer, swing, swing_rates
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Disconnected, InvalidInput, RecordingError, UnknownFrame

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from mcap.reader import NonSeekingReader, make_reader
-from mcap_ros2.decoder import DecoderFactory
-from recordings import (
+from helpers.processes import Child
+from helpers.recording_files import (
     DESCRIPTION,
     LATCHED,
     MS,
@@ -22,8 +21,9 @@ from recordings import (
     string_bytes,
     write_run,
 )
+from mcap.reader import NonSeekingReader, make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from support import Child
 
 from zstate.errors import InvalidInput, RecordingError
 from zstate.recording.mcap.writer import MIN_BYTES, RecordingWriter
@@ -207,7 +207,7 @@ KILLED = """
     import sys
     sys.path.insert(0, sys.argv[2])
     from pathlib import Path
-    from recordings import *
+    from helpers.recording_files import *
     writer = RecordingWriter(sys.argv[1])
     described, joints = declared(writer)
     writer.latch(described, "", DESCRIPTION, START, START)
@@ -233,7 +233,7 @@ def test_a_killed_recorder_leaves_all_that_it_flushed(tmp_path: Path, spawn: Cal
 FULL = """
     import resource, signal, sys
     sys.path.insert(0, sys.argv[2])
-    from recordings import *
+    from helpers.recording_files import *
     from zstate.errors import RecordingError
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
     writer = RecordingWriter(sys.argv[1])

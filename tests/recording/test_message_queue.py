@@ -3,8 +3,8 @@ from __future__ import annotations
 import time
 from contextlib import closing
 
-from live import Tap, await_reader
-from support import SOON_S, until
+from helpers.processes import SOON_S, until
+from helpers.robots import Tap, await_reader
 
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import CAPACITY, StreamPublisher

@@ -7,9 +7,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from live import RRBOT
-from support import until
-from tales import MS, START, Tale, pose
+from helpers.processes import until
+from helpers.recording_builder import MS, START, Tale, pose
+from helpers.robots import RRBOT
 
 from zstate.errors import SecondWriter
 from zstate.net.presence import current_tokens

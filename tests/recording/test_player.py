@@ -10,10 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live import Tap, await_reader, settle
+from helpers.processes import Stepping, until
+from helpers.recording_builder import (
+    LATENCY,
+    MS,
+    RRBOT,
+    START,
+    Bag,
+    S,
+    Tale,
+    pose,
+    recorded_buffer,
+    swing,
+    swing_rates,
+)
+from helpers.robots import Tap, await_reader, settle
 from rosbags.rosbag2 import StoragePlugin
-from support import Stepping, until
-from tales import LATENCY, MS, RRBOT, START, Bag, S, Tale, pose, recorded_buffer, swing, swing_rates
 
 from zstate import Recording, StatePublisher, StaticPublisher, TransformBuffer, TransformListener
 from zstate.errors import InvalidInput

@@ -6,7 +6,7 @@ import math
 import threading
 
 import pytest
-from support import Stepping
+from helpers.processes import Stepping
 
 from zstate.errors import InvalidInput
 from zstate.recording.player_clock import Lateness, PlayerClock

@@ -12,14 +12,14 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
+from helpers.processes import Child
+from helpers.recording_files import DESCRIPTION, MS, START, STORE, S, declared, joint_states, write_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
-from recordings import DESCRIPTION, MS, START, STORE, S, declared, joint_states, write_run
 from rosbags.rosbag2 import Reader as RosbagReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
-from support import Child
 
 from zstate.errors import RecordingError
 from zstate.recording.info import read_info

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tales import MS, RRBOT, START, Bag, Tale, swing
+from helpers.recording_builder import MS, RRBOT, START, Bag, Tale, swing
 
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedRecording, first_descriptions, recorded_model

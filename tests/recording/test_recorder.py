@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live import RRBOT, STAMP, UPRIGHT, Tap, settle
+from helpers.processes import SOON_S, until
+from helpers.robots import RRBOT, STAMP, UPRIGHT, Tap, settle
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from support import SOON_S, until
 
 from zstate.errors import InvalidInput, RecordingError
 from zstate.model.kinematics import Kinematics

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recordings import START, S, joint_states, write_run
+from helpers.recording_files import START, S, joint_states, write_run
 
 from zstate.errors import RecordingError
 from zstate.recording.info import read_info

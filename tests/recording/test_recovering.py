@@ -6,9 +6,9 @@ import random
 from pathlib import Path
 
 import pytest
+from helpers.recording_files import DESCRIPTION, START, S, declared, joint_states, write_run
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from recordings import DESCRIPTION, START, S, declared, joint_states, write_run
 
 from zstate.errors import RecordingError
 from zstate.recording.mcap.recover import recover

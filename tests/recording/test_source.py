@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live import RRBOT
-from support import Stepping
-from tales import MS, START, Bag, S, Tale, swing, swing_rates
+from helpers.processes import Stepping
+from helpers.recording_builder import MS, START, Bag, S, Tale, swing, swing_rates
+from helpers.robots import RRBOT
 
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model

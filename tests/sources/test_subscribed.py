@@ -2,8 +2,8 @@ import logging
 import threading
 
 import pytest
-from live import RRBOT, await_reader
-from support import until
+from helpers.processes import until
+from helpers.robots import RRBOT, await_reader
 
 from zstate.model.load import load_model
 from zstate.net.session import Session

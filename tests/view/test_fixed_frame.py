@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from live import RRBOT
+from helpers.robots import RRBOT
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.transform import Transform

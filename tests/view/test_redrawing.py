@@ -8,8 +8,8 @@ from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
-from live import RRBOT
-from support import DEADLINE_S, until
+from helpers.processes import DEADLINE_S, until
+from helpers.robots import RRBOT
 
 pytest.importorskip("viser")
 

@@ -7,8 +7,8 @@ import os
 
 import numpy as np
 import pytest
-from live import RRBOT, Tap
-from support import SOON_S, until
+from helpers.processes import SOON_S, until
+from helpers.robots import RRBOT, Tap
 
 from zstate.errors import InvalidInput
 from zstate.model.urdf import parse_urdf

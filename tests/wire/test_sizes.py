@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
-from live import RRBOT, settle
-from support import again_and_again, until
+from helpers.processes import again_and_again, until
+from helpers.robots import RRBOT, settle
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import MessageError

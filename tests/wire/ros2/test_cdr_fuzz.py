@@ -1,8 +1,8 @@
 import pytest
-from cdr_fuzz import NEW, Fuzz, answer, long_lived
+from helpers.cdr_fuzz import NEW, Fuzz, answer, long_lived
+from helpers.manual_cdr import cdr, joint_state, tf_message
 from hypothesis import given
 from hypothesis import strategies as st
-from wire.ros2.by_hand import cdr, joint_state, tf_message
 
 POSE = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]
 WHOLE = [

@@ -4,9 +4,9 @@ import struct
 import tracemalloc
 
 import pytest
+from helpers.manual_cdr import STORE, cdr, joint_state, rosbags_joint_state
 from hypothesis import given
 from hypothesis import strategies as st
-from wire.ros2.by_hand import STORE, cdr, joint_state, rosbags_joint_state
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from wire.ros2.by_hand import (
+from helpers.manual_cdr import (
     STORE,
     rosbags_cdr,
     rosbags_joint_state,

@@ -5,9 +5,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers.manual_cdr import STORE, Edges, cdr, rosbags_tf_message, tf_message
 from hypothesis import given
 from hypothesis import strategies as st
-from wire.ros2.by_hand import STORE, Edges, cdr, rosbags_tf_message, tf_message
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block

@@ -2,9 +2,9 @@ import json
 from hashlib import sha256
 
 import pytest
+from helpers.manual_cdr import STORE, rosbags_joint_state, rosbags_tf_message
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from wire.ros2.by_hand import STORE, rosbags_joint_state, rosbags_tf_message
 
 from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
 

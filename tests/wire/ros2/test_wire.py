@@ -3,10 +3,8 @@
 import struct
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from wire.ros2.by_hand import rosbags_joint_state
-from wire.ros2.raw_nodes import (
+from helpers.manual_cdr import rosbags_joint_state
+from helpers.raw_ros_nodes import (
     DESCRIPTION,
     HUMBLE,
     JOINT_STATES,
@@ -17,6 +15,8 @@ from wire.ros2.raw_nodes import (
     gid_of,
     key_of,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from zstate.errors import MessageError
 from zstate.wire.identity import WriterId

@@ -1,0 +1,78 @@
+"""What the tests with ROS 1 have: a master for each file, and processes that find it."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Iterator
+
+import pytest
+from helpers.processes import Child
+from helpers.ros1_processes import (
+    BRIDGE,
+    DEBIAN_PYTHON,
+    ROS_PEER,
+    TF2_LISTENER,
+    Peer,
+    Roscore,
+    Spawn,
+    ros_environment,
+)
+
+IN_DEBIAN = "import os, sys; os.execv(sys.argv[1], [sys.argv[1], '-u', '-c', *sys.argv[2:]])"
+
+
+@pytest.fixture(scope="module")
+def roscore(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """The environment in which a master is found."""
+    environment = ros_environment(tmp_path_factory.mktemp("ros"))
+    core = Roscore(environment)
+    yield environment
+    core.close()
+
+
+@pytest.fixture
+def namespace(
+    roscore: dict[str, str], monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> str:
+    """The name space that processes started from here on have to themselves in the ROS of this file."""
+    for name, value in roscore.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ROS_NAMESPACE", f"/{request.node.name}")
+    return f"/{request.node.name}"
+
+
+def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
+    """A node that runs ``code`` with Debian's Python, once it says so."""
+    child = spawn(IN_DEBIAN, DEBIAN_PYTHON, textwrap.dedent(code), *arguments)
+    assert child.line() == "ready", child.stderr
+    return child
+
+
+@pytest.fixture
+def peer(namespace: str, spawn: Spawn) -> Callable[..., Peer]:
+    """``peer()`` is a node that talks, ``peer("hear")`` one that also listens."""
+    return lambda *arguments: Peer(ready(spawn, ROS_PEER, *arguments))
+
+
+@pytest.fixture
+def tf2_listener(namespace: str, spawn: Spawn) -> Callable[[], Peer]:
+    """``tf2_listener().ask(target, source, stamp, wait_s)`` asks the real tf2_ros."""
+    return lambda: Peer(ready(spawn, TF2_LISTENER))
+
+
+@pytest.fixture
+def program(namespace: str, spawn: Spawn) -> Callable[..., Child]:
+    """``program(path, *arguments)`` runs a program of ROS."""
+    return lambda *command: spawn("import os, sys; os.execv(sys.argv[1], sys.argv[1:])", *command)
+
+
+@pytest.fixture
+def bridge(namespace: str, spawn: Spawn) -> Callable[..., Child]:
+    """``bridge(*arguments)`` is ``zstate ros1 rrbot ...``, running."""
+
+    def start(*arguments: str) -> Child:
+        child = spawn(BRIDGE, "ros1", "rrbot", *arguments)
+        assert child.line().startswith("bridging 'rrbot'"), child.stderr
+        return child
+
+    return start

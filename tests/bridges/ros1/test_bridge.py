@@ -1,0 +1,323 @@
+"""zstate and a real ROS 1, joined by the bridge."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from xmlrpc.client import ServerProxy
+
+import numpy as np
+import pytest
+from helpers.processes import DEADLINE_S, Child, until
+from helpers.ros1_processes import (
+    BRIDGE,
+    DEBIAN_PACKAGES,
+    JOINTS,
+    RRBOT,
+    STATE_PUBLISHER,
+    Peer,
+    Roscore,
+    Spawn,
+    ros_environment,
+    why_no_ros,
+)
+
+from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
+from zstate.bridges.ros1.node import Master
+from zstate.sources import SubscribedSource
+
+pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(why_no_ros()), reason=why_no_ros())]
+
+Bridge = Callable[..., Child]
+MODEL = load_model(RRBOT)
+S = 1_000_000_000
+# Noetic's Python carries time as float seconds, which resolve 238 ns today: 0.3 um at 1.5 rad/s and 0.8 m.
+NOETIC = 1e-6
+
+
+def swing(stamp: int) -> list[float]:
+    """Positions of rrbot at a stamp."""
+    t = (stamp % (1000 * S)) / S
+    return [0.5 * math.sin(1.5 * t), -0.3 + 0.4 * math.cos(t)]
+
+
+def say_joints(speaking: Peer, stamp: int) -> None:
+    speaking.ask("joints", stamp, JOINTS, swing(stamp))
+
+
+def answer(listener: TransformListener, target: str, source: str) -> Transform | None:
+    buffer = listener.buffer
+    return buffer.lookup(target, source) if buffer.can_lookup(target, source) else None
+
+
+def assert_same_pose(a: Sequence[float], b: Sequence[float], tolerance: float) -> None:
+    sign = math.copysign(1.0, float(np.dot(a[3:], b[3:])))
+    np.testing.assert_allclose((*a[:3], *(sign * np.array(a[3:]))), b, atol=tolerance)
+
+
+def interrupted(child: Child) -> None:
+    began = time.monotonic()
+    child.process.send_signal(signal.SIGINT)
+    assert child.wait() == 130, child.stderr
+    assert time.monotonic() - began < DEADLINE_S
+    assert "Traceback" not in child.stderr
+
+
+def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_listener: Callable[[], Peer]):
+    listening = tf2_listener()
+    with (
+        connect() as session,
+        StatePublisher(session, MODEL, "rrbot") as publisher,
+        StaticPublisher(session, "rrbot", "mount") as statics,
+        TransformListener(session) as listener,
+    ):
+        statics.set(Transform.from_rpy("tool", "probe", (0.1, 0.0, 0.05), (0.2, -0.3, 0.4)))
+        carrying = bridge("--to-ros")
+        stamp = time.time_ns()
+
+        def goes_on() -> int:
+            nonlocal stamp
+            stamp += 10_000_000
+            publisher.publish(swing(stamp), stamp=stamp)
+            return stamp
+
+        # Until a sample has come through, nobody is sure to hear the next ones.
+        until(lambda: isinstance(listening.ask("base", "probe", goes_on(), 0.02), list))
+        begin = stamp
+        end = [goes_on() for _ in range(50)][-1]
+        for at in range(begin, end, 17_000_003):
+            theirs, at_theirs = listening.ask("world", "probe", at, 5.0)
+            ours = listener.buffer.lookup("world", "probe", at, timeout_s=5.0)
+            assert_same_pose(theirs, ours.pose7.tolist(), NOETIC)
+            # Noetic's Python asks at float seconds.
+            assert abs(at_theirs - at) < 1_000
+        # Whoever comes late has the edges that never move, of the model and of others.
+        theirs, _ = tf2_listener().ask("lower", "probe", 0, 5.0)
+        assert_same_pose(theirs, listener.buffer.lookup("lower", "probe").pose7.tolist(), 1e-12)
+        interrupted(carrying)
+        assert carrying.line().endswith(" samples to ROS, 0 from there")
+
+
+def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
+    bridge: Bridge, peer: Callable[..., Peer], program: Bridge, namespace: str
+):
+    Master().set_parameter(f"{namespace}/robot_description", RRBOT.read_text())
+    program(str(STATE_PUBLISHER), "_publish_frequency:=1000", "_ignore_timestamp:=true")
+    speaking, hearing = peer(), peer("hear")
+    carrying = bridge("--from-ros")
+    probe = Transform.from_rpy("tool", "probe", (0.1, 0.0, 0.05), (0.2, -0.3, 0.4))
+    identity = [0.0] * 6 + [1.0]
+    with connect() as session, TransformListener(session, "rrbot") as listener:
+        lookup = listener.buffer.lookup
+        # In ROS the newest parent of a child counts, and its newest pose.
+        for parent, pose in (("lower", identity), ("tool", identity), ("tool", probe.pose7.tolist())):
+            speaking.ask("edge", "/tf_static", parent, "probe", pose)
+            placed = Transform.from_pose7(parent, "probe", pose)
+            until(lambda placed=placed: answer(listener, placed.target, "probe") == placed)
+        speaking.ask("edge", "/tf", "odom", "world", identity)
+        until(lambda: speaking.ask("readers") == 3)  # the state publisher, the other node, and the bridge
+        stamps: list[int] = []
+
+        def have_met() -> bool:
+            stamps.append(time.time_ns())
+            say_joints(speaking, stamps[-1])
+            return listener.buffer.can_lookup("world", "probe") and len(stamps) > 50
+
+        until(have_met)
+        until(lambda: hearing.listen() or ("upper", "lower", stamps[-1]) in hearing.edges)
+        listener.buffer.wait("world", "tool", stamps[-1], 5.0)
+        compared = [key for key in hearing.edges if listener.buffer.can_lookup(*key)]
+        assert len(compared) >= 20
+        for parent, child, stamp in compared:
+            writer, theirs = hearing.edges[parent, child, stamp]
+            assert "state_publisher" in writer
+            ours = lookup(parent, child, stamp)
+            assert ours.kind == "exact"  # the very sample of that stamp
+            assert_same_pose(ours.pose7.tolist(), theirs, 1e-12)
+        # What the model fixes, the static writer does not say again.
+        kinds = {frame.name: (frame.kind, frame.writer) for frame in listener.buffer.frames()}
+        assert [name for name, (_, writer) in kinds.items() if writer == kinds["rrbot/probe"][1]] == [
+            "rrbot/probe"
+        ]
+        until(lambda: "'odom' -> 'world'" in carrying.stderr)
+    interrupted(carrying)
+    assert carrying.stderr.count("odom") == 1
+
+
+def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[..., Peer]):
+    hearing, speaking = peer("hear"), peer()
+    carrying = bridge("--to-ros", "--from-ros")
+    in_zstate: Counter[int] = Counter()
+
+    def count() -> None:
+        for reading in source:
+            assert reading.stamp is not None
+            in_zstate[reading.stamp] += 1
+
+    with (
+        connect() as session,
+        StatePublisher(session, MODEL, "rrbot") as publisher,
+        SubscribedSource(session, MODEL, "rrbot") as source,
+    ):
+        counting = threading.Thread(target=count)
+        counting.start()
+
+        def say(ours: int, theirs: int) -> None:
+            publisher.publish(swing(ours), stamp=ours)
+            say_joints(speaking, theirs)
+
+        def have_been_everywhere(*stamps: int) -> bool:
+            in_ros = hearing.counts()
+            return all(in_ros[stamp] and in_zstate[stamp] for stamp in stamps)
+
+        first = iter(range(S, 2 * S, 2))
+
+        def have_met() -> bool:
+            stamp = next(first)
+            say(stamp, stamp + 1)
+            return have_been_everywhere(stamp - 2, stamp - 1)
+
+        until(have_met)
+        ours, theirs = range(2 * S, 2 * S + 100), range(3 * S, 3 * S + 100)
+        for pair in zip(ours, theirs, strict=True):
+            say(*pair)
+        # Once the last of each has been everywhere, what goes round in circles has come by again.
+        until(lambda: have_been_everywhere(ours[-1], theirs[-1]))
+        for heard in (hearing.counts(), in_zstate):
+            assert [heard[stamp] for stamp in (*ours, *theirs)] == [1] * 200
+        source.close()
+        counting.join(1.0)
+    interrupted(carrying)
+    assert "refused" not in carrying.stderr
+
+
+def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callable[..., Peer]):
+    hearing = peer("hear")
+    bridge("--to-ros")
+    back = bridge("--from-ros", "--model", str(RRBOT))
+    with connect() as session, StatePublisher(session, MODEL, "rrbot", takeover=True) as publisher:
+        stamps = iter(range(S, 2 * S))
+
+        def refused() -> bool:
+            publisher.publish([0.0, 0.0], stamp=next(stamps))
+            return "(another bridge)" in back.stderr and len(hearing.counts()) > 10
+
+        until(refused)
+        assert set(hearing.counts().values()) == {1}
+
+
+def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
+    bridge: Bridge, peer: Callable[..., Peer], namespace: str
+):
+    hearing = peer("hear")
+    bridge("--to-ros", "--frame-prefix", "left_")
+    stamps = iter(range(1_700_000_000_123_456_789, 2**62))
+    sent: set[int] = set()
+    with connect() as session, StatePublisher(session, MODEL, "rrbot") as publisher:
+
+        def heard() -> bool:
+            sent.add(stamp := next(stamps))
+            publisher.publish([0.25, -1.5], [0.5, 1.0], [7.0, -8.0], stamp)
+            hearing.listen()
+            return bool(hearing.joints and hearing.edges)
+
+        until(heard)
+    stamp, names, numbers = hearing.joints[0]
+    assert stamp in sent
+    assert (names, numbers) == (list(JOINTS), [[0.25, -1.5], [0.5, 1.0], [7.0, -8.0]])
+    edges = {(parent, child) for parent, child, _ in hearing.edges}
+    assert edges == {("left_base", "left_upper"), ("left_upper", "left_lower")}
+    # It is set by the thread that hears of the model, not by the one that carries samples.
+    until(lambda: hearing.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
+
+
+def test_what_cannot_be_used_is_counted_and_said_once(bridge: Bridge, peer: Callable[..., Peer]):
+    speaking = peer()
+    carrying = bridge("--from-ros", "--model", str(RRBOT))
+    until(lambda: speaking.ask("readers") == 1)
+    with connect() as session, TransformListener(session, "rrbot") as listener:
+        for _ in range(2):
+            speaking.ask("joints", 0, JOINTS, [0.0, 0.0])
+            speaking.ask("joints", S, JOINTS, [0.0, math.nan])
+            speaking.ask("joints", S, ["shoulder"], [0.0])
+            speaking.ask("joints", S, JOINTS, [0.0])
+        # It goes on; joints beside those of the model are left out.
+        stamps = iter(range(2 * S, 3 * S))
+
+        def is_carried() -> bool:
+            speaking.ask("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
+            return listener.buffer.can_lookup("world", "tool")
+
+        until(is_carried)
+        # Both joints turn about y, by 0.2 and by 0.1.
+        assert math.isclose(listener.buffer.lookup("world", "tool").rpy[1], 0.3, abs_tol=1e-12)
+    interrupted(carrying)
+    refused = "zero stamp 2, bad numbers 2, missing joints 2, sizes 2, unknown joints 1"
+    assert carrying.line().endswith(f"from there; refused: {refused}")
+    for advice in ("header.stamp", "(nan)", "without 'elbow'", "1 numbers of position", "'wheel'"):
+        assert carrying.stderr.count(advice) == 1, carrying.stderr
+
+
+def test_a_node_that_is_killed_ends_with_a_word(namespace: str, spawn: Spawn):
+    carrying = spawn(BRIDGE, "ros1", "rrbot", "--to-ros")
+    name = carrying.line().rpartition(" ")[2]
+    with ServerProxy(os.environ["ROS_MASTER_URI"]) as master:
+        _, _, uri = master.lookupNode("/test", name)  # type: ignore[misc]
+    with ServerProxy(str(uri)) as node:
+        node.shutdown("/test", "as rosnode kill does")
+    assert carrying.wait() == 1
+    assert "zstate: ROS has ended the node" in carrying.stderr
+
+
+def test_rospy_leaves_the_logging_of_others_alone(namespace: str, spawn: Spawn):
+    child = spawn(
+        f"""
+        import logging, sys
+        sys.path.append({DEBIAN_PACKAGES!r})
+        logging.basicConfig(level=logging.ERROR)
+        before = logging.root.handlers[:], logging.root.level, logging.getLoggerClass()
+        from zstate.bridges.ros1.node import Node
+        with Node():
+            print(before == (logging.root.handlers, logging.root.level, logging.getLoggerClass()))
+        """
+    )
+    assert child.line() == "True", child.stderr
+    assert child.wait() == 0
+
+
+def test_a_master_that_goes_is_told_and_another_one_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spawn: Spawn
+):
+    environment = ros_environment(tmp_path)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    first = Roscore(environment)
+    child = spawn(BRIDGE, "ros1", "rrbot", "--to-ros")
+    child.line()
+    first.close()
+    until(lambda: "no ROS master answers" in child.stderr)
+    second = Roscore(environment)
+    try:
+        assert child.wait() == 1
+    finally:
+        second.close()
+    assert "the ROS master was started anew" in child.stderr
+    assert child.stderr.count("no ROS master answers") == 1
+    assert "Traceback" not in child.stderr
+
+
+def test_without_a_master_the_bridge_says_what_to_start(
+    monkeypatch: pytest.MonkeyPatch, spawn: Spawn, free_port: int
+):
+    monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{free_port}")
+    child = spawn(BRIDGE, "ros1", "rrbot", "--to-ros")
+    assert child.wait(5.0) == 1
+    for fact in (f"127.0.0.1:{free_port}", "ROS_MASTER_URI", "`roscore`"):
+        assert fact in child.stderr
+    assert "Traceback" not in child.stderr

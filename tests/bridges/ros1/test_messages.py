@@ -1,0 +1,147 @@
+"""Names, stamps and numbers on their way to ROS and back; no ROS is needed for these."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.processes import until
+from helpers.ros1_processes import JOINTS, RRBOT, Spawn
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zstate import load_model
+from zstate.bridges.ros1.messages import (
+    JointStateReader,
+    JointStateWriter,
+    Ros1FrameNames,
+    get_stamp,
+    set_stamp,
+)
+from zstate.bridges.ros1.node import RospyModules
+from zstate.errors import MessageError
+from zstate.wire.joint_order import JointNumbers
+
+MODEL = load_model(RRBOT)
+BARE = st.text("abc_/", min_size=1, max_size=8).filter(lambda name: not name.startswith("/"))
+
+
+def header(secs: int = 0, nsecs: int = 0) -> Any:
+    return SimpleNamespace(stamp=SimpleNamespace(secs=secs, nsecs=nsecs))
+
+
+def joint_state(names: Any, position: Any = (), velocity: Any = (), effort: Any = ()) -> Any:
+    return SimpleNamespace(name=list(names), position=position, velocity=velocity, effort=effort)
+
+
+# A message of ROS, without ROS: the fields that its class has.
+ROS = RospyModules(None, lambda name: SimpleNamespace(header=header(), name=name), None, None)
+
+
+@given(st.integers(1, 2**32 * 10**9 - 1))
+def test_a_stamp_goes_to_ros_and_back_to_the_nanosecond(stamp: int):
+    there = header()
+    set_stamp(there, stamp)
+    assert there.stamp.nsecs < 10**9
+    assert there.stamp.secs < 2**32
+    assert get_stamp(there) == stamp
+
+
+@pytest.mark.parametrize("stamp", [0, -1, 2**32 * 10**9])
+def test_a_stamp_that_ros_cannot_say_is_refused(stamp: int):
+    with pytest.raises(MessageError, match=f"stamp {stamp} cannot be said"):
+        set_stamp(header(), stamp)
+
+
+def test_a_zero_stamp_of_ros_is_none():
+    with pytest.raises(MessageError, match=r"header\.stamp") as caught:
+        get_stamp(header())
+    assert caught.value.reason == "zero stamp"
+
+
+@given(BARE, st.sampled_from(["", "left_", "tf/"]))
+def test_a_frame_name_comes_back_from_ros(bare: str, prefix: str):
+    names = Ros1FrameNames("rrbot", prefix)
+    for frame in (bare, f"rrbot/{bare}"):
+        if frame == bare and "/" in bare:
+            assert names.in_ros(frame) == frame  # it is another robot's, in full
+        else:
+            assert names.in_ros(frame) == prefix + bare
+            assert names.bare(names.in_ros(frame)) == bare
+
+
+def test_old_programs_put_a_slash_before_a_frame_name():
+    assert Ros1FrameNames("rrbot", "left_").in_zstate("/left_tool", frozenset()) == "tool"
+
+
+def test_a_link_with_a_slash_in_its_name_is_the_robots_own():
+    names = Ros1FrameNames("rrbot")
+    assert names.in_zstate("camera/lens", frozenset({"camera/lens"})) == "rrbot/camera/lens"
+    assert names.in_zstate("fleet/map", frozenset({"camera/lens"})) == "fleet/map"
+
+
+def test_joints_are_found_by_name_in_any_order():
+    reader = JointStateReader(MODEL)
+    message = joint_state(("wheel", "elbow", "shoulder"), (9.0, 0.2, 0.1), (), (0.0, 4.0, 3.0))
+    numbers = reader.read(message)
+    assert np.array_equal(numbers.positions, [0.1, 0.2])
+    assert numbers.velocities is None
+    assert numbers.efforts is not None
+    assert np.array_equal(numbers.efforts, [3.0, 4.0])
+    assert reader.unknown(message) == ("wheel",)
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (joint_state(["shoulder"], [0.0]), "missing joints"),
+        (joint_state(["shoulder", "elbow", "elbow"], [0.0, 1.0, 2.0]), "names"),
+        (joint_state(JOINTS), "sizes"),
+        (joint_state(JOINTS, [0.0]), "sizes"),
+        (joint_state(JOINTS, [0.0, 0.0], [0.0]), "sizes"),
+    ],
+)
+def test_a_joint_state_that_is_not_the_whole_robot_is_refused(message: Any, reason: str):
+    with pytest.raises(MessageError) as caught:
+        JointStateReader(MODEL).read(message)
+    assert caught.value.reason == reason
+
+
+def test_each_number_of_a_floating_joint_has_a_name_in_ros():
+    model = load_model("""
+        <robot name="drone">
+          <link name="map"/> <link name="body"/> <link name="rotor"/>
+          <joint name="flight" type="floating"><parent link="map"/> <child link="body"/></joint>
+          <joint name="spin" type="continuous"><parent link="body"/> <child link="rotor"/></joint>
+        </robot>
+    """)
+    positions, velocities = np.array([1, 2, 3, 0, 0, 0, 1, 9.0]), np.arange(7.0)
+    said = JointStateWriter(ROS, model).message(1, JointNumbers(positions, velocities, None))
+    assert said.name == [*(f"flight.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")), "spin"]
+    read = JointStateReader(model).read(said)
+    assert np.array_equal(read.positions, positions)
+    assert read.velocities is not None
+    assert np.array_equal(read.velocities, velocities)
+    assert read.efforts is None
+
+
+@pytest.mark.processes
+def test_without_rospy_the_command_says_what_to_install(spawn: Spawn):
+    child = spawn(
+        "import sys; sys.modules['rospy'] = None; from zstate.cli.main import main; main()",
+        *("ros1", "rrbot", "--to-ros"),
+    )
+    assert child.wait() == 1
+    until(lambda: child.stderr)
+    assert "apt-get install python3-rospy" in child.stderr
+    assert "--system-site-packages" in child.stderr
+    assert "Traceback" not in child.stderr
+
+
+@pytest.mark.processes
+def test_a_direction_must_be_chosen(spawn: Spawn):
+    child = spawn("from zstate.cli.main import main; main()", "ros1", "rrbot")
+    assert child.wait() == 2
+    assert "--to-ros, --from-ros, or both" in child.stderr

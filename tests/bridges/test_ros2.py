@@ -1,0 +1,386 @@
+"""Whole robots between two networks: native sessions that meet on this host, ROS's behind a router."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from helpers.processes import a_free_port, until
+from helpers.robots import RRBOT, STAMP, UPRIGHT
+
+from zstate.bridges.ros2 import Bridge
+from zstate.errors import InvalidInput
+from zstate.model.load import load_model
+from zstate.net.presence import discover
+from zstate.net.session import Session, connect
+from zstate.net.streams import StreamSubscriber
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.sources import SineSource, SubscribedSource
+from zstate.transform import Transform
+from zstate.wire.protocol import SerializedSample
+from zstate.wire.registry import get_wire
+
+GRIPPER = load_model("gripper")
+EACH = "ros2:namespace=*"
+STAMPS = [STAMP + number * 10_000_000 for number in range(20)]
+SINE = SineSource(RRBOT)
+EFFORTS = [0.25, -3.5]
+TO_ROS, TO_NATIVE = "native to ROS", "ROS to native"
+
+
+@dataclass
+class World:
+    """Two networks and the bridges between them; ``changes`` is what those said."""
+
+    endpoint: str
+    join: Callable[[str], Session]
+    open: Callable[..., Bridge]
+    changes: list[tuple[str, str | None]] = field(default_factory=list)
+
+    def bridge(self, *robots: str, wire: str = "ros2") -> Bridge:
+        said = lambda robot, way: self.changes.append((robot, way))  # noqa: E731
+        return self.open(self.join("native"), self.join("ros2"), wire, robots or None, on_change=said)
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    with ExitStack() as opened:
+        opened.enter_context(connect(mode="router", listen=endpoint))
+
+        def join(wire: str) -> Session:
+            where = {} if wire == "native" else {"mode": "client", "endpoints": endpoint}
+            return opened.enter_context(connect(**where))
+
+        yield World(endpoint, join, lambda *args, **options: opened.enter_context(Bridge(*args, **options)))
+
+
+@pytest.fixture(params=["native", "ros2"])
+def here(request: pytest.FixtureRequest) -> str:
+    """The wire on which the robot is written."""
+    return request.param
+
+
+@pytest.fixture
+def there(here: str) -> str:
+    return "ros2" if here == "native" else "native"
+
+
+def way_of(here: str) -> str:
+    return TO_ROS if here == "native" else TO_NATIVE
+
+
+def publish(publisher: StatePublisher, stamps: list[int] = STAMPS) -> None:
+    for stamp in stamps:
+        reading = SINE.read(stamp)
+        publisher.publish(reading.positions, reading.velocities, EFFORTS, stamp)
+
+
+def publish_until(publisher: StatePublisher, arrived: Callable[[], object]) -> None:
+    """Samples at ever new stamps, until one of them got through."""
+    stamps = iter(range(1, 1_000_000))
+    until(lambda: publish(publisher, [next(stamps)]) or arrived())
+
+
+class Ear:
+    """Counts what is heard of a robot's joint states, by stamp."""
+
+    def __init__(self, session: Session, robot: str, wire: str) -> None:
+        self.stamps: Counter[int] = Counter()
+        self._robot, self._wire = robot, get_wire(wire)
+        self._subscriber = StreamSubscriber(session, self._wire.expression(robot, "joint_states"), self._take)
+
+    def _take(self, arrivals: list[SerializedSample]) -> None:
+        for arrival in arrivals:
+            self.stamps.update(s.stamp for s in self._wire.decode("joint_states", arrival, self._robot))
+
+    def __enter__(self) -> Ear:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._subscriber.close()
+
+
+def hears(listener: TransformListener, stamp: int | None = None) -> bool:
+    return listener.buffer.can_lookup("world", "tool", stamp)
+
+
+def frames(listener: TransformListener) -> set[str]:
+    return {frame.name.partition("/")[2] for frame in listener.buffer.frames()}
+
+
+def programs(session: Session, wire: str, robot: str = "") -> set[str]:
+    """Which programs write for ``robot``, or for all."""
+    infos = [info for info in discover(session, wire=wire) if robot in ("", info.name)]
+    return {writer.program for info in infos for _, writer in info.writers}
+
+
+def test_a_robot_is_carried_bit_for_bit_with_its_stamps(world, here, there):
+    world.bridge("r1")
+    with (
+        StatePublisher(world.join(here), RRBOT, "r1", (here,)) as publisher,
+        TransformListener(world.join(here), "r1", wire=here) as original,
+        TransformListener(world.join(there), "r1", wire=there) as carried,
+    ):
+        publish_until(publisher, lambda: hears(original) and hears(carried))
+        publish(publisher)
+        until(lambda: hears(original, STAMPS[-1]) and hears(carried, STAMPS[-1]))
+        for stamp in [*STAMPS, STAMP + 5_000_001]:
+            one, other = (side.buffer.lookup("world", "tool", stamp) for side in (original, carried))
+            assert one.pose7.tobytes() == other.pose7.tobytes()
+            assert (one.stamp, one.kind) == (other.stamp, other.kind)
+        assert carried.stats.refused == {}
+    assert world.changes[0] == ("r1", way_of(here))
+
+
+def test_every_number_of_a_joint_state_is_carried(world, here, there):
+    world.bridge("r1")
+    with (
+        StatePublisher(world.join(here), RRBOT, "r1", (here,)) as publisher,
+        SubscribedSource(world.join(there), RRBOT, "r1", wire=there) as source,
+    ):
+        publish_until(publisher, lambda: source.read(0))
+        publish(publisher)
+        carried = next(reading for reading in source if reading.stamp == STAMPS[0])
+        expected = SINE.read(STAMPS[0])
+        assert carried.positions.tobytes() == expected.positions.tobytes()
+        assert carried.velocities.tobytes() == expected.velocities.tobytes()
+        assert carried.efforts.tolist() == EFFORTS
+
+
+def test_who_joins_late_is_given_the_model_and_the_fixed_edges(world, here, there):
+    with StatePublisher(world.join(here), RRBOT, "r1", (here,)):
+        world.bridge("r1")
+        until(lambda: world.changes)
+        with TransformListener(world.join(there), "r1", wire=there, follow="tf") as listener:
+            until(lambda: listener.buffer.can_lookup("tool", "camera_link"))
+
+
+def test_static_edges_of_others_are_carried_and_those_of_the_model_are_not_repeated(world, here, there):
+    world.bridge("r1")
+    hook = Transform("tool", "hook", (0.0, 0.125, 0.25), UPRIGHT)
+    session = world.join(here)
+    with (
+        StaticPublisher(session, "r1", "mount", here) as statics,
+        StatePublisher(session, RRBOT, "r1", (here,)),
+        TransformListener(world.join(there), "r1", wire=there) as listener,
+    ):
+        statics.set(hook)
+        camera_from_hook = listener.buffer.wait("camera_link", "hook", timeout_s=10.0)
+        with TransformListener(session, "r1", wire=here) as near:
+            expected = near.buffer.wait("camera_link", "hook", timeout_s=10.0)
+        assert np.allclose(camera_from_hook.matrix, expected.matrix, rtol=0, atol=1e-15)
+        moved = Transform("tool", "hook", (0.5, 0.0, 0.0), UPRIGHT)
+        statics.set(moved)
+        until(lambda: listener.buffer.lookup("tool", "hook").translation.tolist() == [0.5, 0.0, 0.0])
+        assert listener.stats.refused == {}
+
+
+def test_what_is_withdrawn_natively_is_withdrawn_on_ros_for_late_joiners(world):
+    world.bridge("r1")
+    session = world.join("native")
+    with (
+        StatePublisher(session, RRBOT, "r1"),
+        StaticPublisher(session, "r1", "mount") as statics,
+        TransformListener(world.join("ros2"), "r1", wire="ros2") as early,
+    ):
+        statics.set(Transform("tool", "hook", (0.0, 0.0, 0.25), UPRIGHT))
+        statics.set(Transform("tool", "lamp", (0.0, 0.0, 0.5), UPRIGHT))
+        until(lambda: {"hook", "lamp"} <= frames(early))
+        statics.withdraw("hook")
+        statics.set(Transform("tool", "bolt", (0.0, 0.0, 0.75), UPRIGHT))
+        until(lambda: "bolt" in frames(early))
+        with TransformListener(world.join("ros2"), "r1", wire="ros2") as late:
+            until(lambda: {"lamp", "bolt", "tool"} <= frames(late))
+            assert "hook" not in frames(late)
+
+
+def test_another_model_replaces_the_first(world, here, there):
+    world.bridge("r1")
+    session = world.join(here)
+    still = [0.0] * GRIPPER.position_count
+    with (
+        TransformListener(world.join(there), "r1", wire=there) as listener,
+        StatePublisher(session, RRBOT, "r1", (here,)),
+    ):
+        until(lambda: "tool" in frames(listener))
+        with StatePublisher(session, GRIPPER, "r1", (here,), takeover=True) as publisher:
+            until(lambda: len(world.changes) == 2)
+            pair = GRIPPER.root, GRIPPER.links[-1]
+            until(lambda: publisher.publish(still) or listener.buffer.can_lookup(*pair))
+    assert world.changes[:2] == [("r1", way_of(here))] * 2
+
+
+def test_a_robot_that_is_gone_is_carried_no_more_and_its_return_is_a_new_beginning(world, here, there):
+    world.bridge("r1")
+    session, other = world.join(here), world.join(there)
+    with TransformListener(other, "r1", wire=there) as listener:
+        for time in (1, 2):
+            with StatePublisher(session, RRBOT, "r1", (here,)) as publisher:
+                until(lambda: programs(other, there) == {bridge_on(there)})
+                # The second run begins at earlier stamps, as after a reset of simulated time.
+                stamp = STAMP - time * 3600 * 10**9
+                until(lambda s=stamp, p=publisher: publish(p, [s]) or hears(listener, s))
+            until(lambda n=time: len(world.changes) == 2 * n)
+            until(lambda: not programs(other, there))
+        assert listener.buffer.latest("world", "tool") == STAMP - 2 * 3600 * 10**9
+    assert world.changes == [("r1", way_of(here)), ("r1", None)] * 2
+
+
+def bridge_on(wire: str) -> str:
+    return "zstate_bridge" if wire == "native" else "/zstate_bridge"
+
+
+WRITER = """
+    import sys
+    from zstate import StatePublisher, connect, load_model
+    options = {"mode": "client", "endpoints": sys.argv[2]} if sys.argv[2] else {}
+    with connect(**options) as session, StatePublisher(session, load_model("rrbot"), "r1", (sys.argv[1],)):
+        print("there")
+        sys.stdin.readline()
+"""
+
+
+@pytest.mark.processes
+def test_a_writer_that_is_killed_is_carried_no_more(world, here, there, spawn):
+    world.bridge("r1")
+    other = world.join(there)
+    child = spawn(WRITER, here, world.endpoint if here == "ros2" else "")
+    assert child.line() == "there"
+    until(lambda: programs(other, there))
+    child.kill()
+    until(lambda: world.changes == [("r1", way_of(here)), ("r1", None)])
+    until(lambda: not programs(other, there))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_nothing_comes_back_through_bridges_side_by_side(world, count):
+    bridges = [world.bridge(wire=EACH) for _ in range(count)]
+    with ExitStack() as opened:
+        for robot, here, there in (("r1", "native", EACH), ("r2", EACH, "native")):
+            session = world.join(here)
+            publisher = opened.enter_context(StatePublisher(session, RRBOT, robot, (here,)))
+            source = opened.enter_context(Ear(world.join(here), robot, here))
+            carried = opened.enter_context(Ear(world.join(there), robot, there))
+            publish_until(publisher, lambda e=carried, s=source: s.stamps and count in e.stamps.values())
+            # An echo of the first would be there before all of the last were carried.
+            publish(publisher)
+            for stamp in (STAMPS[-1] + 1, STAMPS[-1] + 2):
+                publish(publisher, [stamp])
+                until(lambda e=carried, s=stamp: e.stamps[s] == count)
+                until(lambda e=source, s=stamp: e.stamps[s])
+            assert {source.stamps[stamp] for stamp in STAMPS} == {1}
+            assert {carried.stamps[stamp] for stamp in STAMPS} == {count}
+            assert not any("zstate_bridge" in name for name in programs(session, here, robot))
+    until(lambda: len(world.changes) == 4 * count)
+    assert sorted(world.changes[: 2 * count]) == sorted([("r1", TO_ROS), ("r2", TO_NATIVE)] * count)
+    assert [bridge.carriers for bridge in bridges] == [()] * count
+
+
+def test_every_robot_stands_in_a_namespace_of_its_own(world):
+    world.bridge(wire=EACH)
+    session = world.join("native")
+    with (
+        StatePublisher(session, RRBOT, "r1") as first,
+        StatePublisher(session, RRBOT, "r2") as second,
+        TransformListener(world.join("ros2"), wire=EACH) as listener,
+    ):
+        tools = [("r1/world", "r1/tool"), ("r2/world", "r2/tool")]
+        until(
+            lambda: (
+                first.publish([0.5, 0.0], stamp=STAMP)
+                or second.publish([1.0, 0.0], stamp=STAMP)
+                or all(listener.buffer.can_lookup(*pair) for pair in tools)
+            )
+        )
+        one, other = (listener.buffer.lookup(*pair, STAMP) for pair in tools)
+        assert not np.allclose(one.matrix, other.matrix)
+        assert {"r1", "r2"} <= set(listener.robots())
+
+
+def test_static_edges_of_another_robot_are_not_taken_for_ones_own(world):
+    world.bridge(wire=EACH)
+    ros = world.join("ros2")
+    with (
+        StatePublisher(ros, RRBOT, "r1", (EACH,)),
+        StaticPublisher(ros, "r1", wires=EACH) as own,
+        StaticPublisher(ros, "r2", wires=EACH) as foreign,
+        TransformListener(world.join("native")) as listener,
+    ):
+        foreign.set(Transform("base", "plate", (0.0, 0.0, 1.0), UPRIGHT))
+        own.set(Transform("fleet/map", "world", (1.0, 0.0, 0.0), UPRIGHT))
+        until(lambda: listener.buffer.can_lookup("fleet/map", "r1/world"))
+        # Each of ROS's late joiners' values has come by then, or comes with the next.
+        own.set(Transform("tool", "hook", (0.0, 0.0, 1.0), UPRIGHT))
+        until(lambda: "r1/hook" in {frame.name for frame in listener.buffer.frames()})
+        assert not any("plate" in frame.name for frame in listener.buffer.frames())
+
+
+def test_a_robot_that_is_written_on_both_sides_is_not_carried_and_that_is_said_once(world, caplog):
+    bridge = world.bridge("r1")
+    native, ros = world.join("native"), world.join("ros2")
+    with caplog.at_level(logging.WARNING, "zstate"), StatePublisher(native, RRBOT, "r1"):
+        until(lambda: bridge.carriers)
+        with StatePublisher(ros, RRBOT, "r1", ("ros2:node=driver",)):
+            until(lambda: programs(ros, "ros2") == {"/driver"} and bridge.carriers == ())
+        # With one of them gone the other one is carried again.
+        until(lambda: world.changes[-1:] == [("r1", TO_ROS)])
+    said = [record.message for record in caplog.records if "not carried" in record.message]
+    assert len(said) == 1
+    assert "on ROS by '/driver'" in said[0]
+    assert {way for _, way in world.changes} <= {TO_ROS, None}
+
+
+def test_what_ros_cannot_say_is_counted_and_ends_nothing(world, caplog):
+    bridge = world.bridge("r1")
+    with (
+        StatePublisher(world.join("native"), RRBOT, "r1") as publisher,
+        TransformListener(world.join("ros2"), "r1", wire="ros2") as listener,
+    ):
+        publish_until(publisher, lambda: hears(listener))
+        publish(publisher, [0, 0, STAMP])
+        until(lambda: hears(listener, STAMP))
+        (carrier,) = bridge.carriers
+        assert carrier.refused == {"joint state": 2}
+    assert sum("the stamp is 0" in record.message for record in caplog.records) == 1
+
+
+def test_a_name_that_no_ros_namespace_can_have_is_said(world, caplog):
+    bridge = world.bridge(wire=EACH)
+    with StatePublisher(world.join("native"), RRBOT, "arm-1"):
+        until(lambda: bridge.carriers and bridge.carriers[0].refused)
+    assert "'arm_1'" in caplog.text
+    assert world.changes == []
+
+
+@pytest.mark.parametrize(
+    ("wire", "robots", "words"),
+    [
+        ("ros2", None, ["room for one robot, not for all", "zstate bridge panda", EACH]),
+        ("ros2", ["r1", "r2"], ["not for 'r1' and 'r2'", EACH]),
+        ("ros2:namespace=cell", None, ["namespace '/cell'"]),
+        ("ros2:namespace=*,frame_prefix=x/", None, ["mixed up in /tf", EACH]),
+        ("ros2:node=mine", ["r1"], ["node is 'mine'", "zstate_bridge"]),
+        ("ros2dds", ["r1"], ["'ros2dds'", "wrote itself"]),
+        ("native", ["r1"], ["'native'"]),
+        ("ros2", ["a/b"], ["'a/b'"]),
+    ],
+)
+def test_what_would_be_mixed_up_is_refused(sessions, wire, robots, words):
+    with pytest.raises(InvalidInput) as caught:
+        Bridge(*sessions, wire, robots)
+    assert all(word in str(caught.value) for word in words)
+
+
+@pytest.mark.parametrize("wire", ["ros2:namespace=*,tf=namespace", "ros2:namespace=cell", "ros2:domain=7"])
+def test_one_robot_may_stand_anywhere(sessions, wire):
+    with Bridge(*sessions, wire, ["r1"]) as bridge:
+        assert bridge.carriers == ()
+    bridge.close()

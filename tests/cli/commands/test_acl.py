@@ -1,0 +1,86 @@
+"""The access control of a fleet, by commands as people run them: robots r1 and r2, and the viewer desk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import RRBOT, Spawn, failure, started, zstate
+
+from zstate import connect
+from zstate.net.security.credentials import Credentials
+from zstate.net.streams import StreamSubscriber
+from zstate.wire.protocol import SerializedSample
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture
+def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Where the router of the fleet listens; whoever names a user has the right password."""
+    acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
+    acl.write_bytes(zstate("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
+    users.write_text("r1:secret\nr2:secret\ndesk:secret\n")
+    users.chmod(0o600)
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    started(spawn, "router", "--listen", endpoint, "--acl", str(acl), "--users", str(users)).line()
+    monkeypatch.setenv("ZSTATE_CONNECT", endpoint)
+    monkeypatch.setenv("ZSTATE_PASSWORD", "secret")
+    return endpoint
+
+
+def test_a_viewer_who_comes_late_sees_the_robot_move(spawn: Spawn, router: str):
+    started(spawn, "publish", RRBOT, "--name", "r1", "--source", "sine", "--user", "r1").line()
+    seen = zstate("tf", "base", "lower", "--once", "--json", "--user", "desk")
+    assert seen.returncode == 0, seen.stderr
+    assert json.loads(seen.stdout)["target"] == "base"
+    (robot,) = json.loads(zstate("ls", "--json", "--user", "desk").stdout)
+    assert robot["robot"] == "r1"
+
+
+@pytest.mark.parametrize("user", ["r2", "desk"])
+def test_somebody_else_cannot_write_the_robot_and_is_told_why(router: str, user: str):
+    credentials = Credentials(user="desk", password="secret")
+    heard: list[SerializedSample] = []
+    with connect(mode="client", endpoints=router, credentials=credentials) as session:
+        ear = StreamSubscriber(session, "zstate/r1/**", heard.extend)
+        told = failure("publish", RRBOT, "--name", "r1", "--source", "sine", "--user", user)
+        ear.close()
+    assert f"the router does not let user '{user}' write as robot 'r1'" in told
+    assert "`zstate acl --robot r1`" in told
+    assert heard == []
+
+
+def test_the_names_are_checked():
+    assert "cannot be the name of an identity" in failure("acl", "--robot", "a/b")
+    assert "name somebody" in failure("acl", code=2)
+
+
+def test_a_placer_writes_static_edges_under_its_own_name():
+    printed = zstate("acl", "--robot", "r1", "--placer", "site").stdout.decode()
+    assert "placers:     site" in printed
+    assert '"zstate/site/tf_static/*"' in printed
+    assert '"zstate/site/**"' not in printed
+
+
+def test_a_file_without_access_control_is_not_taken_for_one(tmp_path: Path):
+    file = tmp_path / "acl.json5"
+    file.write_text("{}")
+    assert "has no access_control" in failure("router", "--acl", str(file))
+
+
+def test_access_control_for_nobody_is_refused(tmp_path: Path):
+    file = tmp_path / "acl.json5"
+    file.write_bytes(zstate("acl", "--robot", "r1").stdout)
+    assert "nobody is asked for a name" in failure("router", "--acl", str(file))
+
+
+def test_robots_of_ros_are_told_apart_by_their_namespaces():
+    robots = ("--robot", "r1", "--robot", "r2")
+    printed = zstate(
+        "acl", *robots, "--wire", "native", "--wire", "ros2:domain=5,namespace=*"
+    ).stdout.decode()
+    for key in ("zstate/r1/**", "5/r1/**", "5/r1/**/@adv/**", "@ros2_lv/5/*/*/*/NN/*/%r2/**"):
+        assert f'"{key}"' in printed
+    assert "namespace=*" in failure("acl", *robots, "--wire", "ros2")

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import RRBOT, failure, zstate
+
+from zstate import load_model
+
+pytestmark = pytest.mark.processes
+
+LINKS = '<robot name="arm">\n<link name="base"/>\n<link name="hand"/>\n'
+SOUND = LINKS + '<joint name="wrist" type="fixed"><parent link="base"/><child link="hand"/></joint>\n</robot>'
+WITHOUT_LIMIT = SOUND.replace('type="fixed"', 'type="revolute"')
+HEAVY = SOUND.replace(
+    '<link name="hand"/>', '<link name="hand"><inertial><mass value="-1"/></inertial></link>'
+)
+
+
+def deep(count: int) -> str:
+    links = "".join(f'<link name="l{n}"/>' for n in range(count + 1))
+    joints = "".join(
+        f'<joint name="j{n}" type="fixed"><parent link="l{n}"/><child link="l{n + 1}"/></joint>'
+        for n in range(count)
+    )
+    return f'<robot name="chain">{links}{joints}</robot>'
+
+
+def test_a_sound_model_is_drawn_as_a_tree():
+    ended = zstate("check", RRBOT)
+    headline, *lines = ended.stdout.decode().splitlines()
+    assert ended.returncode == 0
+    assert "robot 'rrbot', 7 links, 6 joints (2 driven)" in headline
+    assert lines[0] == "world"
+    assert lines[2].split() == ["└──", "upper", "shoulder", "continuous"]
+    assert len(lines) == 7
+
+
+def test_each_error_stands_with_its_line():
+    ended = zstate("check", "-", stdin=WITHOUT_LIMIT.encode())
+    headline, finding = ended.stdout.decode().splitlines()
+    assert ended.returncode == 1
+    assert headline == "standard input cannot be used (1 error)"
+    assert finding.split()[:3] == ["line", "4", "error"]
+    assert "'wrist'" in finding
+
+
+def test_what_to_write_instead_stands_below_each_finding(tmp_path: Path):
+    file = tmp_path / "my arm.urdf"
+    file.write_text(WITHOUT_LIMIT)
+    *_, advice = zstate("check", str(file)).stdout.decode().splitlines()
+    assert advice == f"`zstate check '{file}' --fix-hints` says what to write instead"
+    _, _, fix = zstate("check", str(file), "--fix-hints").stdout.decode().splitlines()
+    assert fix.strip().startswith('fix: <limit lower="-3.14" upper="3.14"')
+    broken = zstate("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
+    assert json.loads(broken.stdout)["findings"][0]["fix"] in fix
+
+
+def test_the_joints_are_a_table_in_the_order_of_their_positions():
+    _, headings, *rows = zstate("check", RRBOT, "--joints").stdout.decode().splitlines()
+    assert headings.split()[:5] == ["joint", "type", "parent", "child", "position"]
+    moving = [row.split() for row in rows if " - " not in row[:60]]
+    assert [(row[0], row[4]) for row in moving] == [("shoulder", "0"), ("elbow", "1")]
+
+
+def test_a_warning_is_told_but_does_not_fail():
+    ended = zstate("check", "-", stdin=HEAVY.encode())
+    assert ended.returncode == 0
+    assert ended.stdout.decode().splitlines()[1].split()[:3] == ["line", "3", "warning"]
+
+
+def test_a_name_of_the_catalog_is_checked_too():
+    assert zstate("check", "rrbot").stdout.decode().startswith("rrbot: robot 'rrbot'")
+
+
+def test_a_name_that_nothing_has_is_met_with_near_misses():
+    assert "rrbot" in failure("check", "rrbt")
+
+
+def test_json_says_all_of_it():
+    facts = json.loads(zstate("check", RRBOT, "--json").stdout)
+    assert facts["usable"] is True
+    assert facts["digest"] == load_model(RRBOT).digest
+    assert [joint["name"] for joint in facts["joints"]][1] == "shoulder"
+    assert facts["joints"][1]["lower"] is None  # continuous: JSON has no infinity
+    broken = zstate("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())
+    assert broken.returncode == 1
+    assert json.loads(broken.stdout)["findings"][0]["line"] == 4
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [b"", b"\x00\x01\x02\xff", b"<robot", "<robot name='é'/>".encode("latin-1"), b"just words"],
+    ids=["empty", "binary", "truncated", "latin-1", "text"],
+)
+def test_garbage_fails_without_a_traceback(garbage: bytes):
+    ended = zstate("check", "-", stdin=garbage)
+    assert ended.returncode == 1
+    assert b"Traceback" not in ended.stderr
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path):
+    missing = str(tmp_path / "arm.urdf")
+    ended = zstate("check", missing)
+    assert ended.returncode == 1
+    assert "no such file" in ended.stdout.decode()
+
+
+def test_the_deepest_chain_that_is_allowed_is_drawn():
+    ended = zstate("check", "-", stdin=deep(500).encode())
+    assert ended.returncode == 0
+    assert len(ended.stdout.decode().splitlines()) == 502

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import os
+import pty
+import re
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import failure, standing, zstate
+from helpers.processes import until
+
+pytestmark = pytest.mark.processes
+
+CLEARED = "\x15"
+"""Ctrl-U, which empties the line."""
+
+
+def offered(*words: str) -> list[str]:
+    """What bash would be offered for the last of ``words``."""
+    line = ["zstate", *words]
+    asked = {"_ZSTATE_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(line), "COMP_CWORD": str(len(words))}
+    answer = subprocess.run(
+        [sys.executable, "-m", "zstate"],
+        env={**os.environ, **asked},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=15.0,
+    )
+    assert answer.stderr == ""
+    return answer.stdout.split()
+
+
+def test_commands_and_their_options_are_offered():
+    assert offered("sn") == ["plain,snapshot"]
+    assert offered("snapshot", "l") == ["plain,load"]
+    assert "plain,--fix-hints" in offered("check", "--f")
+
+
+def test_models_are_offered_by_name_and_files_besides():
+    assert "plain,rrbot" in offered("publish", "rr")
+    assert offered("check", "./models/rr") == ["file,./models/rr"]
+
+
+def test_robots_are_offered_that_are_announced():
+    with standing("left"), standing("right"):
+        assert offered("tree", "le") == ["plain,left"]
+        assert offered("snapshot", "save", "a.toml", "r") == ["plain,right"]
+
+
+def test_where_nobody_is_announced_nothing_is_offered_and_nothing_said():
+    assert offered("echo", "l") == []
+
+
+def test_parameters_of_a_file_are_offered(tmp_path: Path):
+    file = tmp_path / "cell.toml"
+    file.write_text("[parameters]\nspeed = 1\nsite = 'lab'\n")
+    assert offered("up", str(file), "s") == ["plain,speed=1", "plain,site=lab"]
+
+
+class Typist:
+    """Sits at a shell that has been taught, and types."""
+
+    def __init__(self, *shell: str) -> None:
+        self._terminal, theirs = pty.openpty()
+        self._shell = subprocess.Popen(
+            shell, stdin=theirs, stdout=theirs, stderr=theirs, env=with_zstate(), start_new_session=True
+        )
+        os.close(theirs)
+        os.set_blocking(self._terminal, False)
+        self._screen = ""
+        # Wide, since shells draw a line anew that reaches the edge.
+        self.type("stty columns 200\r")
+        self.type(f'eval "$(zstate completion {Path(shell[0]).name})" && echo taught $((40 + 2))\r')
+        self.sees("taught 42")
+
+    def __enter__(self) -> Typist:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._shell.kill()
+        self._shell.wait()
+        os.close(self._terminal)
+
+    def type(self, text: str) -> None:
+        self._screen = ""
+        os.write(self._terminal, text.encode())
+
+    def completed(self, line: str, whole: str) -> None:
+        """Tab makes ``whole`` of ``line``."""
+        self.type(line + "\t")
+        self.sees(whole)
+        self.type(CLEARED)
+
+    def sees(self, text: str) -> None:
+        until(lambda: text in self._looked())
+
+    def _looked(self) -> str:
+        with suppress(BlockingIOError):
+            self._screen += os.read(self._terminal, 65536).decode(errors="replace")
+        return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]|[\x00-\x1f]", "", self._screen)
+
+
+def with_zstate() -> dict[str, str]:
+    """An environment where `zstate` is this one, and terminals are plain."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return {**os.environ, "PATH": path, "TERM": "dumb", "PS1": "$ "}
+
+
+def needs(shell: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(shutil.which(shell) is None, reason=f"apt-get install {shell}")
+
+
+@pytest.mark.parametrize(
+    "shell",
+    [
+        pytest.param(("bash", "--norc", "--noprofile", "-i"), id="bash"),
+        pytest.param(("zsh", "-f", "-i"), id="zsh", marks=needs("zsh")),
+    ],
+)
+def test_tab_completes_commands_options_robots_and_files(
+    shell: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "cell.toml").touch()
+    monkeypatch.chdir(tmp_path)
+    with standing("lefty"), Typist(*shell) as typist:
+        typist.completed("zstate sn", "zstate snapshot ")
+        typist.completed("zstate check --f", "zstate check --fix-hints ")
+        typist.completed("zstate tree le", "zstate tree lefty ")
+        typist.completed("zstate publish rr", "zstate publish rrbot ")
+        typist.completed("zstate up ce", "zstate up cell.toml ")
+
+
+@needs("fish")
+def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "cell.toml").touch()
+    monkeypatch.chdir(tmp_path)
+    lines = ("sn", "check --f", "tree le", "publish rr", "up ce")
+    asked = "; ".join(f"complete -C 'zstate {line}'" for line in lines)
+    with standing("lefty"):
+        said = subprocess.run(
+            ["fish", "--no-config", "-c", f"zstate completion fish | source; {asked}"],
+            env=with_zstate(),
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=30.0,
+        )
+    snapshot, fix_hints, *others = said.stdout.splitlines()
+    assert snapshot.split("\t") == ["snapshot", group_help("snapshot")]
+    assert fix_hints.startswith("--fix-hints\t")
+    assert others == ["lefty", "rrbot", "cell.toml"]
+
+
+def group_help(command: str) -> str:
+    """What `zstate --help` says of ``command``; one with a comma in it."""
+    (line,) = (
+        line for line in zstate("--help").stdout.decode().splitlines() if line.split()[:1] == [command]
+    )
+    text = line.split(maxsplit=1)[1]
+    assert "," in text
+    return text
+
+
+def test_another_shell_is_told_which_there_are():
+    assert "'bash', 'zsh', 'fish'" in failure("completion", "tcsh", code=2)

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import json
+import os
+import socket
+from xml.etree import ElementTree
+
+import pytest
+from helpers.cli_runner import RRBOT, Spawn, failure, standing, started, zstate
+from helpers.processes import until
+
+from zstate import StaticPublisher, TransformListener, connect, discover
+from zstate.cli.output.drawing import dot, mermaid, svg
+from zstate.cli.output.graph_text import graph_drawing, graph_text
+from zstate.net.graph import Graph, StreamUse
+
+DRIVER, PUBLISH, VIEWER = "driver@jetson pid 4", "zstate-publish@nuc pid 5", "viewer@desk pid 6"
+
+GRAPH = Graph(
+    (
+        StreamUse("arm", "joint_states", (DRIVER,), (PUBLISH,), 500.0),
+        StreamUse("arm", "robot_description", (PUBLISH,), (VIEWER,)),
+        StreamUse("arm", "tf_static", (PUBLISH,), (VIEWER,)),
+        StreamUse("base", "joint_states", (), (VIEWER,)),
+    )
+)
+
+
+def test_streams_with_the_same_ends_stand_together():
+    assert graph_text(GRAPH).splitlines() == [
+        "arm: joint_states (500.0 Hz)",
+        "  written by  driver@jetson pid 4",
+        "  read by     zstate-publish@nuc pid 5",
+        "arm: robot_description, tf_static",
+        "  written by  zstate-publish@nuc pid 5",
+        "  read by     viewer@desk pid 6",
+        "base: joint_states",
+        "  written by  nobody",
+        "  read by     viewer@desk pid 6",
+    ]
+
+
+def test_pictures_have_a_node_for_each_program_and_bundle_and_an_edge_for_each_use():
+    root = ElementTree.fromstring(svg(graph_drawing(GRAPH), "A & B"))
+    name = "{http://www.w3.org/2000/svg}"
+    texts = [element.text for element in root.iter(f"{name}text")]
+    assert {"A & B", "driver", "jetson pid 4", "joint_states (500.0 Hz)", "tf_static"} <= set(texts)
+    assert len(list(root.iter(f"{name}rect"))) == 1 + 3 + 3  # paper, bundles, programs
+    assert len(list(root.iter(f"{name}path"))) == 2 * 5  # each with its arrow's head
+    assert sum(" -> " in line for line in dot(graph_drawing(GRAPH)).splitlines()) == 5
+    assert sum(" --> " in line for line in mermaid(graph_drawing(GRAPH)).splitlines()) == 5
+
+
+@pytest.mark.processes
+def test_writers_and_readers_of_a_robot_are_seen_with_rates():
+    here = f"@{socket.gethostname()} pid {os.getpid()}"
+    with standing(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
+        until(lambda: discover(session))
+        facts = json.loads(zstate("graph", "--json").stdout)
+    streams = {one["stream"]: one for one in facts["streams"]}
+    assert set(streams) == {"joint_states", "robot_description", "tf", "tf_static"}
+    assert streams["joint_states"]["readers"] == []
+    assert streams["tf"]["readers"][0].endswith(here)
+    assert all(one["writers"][0].endswith(here) for one in streams.values())
+    assert all(streams[name]["rate_hz"] > 10.0 for name in ("joint_states", "tf"))
+
+
+@pytest.mark.processes
+def test_a_stream_that_is_read_and_not_written_stands_out(spawn: Spawn):
+    started(spawn, "publish", RRBOT).line()
+    with connect() as session:
+        until(lambda: discover(session))
+    lines = zstate("graph").stdout.decode().splitlines()
+    assert lines[:2] == ["rrbot: joint_states", "  written by  nobody"]
+    assert lines[2].startswith("  read by     zstate-publish@")
+
+
+@pytest.mark.processes
+def test_whoever_reads_all_robots_reads_each_of_them_and_static_writers_have_names():
+    with (
+        connect() as session,
+        StaticPublisher(session, "left", "mount"),
+        standing("right"),
+        TransformListener(session),
+    ):
+        text = zstate("graph").stdout.decode()
+    assert "left: tf_static/mount" in text
+    assert text.count("read by     nobody") == 1  # the transforms of the right one
+
+
+@pytest.mark.processes
+def test_a_robot_that_nobody_speaks_of_is_an_error_and_no_robot_at_all_is_none():
+    with standing():
+        assert "did you mean 'rrbot'?" in failure("graph", "rbot")
+    ended = zstate("graph")
+    assert (ended.returncode, ended.stdout) == (0, b"")
+    assert b"no robot is announced" in ended.stderr
+
+
+@pytest.mark.processes
+def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
+    with standing(wire="ros2", router=ros_router):
+        text = zstate("graph").stdout.decode()
+    assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
+    assert text.count("written by  /") == 1
+    assert text.count("read by     nobody") == 1

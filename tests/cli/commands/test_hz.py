@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from helpers.cli_runner import Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import until
+
+pytestmark = pytest.mark.processes
+
+
+def test_it_measures_once_a_second_in_the_usual_words(spawn: Spawn):
+    command = started(spawn, "hz", "rrbot")
+    with standing():
+        assert re.fullmatch(r"average rate: \d+\.\d{3}", command.line())
+        assert re.fullmatch(
+            r"\tmin: \d+\.\d{3}s max: \d+\.\d{3}s std dev: \d+\.\d{5}s window: \d+", command.line()
+        )
+        assert command.line().startswith("average rate: ")
+    until(lambda: "nobody announces the robot 'rrbot'" in command.stderr)
+    interrupted(command)
+
+
+@pytest.mark.parametrize("stream", ["joint_states", "tf"])
+def test_json_has_the_numbers_of_either_stream(stream: str):
+    with standing():
+        measured = json.loads(zstate("hz", "rrbot", "--stream", stream, "--once", "--json").stdout)
+    # The publisher waits a hundredth of a second between samples; it may be slower, never faster.
+    assert 10.0 < measured["rate_hz"] < 110.0
+    assert measured["min_s"] <= 1.0 / measured["rate_hz"] <= measured["max_s"]
+    assert measured["missed"] == 0
+
+
+def test_the_window_limits_what_is_measured():
+    with standing():
+        measured = json.loads(zstate("hz", "rrbot", "--window", "5", "--once", "--json").stdout)
+    assert measured["window"] == 5
+
+
+def test_once_gives_up_with_the_reason():
+    message = failure("hz", "rrbot", "--once", "--timeout", "1")
+    assert "zstate: gave up after 1 s: nobody announces the robot 'rrbot'" in message
+
+
+def test_a_stream_that_nobody_writes_is_named_with_who_would():
+    with standing(streams=("robot_description",)):
+        message = failure("hz", "rrbot", "--once", "--timeout", "1")
+    assert "nobody writes joint_states of 'rrbot'; `zstate joints rrbot` would" in message
+
+
+def test_a_window_of_one_is_wrong_usage():
+    assert "--window" in failure("hz", "rrbot", "--window", "1", code=2)

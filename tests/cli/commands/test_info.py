@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import failure, zstate
+from helpers.processes import until
+from helpers.robots import RRBOT, STAMP, settle
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from zstate.net.session import Session
+from zstate.nodes.publisher import StatePublisher
+from zstate.recording.recorder import Recorder
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture
+def run(sessions: tuple[Session, Session], tmp_path: Path) -> Path:
+    """Fifty samples of one robot."""
+    writer, reader = sessions
+    path = tmp_path / "run.mcap"
+    with StatePublisher(writer, RRBOT, "r1") as publisher, Recorder(reader, path, ["r1"]) as recorder:
+        settle(writer, "r1", "joint_states", "tf")
+        for number in range(50):
+            publisher.publish([0.0, 0.0], stamp=STAMP + number)
+        until(lambda: all(recorder.stats.messages.get(("r1", s), 0) == 50 for s in ("joint_states", "tf")))
+    return path
+
+
+def facts(path: Path) -> dict:
+    return json.loads(zstate("info", str(path), "--json").stdout)
+
+
+def test_a_recording_is_told_as_others_count_it(run: Path):
+    said = facts(run)
+    with AnyReader([run]) as reader:
+        assert (said["start"], said["end"]) == (reader.start_time, reader.end_time - 1)
+        assert said["messages"] == reader.message_count
+        counts = {name: topic.msgcount for name, topic in reader.topics.items()}
+    (robot,) = said["robots"]
+    assert {stream["topic"]: stream["count"] for stream in robot["streams"]} == counts
+    assert (said["size"], said["complete"], said["losses"]) == (run.stat().st_size, True, [])
+    assert said["files"] == [str(run)]
+
+
+def test_a_robot_is_told_with_its_model_streams_rates_and_writers(run: Path):
+    said = facts(run)
+    (robot,) = said["robots"]
+    assert robot["robot"] == "r1"
+    assert robot["model"] == {
+        "name": RRBOT.name,
+        "links": list(RRBOT.links),
+        "joints": list(RRBOT.joint_names),
+    }
+    streams = {stream["stream"]: stream for stream in robot["streams"]}
+    assert streams["joint_states"]["rate_hz"] == pytest.approx(49 / said["duration_s"])
+    assert streams["tf_static"]["rate_hz"] is None
+    assert all(" pid " in stream["writer"] for stream in streams.values())
+
+
+def test_people_read_the_same_in_lines(run: Path):
+    text = zstate("info", str(run)).stdout.decode()
+    said = facts(run)
+    head, start, end, *_ = text.splitlines()
+    assert re.fullmatch(rf"{re.escape(str(run))}: [\d.]+ kB \(mcap, zstd\) by zstate \S+", head)
+    assert start.split()[-1] == str(said["start"])
+    assert end.split()[-1] == str(said["end"])
+    assert f"\n{said['messages']} messages in {said['duration_s']:.3f} s\ncomplete\n" in text
+    links, joints = len(RRBOT.links), len(RRBOT.joints)
+    assert f"r1: model '{RRBOT.name}', {links} links, {joints} joints (2 driven)" in text
+    assert re.search(
+        r"^  joint_states +/joint_states +sensor_msgs/msg/JointState +50 +[\d.]+ Hz ", text, re.M
+    )
+
+
+def test_one_that_was_cut_off_is_told_with_the_command_that_mends_it(run: Path):
+    run.write_bytes(run.read_bytes()[:-40])
+    text = zstate("info", str(run)).stdout.decode()
+    assert "\nnot complete\n" in text
+    assert f"`zstate recover {run}`" in text
+    assert "r1: model " in text
+    said = facts(run)
+    assert (said["complete"], said["recoverable"]) == (False, [str(run)])
+
+
+def test_a_bag_of_ros_is_told_too_with_topics_that_are_not_a_robots_state(tmp_path: Path):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, kind in (("/arm/joint_states", "JointState"), ("/image", "Image")):
+            name = f"sensor_msgs/msg/{kind}"
+            writer.write(writer.add_connection(topic, name, typestore=store), 5, b"\0\1\0\0")
+    said = facts(tmp_path / "bag")
+    (robot,) = said["robots"]
+    assert (robot["robot"], robot["model"]) == ("arm", None)
+    assert [(other["topic"], other["count"]) for other in said["others"]] == [("/image", 1)]
+    text = zstate("info", str(tmp_path / "bag")).stdout.decode()
+    assert "arm: no model" in text
+    assert re.search(r"other topics\n  /image +sensor_msgs/msg/Image +1 +-", text)
+
+
+def test_what_is_no_recording_is_told_in_words(tmp_path: Path):
+    assert "No such file" in failure("info", str(tmp_path / "nothing.mcap"))
+    (tmp_path / "notes.txt").write_text("hello, this is a note")
+    assert "is not a recording" in failure("info", str(tmp_path / "notes.txt"))

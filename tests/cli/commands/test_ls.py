@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import json
+import os
+import socket
+
+import pytest
+from helpers.cli_runner import EVERYTHING, Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import until
+
+from zstate import StaticPublisher, connect
+from zstate.cli.output.robot_table import robots_text
+from zstate.net.presence import RobotInfo
+from zstate.net.topic_statistics import TopicStatistics
+from zstate.wire.identity import WriterId
+from zstate.wire.registry import get_wire
+
+pytestmark = pytest.mark.processes
+
+
+def test_each_stream_stands_with_its_writer():
+    with standing():
+        robot, *streams = zstate("ls").stdout.decode().splitlines()
+    assert robot == "rrbot"
+    assert sorted(line.split()[0] for line in streams) == sorted(EVERYTHING)
+    for line in streams:
+        assert f"@{socket.gethostname()} pid {os.getpid()}" in line
+        assert "since 20" in line
+
+
+def test_json_names_robots_and_writers():
+    with standing("left", streams=("joint_states",)), standing("right"):
+        robots = json.loads(zstate("ls", "--json").stdout)
+    assert [robot["robot"] for robot in robots] == ["left", "right"]
+    (writer,) = robots[0]["writers"]
+    assert (writer["stream"], writer["pid"]) == ("joint_states", os.getpid())
+
+
+def test_static_edges_stand_with_the_name_under_which_they_are_written():
+    with connect() as session, StaticPublisher(session, "arm", "mount"):
+        lines = zstate("ls").stdout.decode().splitlines()
+        (robot,) = json.loads(zstate("ls", "--json").stdout)
+    assert lines[0] == "arm"
+    assert lines[1].split()[0] == "tf_static/mount"
+    assert [writer["names"] for writer in robot["writers"]] == [["mount"]]
+
+
+def test_nobody_is_no_error():
+    ended = zstate("ls")
+    assert (ended.returncode, ended.stdout) == (0, b"")
+    assert b"no robot is announced" in ended.stderr
+    assert json.loads(zstate("ls", "--json").stdout) == []
+
+
+def test_an_endpoint_that_cannot_be_is_named():
+    assert "nonsense" in failure("ls", "--connect", "nonsense")
+
+
+def test_joint_states_have_a_rate_and_an_age_and_nothing_is_made_to_say_more():
+    with standing():
+        lines = {line.split()[0]: line for line in zstate("ls").stdout.decode().splitlines()}
+        (robot,) = json.loads(zstate("ls", "--json").stdout)
+    assert " Hz  " in lines["joint_states"]
+    assert " Hz  " not in lines["tf"]
+    (joints,) = [writer for writer in robot["writers"] if writer["stream"] == "joint_states"]
+    assert 20.0 < joints["rate_hz"] < 200.0
+    assert 0.0 <= joints["silent_s"] < 1.0
+
+
+def test_watched_the_list_comes_anew_when_somebody_comes_or_goes(spawn: Spawn):
+    command = started(spawn, "ls", "--watch")
+    assert command.line().startswith("no robot is announced")
+    with standing(streams=("joint_states",)):
+        until(lambda: command.line() == "rrbot")
+        assert command.line().split()[0] == "joint_states"
+    until(lambda: command.line().startswith("no robot is announced"))
+    interrupted(command)
+
+
+def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
+    with standing():
+        command = started(spawn, "ls", "--watch", "--json")
+        documents = [json.loads(command.line()) for _ in range(2)]
+    assert [robot["robot"] for robot in documents[-1]] == ["rrbot"]
+    interrupted(command)
+
+
+def test_a_narrow_terminal_has_less_of_when_and_of_age():
+    writer = WriterId("driver", "jetson", 412, 0, 7)
+    robots = (RobotInfo("arm", (("joint_states", writer),)),)
+    with connect() as session, TopicStatistics(session, get_wire("native")) as statistics:
+        wide = robots_text(robots, statistics).splitlines()[1]
+        headings, robot, narrow = robots_text(robots, statistics, width=55).splitlines()
+        narrowest = robots_text(robots, statistics, width=40).splitlines()[1]
+    assert (robot, headings.split()) == ("arm", ["robot,", "stream", "rate", "age", "writer"])
+    assert headings.index("writer") == narrow.index("driver@")
+    assert "since 1970-01-01" in wide
+    assert "since" not in narrow
+    assert len(narrow) <= 55
+    assert narrowest.split() == ["joint_states", "driver@jetson", "pid", "412"]
+
+
+def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
+    command = started(spawn, "ls", "--watch")
+    assert command.line().startswith("no ROS 2 node")
+    with standing(wire="ros2", router=ros_router):
+        until(lambda: "/joint_states" in command.line())
+    interrupted(command)

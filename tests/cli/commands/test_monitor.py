@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import until
+
+from zstate import StaticPublisher, Transform, connect, load_model
+from zstate.buffer.frame_tree import FrameInfo
+from zstate.cli.monitor import EdgeMeasure, EdgeStatistics, Row, overview_text, path_between, report_text
+from zstate.clock import ClockOffset, ManualClock
+from zstate.net.streams import StreamPublisher
+from zstate.wire.messages import JointState, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+DRIVER = "driver@jetson pid 412"
+
+MODEL = load_model(RRBOT)
+FIXED = str(len(MODEL.links) - 1 - len(MODEL.joint_names))
+
+
+CLOCK = ManualClock(1_789_000_000_000_000_000)
+
+
+def frame(name: str, parent: str | None, kind: str = "joint", writer: str = DRIVER) -> FrameInfo:
+    return FrameInfo(name, parent, kind, writer, None, None, None, 0)
+
+
+TREE = (
+    frame("r1/base", None, "root"),
+    frame("r1/torso", "r1/base", "static"),
+    frame("r1/left", "r1/torso"),
+    frame("r1/hand", "r1/left"),
+    frame("r1/right", "r1/torso"),
+)
+MEASURE = EdgeMeasure(99.96, 0.0004, 0.0021, 0.00011, 3, 0.004)
+
+
+def rows(offset: ClockOffset | None = None) -> list[Row]:
+    begin, legs = path_between(TREE, "base", "hand")
+    measured = [
+        Row(leg.frame, leg.edge, MEASURE if leg.edge.kind == "joint" else None, offset) for leg in legs
+    ]
+    return [Row(begin, None, None, None), *measured]
+
+
+def test_the_path_goes_up_and_down_over_the_frame_that_both_hang_on():
+    begin, legs = path_between(TREE, "r1/hand", "right")
+    assert begin == "r1/hand"
+    assert [(leg.frame, leg.edge.name) for leg in legs] == [
+        ("r1/left", "r1/hand"),
+        ("r1/torso", "r1/left"),
+        ("r1/right", "r1/right"),
+    ]
+    assert path_between(TREE, "base", "base") == ("r1/base", [])
+
+
+def test_joints_of_one_robot_come_together_and_are_told_once():
+    assert report_text(rows(ClockOffset(10_000, 200_000))).splitlines() == [
+        "frame  edge    rate      latency   max     jitter    missed  clock  writer",
+        "base",
+        "torso  static                                                       driver@jetson pid 412",
+        "left   joint   100.0 Hz  400.0 us  2.1 ms  110.0 us  3       0      driver@jetson pid 412",
+        "hand   joint",
+    ]
+
+
+def test_a_clock_that_is_off_is_told_with_what_that_means():
+    *table, note = report_text(rows(ClockOffset(-1_200_000_000, 100_000))).splitlines()
+    assert "  -1.2 s  " in table[3]
+    assert note == (
+        f"the clock of {DRIVER} is 1.2 s behind the one here (± 100.0 us), and its latencies are off by that"
+    )
+
+
+def test_a_narrow_terminal_has_fewer_columns_and_letters_for_the_writers():
+    lines = report_text(rows(), width=52).splitlines()
+    assert (
+        lines[0] == "frame  edge    rate      latency   jitter    missed  writer"
+        or max(map(len, lines)) <= 52
+    )
+    assert max(map(len, lines)) <= 52
+    assert lines[-1] == f"a: {DRIVER}"
+    assert lines[3].endswith(" a")
+
+
+def test_silence_is_told_instead_of_a_rate():
+    silent = EdgeMeasure(100.0, 0.0004, 0.0021, 0.00011, 0, 12.0, is_stale=True)
+    text = report_text([Row("r1/left", frame("r1/left", "r1/base"), silent, None)])
+    assert "silent 12.0 s" in text
+
+
+@pytest.mark.processes
+def test_each_edge_has_its_rate_latency_writer_and_clock():
+    with standing(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
+        statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+        report = json.loads(zstate("monitor", "world", "gauge", "--once", "--json").stdout)
+    edges = {edge["child"].partition("/")[2]: edge for edge in report["edges"]}
+    assert list(edges) == ["base", "upper", "lower", "tool", "gauge"]
+    assert [edge["kind"] for edge in edges.values()] == ["static", "joint", "joint", "static", "static"]
+    lower = edges["lower"]
+    assert f"pid {os.getpid()}" in lower["writer"]
+    assert 20.0 < lower["rate_hz"] < 200.0
+    assert 0.0 < lower["latency_s"] <= lower["latency_max_s"] < 1.0
+    assert lower["missed"] == 0
+    assert abs(lower["clock_offset_s"]) <= lower["clock_uncertainty_s"] + 0.05
+    assert edges["gauge"]["writer"] == "mount"
+
+
+@pytest.mark.processes
+def test_fixed_edges_stand_under_the_writer_of_the_model(spawn: Spawn):
+    model = started(spawn, "publish", "rrbot")
+    model.line()
+    with standing(streams=("joint_states",)):
+        report = json.loads(zstate("monitor", "world", "tool", "--once", "--json").stdout)
+    pids = {(edge["kind"], int(edge["writer"].rpartition(" ")[2])) for edge in report["edges"]}
+    assert pids == {("joint", os.getpid()), ("static", model.process.pid)}
+
+
+@pytest.mark.processes
+def test_it_goes_on_and_names_who_has_gone_silent(spawn: Spawn):
+    command = started(spawn, "monitor", "base", "tool")
+    until(lambda: "waiting: " in command.stderr)
+    with standing():
+        assert command.line().startswith("pose of tool in base: the newest is ")
+        lines = [command.line() for _ in range(6)]
+        assert [line.split()[0] for line in lines[:5]] == ["frame", "base", "upper", "lower", "tool"]
+    until(lambda: "silent" in command.line())
+    interrupted(command)
+
+
+def test_gaps_in_the_numbers_and_stamps_that_are_late_are_measured():
+    with (
+        connect() as writer,
+        connect() as reader,
+        EdgeStatistics(reader, "r1", "native", "joint_states", CLOCK) as meter,
+    ):
+        key, order = "zstate/r1/joint_states", order_digest(("swing",))
+        with StreamPublisher(writer, key, ENCODINGS[JointState]) as stream:
+            until(lambda: stream.has_readers)
+            for seq in (0, 1, 5):
+                stream.put(encode(JointState(CLOCK.now() - 10_000_000, seq, 7, order, to_block([0.5]))))
+            until(lambda: (measure := meter.measure(TREE[2])) is not None and measure.missed == 3)
+        measure = meter.measure(TREE[2])
+    assert measure is not None
+    assert measure.latency_s == pytest.approx(0.01)
+    assert meter.measure(frame("r2/left", "r2/torso")) is None
+
+
+@pytest.mark.processes
+def test_once_gives_up_with_the_reason():
+    message = failure("monitor", "base", "tool", "--once", "--timeout", "0.7")
+    assert "gave up after 0.7 s: no robot is announced" in message
+
+
+@pytest.mark.processes
+def test_on_ros_side_each_edge_is_measured(ros_router: str):
+    with standing(wire="ros2", router=ros_router):
+        report = json.loads(zstate("monitor", "base", "tool", "--once", "--json").stdout)
+    assert [edge["kind"] for edge in report["edges"]] == ["pose", "pose", "static"]
+    assert all(edge["rate_hz"] > 20.0 for edge in report["edges"][:2])
+
+
+def test_of_all_edges_the_joints_of_a_robot_are_one_line_and_its_fixed_edges_another():
+    frames = (*TREE[1:], frame("r2/odom", "map", "pose", "odometry"), frame("r2/laser", "r2/odom", "static"))
+    heard = [Row(one.name, one, MEASURE if one.kind != "static" else None, None) for one in frames]
+    assert overview_text(heard).splitlines() == [
+        "frame    edge      rate      latency   max     jitter    missed  clock  writer",
+        f"r1/*     3 joints  100.0 Hz  400.0 us  2.1 ms  110.0 us  3              {DRIVER}",
+        f"r1/*     1 static                                                       {DRIVER}",
+        "r2/odom  pose      100.0 Hz  400.0 us  2.1 ms  110.0 us  3              odometry",
+        f"r2/*     1 static                                                       {DRIVER}",
+    ]
+    narrow = overview_text(heard, width=52).splitlines()
+    assert max(map(len, narrow)) <= 52
+    assert narrow[0].split()[:2] == ["frame", "edge"]
+    assert narrow[-2:] == [f"a: {DRIVER}", "b: odometry"]
+
+
+@pytest.mark.processes
+def test_without_frames_it_monitors_all_that_is_heard():
+    with standing("left"), standing("right"):
+        lines = zstate("monitor", "--once").stdout.decode().splitlines()
+        edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
+        (only,) = zstate("monitor", "--robot", "left", "--once").stdout.decode().splitlines()[1:2]
+    assert [line.split()[:3] for line in lines[1:5]] == [
+        ["left/*", "2", "joints"],
+        ["left/*", FIXED, "static"],
+        ["right/*", "2", "joints"],
+        ["right/*", FIXED, "static"],
+    ]
+    assert f"pid {os.getpid()}" in lines[1]
+    assert only.startswith("left/*")
+    assert {edge["child"] for edge in edges} == {
+        f"{robot}/{link}" for robot in ("left", "right") for link in MODEL.links if link != MODEL.root
+    }
+    assert all(edge["rate_hz"] > 20.0 for edge in edges if edge["kind"] == "joint")
+
+
+@pytest.mark.processes
+def test_without_frames_it_says_that_nobody_is_there():
+    message = failure("monitor", "--once", "--timeout", "0.7")
+    assert "gave up after 0.7 s: no robot is announced" in message
+
+
+def test_one_frame_is_not_enough():
+    assert "'base' is one frame; give two of them, or none" in failure("monitor", "base", code=2)
+
+
+@pytest.mark.processes
+def test_all_edges_on_ros_side_have_their_ros_names(ros_router: str):
+    with standing(wire="ros2", router=ros_router):
+        lines = zstate("monitor", "--once").stdout.decode().splitlines()
+    assert [line.split()[:2] for line in lines[1:4]] == [["lower", "pose"], ["upper", "pose"], ["*", FIXED]]

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import failure, zstate
+from helpers.recording_files import joint_states, write_run
+
+from zstate.recording.info import read_info
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Path:
+    """A recording that ends in the middle of its second chunk."""
+    path = tmp_path / "run.mcap"
+    write_run(path, joint_states(100), flush_every=60)
+    path.write_bytes(path.read_bytes()[:-3000])
+    assert not read_info(path).complete
+    return path
+
+
+def test_what_was_saved_and_lost_is_told_and_stands_beside_the_original(cut: Path):
+    before = cut.read_bytes()
+    said = zstate("recover", str(cut)).stdout.decode()
+    saved = cut.with_name("run_recovered.mcap")
+    count = read_info(saved).message_count
+    assert said.startswith(f"saved {count} messages in ")
+    assert f"into {saved} (/robot_description 1, /joint_states {count - 1})" in said
+    assert "\nlost " in said
+    assert read_info(saved).complete
+    assert cut.read_bytes() == before
+
+
+def test_a_target_may_be_named_and_one_that_exists_is_kept(cut: Path, tmp_path: Path):
+    target = tmp_path / "saved.mcap"
+    assert zstate("recover", str(cut), str(target)).returncode == 0
+    before = target.read_bytes()
+    message = failure("recover", str(cut), str(target))
+    assert "exists" in message
+    assert "--overwrite" in message
+    assert target.read_bytes() == before
+    assert zstate("recover", str(cut), str(target), "--overwrite").returncode == 0
+
+
+def test_a_complete_file_is_copied_and_said_to_be_complete(tmp_path: Path):
+    write_run(tmp_path / "run.mcap", joint_states(10))
+    said = zstate("recover", str(tmp_path / "run.mcap")).stdout.decode()
+    assert "was complete: nothing was to be saved" in said
+
+
+def test_a_file_that_lacks_its_end_only_has_lost_nothing(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    write_run(path, joint_states(10), flush_every=10)
+    path.write_bytes(path.read_bytes()[:-8])
+    said = zstate("recover", str(path)).stdout.decode()
+    assert "saved 11 messages" in said
+    assert "nothing lost" in said
+
+
+def test_what_is_no_recording_is_refused_and_no_target_made(tmp_path: Path):
+    (tmp_path / "notes.mcap").write_text("hello, this is a note")
+    assert "is not a recording" in failure("recover", str(tmp_path / "notes.mcap"))
+    assert "No such file" in failure("recover", str(tmp_path / "nothing.mcap"))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.mcap"]

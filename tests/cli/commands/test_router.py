@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import zenoh
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
+from helpers.processes import until
+from helpers.robots import Tap
+
+from zstate import TransformListener, connect
+from zstate.net.security.credentials import Credentials
+from zstate.net.session import Session
+
+pytestmark = pytest.mark.processes
+
+
+def test_clients_meet_at_it(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = started(spawn, "router", "--listen", endpoint)
+    assert router.line().endswith(f" listens at {endpoint}")
+    client = ("--mode", "client", "--connect", endpoint)
+    started(spawn, "publish", RRBOT, "--source", "sine", *client).line()
+    with (
+        connect(mode="client", endpoints=endpoint) as session,
+        TransformListener(session, "rrbot") as listener,
+    ):
+        assert listener.buffer.wait("base", "lower", timeout_s=10.0).kind == "exact"
+    interrupted(router)
+
+
+def test_a_busy_port_is_told_at_once(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    started(spawn, "router", "--listen", endpoint).line()
+    assert f"somebody listens at '{endpoint}' already" in failure("router", "--listen", endpoint)
+
+
+def ros_node(port: int) -> zenoh.Session:
+    """A session as rmw_zenoh_cpp opens it."""
+    config = zenoh.Config()
+    for path, value in {
+        "mode": "peer",
+        "connect/endpoints": [f"tcp/localhost:{port}"],
+        "listen/endpoints": ["tcp/localhost:0"],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "scouting/gossip/target": {"router": ["router", "peer"], "peer": ["router"]},
+        "timestamping/enabled": True,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return zenoh.open(config)
+
+
+def test_ros_nodes_and_clients_hear_each_other_through_it(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = started(spawn, "router", "--ros2", "--listen", endpoint)
+    assert router.line().endswith(f" listens at {endpoint}")
+    heard: set[tuple[str, str]] = set()
+    with ExitStack() as opened:
+        sessions = {name: opened.enter_context(ros_node(free_port)) for name in ("node", "other")}
+        sessions["client"] = opened.enter_context(connect(mode="client", endpoints=endpoint)).zenoh
+        for name, session in sessions.items():
+
+            def note(sample: zenoh.Sample, reader: str = name) -> None:
+                heard.add((str(sample.key_expr), reader))
+
+            session.declare_subscriber("from/**", note)
+
+        def all_hear_all() -> bool:
+            for name, session in sessions.items():
+                session.put(f"from/{name}", b"something")
+            return len(heard) == len(sessions) ** 2
+
+        until(all_hear_all)
+    interrupted(router)
+
+
+def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{}")
+    assert "--config" in failure("router", "--ros2", "--config", str(file), code=2)
+
+
+def test_it_runs_what_it_prints(spawn: Spawn, free_port: int, tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    printed = zstate("router", "--listen", endpoint, "--print")
+    file = tmp_path / "router.json5"
+    file.write_bytes(printed.stdout)
+    assert started(spawn, "router", "--config", str(file)).line().endswith(f"listens at what '{file}' says")
+    with connect(mode="client", endpoints=endpoint) as session:
+        assert session.zenoh.info.routers_zid()
+
+
+def test_it_thins_streams_towards_its_neighbours(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    options = ("--downsample", "joint_states=5", "--robot", "rrbot", "--wan", "lo")
+    started(spawn, "router", "--listen", endpoint, *options).line()
+    started(spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint).line()
+    with (
+        connect(mode="client", endpoints=endpoint) as session,
+        TransformListener(session, "rrbot") as listener,
+    ):
+        until(lambda: listener.stats.received >= 5)
+        # A hundred a second are written; what was left out on the way is counted.
+        assert listener.stats.missed > 10 * listener.stats.received
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--downsample", "tf"), "write STREAM=HZ"),
+        (("--downsample", "tf=fast"), "write STREAM=HZ"),
+        (("--wan", "wwan0"), "--downsample"),
+    ],
+)
+def test_half_of_a_downsampling_is_wrong_usage(options: tuple[str, ...], text: str):
+    assert text in failure("router", *options, code=2)
+
+
+def test_a_file_is_the_whole_configuration(tmp_path):
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{}")
+    for option in (("--print",), ("--downsample", "tf=1", "--robot", "r1"), ("--acl", str(file))):
+        message = failure("router", "--config", str(file), *option, code=2)
+        assert option[0] in message
+        assert "exclude each other" in message
+
+
+def test_peers_are_not_introduced_past_its_access_control(spawn: Spawn, free_port: int, tmp_path: Path):
+    """Over a direct link a robot could write another robot's keys."""
+    pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
+    certs, acl, endpoint = str(tmp_path / "pki"), tmp_path / "acl.json5", f"tls/127.0.0.1:{free_port}"
+    zstate(
+        "certs", certs, "--identity", "router", "--identity", "ra", "--identity", "rb", "--identity", "desk"
+    )
+    acl.write_bytes(zstate("acl", "--robot", "ra", "--robot", "rb", "--viewer", "desk").stdout)
+    options = ("--listen", endpoint, "--certs", certs, "--identity", "router", "--acl", str(acl))
+    started(spawn, "router", *options).line()
+
+    def join(mode: str, name: str) -> Session:
+        return connect(mode=mode, endpoints=endpoint, credentials=Credentials.from_folder(certs, name))
+
+    with (
+        join("peer", "rb") as victim,
+        join("peer", "ra") as intruder,
+        join("client", "rb") as own,
+        join("client", "desk") as viewer,
+    ):
+        direct = Tap(victim, "zstate/rb/joint_commands")
+        routed = Tap(viewer, "zstate/*/tf_static/*")
+
+        def is_routed() -> bool:
+            intruder.zenoh.put("zstate/rb/joint_commands", b"go")
+            own.zenoh.put("zstate/rb/tf_static/model", b"from rb")
+            return len(routed.arrivals) >= 100
+
+        until(is_routed)
+        assert direct.arrivals == []
+        assert list(victim.zenoh.info.peers_zid()) == []
+
+
+def test_the_password_is_in_the_file_it_writes_and_not_in_what_it_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("ZSTATE_PASSWORD", "open sesame")
+    users, file = tmp_path / "users", tmp_path / "router.json5"
+    users.touch(0o600)
+    users.write_text("r1:open sesame\n")
+    options = ("router", "--user", "r1", "--users", str(users))
+    printed = zstate(*options, "--print").stdout.decode()
+    assert 'user: "r1"' in printed
+    assert "sesame" not in printed
+    assert zstate(*options, "--output", str(file)).stdout == b""
+    assert 'password: "open sesame"' in file.read_text()
+    assert file.read_text() == printed.replace("********", "open sesame")
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert f"'{file}' cannot be written: File exists" in failure(*options, "--output", str(file))

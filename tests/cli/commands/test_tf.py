@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+
+import pytest
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import until
+
+from zstate import StaticPublisher, Transform, connect
+from zstate.cli.commands.tf import transform_text
+
+pytestmark = pytest.mark.processes
+
+# From the model: the shoulder stands 1.05 m above the base, the elbow 0.7 m further along the upper
+# link, each a little to the side; both turn about y, which is pitch.
+BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(SHOULDER))
+PITCH = SHOULDER + ELBOW
+
+
+def test_it_looks_as_tf2_echo_does():
+    with standing():
+        lines = zstate("tf", "base", "lower", "--once").stdout.decode().splitlines()
+    c, s = math.cos(PITCH), math.sin(PITCH)
+    x, y, z = BASE_FROM_LOWER
+    qy, qw = math.sin(PITCH / 2), math.cos(PITCH / 2)
+    assert lines[0] == "pose of lower in base"
+    seconds, _, nanoseconds = lines[1].removeprefix("At time ").partition(".")
+    assert seconds.isdigit()
+    assert nanoseconds.isdigit()
+    assert len(nanoseconds) == 9
+    assert lines[2:] == [
+        f"- Translation: [{x:.3f}, {y:.3f}, {z:.3f}]",
+        f"- Rotation: in Quaternion (xyzw) [0.000, {qy:.3f}, 0.000, {qw:.3f}]",
+        f"- Rotation: in RPY (radian) [0.000, {PITCH:.3f}, 0.000]",
+        f"- Rotation: in RPY (degree) [0.000, {math.degrees(PITCH):.3f}, 0.000]",
+        "- Matrix:",
+        f"  {c:.3f}  0.000  {s:.3f}  {x:.3f}",
+        f"  0.000  1.000  0.000  {y:.3f}",
+        f" {-s:.3f}  0.000  {c:.3f}  {z:.3f}",
+        "  0.000  0.000  0.000  1.000",
+    ]
+
+
+def test_the_twist_is_that_of_the_published_velocities():
+    shoulder_rate, elbow_rate = 0.5, 0.25
+    with standing(velocities=(shoulder_rate, elbow_rate)):
+        lines = zstate("tf", "base", "lower", "--once", "--twist").stdout.decode().splitlines()
+        facts = json.loads(zstate("tf", "base", "lower", "--once", "--twist", "--json").stdout)
+    linear = [0.7 * math.cos(SHOULDER) * shoulder_rate, 0.0, -0.7 * math.sin(SHOULDER) * shoulder_rate]
+    angular = [0.0, shoulder_rate + elbow_rate, 0.0]
+    assert lines[-2] == f"- Twist: linear [{linear[0]:.3f}, 0.000, {linear[2]:.3f}] m/s"
+    assert lines[-1] == "- Twist: angular [0.000, 0.750, 0.000] rad/s"
+    assert facts["linear"] == pytest.approx(linear, abs=1e-12)
+    assert facts["angular"] == pytest.approx(angular, abs=1e-12)
+
+
+def test_a_twist_of_what_never_moves_is_zero():
+    with standing():
+        lines = zstate("tf", "world", "base", "--once", "--twist").stdout.decode().splitlines()
+    assert lines[-2:] == [
+        "- Twist: linear [0.000, 0.000, 0.000] m/s",
+        "- Twist: angular [0.000, 0.000, 0.000] rad/s",
+    ]
+
+
+def test_the_precision_is_that_of_every_number():
+    lines = transform_text(Transform("a", "b", (1 / 3, 0.0, -2.0), (0.0, 0.0, 0.0, 1.0), 5), 5).splitlines()
+    assert lines[1] == "- Translation: [0.33333, 0.00000, -2.00000]"
+    assert lines[6] == "  1.00000  0.00000  0.00000  0.33333"
+    assert transform_text(Transform("a", "b", (0.6, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 5), 0).splitlines()[
+        1
+    ] == ("- Translation: [1, 0, 0]")
+
+
+def test_stamps_have_nine_digits_and_zeros_no_sign():
+    lines = transform_text(Transform("a", "b", (-1e-9, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 5)).splitlines()
+    assert lines[:2] == ["At time 0.000000005", "- Translation: [0.000, 0.000, 0.000]"]
+
+
+def test_json_is_one_object_for_a_program():
+    with standing():
+        answer = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
+    assert (answer["target"], answer["source"]) == ("base", "lower")
+    assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
+    assert answer["rpy"] == pytest.approx([0.0, PITCH, 0.0], abs=1e-12)
+    assert 0.0 <= answer["age_s"] < 10.0
+
+
+def test_fixed_frames_answer_although_nothing_moves():
+    with connect() as session, StaticPublisher(session, "cell") as statics:
+        statics.set(Transform("floor", "table", (0.0, 0.0, 0.8), (0.0, 0.0, 0.0, 1.0)))
+        lines = zstate("tf", "floor", "table", "--once").stdout.decode().splitlines()
+    assert lines[1:3] == ["At any time (static)", "- Translation: [0.000, 0.000, 0.800]"]
+
+
+def test_it_says_what_it_waits_for_and_that_the_wait_is_over(spawn: Spawn):
+    command = started(spawn, "tf", "base", "lower", "--rate", "20")
+    assert command.line() == "pose of lower in base"
+    until(lambda: "waiting: no robot is announced" in command.stderr)
+    with standing(streams=("joint_states",)):
+        until(lambda: "waiting: nobody writes robot_description of 'rrbot'" in command.stderr)
+    with standing():
+        assert command.line().startswith("At time ")
+    assert "heard rrbot: 7 frames, 2 joints" in command.stderr
+    interrupted(command)
+
+
+def test_it_says_when_the_samples_stop(spawn: Spawn):
+    command = started(spawn, "tf", "base", "lower", "--rate", "20")
+    with standing():
+        command.line()
+        assert command.line().startswith("At time ")
+    until(lambda: "no new sample of 'rrbot/base' -> 'rrbot/upper'" in command.stderr)
+    interrupted(command)
+
+
+def test_once_gives_up_with_the_reason():
+    message = failure("tf", "base", "lower", "--once", "--timeout", "1")
+    assert "zstate: gave up after 1 s: no robot is announced" in message
+    with standing():
+        message = failure("tf", "base", "lowr", "--once", "--timeout", "1")
+    assert "zstate: gave up after 1 s: the frame 'lowr' is unknown; did you mean 'lower'" in message
+
+
+def test_a_robot_that_is_not_there_is_met_with_those_that_are():
+    with standing():
+        message = failure("tf", "base", "lower", "--once", "--timeout", "1", "--robot", "rrbt")
+    assert "'rrbt'" in message
+    assert "did you mean 'rrbot'?" in message
+
+
+def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
+    with standing():
+        soon = time.time_ns() + 6_000_000_000  # a busy machine takes its time to start a command
+        as_printed = f"{soon // 10**9}.{soon % 10**9:09d}"
+        answer = json.loads(
+            zstate("tf", "base", "lower", "--at", as_printed, "--timeout", "20", "--json").stdout
+        )
+        assert answer["stamp"] == soon
+        message = failure("tf", "base", "lower", "--at", str(soon - 3_600 * 10**9))
+        other = failure("tf", "base", "lower", "--at", "250.655")
+        late = failure("tf", "base", "lower", "--at", str(soon + 3_600 * 10**9), "--timeout", "1")
+        seconds = failure("tf", "base", "lower", "--at", str(soon // 10**9))
+    assert re.search("before the (oldest|only) sample of 'rrbot/base' -> 'rrbot/upper'", message)
+    assert "leave --at out for the newest pose, or name an instant to come" in message
+    assert "that instant, 250.655 s, is simulated time or one since a machine was switched on, and" in other
+    assert "those samples keep wall-clock time" in other
+    assert re.search("after the (newest|only) sample of 'rrbot/base' -> 'rrbot/upper'", late)
+    assert "wait longer (--timeout), or leave --at out" in late
+    assert "looks like seconds: stamps are nanoseconds" in seconds
+    assert not any(word in message + other + late + seconds for word in ("timeout_s", "at=None", "history_s"))
+
+
+@pytest.mark.parametrize("stamp", ["noon", "1.0000000001", "nan", "1e40"])
+def test_what_is_no_stamp_is_wrong_usage(stamp: str):
+    assert f"{stamp!r} is no stamp" in failure("tf", "a", "b", "--at", stamp, code=2)
+
+
+@pytest.mark.parametrize(("option", "value"), [("--rate", "0"), ("--rate", "nan"), ("--timeout", "-1")])
+def test_numbers_that_cannot_be_are_wrong_usage(option: str, value: str):
+    assert option in failure("tf", "a", "b", option, value, code=2)
+
+
+def test_a_bare_name_of_two_robots_lists_both():
+    with standing("r1"), standing("r2"):
+        message = failure("tf", "world", "tool", "--once", "--timeout", "5")
+        named = zstate("tf", "r1/world", "r1/tool", "--once")
+    assert "'r1/world'" in message
+    assert "'r2/world'" in message
+    assert named.returncode == 0

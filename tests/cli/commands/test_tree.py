@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import json
+from xml.etree import ElementTree
+
+import pytest
+from helpers.cli_runner import failure, standing, zstate
+
+from zstate import StaticPublisher, Transform, connect
+
+pytestmark = pytest.mark.processes
+
+
+def drawn(*arguments: str) -> list[str]:
+    ended = zstate("tree", *arguments)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout.decode().splitlines()
+
+
+def test_each_edge_has_its_kind_rate_age_and_writer():
+    with standing():
+        heading, root, *lines = drawn()
+    assert heading.split() == ["frame", "edge", "rate", "age", "writer"]
+    assert root.split() == ["rrbot/world", "root"]
+    assert [line.lstrip(" │├└─").split()[0] for line in lines] == [
+        "base",
+        "upper",
+        "lower",
+        "camera_link",
+        "laser_link",
+        "tool",
+    ]
+    upper = lines[1].split()
+    assert upper[1:3] == ["upper", "joint"]
+    assert upper[4] == "Hz"
+    assert "pid" in upper
+    assert lines[0].split()[2] == "static"
+
+
+def test_guides_show_who_hangs_on_whom():
+    with standing():
+        lines = drawn()
+    assert lines[2].startswith("└── base ")
+    assert lines[5].startswith("            ├── camera_link ")
+    assert lines[7].startswith("            └── tool ")
+
+
+def test_static_edges_of_others_stand_in_the_tree():
+    with standing(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
+        statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+        gauge = next(line for line in drawn() if "gauge" in line)
+    assert gauge.split()[-2:] == ["static", "mount"]
+
+
+def test_json_has_every_frame():
+    with standing():
+        frames = {frame["name"]: frame for frame in json.loads("\n".join(drawn("rrbot", "--json")))}
+    assert frames["rrbot/lower"]["parent"] == "rrbot/upper"
+    assert frames["rrbot/lower"]["kind"] == "joint"
+    assert frames["rrbot/lower"]["count"] >= 2
+    assert frames["rrbot/world"]["parent"] is None
+
+
+def test_dot_and_mermaid_have_an_edge_for_each_frame_but_the_root():
+    with standing():
+        dot, mermaid = drawn("--dot"), drawn("--mermaid")
+    assert dot[0] == "digraph frames {"
+    assert '  "rrbot/world" -> "rrbot/base" [label="static"];' in dot
+    assert sum("->" in line for line in dot) == 6
+    assert mermaid[0] == "graph TD"
+    assert '  n0["rrbot/world"]' in mermaid
+    assert sum("-->" in line for line in mermaid) == 6
+
+
+def test_the_picture_is_svg_with_every_frame_and_writer():
+    with standing(), connect() as session, StaticPublisher(session, "rrbot", "<mount>") as statics:
+        statics.set(Transform("tool", "gauge & dial", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
+        root = ElementTree.fromstring("\n".join(drawn("rrbot", "--svg")))
+    assert root.tag == "{http://www.w3.org/2000/svg}svg"
+    texts = [element.text or "" for element in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"rrbot/world", "base", "upper", "lower", "tool", "gauge & dial"} <= set(texts)
+    assert "<mount>: 1 edge" in texts
+    assert sum(text.startswith("joint · ") and "Hz" in text for text in texts) == 2
+
+
+def test_a_robot_that_is_not_there_is_an_error_that_lists_the_others():
+    with standing():
+        message = failure("tree", "rrbt")
+    assert "did you mean 'rrbot'?" in message
+    assert "announced: 'rrbot'" in message
+
+
+def test_nobody_at_all_is_no_error_as_in_ls_and_it_is_said_how_to_begin():
+    ended = zstate("tree")
+    assert (ended.returncode, ended.stdout) == (0, b"")
+    assert b"zstate publish" in ended.stderr
+    assert json.loads(zstate("tree", "--json").stdout) == []
+    assert "nobody announces the robot 'rrbot'" in failure("tree", "rrbot")
+
+
+def test_joint_states_alone_have_no_tree_and_it_is_said_who_would_make_one():
+    with standing(streams=("joint_states",)):
+        ended = zstate("tree")
+    assert ended.returncode == 0
+    assert ended.stdout == b""
+    assert b"zstate publish" in ended.stderr

@@ -1,0 +1,158 @@
+"""zstate view, as it is typed."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import RRBOT, failure, interrupted, standing, started, zstate
+from helpers.processes import until
+
+from zstate import StatePublisher, connect, load_model
+
+pytestmark = [pytest.mark.processes]
+
+
+def address(line: str) -> str:
+    found = re.fullmatch(r"the view is at (http://\S+)", line)
+    assert found, line
+    return found[1]
+
+
+def test_it_says_the_address_that_is_to_be_opened(spawn):
+    child = started(spawn, "view", "--port", "0")
+    url = address(child.line())
+    assert url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(url) as answer:
+        assert b"<html" in answer.read()
+    interrupted(child)
+    assert child.stderr == ""
+
+
+def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(spawn):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = failure("view", "--port", str(port))
+    assert f"port {port} is taken at '127.0.0.1'" in said
+    first, second = started(spawn, "view"), started(spawn, "view")
+    assert address(first.line()) != address(second.line())
+
+
+def test_beyond_loopback_the_address_holds_a_token_and_a_word_of_warning(spawn):
+    child = started(spawn, "view", "--host", "0.0.0.0", "--port", "0")
+    assert re.search(r":\d+/\?token=[\w-]{20,}$", address(child.line()))
+    until(lambda: "in the clear" in child.stderr)
+    interrupted(child)
+
+
+def test_with_sliders_a_robot_is_there_for_everybody(spawn):
+    child = started(spawn, "view", RRBOT, "--sliders", "--port", "0")
+    child.line()
+    said = zstate("tf", "base", "tool", "--once", "--json").stdout.decode()
+    assert '"target": "base"' in said
+    interrupted(child)
+
+
+def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
+    with standing():
+        child = started(spawn, "view", "rrbot", "--sliders", "--port", "0")
+        child.line()
+        interrupted(child)
+    assert "'rrbot' is not moved: " in child.stderr
+    assert "joint_states of 'rrbot'" in child.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--snapshot", "picture.jpg"], 2, "'picture.jpg' does not end with .png"),
+        (["a.mcap", "b.mcap"], 2, "a recording is viewed alone; got a.mcap, b.mcap"),
+        (["a.mcap", "--sliders"], 2, "--sliders moves robots that are here"),
+        (["nowhere.mcap"], 1, "nowhere.mcap"),
+        (["--rate", "0"], 2, "a rate is above 0"),
+        (["--host", "nowhere.invalid"], 1, "nobody can listen at 'nowhere.invalid'"),
+        (["pandda", "--sliders"], 1, "panda"),
+        (["--port", "99999"], 2, "99999"),
+        (["--camera", "1,2"], 2, "'1,2' is not three numbers with commas between"),
+        (["--camera", "1,2,nan"], 2, "'1,2,nan' is not three numbers"),
+        (["--camera", "-1,2,3:-1,2,3"], 2, "a camera at -1,2,3 cannot look at the same point"),
+    ],
+)
+def test_a_mistake_is_told_in_a_line(arguments: list[str], code: int, said: str):
+    assert said in failure("view", *arguments, code=code)
+
+
+def test_without_viser_it_says_what_to_install(tmp_path: Path):
+    (tmp_path / "viser.py").write_text("raise ImportError('no module of that name')")
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.argv[1:] = ['view']\n"
+    code += "from zstate.cli.main import main; main()"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert "pip install 'zstate[view]'" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.browser
+def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
+    imageio = pytest.importorskip("imageio.v3")
+    picture = tmp_path / "rrbot.png"
+    with standing():
+        command = [sys.executable, "-m", "zstate", "view", "rrbot", "--snapshot", str(picture)]
+        command += ["--size", "320", "240"]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=100.0, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == f"wrote {picture}: rrbot, 320 x 240 pixels\n"
+    pixels = imageio.imread(picture)
+    assert pixels.shape == (240, 320, 3)
+    middle = pixels[80:160, 120:200]
+    assert (middle.min(axis=2) < 200).mean() > 0.02
+
+
+MINE = """<robot name="mine"><link name="base"><visual><geometry>
+<mesh filename="package://mine/meshes/base.stl"/></geometry></visual></link></robot>"""
+
+
+@pytest.mark.browser
+def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_path: Path):
+    trimesh = pytest.importorskip("trimesh")
+    urdf = tmp_path / "mine" / "urdf" / "mine.urdf"
+    mesh = tmp_path / "mine" / "meshes" / "base.stl"
+    for file in (urdf, mesh):
+        file.parent.mkdir(parents=True)
+    urdf.write_text(MINE)
+    trimesh.creation.box().export(mesh)
+    picture = tmp_path / "picture.png"
+
+    def snapshot(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "zstate", "view", *arguments, "--snapshot", str(picture)]
+        command += ["--size", "320", "240"]
+        ended = subprocess.run(
+            command, capture_output=True, text=True, timeout=100.0, check=False, cwd=urdf.parents[1]
+        )
+        assert ended.returncode == 0, ended.stderr
+        return ended
+
+    with connect() as session, StatePublisher(session, load_model(urdf)) as mine, standing():
+        mine.publish([])
+        both = snapshot()
+        assert both.stdout == f"wrote {picture}: mine, rrbot, 320 x 240 pixels\n"
+        assert "the frames are in 2 trees (mine/base; rrbot/world)" in both.stderr
+        assert "1 file of the robots cannot be drawn: package://mine/meshes/base.stl" in both.stderr
+        assert "ROS_PACKAGE_PATH" in both.stderr
+        one = snapshot("--fixed-frame", "mine/base", "--camera", "0,0,9:0,0,10")
+        assert one.stdout == f"wrote {picture}: no robot, 320 x 240 pixels\n"
+        assert "'rrbot' is not in the picture: it is outside of what the camera sees" in one.stderr
+        # The file is named by a relative path, and its package is found around it.
+        own = snapshot("urdf/mine.urdf")
+        assert own.stdout == f"wrote {picture}: mine, 320 x 240 pixels\n"
+        assert own.stderr == ""
+
+
+def test_a_snapshot_of_a_robot_that_is_not_there_says_who_is(tmp_path: Path):
+    said = failure("view", "nobody", "--snapshot", str(tmp_path / "x.png"))
+    assert "waited 5 s for 'nobody'; robots that were heard: none" in said

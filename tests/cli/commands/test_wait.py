@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+from helpers.cli_runner import EVERYTHING, RRBOT, Spawn, failure, interrupted, standing, started, zstate
+from helpers.processes import Child, until
+
+from zstate import StatePublisher, connect, load_model
+
+pytestmark = pytest.mark.processes
+
+
+def waited(*arguments: str, code: int) -> dict[str, object]:
+    ended = zstate("wait", *arguments, "--json")
+    assert ended.returncode == code, ended.stderr
+    return json.loads(ended.stdout)
+
+
+def await_words(child: Child, text: str) -> None:
+    until(lambda: text in child.stderr)
+
+
+def test_a_robot_that_is_there_is_not_waited_for():
+    with standing():
+        ended = zstate("wait", "robot", "rrbot")
+    assert (ended.returncode, ended.stdout.decode()) == (0, "ready: 'rrbot' (7 frames)\n")
+    assert ended.stderr == b""
+
+
+def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
+    child = started(spawn, "wait", "robot", "rrbot")
+    await_words(child, "nobody announces the robot 'rrbot'")
+    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
+        await_words(child, "nobody writes joint_states of 'rrbot'")
+        assert child.process.poll() is None
+        with standing(streams=("joint_states",)):
+            assert child.line() == "ready: 'rrbot' (7 frames)"
+            assert child.wait() == 0
+
+
+def test_every_robot_that_is_named_has_to_be_there():
+    with standing("left"):
+        said = waited("robot", "left", "right", "--timeout", "1", code=1)
+    assert said["ready"] is False
+    assert "nobody announces the robot 'right'" in str(said["reason"])
+    assert float(str(said["waited_s"])) >= 1.0
+
+
+def test_a_robot_that_says_transforms_needs_no_joint_states():
+    with standing(streams=("tf", "robot_description")):
+        assert waited("robot", "rrbot", code=0)["ready"] is True
+
+
+def test_a_robot_that_cannot_move_is_ready_with_its_model(tmp_path: Path):
+    table = tmp_path / "table.urdf"
+    table.write_text('<robot name="table"><link name="top"/></robot>')
+    with connect() as session, StatePublisher(session, load_model(table)):
+        assert waited("robot", "table", code=0)["ready"] is True
+
+
+def test_a_pose_is_waited_for_with_the_reason():
+    with standing():
+        assert waited("frame", "base", "lower", code=0)["ready"] is True
+        assert "did you mean 'lower'" in failure("wait", "frame", "base", "lwer", "--timeout", "0.6")
+
+
+def test_a_router_may_come_late(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    child = started(spawn, "wait", "router", endpoint)
+    await_words(child, f"waiting: nobody answers at '{endpoint}' yet")
+    started(spawn, "router", "--listen", endpoint)
+    assert child.line() == f"ready: the router at '{endpoint}'"
+    assert child.wait() == 0
+
+
+def test_a_robot_behind_a_router_that_comes_late_is_waited_for_as_well(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    child = started(spawn, "wait", "robot", "rrbot", "--connect", endpoint)
+    started(spawn, "router", "--listen", endpoint).line()
+    with standing(router=endpoint):
+        assert child.line() == "ready: 'rrbot' (7 frames)"
+
+
+def test_a_router_that_never_comes_ends_the_wait_in_time(free_port: int):
+    began = time.monotonic()
+    said = waited("router", f"tcp/127.0.0.1:{free_port}", "--timeout", "1", code=1)
+    assert "nothing answers" in str(said["reason"])
+    assert time.monotonic() - began < 10.0
+
+
+def test_ctrl_c_ends_a_wait(spawn: Spawn):
+    child = started(spawn, "wait", "robot", "rrbot")
+    await_words(child, "waiting:")
+    interrupted(child)
+
+
+def test_what_is_waited_for_is_checked():
+    assert "which robot?" in failure("wait", "robot", code=2)
+    assert "two frames" in failure("wait", "frame", "base", code=2)
+    assert "'robto' is not one of" in failure("wait", "robto", code=2)
+    assert "contains '/'" in failure("wait", "robot", "a/b")

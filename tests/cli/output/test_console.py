@@ -1,0 +1,70 @@
+"""Names and texts from the network cannot steer the terminal that a command prints them on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+from helpers.cli_runner import RRBOT, zstate
+from helpers.processes import again_and_again
+
+from zstate import StatePublisher, connect, load_model
+from zstate.cli.output.logs import without_controls
+from zstate.net.latched import LatchedPublisher
+from zstate.net.presence import announce
+from zstate.net.streams import StreamPublisher
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import reader_key, status_key, stream_key, writer_key
+from zstate.wire.messages import StaticTransforms, Status, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+FAKE = "\x1b]0;owned\x07\x1b[2J\x9b31m\nok       robots        all is well\u202e"
+
+EVIL = WriterId(f"driver{FAKE}", f"host{FAKE}", 1, 5, 77)
+
+
+@pytest.fixture
+def stranger() -> Iterator[None]:
+    """Everything that a program can name, with escapes and line ends in it, beside a robot that is sound."""
+    pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    status = Status(time.time_ns(), 77, "error", EVIL.program, EVIL.host, 1, 1.0, 1, 0, FAKE)
+    with ExitStack() as opened:
+        session = opened.enter_context(connect())
+        publisher = opened.enter_context(StatePublisher(session, load_model(RRBOT), robot="rrbot"))
+        publisher.publish([0.0, 0.0])
+        statics = Announcement("rrbot", "tf_static", EVIL, f"mount{FAKE}")
+        for token in (
+            writer_key("rrbot", "joint_commands", EVIL.identity),
+            writer_key("rrbot", "tf_static", statics.identity),
+            reader_key("rrbot", "joint_states", EVIL.identity),
+        ):
+            opened.enter_context(announce(session, token))
+        mount = LatchedPublisher(
+            session, stream_key("rrbot", "tf_static", "mount"), ENCODINGS[StaticTransforms]
+        )
+        opened.enter_context(mount)
+        for frame in ("gauge", f"cam{FAKE}"):
+            mount.set(encode(StaticTransforms(77, (("tool", frame),), pose)))
+        status_publisher = StreamPublisher(session, status_key("rrbot", EVIL.identity), ENCODINGS[Status])
+        opened.enter_context(status_publisher)
+        opened.enter_context(again_and_again(lambda: status_publisher.put(encode(status))))
+        yield
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("command", [("ls",), ("tree",), ("graph",), ("doctor",), ("doctor", "rrbot")])
+def test_a_command_prints_foreign_names_without_acting_on_them(stranger: None, command: tuple[str, ...]):
+    ended = zstate(*command)
+    printed = (ended.stdout + ended.stderr).decode()
+    assert "rrbot" in printed
+    assert [letter for letter in printed if letter != "\n" and not letter.isprintable()] == []
+    assert not any(line.startswith("ok       robots        all is well") for line in printed.splitlines())
+
+
+def test_escapes_are_shown_as_text_and_our_own_colours_stay_where_there_are_any():
+    assert without_controls("plain \t text\n") == "plain \t text\n"
+    assert without_controls("\x1b[31mred\x1b[0m") == r"\x1b[31mred\x1b[0m"
+    assert without_controls("\x1b[31mred\x1b[0m\x1b[2J", colors=True) == "\x1b[31mred\x1b[0m" + r"\x1b[2J"
+    assert without_controls("\x9b2J\x7f\u202e") == r"\x9b2J\x7f\u202e"

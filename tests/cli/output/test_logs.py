@@ -1,0 +1,178 @@
+"""Lines on standard error: for people, for programs, and beside a live table."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+import textwrap
+import time
+from datetime import datetime, timezone
+
+import pytest
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started
+from helpers.processes import DEADLINE_S, until
+
+from zstate import connect
+from zstate.cli.commands import joints
+from zstate.cli.output.logs import text_in
+from zstate.net.streams import StreamPublisher
+from zstate.wire.messages import JointState
+from zstate.wire.native import ENCODINGS
+
+pytestmark = pytest.mark.processes
+
+
+def entries(stderr: str) -> list[dict[str, object]]:
+    return [json.loads(line) for line in stderr.splitlines()]
+
+
+def instant(text: object) -> float:
+    """Seconds since the epoch of an RFC 3339 time in UTC, to the microsecond."""
+    match = re.fullmatch(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)\.(\d{9})Z", str(text))
+    assert match, text
+    whole = datetime.strptime(match[1], "%Y-%m-%dT%H:%M:%S").replace(tzinfo=timezone.utc)
+    return whole.timestamp() + int(match[2]) * 1e-9
+
+
+def test_a_failure_is_a_json_line_with_time_level_event_and_text():
+    before = time.time()
+    (entry,) = entries(failure("joints", "no_such_robot", "--log-format", "json"))
+    assert before - 1e-3 <= instant(entry.pop("time")) <= time.time()
+    assert (entry["level"], entry["event"]) == ("error", "failed")
+    assert "no robot is called 'no_such_robot'" in str(entry["text"])
+
+
+def test_the_format_is_also_read_from_the_environment_and_the_option_goes_before(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setenv("ZSTATE_LOG_FORMAT", "json")
+    assert "did you mean 'joints'" in str(entries(failure("jonts", code=2))[0]["text"])
+    assert failure("joints", "no_such_robot", "--log-format", "text").startswith("zstate: no robot")
+
+
+def test_a_format_that_is_none_is_refused():
+    assert "'jason' is not one of 'text', 'json'" in failure("joints", RRBOT, "--log-format", "jason", code=2)
+
+
+def test_every_line_of_a_command_that_goes_on_is_json(spawn: Spawn):
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
+    until(lambda: "waiting: nobody announces" in command.stderr)
+    with standing() as publisher:
+        command.line()
+        said = entries(command.stderr)
+    interrupted(command)
+    assert {entry["level"] for entry in said} == {"info"}
+    assert {entry.get("robot") for entry in said if "following" in str(entry["text"])} == {publisher.robot}
+
+
+def test_what_a_service_announces_on_standard_output_is_json_too(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = started(spawn, "router", "--listen", endpoint, "--log-format", "json")
+    publisher = started(
+        spawn, "publish", RRBOT, "--source", "sine", "--connect", endpoint, "--log-format", "json"
+    )
+    for service, text in ((router, "listens at"), (publisher, "publishing 'rrbot'")):
+        (entry,) = entries(service.line())
+        assert (entry["level"], entry["event"]) == ("info", "result")
+        assert text in str(entry["text"])
+
+
+def test_a_warning_of_the_library_tells_its_event_and_reason(spawn: Spawn):
+    command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
+    key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
+    with standing(), connect() as session, StreamPublisher(session, key, encoding) as noise:
+        command.line()
+        until(lambda: noise.has_readers)
+        noise.put(b"noise")
+        until(lambda: '"level": "warning"' in command.stderr)
+    (warning,) = [entry for entry in entries(command.stderr) if entry["level"] == "warning"]
+    assert (warning["event"], warning["reason"]) == ("refused", "malformed")
+    interrupted(command)
+
+
+def test_what_a_thread_ends_with_is_a_json_line_too(spawn: Spawn):
+    child = spawn(
+        "import threading\n"
+        "from zstate.cli.output.logs import use_format\n"
+        "use_format('json')\n"
+        "threading.Thread(target=lambda: 1 / 0).start()"
+    )
+    assert child.wait() == 0
+    (entry,) = entries(child.stderr)
+    assert entry["event"] == "crash"
+    assert "ZeroDivisionError" in str(entry["text"])
+
+
+def test_the_text_of_a_line_is_found_in_either_format():
+    assert text_in("zstate: it is so") == "zstate: it is so"
+    assert text_in('{"level": "error", "text": "it is so"}') == "it is so"
+    assert text_in("[1, 2]") == "[1, 2]"
+
+
+def test_every_command_has_the_option_once():
+    from zstate.cli.main import group
+
+    for _ in range(2):
+        command = group.get_command(None, "joints")  # type: ignore[arg-type]
+        assert command is joints.joints_command
+        assert sum("--log-format" in option.opts for option in command.params) == 1
+
+
+LIVE = """
+    import logging
+    from rich.live import Live
+    from rich.text import Text
+    from zstate.cli.output.console import print_status
+    from zstate.cli.output.logs import warn_on_standard_error
+    warn_on_standard_error()
+    with Live(Text("live"), auto_refresh=False) as live:
+        live.update(Text("12 messages"), refresh=True)
+        print_status("recording panda")
+        logging.getLogger("zstate").warning("a gap")
+        live.update(Text("13 messages"), refresh=True)
+"""
+
+
+def shown(stream: int) -> list[str]:
+    """The lines that a terminal of one live line is left with: what is erased is not there."""
+    heard = b""
+    try:
+        while chunk := os.read(stream, 4096):
+            heard += chunk
+    except OSError:  # the end of a terminal
+        pass
+    text = heard.decode().replace("\r\n", "\n")
+    lines = (re.split(r"\r\x1b\[2K", line)[-1] for line in text.split("\n"))
+    return [re.sub(r"\x1b\[[?\d;]*\w", "", line) for line in lines]
+
+
+def live_on_a_terminal(errors: int | None) -> tuple[list[str], str]:
+    """What the terminal shows, and what standard error got where that is not the terminal."""
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-c", textwrap.dedent(LIVE)]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "80"}
+    process = subprocess.Popen(command, stdout=theirs, stderr=errors or theirs, env=environment)
+    os.close(theirs)
+    lines = shown(ours)
+    os.close(ours)
+    said = process.stderr.read().decode() if process.stderr else ""
+    assert process.wait(DEADLINE_S) == 0
+    return lines, said
+
+
+def test_a_note_beside_a_live_table_has_a_line_of_its_own():
+    lines, _ = live_on_a_terminal(None)
+    assert "recording panda" in lines
+    assert "zstate: a gap" in lines
+    assert "13 messages" in lines
+    assert not [line for line in lines if "12 messages" in line]
+
+
+def test_a_file_gets_its_lines_though_a_live_table_is_shown():
+    lines, said = live_on_a_terminal(subprocess.PIPE)
+    assert said == "recording panda\nzstate: a gap\n"
+    assert not [line for line in lines if "panda" in line or "gap" in line]

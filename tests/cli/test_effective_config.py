@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.cli_runner import failure, zstate
+
+pytestmark = pytest.mark.processes
+
+
+@pytest.fixture(autouse=True)
+def _bare_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for variable in [name for name in os.environ if name.startswith("ZSTATE_")] + ["ROS_DOMAIN_ID"]:
+        monkeypatch.delenv(variable, raising=False)
+
+
+def told(*arguments: str, code: int = 0) -> tuple[dict[str, tuple[Any, str]], list[str]]:
+    """Each setting with its origin, and the problems."""
+    ended = zstate("config", *arguments, "--json")
+    assert ended.returncode == code, ended.stderr
+    said = json.loads(ended.stdout)
+    return {one["name"]: (one["value"], one["origin"]) for one in said["settings"]}, said["problems"]
+
+
+def test_without_a_word_everything_is_default():
+    settings, problems = told()
+    assert settings["mode"] == ("peer", "default")
+    addresses = "127.0.0.1:7450 127.0.0.1:7451 127.0.0.1:7452"
+    assert settings["rendezvous"] == (addresses, "default")
+    assert settings["wire"] == ("native", "default")
+    assert {origin for name, (_, origin) in settings.items() if name != "kernel"} == {"default"}
+    assert problems == []
+
+
+def test_options_come_before_the_environment(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZSTATE_MODE", "lan")
+    monkeypatch.setenv("ZSTATE_CLOCK", "sim")
+    settings, _ = told("--mode", "peer")
+    assert settings["mode"] == ("peer", "option --mode")
+    assert settings["clock"] == ("sim", "environment ZSTATE_CLOCK")
+
+
+def test_what_follows_from_another_option_says_from_which():
+    settings, _ = told("--connect", "tcp/10.0.0.1:7447")
+    assert settings["mode"] == ("client", "option --connect, which alone means a router")
+    assert settings["connect"] == (["tcp/10.0.0.1:7447"], "option --connect")
+    assert "rendezvous" not in settings
+
+
+def test_a_configuration_of_zenoh_counts_where_nothing_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}}')
+    monkeypatch.setenv("ZENOH_CONFIG", str(file))
+    settings, _ = told("--connect", "tcp/10.0.0.2:7447")
+    assert settings["config"] == (str(file), "environment ZENOH_CONFIG")
+    assert settings["mode"] == ("client", f"file {file}")
+    assert settings["connect"] == (["tcp/10.0.0.2:7447"], "option --connect")
+    assert settings["listen"][1] == "default of Zenoh"
+
+
+def test_the_domain_of_ros_is_that_of_the_wire_before_that_of_the_environment(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    assert told("--wire", "ros2")[0]["ros domain"] == (7, "environment ROS_DOMAIN_ID")
+    assert told("--wire", "ros2:domain=3")[0]["ros domain"] == (3, "option --wire")
+
+
+def test_a_password_is_never_shown(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZSTATE_PASSWORD", "hunter2")
+    for form in ((), ("--json",), ("--zenoh",)):
+        ended = zstate("config", "--connect", "tcp/10.0.0.1:7447", "--user", "bob", *form)
+        assert ended.returncode == 0
+        assert b"bob" in ended.stdout
+        assert b"hunter2" not in ended.stdout + ended.stderr
+
+
+def test_what_zenoh_is_told_can_be_seen():
+    said = json.loads(zstate("config", "--zenoh", "--json", "--connect", "tcp/10.0.0.1:7447").stdout)
+    assert said["mode"] == "client"
+    assert said["connect/endpoints"] == ["tcp/10.0.0.1:7447"]
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "problem"),
+    [
+        ("ZSTATE_CONECT", "tcp/10.0.0.1:7447", "nothing reads ZSTATE_CONECT; did you mean 'ZSTATE_CONNECT'?"),
+        ("ZSTATE_RENDEZVOUS", "here", "ZSTATE_RENDEZVOUS is 'here'"),
+        ("ZSTATE_CERTS", "/", "--certs is of no use without --identity"),
+        ("ZSTATE_CONNECT", "10.0.0.1", "write 'tcp/10.0.0.1:7447'"),
+        ("ZSTATE_MODE", "client", "mode 'client' needs --connect"),
+    ],
+)
+def test_what_is_wrong_with_the_environment_is_said(monkeypatch, variable: str, value: str, problem: str):
+    monkeypatch.setenv(variable, value)
+    _, problems = told(code=1)
+    assert len(problems) == 1
+    assert problem in problems[0]
+    assert problem in zstate("config").stderr.decode()
+
+
+def test_every_option_of_a_command_may_stand_in_the_environment(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ZSTATE_TF_RATE", "5")
+    assert told()[1] == []
+
+
+def test_a_file_that_is_not_there_is_wrong_usage():
+    assert "'nowhere.json5' does not exist" in failure("config", "--config", "nowhere.json5", code=2)

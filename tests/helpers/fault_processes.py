@@ -1,0 +1,82 @@
+"""Starting the processes of ``roles``, and asking them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from helpers.processes import DEADLINE_S, Child
+
+SLACK = 3.0
+"""A machine of CI is busy with other tests: what exceeds a stated bound by so much does not come back at all.
+
+The figures are printed (``-rP``); hold them against the bounds where nothing else runs (``-n 0``).
+"""
+
+HERE = str(Path(__file__).parent)
+_CODE = f"import sys; sys.path.insert(0, {HERE!r}); import roles; roles.main()"
+
+
+class Party:
+    """A process of the suite."""
+
+    def __init__(self, child: Child) -> None:
+        self.child = child
+        self.ready_at = 0
+
+    def ready(self) -> Party:
+        assert self.child.line(30.0) == "ready", self.child.stderr
+        self.ready_at = time.time_ns()
+        return self
+
+    def ask(self, question: str, *arguments: Any, timeout_s: float = DEADLINE_S + 5.0) -> Any:
+        self.tell(question, *arguments)
+        return self.hear(timeout_s)
+
+    def tell(self, question: str, *arguments: Any) -> None:
+        self.child.tell(json.dumps([question, *arguments]))
+
+    def hear(self, timeout_s: float = DEADLINE_S + 5.0) -> Any:
+        """The answer to a question that was told before."""
+        return json.loads(self.child.line(timeout_s))
+
+    def signal(self, number: int) -> None:
+        self.child.process.send_signal(number)
+
+    def kill(self) -> None:
+        self.child.kill()
+
+
+Start = Callable[..., Party]
+
+
+def starter(spawn: Callable[..., Child]) -> Start:
+    """``start(role, **options)``: a process that is ready; with ``wait=False`` perhaps not yet."""
+
+    def start(role: str, *, wait: bool = True, **options: Any) -> Party:
+        party = Party(spawn(_CODE, role, json.dumps(options)))
+        return party.ready() if wait else party
+
+    return start
+
+
+def client(*endpoints: str) -> dict[str, Any]:
+    return {"mode": "client", "endpoints": endpoints}
+
+
+def assert_no_growth(before: dict[str, int], after: dict[str, int], *, rss_kb: int = 30_000) -> None:
+    """Nothing that a round of the fault leaves behind. Zenoh's pool of threads comes and goes by a few."""
+    assert after["threads"] <= before["threads"] + 6, (before, after)
+    assert after["fds"] <= before["fds"] + 3, (before, after)
+    assert after["rss_kb"] <= before["rss_kb"] + rss_kb, (before, after)
+
+
+def figures(title: str, seconds: list[float]) -> None:
+    """What was measured, for `pytest -rP`."""
+    ordered = sorted(seconds)
+    print(
+        f"{title}: median {ordered[len(ordered) // 2]:.3f} s, largest {ordered[-1]:.3f} s, of {len(ordered)}"
+    )

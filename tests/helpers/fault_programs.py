@@ -1,0 +1,179 @@
+"""The processes that the fault suite breaks: each does its work, and answers questions on its standard input.
+
+A question is a line of JSON, ``[name, *arguments]``; so is the answer.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from helpers.fault_queries import Answers
+
+from zstate import (
+    SineSource,
+    StatePublisher,
+    StaticPublisher,
+    TransformListener,
+    connect,
+    load_model,
+)
+from zstate.clock import SystemClock
+from zstate.recording.recorder import Recorder
+from zstate.sources.joint_source import JointReading
+from zstate.transform import Transform
+
+CLONE_NEWNET = 0x40000000
+
+Session = dict[str, Any]
+Answer = Callable[..., Any]
+
+
+def main() -> None:
+    role, options = sys.argv[1], json.loads(sys.argv[2])
+    namespace = options.pop("namespace", None)
+    if namespace:
+        _enter(namespace)
+    {"publisher": publisher, "reader": reader, "recorder": recorder, "router": router}[role](**options)
+
+
+def _enter(namespace: str) -> None:
+    """Go there before any thread exists: a network namespace is a property of each thread."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    with Path(f"/run/netns/{namespace}").open() as file:
+        if libc.setns(file.fileno(), CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns")
+
+
+def _serve(**answers: Answer) -> None:
+    print("ready", flush=True)
+    for line in sys.stdin:
+        name, *arguments = json.loads(line)
+        print(json.dumps({"census": census, **answers}[name](*arguments)), flush=True)
+
+
+def census() -> dict[str, int]:
+    """What must not grow. Threads are those of the process, Zenoh's too."""
+    status = Path("/proc/self/status").read_text()
+    resident = next(line for line in status.splitlines() if line.startswith("VmRSS"))
+    return {
+        "threads": len(list(Path("/proc/self/task").iterdir())),
+        "fds": len(list(Path("/proc/self/fd").iterdir())),
+        "rss_kb": int(resident.split()[1]),
+    }
+
+
+class ShiftedClock(SystemClock):
+    """The system's clock, set wrong by ``shift_ns``."""
+
+    shift_ns = 0
+
+    def now(self) -> int:
+        return super().now() + self.shift_ns
+
+    def wait_until(self, stamp: int, stop: threading.Event) -> bool:
+        return super().wait_until(stamp - self.shift_ns, stop)
+
+
+class Pausable:
+    """A sine that remembers the last stamp it was asked for, until it is told to say nothing."""
+
+    def __init__(self, source: SineSource) -> None:
+        self._source = source
+        self._last = 0
+        self._paused = False
+
+    def read(self, stamp: int) -> JointReading | None:
+        if self._paused:
+            return None
+        self._last = stamp
+        return self._source.read(stamp)
+
+    def pause(self) -> int:
+        self._paused = True
+        return self._last
+
+
+def publisher(
+    robot: str, session: Session, rate_hz: float = 100.0, mark: float = 0.0, takeover: bool = False
+) -> None:
+    """A robot that moves, with one static edge besides its model, whose length is the mark."""
+    model, clock = load_model("rrbot"), ShiftedClock()
+    source = Pausable(SineSource(model))
+
+    def shift(shift_ns: int) -> int:
+        clock.shift_ns = shift_ns
+        return clock.now()
+
+    def leave() -> float:
+        began = time.monotonic()
+        opened.close()
+        return time.monotonic() - began
+
+    with (
+        connect(**session) as opened,
+        StatePublisher(opened, model, robot, clock=clock, takeover=takeover) as writing,
+        StaticPublisher(opened, robot, f"mark.{os.getpid()}", takeover=takeover) as statics,
+    ):
+
+        def put_mark(value: float) -> None:
+            statics.set(Transform.from_rpy("world", "mark", (value, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+        def routers() -> list[str]:
+            return [str(zid) for zid in opened.zenoh.info.routers_zid()]
+
+        put_mark(mark)
+        running = threading.Thread(target=writing.run, args=(source, rate_hz), daemon=True)
+        running.start()
+        _serve(mark=put_mark, shift=shift, pause=source.pause, routers=routers, leave=leave)
+
+
+def recorder(session: Session, path: str) -> None:
+    with connect(**session) as opened, Recorder(opened, path, ["r1"]) as recording:
+
+        def ended() -> str | None:
+            return f"{type(recording.failure).__name__}: {recording.failure}" if recording.wait(0.0) else None
+
+        _serve(ended=ended, written=lambda: sum(recording.stats.messages.values()))
+
+
+def router(listen: str, connect_to: list[str] | None = None) -> None:
+    with connect(mode="router", listen=listen, endpoints=connect_to or ()) as opened:
+        _serve(zid=lambda: opened.zid)
+
+
+def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
+    """One that follows robots; with ``busy_ms`` each sample costs it so long, and nobody else runs."""
+    with connect(**session) as opened, TransformListener(opened, robot, follow=follow) as listener:
+        answers = Answers(listener)
+        if busy_ms:
+            _burden(listener, busy_ms)
+        _serve(
+            after=answers.after,
+            newest=answers.newest,
+            near=answers.near,
+            mark=answers.mark,
+            stats=answers.stats,
+            watch=answers.watch,
+            watched=answers.watched,
+            latencies=answers.latencies,
+        )
+
+
+def _burden(listener: TransformListener, busy_ms: float) -> None:
+    insert = listener.buffer.insert_joints
+
+    def slowly(*arguments: Any) -> bool:
+        until = time.perf_counter() + busy_ms * 1e-3
+        while time.perf_counter() < until:
+            pass
+        return insert(*arguments)
+
+    listener.buffer.insert_joints = slowly  # type: ignore[method-assign]

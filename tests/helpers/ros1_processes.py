@@ -1,0 +1,199 @@
+"""A real ROS 1 beside zstate: its master, its nodes, and the bridge, each a process of its own.
+
+    apt-get install -y --no-install-recommends \\
+        python3-roslaunch ros-robot-state-publisher python3-tf2-ros python3-sensor-msgs
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from helpers.processes import Child, a_free_port, until
+
+from zstate.bridges.ros1.node import Master
+from zstate.errors import Unreachable
+
+DEBIAN_PYTHON = "/usr/bin/python3"
+DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"
+STATE_PUBLISHER = Path("/usr/lib/robot_state_publisher/robot_state_publisher")
+ROSCORE = Path("/usr/bin/roscore")
+RRBOT = Path(__file__).parents[2] / "models" / "rrbot.urdf"
+JOINTS = ("shoulder", "elbow")
+
+# rospy is Python without extensions: behind all else, Debian's serves any Python of the same version.
+BRIDGE = f"""
+    import sys
+    sys.path.append({DEBIAN_PACKAGES!r})
+    from zstate.cli.main import main
+    main()
+"""
+
+# Answers lookups by the real tf2_ros: [pose7, stamp], or the text of the error.
+TF2_LISTENER = """
+    import json, sys
+    import rospy, tf2_ros
+    rospy.init_node("asker", anonymous=True, disable_signals=True)
+    buffer = tf2_ros.Buffer()
+    listener = tf2_ros.TransformListener(buffer)
+    print("ready")
+    for line in sys.stdin:
+        target, source, stamp, wait_s = json.loads(line)
+        time = rospy.Time(*divmod(stamp, 10**9))
+        try:
+            found = buffer.lookup_transform(target, source, time, rospy.Duration(wait_s))
+        except tf2_ros.TransformException as error:
+            print(json.dumps(str(error)))
+            continue
+        t, q, at = found.transform.translation, found.transform.rotation, found.header.stamp
+        print(json.dumps([[t.x, t.y, t.z, q.x, q.y, q.z, q.w], at.secs * 10**9 + at.nsecs]))
+"""
+
+# Publishes on /joint_states, /tf and /tf_static what it is told; tells what it heard of the first two.
+ROS_PEER = """
+    import json, sys
+    import rospy
+    from geometry_msgs.msg import TransformStamped
+    from sensor_msgs.msg import JointState
+    from tf2_msgs.msg import TFMessage
+
+    rospy.init_node("peer", anonymous=True, disable_signals=True)
+    joints = rospy.Publisher("joint_states", JointState, queue_size=1000)
+    latched = {"latch": True, "queue_size": 10}
+    edges = {name: rospy.Publisher(name, TFMessage, **latched) for name in ("/tf", "/tf_static")}
+    heard_joints, heard_edges = [], []
+
+    def when(header):
+        return header.stamp.secs * 10**9 + header.stamp.nsecs
+
+    def hear(message):
+        numbers = [message.position, message.velocity, message.effort]
+        heard_joints.append([when(message.header), message.name, numbers])
+
+    def hear_edges(message):
+        writer = message._connection_header["callerid"]
+        for edge in message.transforms:
+            t, q = edge.transform.translation, edge.transform.rotation
+            pose = [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
+            heard_edges.append([writer, edge.header.frame_id, edge.child_frame_id, when(edge.header), pose])
+
+    def say_joints(stamp, names, positions):
+        message = JointState(name=names, position=positions)
+        message.header.stamp = rospy.Time(*divmod(stamp, 10**9))
+        joints.publish(message)
+
+    def say_edge(topic, parent, child, pose):
+        edge = TransformStamped(child_frame_id=child)
+        edge.header.frame_id = parent
+        edge.header.stamp = rospy.Time(1)
+        t, q = edge.transform.translation, edge.transform.rotation
+        t.x, t.y, t.z, q.x, q.y, q.z, q.w = pose
+        edges[topic].publish(TFMessage([edge]))
+
+    def heard():
+        told = [heard_joints[:], heard_edges[:]]
+        del heard_joints[:len(told[0])], heard_edges[:len(told[1])]
+        return told
+
+    if "hear" in sys.argv:
+        rospy.Subscriber("joint_states", JointState, hear)
+        rospy.Subscriber("/tf", TFMessage, hear_edges)
+    answers = {
+        "joints": say_joints,
+        "edge": say_edge,
+        "heard": heard,
+        "readers": joints.get_num_connections,
+        "parameter": lambda name: rospy.get_param(name, None),
+    }
+    print("ready")
+    for line in sys.stdin:
+        what, *told = json.loads(line)
+        print(json.dumps(answers[what](*told)))
+"""
+
+
+class Peer:
+    """A node of ROS that talks and listens (``ROS_PEER``)."""
+
+    def __init__(self, child: Child) -> None:
+        self._child = child
+        self.joints: list[tuple[int, list[str], list[list[float]]]] = []
+        self.edges: dict[tuple[str, str, int], tuple[str, list[float]]] = {}
+
+    def ask(self, *question: Any) -> Any:
+        self._child.tell(json.dumps(question))
+        return json.loads(self._child.line())
+
+    def listen(self) -> None:
+        """Add what was heard since to ``joints`` and to ``edges``: writer and pose, by edge and stamp."""
+        joints, edges = self.ask("heard")
+        self.joints += map(tuple, joints)
+        for writer, parent, child, stamp, pose in edges:
+            self.edges[parent, child, stamp] = (writer, pose)
+
+    def counts(self) -> Counter[int]:
+        """How often each stamp was heard on ``joint_states``."""
+        self.listen()
+        return Counter(stamp for stamp, *_ in self.joints)
+
+
+@functools.cache
+def why_no_ros() -> str:
+    """Why there is no ROS 1 to test against; empty when there is one."""
+    for program in (ROSCORE, STATE_PUBLISHER):
+        if not program.exists():
+            return f"{program} is not there (Debian's python3-roslaunch, ros-robot-state-publisher)"
+    ask = "import rospy, sensor_msgs, tf2_ros, sys; print(*sys.version_info[:2])"
+    said = subprocess.run([DEBIAN_PYTHON, "-c", ask], capture_output=True, text=True, check=False)
+    if said.returncode:
+        return f"Debian's Python has no ROS 1: {said.stderr.strip().splitlines()[-1]}"
+    if said.stdout.split() != [str(part) for part in sys.version_info[:2]]:
+        return f"ROS 1 is there for Python {'.'.join(said.stdout.split())}"
+    return ""
+
+
+class Roscore:
+    """A real ``roscore``, on a port of its own."""
+
+    def __init__(self, environment: dict[str, str]) -> None:
+        self._master = Master(environment["ROS_MASTER_URI"])
+        self._process = subprocess.Popen(
+            [ROSCORE, "-p", self._master.uri.rpartition(":")[2]],
+            # Its programs run with the first python3 there is.
+            env={**environment, "PATH": "/usr/bin:/bin"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        until(self._answers)
+
+    def _answers(self) -> bool:
+        try:
+            return bool(self._master.pid())
+        except Unreachable:
+            return False
+
+    def close(self) -> None:
+        """As Ctrl-C does: it ends its own children, which a kill would leave behind."""
+        self._process.send_signal(signal.SIGINT)
+        self._process.wait(15)
+
+
+def ros_environment(home: Path) -> dict[str, str]:
+    """The environment of ROS programs that write into ``home`` and know no other master."""
+    return {
+        "HOME": str(home),
+        "ROS_HOME": str(home / "ros"),
+        "ROS_LOG_DIR": str(home / "log"),
+        "ROS_IP": "127.0.0.1",
+        "ROS_MASTER_URI": f"http://127.0.0.1:{a_free_port()}",
+    }
+
+
+Spawn = Callable[..., Child]

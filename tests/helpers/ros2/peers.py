@@ -1,0 +1,122 @@
+"""Other implementations of ROS 2 over Zenoh, each a process that the tests talk to."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.processes import DEADLINE_S, Child, until
+from oracles import ORACLES
+
+HERE = Path(__file__).parent
+RUN = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
+DOMAIN = 5
+
+Message = dict[str, Any]
+Spawn = Callable[..., Child]
+
+
+def interpreter(oracle: str) -> str:
+    """Where the environment of ``oracle`` is; a test that needs one that is not there is skipped."""
+    found = os.environ.get(ORACLES[oracle].variable)
+    if not found:
+        pytest.skip(ORACLES[oracle].reason)
+    return found
+
+
+def repeat_until(say: Callable[[], object], condition: Callable[[], object]) -> None:
+    """Say it again and again until ``condition()``: who has just come is not heard by everybody yet."""
+
+    def said() -> object:
+        say()
+        return condition()
+
+    until(said)
+
+
+class Program:
+    """One of the programs beside this file, in the environment of ``oracle``; lines.py has the rules."""
+
+    def __init__(self, spawn: Spawn, oracle: str, file: str, *arguments: object) -> None:
+        self._child = spawn(RUN, interpreter(oracle), str(HERE / file), *map(str, arguments))
+        self._heard: list[tuple[str, Message]] = []
+        self._answer("start")
+
+    def ask(self, do: str, **arguments: Any) -> Any:
+        self._child.tell(json.dumps({"do": do, **arguments}))
+        return self._answer(do)
+
+    def _answer(self, did: str) -> Any:
+        while True:
+            line = json.loads(self._child.line(DEADLINE_S))
+            if line.get("did") == did:
+                return line["answer"]
+            assert "heard" in line, (line, self._child.stderr)
+            self._heard.append((line["heard"], line["message"]))
+
+    def hears(self, topic: str, repeat: Callable[[], object] = lambda: None) -> Message:
+        """The first message on ``topic`` since it was last asked for; ``repeat`` is done until it comes."""
+        found: list[Message] = []
+
+        def looked() -> bool:
+            self.ask("sync")
+            found.extend(message for heard, message in self._heard if heard == topic)
+            self._heard = [(heard, message) for heard, message in self._heard if heard != topic]
+            return bool(found)
+
+        repeat_until(repeat, looked)
+        return found[0]
+
+
+class Peer(Program):
+    """Somebody who publishes and subscribes topics under the keys of rmw_zenoh_cpp."""
+
+    can_latch = True
+    node = "sdk_peer"
+
+    def subscribe(self, topic: str, type: str, latched: bool = False) -> None:
+        self.ask("subscribe", topic=topic, type=type, latched=latched)
+
+    def advertise(self, topic: str, type: str, latched: bool = False) -> None:
+        self.ask("advertise", topic=topic, type=type, latched=latched)
+
+    def publish(self, topic: str, message: Message) -> None:
+        self.ask("publish", topic=topic, message=message)
+
+
+class PyzerosPeer(Peer):
+    """It has no durability but volatile."""
+
+    can_latch = False
+    node = "pyzeros_peer"
+
+
+class BridgedPeer(Peer):
+    """An rclpy node on DDS, behind a bridge that carries its bytes as they are."""
+
+    node = "dds_bridge"
+
+    def __init__(self, spawn: Spawn, endpoint: str, ros_domain: int) -> None:
+        self._bridge = Program(spawn, "kilted", "rclpy_bridge.py", endpoint, DOMAIN, ros_domain)
+        super().__init__(spawn, "kilted", "rclpy_peer.py", ros_domain)
+
+    def subscribe(self, topic: str, type: str, latched: bool = False) -> None:
+        super().subscribe(topic, type, latched)
+        self._bridge.ask("to_ros", topic=topic, type=type, latched=latched)
+
+    def advertise(self, topic: str, type: str, latched: bool = False) -> None:
+        self._bridge.ask("to_zenoh", topic=topic, type=type, latched=latched)
+        super().advertise(topic, type, latched)
+
+
+def start_peer(oracle: str, spawn: Spawn, endpoint: str) -> Peer:
+    """A peer on ``oracle``, attached to the router at ``endpoint``."""
+    if oracle == "kilted":
+        # A DDS domain that no other run of the tests on this host is likely to use.
+        return BridgedPeer(spawn, endpoint, 1 + os.getpid() % 100)
+    kind = PyzerosPeer if oracle == "pyzeros" else Peer
+    return kind(spawn, oracle, f"{oracle}_peer.py", endpoint, DOMAIN)

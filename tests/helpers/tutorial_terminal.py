@@ -1,0 +1,127 @@
+"""The tutorial's document: its files, and what its terminal is told and says."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from helpers.processes import until
+
+FOLDER = Path(__file__).parents[2] / "models" / "tutorial"
+TEXT = (FOLDER / "README.md").read_text()
+FILES = {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}
+
+_DONE = "exercise done: "
+
+# What differs from run to run, the first that fits.
+_MASKS = {
+    r"pid \d+": "pid N",
+    r"@[\w.-]+ pid": "@HOST pid",
+    r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d": "DATE",
+    r"127\.0\.0\.1:\d+": "PORT",
+    r"\d+\.\d+\.\d+\w*": "VERSION",
+    r"\(\d+\.\d{9}\)": "(STAMP)",
+    # Ten digits: a second after the machine was started, whose uptime is the stamp in one exercise.
+    r"\d+\.\d{9}|\b\d{10,}\b": "STAMP",
+    r"\d+\.\d Hz": "RATE",
+    r"-?\d+(\.\d+)? (ns|us|ms|s|days)\b": "TIME",
+    r"-?\d+\.\d{3}\b": "NUMBER",
+    r"(ahead of|behind) this": "BESIDE this",
+    r"(/\S+)+/arm\.urdf": "PATH/arm.urdf",
+    r"kernel \w+": "kernel KIND",
+    r"that of [\w-]+@": "that of WRITER@",
+    r"(?<=\S) +": " ",
+    r" (0|\+?TIME) ([\w-]+@HOST)": r" CLOCK \2",
+}
+
+
+class Told(NamedTuple):
+    """A command, and the lines that stand below it."""
+
+    command: str
+    lines: list[str]
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it runs in the background; what it prints may come in another order."""
+        return self.command.endswith(" &")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+
+
+def told() -> Iterator[Told]:
+    """The terminal, from the first command to the last."""
+    for block in blocks("console"):
+        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
+            command, *lines = part.splitlines()
+            yield Told(command, lines)
+
+
+def masked(lines: list[str]) -> list[str]:
+    """The lines without what differs from run to run, and without those that tell of waiting."""
+    said: list[str] = []
+    for line in lines:
+        for pattern, name in _MASKS.items():
+            line = re.sub(pattern, name, line)  # noqa: PLW2901  # one after the other
+        said.append(line.rstrip())
+    return [line for line in said if line and not line.startswith(("waiting: ", "heard "))]
+
+
+class Terminal:
+    """bash in the folder of the exercise."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._background = 0
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        self._bash = subprocess.Popen(
+            ["bash"],
+            cwd=folder,
+            env={**os.environ, "PATH": path, "PYTHONUNBUFFERED": "1"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def does(self, one: Told) -> list[str]:
+        """What is printed; by a program in the background, once it has printed all that is expected."""
+        command = one.command.removesuffix(" &")
+        if not one.goes_on:
+            return self._done(f"{{ {command}; }} </dev/null")
+        self._background += 1
+        log = self._folder / f".log{self._background}"
+        log.touch()
+        self._done(f"{command} >{log} 2>&1 </dev/null &")
+        until(lambda: len(log.read_text().splitlines()) >= len(one.lines))
+        return log.read_text().splitlines()[: len(one.lines)]
+
+    def _done(self, command: str) -> list[str]:
+        assert self._bash.stdin
+        assert self._bash.stdout
+        self._bash.stdin.write(f"{command}\necho '{_DONE}'\n")
+        self._bash.stdin.flush()
+        return [line.rstrip("\n") for line in iter(self._bash.stdout.readline, f"{_DONE}\n")]
+
+    def close(self) -> None:
+        """End bash and all that it has started."""
+        os.killpg(self._bash.pid, 9)
+        self._bash.communicate()
+
+
+@contextmanager
+def terminal(folder: Path) -> Iterator[Terminal]:
+    opened = Terminal(folder)
+    try:
+        yield opened
+    finally:
+        opened.close()

@@ -1,0 +1,46 @@
+"""Coordinates: which number of a robot is called what."""
+
+import pytest
+from helpers.model_samples import every_joint
+
+from zstate.model.load import load_model
+from zstate.model.robot import VELOCITY_COUNTS, coordinate_names, velocity_columns_by_position
+
+EVERY = every_joint().model
+
+
+def test_a_joint_of_one_number_is_called_by_its_name_and_others_by_their_parts():
+    # mimic joints (toe, nail) and fixed ones have no numbers of their own
+    assert coordinate_names(EVERY) == (
+        *(f"zz body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")),
+        "universe",
+        "sole.x",
+        "sole.y",
+        "sole.yaw",
+        "knee",
+        "shin",
+    )
+
+
+def test_velocities_stand_under_their_coordinates_but_none_under_the_last_of_a_quaternion():
+    names = coordinate_names(EVERY)
+    assert [names[slot] for slot in velocity_columns_by_position(EVERY)] == [
+        *(f"zz body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz")),
+        *names[7:],
+    ]
+
+
+@pytest.mark.parametrize("model", [EVERY, *map(load_model, ("rrbot", "gripper"))])
+def test_there_are_as_many_as_numbers_each_its_own(model):
+    names, slots = coordinate_names(model), velocity_columns_by_position(model)
+    assert len(names) == len(set(names)) == model.position_count
+    assert len(slots) == len(set(slots)) == sum(VELOCITY_COUNTS[j.type] for j in model.driven_joints)
+    assert set(slots) <= set(range(len(names)))
+    for joint in model.driven_joints:
+        start = model.columns[joint.name]
+        assert names[start] in (joint.name, f"{joint.name}.x")
+
+
+def test_a_robot_that_does_not_move_has_none():
+    stone = load_model('<robot name="stone"><link name="only"/></robot>')
+    assert (coordinate_names(stone), velocity_columns_by_position(stone)) == ((), ())

@@ -1,0 +1,319 @@
+"""The access control of a fleet, as a router enforces it: r1 and r2 are robots, the others look."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+import zenoh
+from helpers.processes import a_free_port, until
+from helpers.robots import RRBOT, UPRIGHT, Tap
+
+from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
+from zstate.errors import InvalidInput
+from zstate.net.presence import announce, discover_readers
+from zstate.net.security.acl import AclRoles, access_control, access_text
+from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher
+from zstate.nodes.publisher import STREAMS
+from zstate.wire import keys
+from zstate.wire.messages import TransformSample, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
+USERS = (*FLEET.names, "stranger")
+
+
+class Site:
+    """A router with users, and sessions that come to it."""
+
+    def __init__(self, folder: Any, fleet: AclRoles) -> None:
+        self.endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+        users = folder / "users.txt"
+        users.write_text("".join(f"{name}:secret\n" for name in USERS))
+        self.opened = ExitStack()
+        self.settings = {
+            "mode": "router",
+            "listen": {"endpoints": [self.endpoint]},
+            "scouting": {"multicast": {"enabled": False}},
+            "timestamping": {"enabled": False},
+            "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
+            "access_control": access_control(fleet),
+        }
+        self.opened.enter_context(connect(self.settings))
+
+    def join(self, user: str, **more: object) -> Session:
+        """A client who is ``user``."""
+        settings = {
+            "mode": "client",
+            "connect": {"endpoints": [self.endpoint], "timeout_ms": 5000},
+            "scouting": {"multicast": {"enabled": False}},
+            "transport": {"auth": {"usrpwd": {"user": user, "password": "secret"}}},
+            **more,
+        }
+        return self.opened.enter_context(connect(settings))
+
+
+@contextmanager
+def a_site(folder: Any, fleet: AclRoles) -> Iterator[Site]:
+    site = Site(folder, fleet)
+    with site.opened:
+        yield site
+
+
+@pytest.fixture
+def site(tmp_path) -> Iterator[Site]:
+    with a_site(tmp_path, FLEET) as one:
+        yield one
+
+
+WRITES = [
+    ("r1", "zstate/r1/joint_states", True),
+    ("r1", "zstate/r1/joint_commands", True),
+    ("r1", "zstate/r2/joint_states", False),
+    ("r1", "zstate/*/joint_states", False),
+    ("r1", "zstate/$*1/joint_states", False),
+    ("r1", "zstate/**", False),
+    ("r1", "zstate/clock", False),
+    ("desk", "zstate/r1/joint_states", False),
+    ("desk", "zstate/r1/joint_commands", False),
+    ("desk", "zstate/clock", False),
+    ("hand", "zstate/r1/joint_commands", True),
+    ("hand", "zstate/r1/joint_states", False),
+    ("simulator", "zstate/clock", True),
+    ("simulator", "zstate/r1/joint_states", False),
+    ("stranger", "zstate/r1/joint_states", False),
+    ("site", "zstate/site/tf_static/map", True),
+    ("site", "zstate/site/joint_states", False),
+    ("site", "zstate/r1/tf_static/map", False),
+]
+
+
+def test_each_writes_what_is_theirs_and_nothing_else(site: Site):
+    tap = Tap(site.join("desk"), "zstate/**")
+    writers = {user: site.join(user) for user in USERS}
+    allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
+
+    def heard() -> set[tuple[bytes, str]]:
+        return {(arrival.payload, arrival.key) for arrival in tap.arrivals}
+
+    def all_is_heard_ten_times() -> bool:
+        for user, key, _ in WRITES:
+            writers[user].zenoh.put(key, user.encode())
+        return heard() >= allowed and len(tap.arrivals) >= 10 * len(allowed)
+
+    until(all_is_heard_ten_times)
+    assert heard() == allowed
+
+
+def test_a_viewer_who_comes_late_is_told_everything(site: Site):
+    robot = site.join("r1")
+    with (
+        StatePublisher(robot, RRBOT, "r1") as publisher,
+        StaticPublisher(robot, "r1", "mount") as mount,
+    ):
+        mount.set(Transform("base", "camera", (0.0, 0.0, 1.0), UPRIGHT))
+        viewer = site.join("desk")
+        (info,) = discover(viewer)
+        assert info.name == "r1"
+        assert {stream for stream, _ in info.writers} == set(STREAMS)
+        with TransformListener(viewer, "*") as model, TransformListener(viewer, "r1", follow="tf") as poses:
+            for listener in (model, poses):
+                assert listener.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
+                until(lambda reader=listener: publish_and_look(publisher, reader))
+
+
+def publish_and_look(publisher: StatePublisher, listener: TransformListener) -> bool:
+    publisher.publish([0.1, 0.2])
+    return listener.buffer.can_lookup("base", "lower")
+
+
+def test_a_robot_hears_no_samples_of_others_but_the_clock(site: Site):
+    taps = {user: Tap(site.join(user), "zstate/r1/joint_commands") for user in ("r1", "r2", "stranger")}
+    clock = Tap(site.join("r2"), "zstate/clock")
+    hand, simulator = site.join("hand"), site.join("simulator")
+
+    def all_is_heard_ten_times() -> bool:
+        hand.zenoh.put("zstate/r1/joint_commands", b"go")
+        simulator.zenoh.put("zstate/clock", b"tick")
+        return min(len(taps["r1"].arrivals), len(clock.arrivals)) >= 10
+
+    until(all_is_heard_ten_times)
+    assert (taps["r2"].arrivals, taps["stranger"].arrivals) == ([], [])
+
+
+def test_a_robot_sees_who_the_others_are_and_their_static_edges(site: Site):
+    with (
+        StatePublisher(site.join("r1"), RRBOT, "r1"),
+        TransformListener(site.join("r2"), "r1", follow="tf") as listener,
+    ):
+        assert [info.name for info in discover(site.join("r2"))] == ["r1"]
+        assert listener.buffer.wait("world", "base", timeout_s=5.0).kind == "static"
+
+
+def test_a_placer_places_the_roots_of_robots_and_robots_none_but_their_own_where_it_is_named(site: Site):
+    robot, thief, placer = site.join("r1"), site.join("r2"), site.join("site")
+    with (
+        StatePublisher(robot, RRBOT, "r1") as publisher,
+        StaticPublisher(thief, "r2", "thief", takeover=True) as stolen,
+        StaticPublisher(placer, "site", "map", takeover=True) as placed,
+        TransformListener(site.join("desk"), "*", placers=["site"]) as listener,
+        TransformListener(site.join("desk"), "*", follow="tf", placers=["site"]) as poses,
+    ):
+        stolen.set(Transform("r2/base", "r1/world", (9.0, 0.0, 0.0), UPRIGHT))
+        stolen.set(Transform("r2/base", "r1/camera", (9.0, 0.0, 0.0), UPRIGHT))
+        for reader in (listener, poses):
+            until(lambda reader=reader: reader.stats.refused.get("foreign frame", 0) >= 2)
+        placed.set(Transform("map", "r1/world", (1.0, 0.0, 0.0), UPRIGHT))
+        with StaticPublisher(robot, "r1", "mount") as mount:
+            mount.set(Transform("base", "camera", (2.0, 0.0, 0.0), UPRIGHT))
+            for reader in (listener, poses):
+                until(lambda reader=reader: publish_and_look(publisher, reader))
+                reader.buffer.wait("site/map", "r1/camera", timeout_s=5.0)
+                assert {frame.writer for frame in reader.buffer.frames(("r1/camera",))} == {"mount"}
+                assert "not among the placers ('site')" in reader.refusals["foreign frame"]
+
+
+def test_a_robot_that_announces_itself_as_another_takes_nothing_over(site: Site):
+    robot, thief = site.join("r1"), site.join("r2")
+    edges = (("r1/upper", "r1/lower"),)
+    with (
+        StatePublisher(robot, RRBOT, "r1") as publisher,
+        TransformListener(site.join("desk"), "*", follow="tf") as listener,
+        StreamPublisher(thief, "zstate/r2/tf", ENCODINGS[TransformSample]) as stream,
+    ):
+        until(lambda: publish_and_look(publisher, listener))
+        (info,) = discover(site.join("desk"))
+        (theirs,) = {writer for stream_of, writer in info.writers if stream_of == "tf"}
+
+        def is_named() -> bool:
+            publisher.publish([0.5, 0.25])  # a sample is inserted under the name that is known by then
+            return listener.buffer.frames(("r1/lower",))[0].writer == str(theirs)
+
+        until(is_named)
+        with announce(thief, f"zstate/r2/@writer/tf/{theirs.identity}"):
+            until(lambda: [one.robot for one in listener.events() if one.robot == "r2"])
+            before = listener.buffer.frames(("r1/lower",))[0].count
+            for seq in range(3):
+                sample = (time.time_ns(), seq, theirs.session, order_digest(edges))
+                pose = to_block([[9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+                stream.put(encode(TransformSample(*sample, pose, edges)))
+            until(lambda: listener.stats.refused == {"foreign frame": 3})
+        until(lambda: [one.kind for one in listener.events() if one.robot == "r2"][-1] == "left")
+        publisher.publish([0.5, 0.25])
+        until(lambda: listener.buffer.frames(("r1/lower",))[0].count > before)
+        assert listener.stats.refused == {"foreign frame": 3}
+        assert listener.buffer.lookup("upper", "lower").translation[0] != 9.0
+
+
+def test_whoever_reads_is_known_to_viewers(site: Site):
+    with (
+        StatePublisher(site.join("r1"), RRBOT, "r1"),
+        TransformListener(site.join("r2"), "r1", follow="tf"),
+        TransformListener(site.join("hand")),
+        TransformListener(site.join("stranger"), "r1"),
+    ):
+        viewer = site.join("desk")
+        until(lambda: {one.robot for one in discover_readers(viewer)} == {"*", "r1"})
+        assert {one.stream for one in discover_readers(viewer) if one.robot == "r1"} == {
+            "robot_description",
+            "tf_static",
+            "tf",
+        }
+
+
+def test_a_robot_that_is_a_viewer_too_sees_the_others_move(tmp_path):
+    with (
+        a_site(tmp_path, AclRoles(("r1", "r2"), ("r2",))) as site,
+        StatePublisher(site.join("r1"), RRBOT, "r1") as publisher,
+        TransformListener(site.join("r2"), "r1") as listener,
+    ):
+        until(lambda: publish_and_look(publisher, listener))
+
+
+def test_what_answers_lookups_is_asked_by_viewers_and_stands_under_its_own_robot(site: Site):
+    robot, other, viewer = site.join("r1"), site.join("r2"), site.join("desk")
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(query.key_expr, b"here")
+
+    robot.zenoh.declare_queryable("zstate/r1/lookup", answer)
+    other.zenoh.declare_queryable("zstate/$*1/lookup", answer)
+
+    def answers() -> list[str]:
+        replies = viewer.zenoh.get("zstate/r1/lookup", target=zenoh.QueryTarget.ALL, timeout=1.0)
+        return [reply.ok.payload.to_string() for reply in replies if reply.ok]
+
+    until(answers)
+    assert answers() == ["here"]
+
+
+def test_a_namespace_stands_before_every_key(tmp_path):
+    with (
+        a_site(tmp_path, AclRoles(("r1",), ("desk",), namespace="hall/east")) as site,
+        StatePublisher(site.join("r1", namespace="hall/east"), RRBOT, "r1") as publisher,
+        TransformListener(site.join("desk", namespace="hall/east"), "r1") as listener,
+    ):
+        until(lambda: publish_and_look(publisher, listener))
+        assert discover(site.join("desk"), 0.2) == ()  # looks where nobody is
+
+
+def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    settings = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "access_control": access_control(AclRoles(("r1",), ("desk",))),
+    }
+    with (
+        connect(settings),
+        connect(mode="client", endpoints=endpoint) as one,
+        connect(mode="client", endpoints=endpoint) as other,
+        StatePublisher(one, RRBOT, "r1"),
+    ):
+        assert discover(other, 0.3) == ()
+
+
+def test_every_chunk_that_wildcards_go_past_is_named():
+    chunks = set(re.findall(r"/(@\w+)/", keys.__doc__ or "")) | {"@adv"}
+    assert len(chunks) >= 2
+    for rule in access_control(AclRoles(("r1",), ("desk",)))["rules"]:
+        if rule["id"] in ("r1 writes", "viewers read"):
+            root = rule["key_exprs"][0].removesuffix("/**")
+            assert {f"{root}/**/{chunk}/**" for chunk in chunks} <= set(rule["key_exprs"])
+
+
+def test_the_text_says_the_same_to_zenoh():
+    parsed = json.loads(str(zenoh.Config.from_json5(access_text(FLEET))))["access_control"]
+    said = access_control(FLEET)
+    for section in ("rules", "subjects", "policies"):
+        named = [{k: v for k, v in one.items() if v is not None} for one in parsed[section]]
+        assert named == said[section]
+    assert (parsed["enabled"], parsed["default_permission"]) == (True, "deny")
+
+
+def test_only_the_rules_that_somebody_has_are_there():
+    rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
+    assert rules == ["viewers read", "viewers are given", "readers are known"]
+
+
+@pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])
+def test_a_name_that_cannot_be_one_is_refused(name: str):
+    with pytest.raises(InvalidInput, match="cannot be the name of an identity"):
+        AclRoles((name,))
+
+
+@pytest.mark.parametrize("namespace", ["/hall", "hall/", "a//b", "h*", "@x"])
+def test_a_namespace_that_cannot_stand_before_keys_is_refused(namespace: str):
+    with pytest.raises(InvalidInput, match="is not made of chunks"):
+        AclRoles(("r1",), namespace=namespace)
+
+
+def test_a_fleet_of_nobody_is_refused():
+    with pytest.raises(InvalidInput, match="nobody is named"):
+        AclRoles()

@@ -1,0 +1,194 @@
+"""The access control of a fleet on ROS 2's wire, as a router in a process of its own enforces it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+import zenoh
+from helpers.processes import Child, until
+from helpers.robots import RRBOT, UPRIGHT, Tap
+
+from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
+from zstate.errors import AccessDenied, InvalidInput
+from zstate.net.presence import current_tokens
+from zstate.net.security.acl import AclRoles, access_control, access_text
+from zstate.net.security.credentials import Credentials
+from zstate.net.session import Session
+
+WIRE = "ros2:domain=7,namespace=*"
+FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,))
+USERS = (*FLEET.names, "stranger")
+JOINTS = "sensor_msgs::msg::dds_::JointState_/hash"
+ENDPOINT = "@ros2_lv/7/z/0/{number}/{kind}/%/%{robot}/node/%{topic}/type/hash/::,10:,:,:,,"
+
+Join = Callable[[str], Session]
+
+
+@pytest.fixture
+def join(tmp_path: Path, spawn: Callable[..., Child], free_port: int) -> Iterator[Join]:
+    """``join(user)``: a client of the router who is that user."""
+    users, acl = tmp_path / "users.txt", tmp_path / "acl.json5"
+    users.touch(0o600)
+    users.write_text("".join(f"{name}:secret\n" for name in USERS))
+    acl.write_text(access_text(FLEET))
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    arguments = ("router", "--listen", endpoint, "--users", str(users), "--acl", str(acl))
+    spawn("from zstate.cli.main import main; main()", *arguments).line()
+    with ExitStack() as opened:
+
+        def enter(user: str) -> Session:
+            who = Credentials(user=user, password="secret")
+            return opened.enter_context(connect(mode="client", endpoints=endpoint, credentials=who))
+
+        yield enter
+
+
+WRITES = [
+    ("r1", f"7/r1/joint_states/{JOINTS}", True),
+    ("r1", f"7/r1/arm/scan/{JOINTS}", True),
+    ("r1", f"7/tf/{JOINTS}", True),
+    ("r1", f"7/tf_static/{JOINTS}", True),
+    ("r1", f"7/rosout/{JOINTS}", True),
+    ("r1", f"7/r2/joint_states/{JOINTS}", False),
+    ("r1", f"7/r10/joint_states/{JOINTS}", False),
+    ("r1", f"7/*/joint_states/{JOINTS}", False),
+    ("r1", f"7/joint_states/{JOINTS}", False),
+    ("r1", f"7/clock/{JOINTS}", False),
+    ("r1", f"5/r1/joint_states/{JOINTS}", False),
+    ("r1", "zstate/r1/joint_states", False),
+    ("desk", f"7/r1/joint_states/{JOINTS}", False),
+    ("desk", f"7/tf/{JOINTS}", False),
+    ("hand", f"7/r1/joint_states/{JOINTS}", False),
+    ("simulator", f"7/clock/{JOINTS}", True),
+    ("simulator", f"7/r1/joint_states/{JOINTS}", False),
+    ("stranger", f"7/r1/joint_states/{JOINTS}", False),
+]
+
+
+def test_each_writes_the_topics_that_are_theirs_and_nothing_else(join: Join):
+    viewer = join("desk")
+    taps = [Tap(viewer, key) for key in ("7/**", "5/**", "zstate/**")]
+    writers = {user: join(user) for user in USERS}
+    allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
+
+    def heard() -> list[tuple[bytes, str]]:
+        return [(arrival.payload, arrival.key) for tap in taps for arrival in tap.arrivals]
+
+    def all_is_heard_ten_times() -> bool:
+        for user, key, _ in WRITES:
+            writers[user].zenoh.put(key, user.encode())
+        return set(heard()) >= allowed and len(heard()) >= 10 * len(allowed)
+
+    until(all_is_heard_ten_times)
+    assert set(heard()) == allowed
+
+
+TOKENS = [
+    ("r1", ENDPOINT.format(number=1, kind="MP", robot="r1", topic="r1%joint_states"), True),
+    ("r1", ENDPOINT.format(number=2, kind="MP", robot="r1%arm", topic="r1%arm%scan"), True),
+    ("r1", ENDPOINT.format(number=3, kind="MP", robot="r1", topic="tf"), True),
+    ("r1", ENDPOINT.format(number=4, kind="MS", robot="r1", topic="tf"), True),
+    ("r1", "@ros2_lv/7/z/5/5/NN/%/%r1/node", True),
+    ("r1", ENDPOINT.format(number=6, kind="MP", robot="r1", topic="r2%joint_states"), False),
+    ("r1", ENDPOINT.format(number=7, kind="MP", robot="r2", topic="r1%joint_states"), False),
+    ("r1", ENDPOINT.format(number=8, kind="SS", robot="r1", topic="r2%stop"), False),
+    ("r1", "@ros2_lv/7/z/9/9/NN/%/%r10/node", False),
+    ("desk", ENDPOINT.format(number=11, kind="MS", robot="r1", topic="r1%joint_states"), True),
+    ("desk", "@ros2_lv/7/z/12/12/NN/%/%/rviz", True),
+    ("desk", ENDPOINT.format(number=13, kind="MP", robot="r1", topic="r1%joint_states"), False),
+    ("simulator", ENDPOINT.format(number=14, kind="MP", robot="gz", topic="clock"), True),
+    ("stranger", "@ros2_lv/7/z/15/15/NN/%/%r1/node", False),
+]
+
+
+def test_each_stands_in_the_graph_with_what_is_theirs(join: Join):
+    sessions = {user: join(user) for user in USERS}
+    tokens = [sessions[user].zenoh.liveliness().declare_token(key) for user, key, _ in TOKENS]
+    allowed = {key for _, key, is_allowed in TOKENS if is_allowed}
+    for observer in ("hand", "r2"):
+
+        def seen(session: Session = sessions[observer]) -> frozenset[str]:
+            return current_tokens(session, "@ros2_lv/7/**", 1.0)
+
+        until(lambda seen=seen: len(seen()) >= len(allowed))
+        assert seen() == allowed
+    del tokens
+
+
+def test_a_viewer_who_comes_late_is_told_everything_of_a_robot(join: Join):
+    robot = join("r1")
+    with (
+        StatePublisher(robot, RRBOT, "r1", WIRE) as publisher,
+        StaticPublisher(robot, "r1", "mount", WIRE) as mount,
+    ):
+        mount.set(Transform("base", "camera", (0.0, 0.0, 1.0), UPRIGHT))
+        viewer = join("desk")
+        assert [info.name for info in discover(viewer, wire=WIRE) if info.name == "r1"] == ["r1"]
+        with TransformListener(viewer, "r1", wire=WIRE) as listener:
+            listener.buffer.wait("base", "camera", timeout_s=5.0)
+
+            def moves() -> bool:
+                publisher.publish([0.1, 0.2])
+                return listener.buffer.can_lookup("base", "lower")
+
+            until(moves)
+
+
+@pytest.mark.parametrize("user", ["r2", "desk", "hand"])
+def test_who_writes_as_another_robot_is_told_so(join: Join, user: str):
+    with pytest.raises(AccessDenied, match="write as robot 'r1'"):
+        StatePublisher(join(user), RRBOT, "r1", WIRE)
+
+
+def test_services_are_called_by_operators_and_answered_by_their_robot(join: Join):
+    robot, other = join("r1"), join("r2")
+    service = "7/r1/stop/std_srvs::srv::dds_::Trigger_/hash"
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(service, b"stopped")
+
+    robot.zenoh.declare_queryable(service, answer)
+    other.zenoh.declare_queryable(service, lambda query: query.reply(service, b"never"))
+
+    def answers(session: Session) -> list[str]:
+        replies = session.zenoh.get(service, target=zenoh.QueryTarget.ALL, timeout=1.0)
+        return [reply.ok.payload.to_string() for reply in replies if reply.ok]
+
+    hand = join("hand")
+    until(lambda: answers(hand))
+    assert answers(hand) == ["stopped"]
+    assert answers(join("desk")) == []
+
+
+def test_several_wires_stand_side_by_side():
+    def rules(*wires: str) -> list[object]:
+        listed = access_control(AclRoles(("r1",), ("desk",), wires=wires))["rules"]
+        return [rule["id"] for rule in listed]  # type: ignore[index, union-attr]
+
+    other = "ros2:domain=5,namespace=*"
+    assert rules("native", WIRE, other) == [*rules("native"), *rules(WIRE), *rules(other)]
+    assert len(set(rules("native", WIRE, other))) == len(rules("native", WIRE, other))
+
+
+def test_a_robot_alone_in_the_root_namespace_has_its_domain():
+    (written, *_) = access_control(AclRoles(("r1",), wires=("ros2:domain=5",)))["rules"]  # type: ignore[misc]
+    assert written["key_exprs"] == ["5/**", "5/**/@adv/**", "@ros2_lv/5/**"]
+
+
+@pytest.mark.parametrize(
+    ("fleet", "text"),
+    [
+        (AclRoles(("r1", "r2"), wires=("ros2",)), "'ros2:namespace=*'"),
+        (AclRoles(("r1", "r2"), wires=("ros2:namespace=site",)), "the same topics"),
+        (AclRoles(("r-1",), wires=("ros2:namespace=*",)), "ROS names are made of"),
+        (AclRoles(("r1",), namespace="hall", wires=("ros2",)), "no Zenoh namespace"),
+        (AclRoles(("r1",), wires=("ros2dds",)), "no access control for the wire 'ros2dds'"),
+        (AclRoles(("r1",), wires=("pigeon",)), "there is for 'native' and 'ros2'"),
+    ],
+)
+def test_what_cannot_be_told_apart_or_is_no_wire_is_refused(fleet: AclRoles, text: str):
+    with pytest.raises(InvalidInput, match=text.replace("*", r"\*")):
+        access_control(fleet)

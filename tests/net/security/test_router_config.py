@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from helpers.processes import a_free_port, until
+from helpers.robots import RRBOT, Tap
+
+from zstate import StatePublisher, connect
+from zstate.errors import ConfigError, InvalidInput
+from zstate.net.config import default_config
+from zstate.net.security.acl import AclRoles, access_control, access_text, read_access_control
+from zstate.net.security.credentials import Credentials
+from zstate.net.security.router_config import Downsampling, RouterConfig
+
+FILES = Credentials(ca="/certs/ca.pem", certificate="/certs/r1.pem", key="/certs/r1.key")
+CONFIGURATIONS = {
+    "plain": RouterConfig(),
+    "ros2": RouterConfig(ros2=True),
+    "whole": RouterConfig(
+        listen=("tls/[::]:7447", "tcp/127.0.0.1:7447"),
+        connect=("tls/fleet.example.com:7447", "tls/spare.example.com:7447"),
+        credentials=FILES,
+        thinning=Downsampling({"joint_states": 10.0, "tf": 2.5}, ("r1", "r2"), ("wwan0",)),
+        access_control=access_control(AclRoles(("r1",), ("desk",))),
+    ),
+    "users": RouterConfig(credentials=Credentials(user="r1", password="secret", users="/etc/users")),
+}
+
+
+def parsed(text: str) -> dict[str, Any]:
+    return json.loads(str(zenoh.Config.from_json5(text)))
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_the_text_says_what_is_run(name: str):
+    """Zenoh refuses names that it does not know, so all of them are its own."""
+    config = CONFIGURATIONS[name]
+    assert parsed(config.text()) == parsed(json.dumps(config.settings()))
+
+
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_every_section_says_what_it_is_for(name: str):
+    lines = CONFIGURATIONS[name].text().splitlines()
+    sections = [number for number, line in enumerate(lines) if line.startswith("  ") and line[2].isalpha()]
+    unsaid = [lines[n].split(":")[0].strip() for n in sections if not lines[n - 1].startswith("  //")]
+    assert set(unsaid) <= {"mode", "transport", "routing"}
+
+
+def test_it_differs_from_a_session_in_router_mode_by_nothing_that_matters_to_a_router():
+    made = parsed(CONFIGURATIONS["plain"].text())
+    opened = json.loads(str(default_config("router", (), ("tcp/127.0.0.1:7447",))))
+    for ours in (made, opened):
+        for of_others in ("connect", "scouting"):
+            del ours[of_others]
+    assert made == opened
+
+
+def test_routers_are_sought_for_ever_and_the_router_serves_meanwhile():
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    config = RouterConfig((endpoint,), (f"tcp/127.0.0.1:{a_free_port()}",))
+    with connect(config.settings()), connect(mode="client", endpoints=endpoint) as client:
+        assert client.zenoh.info.routers_zid()
+
+
+def test_what_stays_on_this_host_needs_no_encryption():
+    RouterConfig(("tcp/127.0.0.1:7447", "tls/[::]:7447"), credentials=FILES)
+    with pytest.raises(ConfigError, match="is not encrypted"):
+        RouterConfig(("tcp/0.0.0.0:7447",), credentials=FILES)
+    with pytest.raises(ConfigError, match="is not encrypted"):
+        RouterConfig(connect=("tcp/fleet.example.com:7447",), credentials=FILES)
+
+
+def test_access_control_without_names_is_refused():
+    access = access_control(AclRoles(("r1",)))
+    with pytest.raises(ConfigError, match="nobody is asked for a name"):
+        RouterConfig(access_control=access)
+    with pytest.raises(ConfigError, match="nobody is asked for a name"):
+        RouterConfig(credentials=Credentials(ca="/certs/ca.pem"), access_control=access)
+    RouterConfig(credentials=Credentials(users="/etc/users"), access_control=access)
+
+
+def test_access_control_is_read_from_a_file_as_it_was_written(tmp_path: Path):
+    fleet = AclRoles(("r1", "r2"), ("desk",))
+    file = tmp_path / "acl.json5"
+    file.write_text(access_text(fleet))
+    assert read_access_control(file) == access_control(fleet)
+
+
+@pytest.mark.parametrize("text", ["{}", "{ access_control: { enabled: false } }"])
+def test_a_file_without_access_control_is_refused(tmp_path: Path, text: str):
+    file = tmp_path / "acl.json5"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match="has no access_control that is enabled"):
+        read_access_control(file)
+
+
+def test_each_robot_is_thinned_apart_and_latched_values_are_not():
+    """For one rule of both, Zenoh would let through as much of them together as of one."""
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    thinning = Downsampling({"joint_states": 20.0}, ("r1", "r2"))
+    with (
+        connect(RouterConfig((endpoint,), thinning=thinning).settings()),
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+    ):
+        taps = [Tap(reader, f"zstate/{robot}/joint_states") for robot in ("r1", "r2")]
+        statics = Tap(reader, "zstate/*/tf_static/*")
+        with (
+            StatePublisher(writer, RRBOT, "r1") as one,
+            StatePublisher(writer, RRBOT, "r2") as other,
+        ):
+            published = 0
+
+            def each_has_ten() -> bool:
+                nonlocal published
+                for publisher in (one, other):
+                    publisher.publish([0.1, 0.2])
+                published += 1
+                return min(len(tap.arrivals) for tap in taps) >= 10
+
+            until(each_has_ten)
+            heard = [len(tap.arrivals) for tap in taps]
+            assert max(heard) < published / 2  # a few hundred a second are put
+            assert max(heard) - min(heard) <= 3
+            until(lambda: len(statics.arrivals) == 2)
+
+
+def test_elsewhere_nothing_is_thinned():
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    thinning = Downsampling({"joint_states": 0.01}, ("r1",), ("no-such-interface",))
+    with (
+        connect(RouterConfig((endpoint,), thinning=thinning).settings()),
+        connect(mode="client", endpoints=endpoint) as writer,
+        connect(mode="client", endpoints=endpoint) as reader,
+    ):
+        tap = Tap(reader, "zstate/r1/joint_states")
+        with StatePublisher(writer, RRBOT, "r1") as publisher:
+            until(lambda: (publisher.publish([0.1, 0.2]), len(tap.arrivals) >= 10)[1])
+
+
+@pytest.mark.parametrize(
+    ("rates_hz", "robots", "text"),
+    [
+        ({"tf_static": 1.0}, ("r1",), "cannot be downsampled"),
+        ({"joint_commands": 1.0}, ("r1",), "cannot be downsampled"),
+        ({"tf": 0.0}, ("r1",), "positive number"),
+        ({"tf": float("nan")}, ("r1",), "positive number"),
+        ({"tf": 1.0}, (), "names of the robots"),
+        ({}, ("r1",), "needs streams"),
+    ],
+)
+def test_thinning_that_would_starve_somebody_is_refused(rates_hz, robots, text: str):
+    with pytest.raises(InvalidInput, match=text):
+        Downsampling(rates_hz, robots)
+
+
+def test_a_namespace_stands_before_the_keys_that_are_thinned():
+    (section,) = Downsampling({"tf": 1.0}, ("r1",), namespace="hall/east").settings()
+    assert section["rules"] == [{"key_expr": "hall/east/zstate/r1/tf", "freq": 1.0}]

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+
+import pytest
+from helpers.processes import a_free_port
+from helpers.robots import RRBOT
+
+from zstate import StatePublisher, StaticPublisher, connect, discover
+from zstate.errors import AccessDenied
+from zstate.net.security.acl import AclRoles, access_control
+from zstate.net.security.credentials import Credentials
+from zstate.net.session import Session
+
+USERS = ("r1", "r2", "desk", "stranger")
+
+
+@pytest.fixture
+def endpoint(tmp_path) -> Iterator[str]:
+    """Where a router listens that knows the robots r1 and r2, and the viewer desk."""
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    users = tmp_path / "users.txt"
+    users.write_text("".join(f"{name}:secret\n" for name in USERS))
+    settings = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "scouting": {"multicast": {"enabled": False}},
+        "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
+        "access_control": access_control(AclRoles(("r1", "r2"), ("desk",))),
+    }
+    with connect(settings):
+        yield endpoint
+
+
+def join(endpoint: str, user: str) -> Session:
+    return connect(mode="client", endpoints=endpoint, credentials=Credentials(user=user, password="secret"))
+
+
+def test_a_robot_may_write_itself(endpoint: str):
+    with (
+        join(endpoint, "r1") as session,
+        StatePublisher(session, RRBOT, "r1"),
+        StaticPublisher(session, "r1", "mount"),
+    ):
+        assert [info.name for info in discover(session)] == ["r1"]
+
+
+@pytest.mark.parametrize("user", ["r2", "desk", "stranger"])
+def test_who_may_not_is_told_who_they_are_and_which_rule_is_missing(endpoint: str, user: str):
+    with join(endpoint, user) as session:
+        with pytest.raises(AccessDenied) as refused:
+            StatePublisher(session, RRBOT, "r1")
+        text = str(refused.value)
+        for needed in (f"user '{user}'", "robot 'r1'", "'r1 writes'", "`zstate acl --robot r1`"):
+            assert needed in text
+        assert "zstate/r1/@writer/" in refused.value.endpoint
+        assert refused.value.reason == "not allowed to write"
+        assert str(pickle.loads(pickle.dumps(refused.value))) == text
+        with pytest.raises(AccessDenied):
+            StaticPublisher(session, "r1", "mount")
+        # Nothing stays behind of what could not be opened.
+        assert discover(session, 0.2) == ()
+
+
+def test_who_shows_nothing_cannot_be_told_apart_and_is_not_asked():
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    with (
+        connect(mode="router", listen=endpoint),
+        connect(mode="client", endpoints=endpoint) as session,
+        StatePublisher(session, RRBOT, "r1"),
+    ):
+        assert session.probe is None
+
+
+def test_where_the_router_is_gone_nothing_is_held_against_the_writer(tmp_path):
+    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    users = tmp_path / "users.txt"
+    users.write_text("r1:secret\n")
+    settings = {
+        "mode": "router",
+        "listen": {"endpoints": [endpoint]},
+        "transport": {"auth": {"usrpwd": {"dictionary_file": str(users)}}},
+    }
+    router = connect(settings)
+    with join(endpoint, "r1") as session:
+        router.close()
+        with StatePublisher(session, RRBOT, "r1") as publisher:
+            publisher.publish([0.1, 0.2])

@@ -1,0 +1,124 @@
+"""Two who say the same static edges at the same moment: one of them is told, whatever the network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from threading import Barrier
+from typing import Any
+
+import pytest
+from helpers.processes import Child, until
+from helpers.robots import RRBOT
+
+from zstate.errors import SecondWriter
+from zstate.net.presence import announce, current_tokens
+from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.transform import Transform
+from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.keys import edge_key
+
+ROUTER = """
+    import sys
+    from zstate.net.session import connect
+    with connect(mode="router", listen=sys.argv[1]):
+        print("ready")
+        sys.stdin.readline()
+"""
+ROUNDS = 10
+
+
+def edge(parent: str, x: float) -> Transform:
+    return Transform(parent, "fleet/camera", [x, 0, 0], [0, 0, 0, 1])
+
+
+@pytest.fixture(params=["peers", "clients", "one peer", "one client"])
+def pair(
+    request: pytest.FixtureRequest, spawn: Callable[..., Child], free_port: int
+) -> Iterator[tuple[Session, Session]]:
+    """Two sessions, or twice the same, directly or behind a router."""
+    how: dict[str, Any] = {}
+    if "client" in request.param:
+        how = {"mode": "client", "endpoints": f"tcp/127.0.0.1:{free_port}"}
+        assert spawn(ROUTER, how["endpoints"]).line() == "ready"
+    with connect(**how) as one, connect(**how) as other:
+        yield one, one if "one" in request.param else other
+
+
+def at_once(*actions: Callable[[], object]) -> list[SecondWriter | None]:
+    """What each of them raised, all begun at the same moment."""
+    barrier = Barrier(len(actions))
+
+    def run(action: Callable[[], object]) -> SecondWriter | None:
+        barrier.wait()
+        try:
+            action()
+        except SecondWriter as error:
+            return error
+        return None
+
+    with ThreadPoolExecutor(len(actions)) as pool:
+        return list(pool.map(run, actions))
+
+
+def the_one_told(errors: Sequence[SecondWriter | None]) -> tuple[int, SecondWriter]:
+    ((place, error),) = [(place, error) for place, error in enumerate(errors) if error is not None]
+    return place, error
+
+
+def test_of_two_who_place_a_frame_at_once_one_is_told_of_the_other_whose_edge_holds(pair):
+    for _ in range(ROUNDS):
+        with (
+            TransformListener(pair[1], "*", history_on_join=False) as listener,
+            StaticPublisher(pair[0], "r1", "mount", program="mount") as mount,
+            StaticPublisher(pair[1], "r2", "room", program="room") as room,
+        ):
+            for session in pair:
+                until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/tf_static/*", 1.0)) == 2)
+            errors = at_once(
+                lambda mount=mount: mount.set(edge("fleet/base", 1.0)),
+                lambda room=room: room.set(edge("fleet/base", 2.0)),
+            )
+            place, error = the_one_told(errors)
+            assert error.first.program == ("room", "mount")[place]
+            assert error.edge == ("fleet/base", "fleet/camera")
+            listener.buffer.wait("fleet/base", "fleet/camera", timeout_s=5.0)
+            assert listener.buffer.lookup("fleet/base", "fleet/camera").translation[0] == (2.0, 1.0)[place]
+
+
+# Peers do not wait for an answer that may never come: of a hundred times they miss each other once.
+@pytest.mark.parametrize("pair", ["clients", "one peer", "one client"], indirect=True)
+def test_of_two_who_open_under_one_name_at_once_one_is_told_of_the_other(pair):
+    for _ in range(ROUNDS):
+        with ExitStack() as opened:
+
+            def open_on(session: Session, opened: ExitStack = opened) -> None:
+                opened.enter_context(StaticPublisher(session, "r1", "mount")).set(edge("fleet/base", 1.0))
+
+            _, error = the_one_told(at_once(*(partial(open_on, session) for session in pair)))
+        assert (error.stream, error.edge) == ("tf_static", None)
+
+
+@pytest.mark.parametrize("pair", ["one peer", "one client"], indirect=True)
+def test_who_comes_second_in_a_session_is_told_always(pair):
+    for _ in range(3 * ROUNDS):
+        with StatePublisher(pair[0], RRBOT, "r1"), pytest.raises(SecondWriter):
+            StatePublisher(pair[1], RRBOT, "r1")
+
+
+def test_what_somebody_was_about_to_place_who_left_may_be_placed(sessions):
+    ours, theirs = sessions
+    early = Announcement("r2", "tf_static", WriterId("room", "laptop", 9, 1, 8), "room")
+    with StaticPublisher(ours, "r1", "mount") as mount:
+        with announce(theirs, edge_key("r2", ("fleet/base", "fleet/camera"), early.identity)):
+            until(lambda: current_tokens(ours, "zstate/*/@edge/**", 1.0))
+            with pytest.raises(SecondWriter, match="is placing 'fleet/camera' on 'fleet/base'") as raised:
+                mount.set(edge("fleet/base", 1.0))
+            assert raised.value.first == early.writer
+        until(lambda: not current_tokens(ours, "zstate/*/@edge/**", 1.0))
+        mount.set(edge("fleet/base", 1.0))

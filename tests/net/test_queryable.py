@@ -1,0 +1,136 @@
+"""Questions on one key, and one thread that answers."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+from helpers.processes import SOON_S, until
+
+from zstate.net.queryable import Queryable, Reply, parse_parameters
+from zstate.net.session import Session
+from zstate.net.streams import StreamPublisher, StreamSubscriber
+
+KEY = "zstate/r1/lookup"
+
+
+def replies(session: Session, selector: str, timeout_s: float = 5.0) -> list[tuple[bool, bytes, str]]:
+    """What is answered: whether it is no error, the payload and its encoding."""
+    found = []
+    for reply in session.zenoh.get(selector, timeout=timeout_s):
+        said = reply.ok or reply.err
+        assert said is not None
+        found.append((reply.ok is not None, said.payload.to_bytes(), str(said.encoding)))
+    return found
+
+
+def answered(session: Session, selector: str) -> list[tuple[bool, bytes, str]]:
+    """The same, once the question finds its way."""
+    found: list[tuple[bool, bytes, str]] = []
+
+    def is_answered() -> bool:
+        found.extend(replies(session, selector))
+        return bool(found)
+
+    until(is_answered)
+    return found
+
+
+def test_a_question_has_its_answer_and_an_error_is_one_to_zenoh(sessions: tuple[Session, Session]):
+    def answer(parameters):
+        return Reply(repr(parameters).encode(), "text/plain", is_error="wrong" in parameters)
+
+    with Queryable(sessions[0], KEY, answer) as service:
+        said = answered(sessions[1], f"{KEY}?a=1;b=x=y")
+        assert said == [(True, b"{'a': '1', 'b': 'x=y'}", "text/plain")]
+        assert replies(sessions[1], f"{KEY}?wrong") == [(False, b"{'wrong': ''}", "text/plain")]
+        until(lambda: service.answered == 2)
+    assert replies(sessions[1], KEY) == []
+
+
+def test_no_answer_is_said_at_once(sessions: tuple[Session, Session]):
+    with Queryable(sessions[0], KEY, lambda parameters: Reply(b"x", "") if parameters else None):
+        answered(sessions[1], f"{KEY}?a=1")
+        start = time.monotonic()
+        assert replies(sessions[1], KEY, timeout_s=30.0) == []
+        assert time.monotonic() - start < 15.0
+
+
+def test_an_answer_that_fails_is_counted_and_reported_once_and_the_next_is_given(
+    sessions: tuple[Session, Session], monkeypatch: pytest.MonkeyPatch
+):
+    reported: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", reported.append)
+
+    def answer(parameters):
+        return Reply(str(1 / int(parameters["n"])).encode(), "")
+
+    with Queryable(sessions[0], KEY, answer) as service:
+        answered(sessions[1], f"{KEY}?n=1")
+        for _ in range(2):
+            assert replies(sessions[1], f"{KEY}?n=0") == []
+        assert replies(sessions[1], f"{KEY}?n=2")[0][1] == b"0.5"
+        until(lambda: service.failures == 2)
+    assert [args.exc_type for args in reported] == [ZeroDivisionError]
+
+
+def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
+    sessions: tuple[Session, Session],
+):
+    writer, reader = sessions
+    may_answer, asked = threading.Event(), threading.Event()
+
+    def answer(parameters):
+        if parameters:
+            asked.set()
+            may_answer.wait(30.0)
+        return Reply(b"x", "")
+
+    heard: list[bytes] = []
+    with (
+        StreamPublisher(reader, "zstate/r1/tf", "") as stream,
+        StreamSubscriber(
+            writer, "zstate/r1/tf", lambda arrivals: heard.extend(one.payload for one in arrivals)
+        ),
+        Queryable(writer, KEY, answer, capacity=4) as service,
+    ):
+        until(lambda: stream.has_readers)
+        answered(reader, KEY)
+        slow = reader.zenoh.get(f"{KEY}?slow", timeout=30.0)
+        assert asked.wait(15.0)
+        flood = [reader.zenoh.get(KEY, timeout=30.0) for _ in range(40)]
+        # Those that found no room are over before anything was answered.
+        until(lambda: sum(not next_reply(get) for get in flood[:36]) == 36)
+        stream.put(b"live")
+        until(lambda: heard == [b"live"])
+        may_answer.set()
+        assert len(list(slow)) == 1
+        assert [len(list(get)) for get in flood[36:]] == [1, 1, 1, 1]
+        until(lambda: service.overflows == 1)
+
+
+def next_reply(get) -> bool:
+    return bool(list(get))
+
+
+def test_closing_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):
+    service = Queryable(sessions[0], KEY, lambda _: None)
+    start = time.monotonic()
+    service.close()
+    service.close()
+    assert time.monotonic() - start < SOON_S
+
+
+@pytest.mark.parametrize(
+    ("text", "parameters"),
+    [
+        ("", {}),
+        ("a=1", {"a": "1"}),
+        ("a=1;b=2", {"a": "1", "b": "2"}),
+        (";a;", {"a": ""}),
+        ("a=b=c", {"a": "b=c"}),
+    ],
+)
+def test_parameters_are_pairs(text: str, parameters: dict[str, str]):
+    assert parse_parameters(text) == parameters

@@ -1,0 +1,61 @@
+"""Simulated time on the network."""
+
+from __future__ import annotations
+
+import pytest
+from helpers.robots import Tap, await_reader
+
+from zstate.errors import Closed, InvalidInput
+from zstate.nodes.clock import ClockPublisher
+from zstate.wire.messages import ClockMessage
+from zstate.wire.native import ENCODINGS, decode
+from zstate.wire.ros2.simple_messages import decode_clock
+
+ROS = "ros2:domain=7,namespace=*,frame_prefix=*/"
+
+
+def test_the_time_is_said_on_both_wires(sessions):
+    writer, reader = sessions
+    native, ros = Tap(reader, "zstate/clock"), Tap(reader, "7/clock/**")
+    with ClockPublisher(writer, ("native", ROS)) as clock:
+        await_reader(writer, "zstate/clock")
+        await_reader(writer, "7/clock/x/y")
+        for stamp in (0, 5, 1_700_000_000_000_000_001):
+            clock.publish(stamp)
+        told = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in native.payloads(3)]
+        assert [clock.stamp for clock in told] == [0, 5, 1_700_000_000_000_000_001]
+        assert [clock.seq for clock in told] == [0, 1, 2]
+        assert len({clock.session for clock in told}) == 1
+        assert [decode_clock(payload) for payload in ros.payloads(3)] == [clock.stamp for clock in told]
+
+
+def test_a_new_publisher_is_a_new_start(sessions):
+    writer, reader = sessions
+    tap = Tap(reader, "zstate/clock")
+    await_reader(writer, "zstate/clock")
+    for _ in range(2):
+        with ClockPublisher(writer) as clock:
+            clock.publish(1)
+    told = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(2)]
+    assert told[0].session != told[1].session
+
+
+def test_what_cannot_be_said_is_refused_and_counts_for_nothing(sessions):
+    writer, reader = sessions
+    tap = Tap(reader, "zstate/clock")
+    with ClockPublisher(writer, ("native", ROS)) as clock:
+        await_reader(writer, "zstate/clock")
+        for wrong in (0.5, 2**62):
+            with pytest.raises(InvalidInput):
+                clock.publish(wrong)
+        clock.publish(3)
+        (told,) = (decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(1))
+        assert (told.stamp, told.seq) == (3, 0)
+
+
+def test_a_closed_clock_says_so(sessions):
+    clock = ClockPublisher(sessions[0])
+    clock.close()
+    clock.close()
+    with pytest.raises(Closed):
+        clock.publish(1)

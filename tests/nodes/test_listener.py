@@ -1,0 +1,262 @@
+"""Following robots over real sessions on loopback."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from helpers.processes import SOON_S, Child, until
+from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, settle
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import ManualClock
+from zstate.errors import AmbiguousFrame, InvalidInput
+from zstate.model.load import load_model
+from zstate.net.clock_offset import measure_offsets
+from zstate.net.presence import discover
+from zstate.net.streams import StreamPublisher
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.sources import SineSource
+from zstate.transform import Transform
+from zstate.wire.messages import JointState, order_digest
+from zstate.wire.native import ENCODINGS, encode
+from zstate.wire.protocol import SerializedSample
+
+PERIOD = 10_000_000
+GRIPPER = load_model("gripper")
+
+
+@pytest.mark.parametrize("model", [RRBOT, load_model("diffbot"), GRIPPER], ids=lambda model: model.name)
+def test_both_ways_of_following_agree_with_kinematics_at_every_stamp(sessions, model):
+    writer, reader = sessions
+    sine = SineSource(model)
+    stamps = [STAMP + number * PERIOD for number in range(20)]
+    with (
+        StatePublisher(writer, model, "r1") as publisher,
+        TransformListener(reader, "r1", history_on_join=False) as joints,
+        TransformListener(reader, "r1", follow="tf", history_on_join=False) as transforms,
+    ):
+        settle(writer, "r1", "joint_states", "tf")
+        for listener in (joints, transforms):
+            # Who does not know yet whose time these are counts none as off the clock.
+            until(lambda listener=listener: listener.buffer.domain.domain_of("r1") == "system")
+        for stamp in stamps:
+            publisher.publish(sine.read(stamp).positions, stamp=stamp)
+        for listener in (joints, transforms):
+            for link in model.links:
+                listener.buffer.wait(model.root, link, timeout_s=5.0)
+            until(lambda listener=listener: listener.stats.received == 20)
+    for stamp in stamps:
+        for link in model.links:
+            expected = kinematic_pose(model, sine.read(stamp).positions, model.root, link)
+            for listener in (joints, transforms):
+                assert_pose(listener.buffer.lookup(model.root, link, stamp), expected)
+    assert joints.stats == transforms.stats
+    assert (joints.stats.missed, joints.stats.late, joints.stats.refused) == (0, 0, {})
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_who_joins_late_has_the_model_and_all_statics_before_any_sample(sessions, follow):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, "r1"), StaticPublisher(writer, "r1", "mount") as statics:
+        statics.set(Transform("tool", "hook", (0.0, 0.0, 0.25), UPRIGHT))
+        with TransformListener(reader, "r1", follow=follow) as listener:
+            camera = listener.buffer.wait("hook", "camera_link", timeout_s=5.0)
+            expected = kinematic_pose(RRBOT, [0.0, 0.0], "tool", "camera_link")
+            expected[2, 3] -= 0.25
+            assert_pose(camera, expected)
+            until(lambda: listener.robots() == ("r1",))
+            assert listener.stats.received == 0
+
+
+def test_frames_answer_to_their_bare_and_their_full_names(sessions):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
+        settle(writer, "r1")
+        publisher.publish([0.5, 0.25], stamp=STAMP)
+        bare = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        for target, source in (("r1/world", "r1/tool"), ("world", "r1/tool")):
+            assert_pose(listener.buffer.lookup(target, source), bare.matrix)
+        assert {frame.name for frame in listener.buffer.frames()} == {f"r1/{link}" for link in RRBOT.links}
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_of_two_robots_of_one_model_bare_names_are_ambiguous_and_full_ones_exact(sessions, follow):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1") as first,
+        StatePublisher(writer, RRBOT, "r2") as second,
+        TransformListener(reader, follow=follow) as listener,
+    ):
+        settle(writer, "r1", follow)
+        settle(writer, "r2", follow)
+        first.publish([0.5, 0.25], stamp=STAMP)
+        second.publish([-1.0, 2.0], stamp=STAMP + 1)
+        for robot, positions in (("r1", [0.5, 0.25]), ("r2", [-1.0, 2.0])):
+            pose = listener.buffer.wait(f"{robot}/world", f"{robot}/tool", timeout_s=5.0)
+            assert_pose(pose, kinematic_pose(RRBOT, positions, "world", "tool"))
+        with pytest.raises(AmbiguousFrame) as caught:
+            listener.buffer.lookup("world", "tool")
+        assert set(caught.value.candidates) == {"r1/world", "r2/world"}
+        assert listener.robots() == ("r1", "r2")
+
+
+def test_a_listener_of_one_robot_hears_nothing_of_another(sessions):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1") as mine,
+        StatePublisher(writer, RRBOT, "r2") as other,
+        TransformListener(reader, "r1") as listener,
+    ):
+        settle(writer, "r1")
+        other.publish([0.0, 0.0])
+        mine.publish([0.0, 0.0])
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        assert listener.robots() == ("r1",)
+        assert all(frame.name.startswith("r1/") for frame in listener.buffer.frames())
+
+
+def test_two_listeners_fill_one_buffer_that_was_handed_in(sessions):
+    writer, reader = sessions
+    buffer = TransformBuffer(history_s=3.0, clock=ManualClock(5))
+    buffer.insert_static(Transform("hall", "r1/world", (1.0, 0.0, 0.0), UPRIGHT))
+    buffer.insert_static(Transform("hall", "r2/mount", (0.0, 2.0, 0.0), UPRIGHT))
+    with (
+        StatePublisher(writer, RRBOT, "r1"),
+        StatePublisher(writer, GRIPPER, "r2"),
+        TransformListener(reader, "r1", buffer) as one,
+        TransformListener(reader, "r2", buffer, follow="tf") as other,
+    ):
+        assert one.buffer is other.buffer is buffer
+        palm_from_base = buffer.wait("base", "palm", timeout_s=5.0)
+        # mount_to_palm is 0.01 above; base is at world.
+        assert np.allclose(palm_from_base.translation, [-1.0, 2.0, 0.01], rtol=0, atol=1e-12)
+
+
+def test_history_and_clock_are_those_of_the_listeners_own_buffer(sessions):
+    clock = ManualClock(5)
+    with TransformListener(sessions[1], "r1", history_s=2.5, clock=clock) as listener:
+        assert (listener.buffer.history_s, listener.buffer.clock) == (2.5, clock)
+
+
+def test_what_cannot_be_followed_is_refused(sessions):
+    with pytest.raises(InvalidInput, match="follow is 'joint_states' or 'tf', not 'joints'"):
+        TransformListener(sessions[0], "r1", follow="joints")
+    with pytest.raises(InvalidInput, match="no wire 'dds'"):
+        TransformListener(sessions[0], "r1", wire="dds")
+    with pytest.raises(InvalidInput, match="robot name 'a/b'"):
+        TransformListener(sessions[0], "a/b")
+    with pytest.raises(InvalidInput, match="history_s"):
+        TransformListener(sessions[0], "r1", history_s=0.0)
+
+
+def test_closing_is_quick_ends_hearing_and_may_be_repeated(sessions):
+    writer, reader = sessions
+    listener = TransformListener(reader, "r1")
+    with StatePublisher(writer, RRBOT, "r1") as publisher:
+        settle(writer, "r1")
+        publisher.publish([0.0, 0.0], stamp=STAMP)
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        began = time.monotonic()
+        listener.close()
+        listener.close()
+        assert time.monotonic() - began < SOON_S
+        with StreamPublisher(writer, "zstate/r1/joint_states", "") as probe:
+            until(lambda: not probe.has_readers)
+        assert listener.buffer.latest("world", "tool") == STAMP
+
+
+READER = """
+    import sys
+    from zstate import TransformListener, connect
+    with connect() as session, TransformListener(session, "r1", follow=sys.argv[1]) as listener:
+        print("ready")
+        print(listener.buffer.wait("world", "tool", timeout_s=15.0).stamp)
+        print(sorted({"pinocchio", "viser", "mcap", "click", "rich"} & set(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_a_reader_loads_neither_pinocchio_nor_a_window(sessions, spawn, follow):
+    reader: Child = spawn(READER, follow)
+    assert reader.line() == "ready"
+    writer = sessions[0]
+    with StatePublisher(writer, RRBOT, "r1") as publisher:
+        settle(writer, "r1", follow)
+        stamp = time.time_ns()
+        publisher.publish([0.0, 0.0], stamp=stamp)
+        assert reader.line() == str(stamp)
+        assert reader.line() == "[]"
+    assert (reader.wait(), reader.stderr) == (0, "")
+
+
+def test_gaps_in_a_batch_that_filled_the_ring_are_our_own(sessions, monkeypatch: pytest.MonkeyPatch):
+    def come(*seqs: int) -> None:
+        states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
+        key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
+        listener._on_samples([SerializedSample(key, encode(state), encoding) for state in states])
+
+    with TransformListener(sessions[0], "r1") as listener:
+        monkeypatch.setattr(listener, "_capacity", 3)
+        come(0)
+        come(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
+        come(8)
+        assert (listener.stats.dropped, listener.stats.missed) == (3, 1)
+
+
+def test_a_key_of_no_robot_is_foreign_and_costs_no_robot_a_sample(sessions):
+    writer, reader = sessions
+    strange = ("zstate/*/joint_states", "zstate/r$*/joint_states", "zstate/a b/joint_states")
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "*", history_on_join=False) as listener,
+    ):
+        settle(writer, "r1")
+        for number in range(50):
+            for key in strange:
+                state = JointState(STAMP + number, number, 99, order_digest(RRBOT.joint_names), bytes(16))
+                writer.zenoh.put(key, encode(state), encoding=ENCODINGS[JointState])
+            publisher.publish([0.0, 0.0])
+        writer.zenoh.put("zstate/*/robot_description", b"noise")
+        writer.zenoh.put("zstate/*/tf_static/mount", b"noise")
+        writer.zenoh.put("zstate/r1/tf_static/*", b"noise")
+        until(lambda: listener.stats.refused.get("foreign", 0) >= 50 * len(strange) + 3)
+        until(lambda: listener.stats.received == 50)
+        assert listener.robots() == ("r1",)
+
+
+@pytest.mark.parametrize("robot", ["*", "r1"])
+def test_a_token_that_no_writer_declares_hides_no_other(sessions, robot):
+    writer, reader = sessions
+    broken = ["p,h," + "1" * 5000 + ",1,1", "p,h,1," + "1" * 30 + ",1", "p,h,1,1," + "1" * 21]
+    keys = [
+        f"zstate/{name}/@writer/joint_states/{identity}" for name in ("r1", "evil") for identity in broken
+    ]
+    tokens = [
+        writer.zenoh.liveliness().declare_token(key) for key in (*keys, "zstate/a b/@writer/tf/p,h,1,1,1")
+    ]
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, robot) as listener,
+    ):
+        publisher.publish([0.0, 0.0])
+        listener.buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        until(lambda: len([event for event in listener.events() if event.kind == "joined"]) == 3)
+        assert [info.name for info in discover(reader)] == ["r1"]
+        assert measure_offsets(reader, "*")
+    for token in tokens:
+        token.undeclare()
+
+
+def test_observers_are_called_after_each_batch_that_was_processed(sessions):
+    writer, reader = sessions
+    seen: list[int] = []
+    with TransformListener(reader, "r1", history_on_join=False) as listener:
+        listener.add_observer(lambda: seen.append(listener.stats.received))
+        with StatePublisher(writer, RRBOT, "r1") as publisher:
+            settle(writer, "r1", "joint_states")
+            publisher.publish(np.zeros(2), stamp=STAMP)
+            until(lambda: 1 in seen)

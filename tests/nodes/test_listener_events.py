@@ -1,0 +1,159 @@
+"""What readers are told when writers and routers die, freeze and come back: real processes, real signals."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+from helpers.processes import Child, until
+from helpers.robots import RRBOT
+
+from zstate.ingest.events import WriterEvent
+from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+
+Spawn = Callable[..., Child]
+
+WRITER = """
+    import sys
+    from zstate import SineSource, StatePublisher, connect, load_model
+    model = load_model("rrbot")
+    how = {"mode": "client", "endpoints": sys.argv[1]} if len(sys.argv) > 1 else {}
+    with connect(**how) as session, StatePublisher(session, model, "r1", program="driver") as publisher:
+        publisher.run(SineSource(model), 100.0)
+"""
+
+ROUTER = """
+    import sys
+    from zstate.net.session import connect
+    with connect(mode="router", listen=sys.argv[1]):
+        print("up")
+        sys.stdin.readline()
+"""
+
+
+class Ear:
+    """The events of the joint states, as a listener tells them."""
+
+    def __init__(self, session: Session) -> None:
+        self.told: list[WriterEvent] = []
+        self.listener = TransformListener(session, "r1", on_event=self._take)
+
+    def _take(self, event: WriterEvent) -> None:
+        if event.stream == "joint_states":
+            self.told.append(event)
+
+    def await_kinds(self, *kinds: str) -> WriterEvent:
+        """The last of them, when just these have been told."""
+        until(lambda: len(self.told) >= len(kinds))
+        assert tuple(event.kind for event in self.told) == kinds
+        return self.told[-1]
+
+    def await_samples(self) -> None:
+        received = self.listener.stats.received
+        until(lambda: self.listener.stats.received > received + 2)
+
+
+@pytest.fixture
+def ear() -> Iterator[Ear]:
+    with connect() as session:
+        ear = Ear(session)
+        with ear.listener:
+            yield ear
+
+
+def test_killed_and_started_again_it_has_left_and_was_restarted(ear, spawn):
+    first = spawn(WRITER)
+    ear.await_samples()
+    joined = ear.await_kinds("joined")
+    assert joined.writer.pid == first.process.pid
+    first.kill()
+    left = ear.await_kinds("joined", "left")
+    assert left.writer == joined.writer
+    second = spawn(WRITER)
+    restarted = ear.await_kinds("joined", "left", "restarted")
+    assert restarted.writer.pid == second.process.pid
+    assert f"pid {first.process.pid} before" in restarted.text
+    ear.await_samples()
+    assert tuple(ear.told) == tuple(
+        event for event in ear.listener.events() if event.stream == "joint_states"
+    )
+
+
+def test_frozen_it_is_stale_then_resumed(ear, spawn):
+    writer = spawn(WRITER)
+    ear.await_samples()
+    writer.process.send_signal(signal.SIGSTOP)
+    stale = ear.await_kinds("joined", "stale")
+    assert "driver@" in stale.text
+    assert stale.writer.pid == writer.process.pid
+    writer.process.send_signal(signal.SIGCONT)
+    ear.await_kinds("joined", "stale", "resumed")
+    ear.await_samples()
+
+
+def test_frozen_for_longer_than_its_lease_it_is_cut_off_then_back(ear, spawn):
+    writer = spawn(WRITER)
+    ear.await_samples()
+    writer.process.send_signal(signal.SIGSTOP)
+    cut_off = ear.await_kinds("joined", "stale", "cut off")
+    assert "fell silent" in cut_off.text
+    writer.process.send_signal(signal.SIGCONT)
+    back = ear.await_kinds("joined", "stale", "cut off", "back")
+    assert back.writer.pid == writer.process.pid
+    ear.await_samples()
+
+
+def test_with_its_router_it_is_cut_off_and_comes_back_with_it(spawn: Spawn, free_port: int):
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    router = spawn(ROUTER, endpoint)
+    router.line()
+    with connect(mode="client", endpoints=endpoint) as session:
+        ear = Ear(session)
+        with ear.listener:
+            writer = spawn(WRITER, endpoint)
+            ear.await_samples()
+            router.kill()
+            cut_off = ear.await_kinds("joined", "cut off")
+            assert "is cut off: the router" in cut_off.text
+            spawn(ROUTER, endpoint).line()
+            back = ear.await_kinds("joined", "cut off", "back")
+            assert back.writer == cut_off.writer
+            ear.await_samples()
+            writer.kill()
+            ear.await_kinds("joined", "cut off", "back", "left")
+
+
+def test_a_callback_that_blocks_or_raises_delays_no_sample(sessions, monkeypatch):
+    monkeypatch.setattr("threading.excepthook", lambda _: None)
+    called, go_on = threading.Event(), threading.Event()
+
+    def wrong(_: WriterEvent) -> None:
+        called.set()
+        go_on.wait(10.0)
+        raise ValueError("not mine")
+
+    with (
+        TransformListener(sessions[1], "r1", on_event=wrong) as listener,
+        StatePublisher(sessions[0], RRBOT, "r1") as publisher,
+    ):
+        assert called.wait(10.0)
+        until(lambda: publisher.publish([0.0, 0.0]) or listener.stats.received > 10)
+        assert not go_on.is_set()
+        go_on.set()
+    assert listener.events()
+
+
+def test_who_wants_no_events_gets_no_thread_for_them_and_may_ask_later(sessions):
+    names = lambda: [thread.name for thread in threading.enumerate()]  # noqa: E731
+    with TransformListener(sessions[1], "r1") as listener:
+        assert "zstate events" not in names()
+        with StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"]):
+            until(lambda: [event.kind for event in listener.events()] == ["joined"])
+        until(lambda: [event.kind for event in listener.events()] == ["joined", "left"])
+    with TransformListener(sessions[1], "r1", on_event=lambda _: None):
+        assert names().count("zstate events") == 1
+    assert "zstate events" not in names()

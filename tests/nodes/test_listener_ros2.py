@@ -1,0 +1,279 @@
+"""A listener on the ros2 wire among nodes made of bare Zenoh and rosbags."""
+
+from __future__ import annotations
+
+import pytest
+from helpers.manual_cdr import rosbags_joint_state, rosbags_tf_message
+from helpers.processes import until
+from helpers.raw_ros_nodes import (
+    DESCRIPTION,
+    HUMBLE,
+    JOINT_STATES,
+    TF,
+    TF_STATIC,
+    RosNode,
+    RosPublisher,
+    attachment,
+    moved,
+)
+from helpers.robots import RRBOT, STAMP, assert_pose, await_reader, kinematic_pose
+from helpers.ros_subscriber import described, following_joints, writers, x_of
+
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+
+SECOND = 10**9
+NAMES = RRBOT.joint_names
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+def test_several_writers_of_transforms_make_one_tree_and_do_not_fight(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
+        arm = RosNode(writer, "robot_state_publisher").publisher(TF).announce().await_reader()
+        odometry = RosNode(writer, "odometry").publisher(TF).announce()
+        for number in range(20):
+            odometry.edge(STAMP + number, "odom", "base", 100.0 + number)
+            arm.edge(STAMP + number, "base", "tool", 1.0 + number)
+        until(lambda: listener.stats.received == 40)
+        assert [x_of(listener, "odom", "tool", STAMP + n) for n in range(20)] == [
+            101.0 + 2 * n for n in range(20)
+        ]
+        assert (listener.stats.refused, listener.stats.missed, listener.stats.late) == ({}, 0, 0)
+
+        def are_named() -> bool:
+            odometry.edge(STAMP + 20, "odom", "base", 1.0)
+            arm.edge(STAMP + 20, "base", "tool", 1.0)
+            return writers(listener) == {"base": "/odometry", "tool": "/robot_state_publisher"}
+
+        until(are_named)
+
+
+def test_a_message_may_have_transforms_of_several_instants(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
+        bag = RosNode(writer, "player").publisher(TF).announce().await_reader()
+        edges = [("odom", "base"), ("base", "tool"), ("odom", "other")]
+        for later in (0, 10):
+            stamps = [STAMP + later + 1, STAMP + later, STAMP + later + 1]
+            bag.put(rosbags_tf_message(stamps, edges, [moved(1.0), moved(2.0), moved(3.0)]))
+        until(lambda: listener.stats.received == 4)
+        assert [x_of(listener, *edge, STAMP + 10) for edge in edges] == [1.0, 2.0, 3.0]
+        assert listener.buffer.latest("odom", "base") == STAMP + 11
+        assert listener.buffer.latest("base", "tool") == STAMP + 10
+        assert (listener.stats.refused, listener.stats.missed) == ({}, 0)
+
+
+def test_writers_are_named_by_their_nodes_also_when_they_are_announced_late(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
+        node = RosNode(writer, "arm", "/fleet/r1")
+        moving, fixed = node.publisher(TF).await_reader(), node.publisher(TF_STATIC)
+        moving.edge(STAMP, "base", "tool", 1.0)
+        fixed.edge(0, "tool", "camera", 2.0)
+        listener.buffer.wait("base", "camera", timeout_s=5.0)
+        assert set(writers(listener).values()) != {"/fleet/r1/arm"}
+        moving.announce()
+        fixed.announce()
+        until(lambda: writers(listener)["camera"] == "/fleet/r1/arm")
+        until(
+            lambda: (
+                moving.edge(STAMP + 1, "base", "tool", 1.0) or writers(listener)["tool"] == "/fleet/r1/arm"
+            )
+        )
+
+
+@pytest.mark.parametrize("written", ["", HUMBLE])
+def test_writers_of_every_distribution_are_heard(sessions, written: str):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        described = RosNode(writer, "rsp").publisher(DESCRIPTION, written)
+        described.text(RRBOT.urdf)
+        driver = RosNode(writer, "driver").publisher(JOINT_STATES, written).announce().await_reader()
+        driver.joints(STAMP, NAMES, [0.5, 0.25])
+        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
+        until(lambda: writers(listener)["lower"] == "/driver")
+
+
+def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
+    writer, reader = sessions
+    nan = float("nan")
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        described(writer)
+        driver = following_joints(writer, listener)
+        driver.joints(STAMP, ("lid", "elbow", "shoulder"), [7.0, 0.25, 0.5], [0.0, 2.0, 1.0], [nan] * 3)
+        pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
+        assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
+        driver.joints(STAMP + SECOND // 100, ("elbow", "shoulder"), [0.27, 0.51], [2.0, 1.0])
+        until(lambda: listener.stats.received == 2)
+        ahead = STAMP + SECOND // 100 + SECOND // 1000
+        predicted = listener.buffer.lookup("world", "tool", ahead, predict_s=0.01)
+        assert predicted.kind == "predicted"
+        assert_pose(predicted, kinematic_pose(RRBOT, [0.511, 0.272], "world", "tool"))
+        assert listener.stats.refused == {}
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        ((0, NAMES, [0.0, 0.0], [], []), "no stamp"),
+        ((STAMP, NAMES, [], [], []), "no positions"),
+        ((STAMP, NAMES, [], [1.0, 1.0], []), "no positions"),
+        ((STAMP, (), [], [], []), "missing joints"),
+        ((STAMP, ("shoulder",), [0.0], [], []), "missing joints"),
+        ((STAMP, NAMES, [0.0, 0.0, 0.0], [], []), "malformed"),
+        ((STAMP, NAMES, [0.0, 0.0], [0.0], []), "malformed"),
+        ((STAMP, ("elbow", "elbow"), [0.0, 0.0], [], []), "malformed"),
+        ((STAMP, NAMES, [0.0, float("nan")], [], []), "bad numbers"),
+        ((STAMP, NAMES, [0.0, float("inf")], [], []), "bad numbers"),
+    ],
+)
+def test_joint_states_that_cannot_be_used_are_counted_by_reason(sessions, said, reason: str):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        described(writer)
+        driver = following_joints(writer, listener)
+        stamp, names, *blocks = said
+        driver.put(rosbags_joint_state(stamp, "", names, *blocks))
+        driver.joints(STAMP + 1, NAMES, [0.5, 0.25])
+        until(lambda: listener.stats.received == 1)
+        assert listener.stats.refused == {reason: 1}
+
+
+GOOD = rosbags_joint_state(STAMP, "", NAMES, [0.5, 0.25], [], [])
+LABELLED = b"\x0fsequence_number" + bytes(8) + b"\x10source_timestamp" + bytes(8)
+
+
+@pytest.mark.parametrize(
+    ("payload", "beside", "reason"),
+    [
+        (GOOD[:-1], "next", "truncated"),
+        (GOOD[:30], "next", "truncated"),
+        (b"", "next", "truncated"),
+        (b"\x00\x03" + GOOD[2:], "next", "malformed"),
+        (b"\xff" * 60, "next", "malformed"),
+        (GOOD, None, "no attachment"),
+        (GOOD, LABELLED, "foreign"),
+        (GOOD, bytes(33), "foreign"),
+        (GOOD, b"x", "foreign"),
+    ],
+    ids=range(9),
+)
+def test_what_is_no_message_of_ros_is_counted_by_reason_on_every_topic(sessions, payload, beside, reason):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2") as listener:
+        node = RosNode(writer, "strange")
+        driver = node.publisher(JOINT_STATES).announce().await_reader()
+        driver.put(payload, beside)
+        until(lambda: listener.stats.refused == {reason: 1})
+        for topic in (TF_STATIC, DESCRIPTION):
+            node.publisher(topic).announce().await_reader().put(payload, beside)
+        until(lambda: sum(listener.stats.refused.values()) == 3)
+        described(writer)
+        following_joints(writer, listener).joints(STAMP + 1, NAMES, [0.5, 0.25])
+        until(lambda: listener.stats.received == 1)
+        assert listener.stats.missed == 0
+
+
+def test_gaps_in_the_numbers_beside_messages_are_missed(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
+        one, other = (RosNode(writer, name).publisher(TF).announce().await_reader() for name in "ab")
+        for node, child in ((one, "x"), (other, "y")):
+            for seq in (5, 6, 9):
+                payload = rosbags_tf_message([STAMP + seq], [("base", child)], [moved(1.0)])
+                node.put(payload, attachment(seq, node.gid))
+        until(lambda: listener.stats.received == 6)
+        assert (listener.stats.missed, listener.stats.dropped) == (4, 0)
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_a_bag_that_begins_again_is_a_new_epoch(sessions, follow: str):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
+        described(writer)
+        node = RosNode(writer, "player")
+        topic = JOINT_STATES if follow == "joint_states" else TF
+        player = node.publisher(topic).announce().await_reader()
+        until(lambda: follow == "tf" or "r1/tool" in {frame.name for frame in listener.buffer.frames()})
+
+        def play(first: float) -> None:
+            for number in range(20):
+                stamp = STAMP + number * SECOND
+                if follow == "tf":
+                    player.edge(stamp, "upper", "lower", first + number)
+                else:
+                    player.joints(stamp, NAMES, [0.0, first + 0.01 * number])
+
+        play(0.0)
+        until(lambda: listener.stats.received == 20)
+        play(0.5)
+        until(lambda: listener.stats.received == 39)
+        assert (listener.stats.late, listener.stats.refused, listener.stats.missed) == (1, {}, 0)
+        assert listener.buffer.latest("upper", "lower") == STAMP + 19 * SECOND
+        assert listener.buffer.can_lookup("upper", "lower", STAMP + 19 * SECOND - 10 * SECOND)
+
+
+@pytest.mark.parametrize("behind", [3 * SECOND, 30 * SECOND, -SECOND])
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_a_node_that_starts_again_begins_a_new_epoch_wherever_its_clock_stands(sessions, follow, behind: int):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
+        described(writer)
+        topic = JOINT_STATES if follow == "joint_states" else TF
+
+        def live(first: int, angle: float, count: int) -> RosPublisher:
+            node = RosNode(writer, "arm").publisher(topic).announce().await_reader()
+            until(lambda: follow == "tf" or "r1/tool" in {frame.name for frame in listener.buffer.frames()})
+            before = listener.stats.received
+            for number in range(5):
+                if follow == "tf":
+                    node.edge(first + number, "upper", "lower", angle)
+                else:
+                    node.joints(first + number, NAMES, [0.0, angle])
+            until(lambda: listener.stats.received == before + count)
+            return node
+
+        live(STAMP, 1.0, 5).leave()
+        until(lambda: ("left", follow) in {(event.kind, event.stream) for event in listener.events()})
+        live(STAMP - behind, 0.5, 5)
+        assert listener.buffer.latest("upper", "lower") == STAMP - behind + 4
+        assert not listener.buffer.can_lookup("upper", "lower", STAMP)
+        assert listener.stats.refused == {}
+
+
+def test_a_namespace_is_heard_alone_and_the_root_alone(sessions):
+    writer, reader = sessions
+    with (
+        TransformListener(reader, "r1", wire="ros2:namespace=r1") as listener,
+        TransformListener(reader, "root", wire="ros2") as root,
+    ):
+        node = RosNode(writer, "rsp", "/r1")
+        described = node.publisher(DESCRIPTION, namespace="r1")
+        described.text(RRBOT.urdf)
+        driver = node.publisher(JOINT_STATES, namespace="r1").announce().await_reader()
+        driver.joints(STAMP, NAMES, [0.5, 0.25])
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        assert root.robots() == ()
+
+
+def test_all_robots_that_stand_in_namespaces_of_their_own_are_followed(sessions):
+    writer, reader = sessions
+    wire = "ros2:namespace=*,frame_prefix=*/"
+    with TransformListener(reader, wire=wire) as listener:
+        publishers = [StatePublisher(writer, RRBOT, robot, (wire,)) for robot in ("r1", "r2")]
+        for number, publisher in enumerate(publishers):
+            await_reader(writer, f"0/{publisher.robot}/joint_states/{JOINT_STATES[1]}/{JOINT_STATES[2]}")
+            publisher.publish([0.1, 0.5 + number], stamp=STAMP)
+        for number, publisher in enumerate(publishers):
+            pose = listener.buffer.wait(f"{publisher.robot}/upper", f"{publisher.robot}/lower", timeout_s=5.0)
+            expected = kinematic_pose(RRBOT, [0.1, 0.5 + number], "upper", "lower")
+            assert_pose(pose, expected)
+            publisher.close()
+        assert {"r1", "r2"} <= set(listener.robots())
+        assert listener.stats.refused == {}

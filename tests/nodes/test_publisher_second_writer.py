@@ -1,0 +1,262 @@
+"""Two that write the same, as real processes and in one."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+
+import pytest
+from helpers.processes import a_free_port, until
+from helpers.robots import RRBOT
+from msgspec.structs import replace
+
+from zstate.errors import InvalidInput, SecondWriter
+from zstate.ingest.events import WriterEvent
+from zstate.net.presence import announce, current_tokens
+from zstate.net.session import Session, connect
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.sources import SineSource
+from zstate.transform import Transform
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import Stream, stream_key, writer_key
+from zstate.wire.messages import JointState, RobotDescription, order_digest
+from zstate.wire.native import ENCODINGS, encode
+
+WRITER = """
+    import sys
+    from zstate import SineSource, StatePublisher, connect, load_model
+    model = load_model("rrbot")
+    with connect() as session, StatePublisher(session, model, "r1", program="driver") as publisher:
+        publisher.publish([0.0, 0.0])
+        print("writing", flush=True)
+        publisher.run(SineSource(model), 100.0)
+"""
+
+# Rounds: "go" opens it, on a network that it has just joined; it writes until it is refused or told to end.
+RIVAL = """
+    import select, sys
+    from zstate import StatePublisher, connect, load_model
+    from zstate.errors import SecondWriter
+    model = load_model("rrbot")
+    print("ready", flush=True)
+    while sys.stdin.readline():
+        try:
+            with connect() as session, StatePublisher(session, model, "r1") as publisher:
+                while not select.select([sys.stdin], [], [], 0.002)[0]:
+                    publisher.publish([0.0, 0.0])
+                publisher.publish([0.0, 0.0])
+                sys.stdin.readline()
+            print("survived", flush=True)
+        except SecondWriter as error:
+            print("refused by", error.first.pid, flush=True)
+"""
+
+
+def writers_seen(session: Session) -> int:
+    return len(current_tokens(session, "zstate/r1/@writer/joint_states/*", 1.0))
+
+
+def edge(child: str) -> Transform:
+    return Transform("base", child, [1, 0, 0], [0, 0, 0, 1])
+
+
+def test_a_second_process_is_refused_naming_the_first_which_goes_on(spawn, sessions):
+    first = spawn(WRITER)
+    first.line()
+    with TransformListener(sessions[1], "r1", history_on_join=False) as listener:
+        second = spawn(WRITER)
+        assert second.wait() == 1
+        assert "driver@" in second.stderr
+        assert f"pid {first.process.pid}'" in second.stderr
+        assert "'r1' already" in second.stderr
+        received = listener.stats.received
+        until(lambda: listener.stats.received > received)
+        assert listener.stats.refused == {}
+        assert "conflict" not in {event.kind for event in listener.events()}
+
+
+def test_after_kill_9_it_may_be_started_again_at_once(spawn):
+    for _ in range(3):
+        writer = spawn(WRITER)
+        assert writer.line() == "writing"
+        writer.kill()
+
+
+@pytest.mark.parametrize("same_session", [True, False])
+def test_after_close_it_may_be_opened_again_at_once(sessions, same_session):
+    for number in range(5):
+        session = sessions[0 if same_session else number % 2]
+        with StatePublisher(session, RRBOT, "r1") as publisher:
+            publisher.publish([0.0, 0.0])
+
+
+@pytest.mark.processes
+def test_of_two_processes_that_start_together_exactly_one_survives_each_of_20_times(spawn):
+    rivals = [spawn(RIVAL), spawn(RIVAL)]
+    for rival in rivals:
+        rival.line()
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(20):
+            for rival in rivals:
+                rival.tell("go")
+            said = {pool.submit(rival.line): rival for rival in rivals}
+            (refused, *_), others = wait(said, return_when=FIRST_COMPLETED)
+            (winner,) = [rival for rival in rivals if rival is not said[refused]]
+            assert refused.result() == f"refused by {winner.process.pid}"
+            assert others
+            winner.tell("end")
+            assert others.pop().result() == "survived"
+
+
+@pytest.mark.parametrize("later_publishes_first", [True, False])
+def test_of_two_on_networks_that_are_joined_later_the_later_one_ends(later_publishes_first):
+    endpoints = [f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2)]
+    with ExitStack() as opened:
+        ours, theirs = (opened.enter_context(connect(listen=endpoint)) for endpoint in endpoints)
+        first = opened.enter_context(StatePublisher(ours, RRBOT, "r1"))
+        second = opened.enter_context(StatePublisher(theirs, RRBOT, "r1"))
+        for publisher in (first, second):
+            publisher.publish([0.0, 0.0])
+        opened.enter_context(connect(endpoints=endpoints))
+        for session in (ours, theirs):
+            until(lambda s=session: writers_seen(s) == 2)
+        if not later_publishes_first:
+            first.publish([0.0, 0.0])
+        with pytest.raises(SecondWriter) as raised:
+            second.run(SineSource(RRBOT), 100.0)
+        assert raised.value.first.session == first.description().session
+        # With it went all that late joiners would have been given by it.
+        until(lambda: writers_seen(ours) == 1)
+        with pytest.raises(SecondWriter):
+            second.publish([0.0, 0.0])
+        first.publish([0.0, 0.0])
+
+
+@pytest.mark.parametrize("stream", ["joint_states", "robot_description"])
+def test_a_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_publishes(
+    sessions, monkeypatch: pytest.MonkeyPatch, stream
+):
+    monkeypatch.setattr("zstate.net.ownership._AT_ONCE_S", 0.0)
+    ours, theirs = sessions
+    stranger = WriterId("stranger", "laptop", 9, 1, 99)
+    with StatePublisher(ours, RRBOT, "r1") as publisher:
+        for _ in range(2):
+            publisher.publish([0.0, 0.0])
+        with announce(theirs, writer_key("r1", stream, stranger.identity)):
+            until(lambda: len(current_tokens(ours, f"zstate/r1/@writer/{stream}/*", 1.0)) == 2)
+            looked_until = time.monotonic() + 0.3
+            while time.monotonic() < looked_until:
+                publisher.publish([0.0, 0.0])
+            description = replace(publisher.description(), session=stranger.session)
+            state = JointState(1, 0, stranger.session, order_digest(RRBOT.joint_names), bytes(16))
+            said = state if stream == "joint_states" else description
+            with pytest.raises(SecondWriter) as raised:
+                until(lambda: put(theirs, stream, said) or publisher.publish([0.0, 0.0]))
+    assert raised.value.first == stranger
+
+
+def put(session: Session, stream: Stream, message: JointState | RobotDescription) -> None:
+    session.zenoh.put(stream_key("r1", stream), encode(message), encoding=ENCODINGS[type(message)])
+
+
+def test_parts_of_a_robot_may_have_a_writer_each(sessions):
+    with (
+        StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"]) as joints,
+        StatePublisher(sessions[1], RRBOT, "r1", streams=["tf", "tf_static", "robot_description"]) as rest,
+        StaticPublisher(sessions[1], "r1", "mount"),
+        StatePublisher(sessions[1], RRBOT, "r2"),
+    ):
+        for session in sessions:
+            until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/*/*", 1.0)) == 9)
+        for publisher in (joints, rest):
+            publisher.publish([0.0, 0.0])
+        with pytest.raises(SecondWriter) as raised:
+            StatePublisher(sessions[0], RRBOT, "r1", streams=["tf"])
+    assert raised.value.stream == "tf"
+
+
+def test_with_takeover_the_newest_is_followed_and_readers_are_told_once(sessions):
+    told: list[WriterEvent] = []
+    with (
+        TransformListener(sessions[1], "r1", on_event=told.append) as listener,
+        StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"], program="driver") as first,
+    ):
+        until(lambda: [event.kind for event in told] == ["joined"])
+        with StatePublisher(
+            sessions[1], RRBOT, "r1", streams=["joint_states"], program="simulator", takeover=True
+        ) as second:
+            until(lambda: listener.stats.refused.get("second writer", 0) >= 200 or fought(first, second))
+            assert [event.kind for event in told] == ["joined", "joined", "conflict"]
+        until(lambda: told[-1].kind == "left")
+    conflict = told[2]
+    assert "simulator@" in conflict.text
+    assert "driver@" in conflict.text
+    assert conflict.writer is not None
+    assert conflict.writer.program == "simulator"
+
+
+def fought(*publishers: StatePublisher) -> None:
+    for publisher in publishers:
+        publisher.publish([0.0, 0.0])
+
+
+def test_on_the_ros_wire_nobody_is_refused(sessions):
+    with (
+        StatePublisher(sessions[0], RRBOT, "r1", ("ros2",)),
+        StatePublisher(sessions[1], RRBOT, "r1", ("ros2",)) as second,
+        StaticPublisher(sessions[0], "r1", "mount", "ros2") as mount,
+        StaticPublisher(sessions[1], "r1", "mount", "ros2") as again,
+    ):
+        second.publish([0.0, 0.0])
+        mount.set(edge("camera"))
+        again.set(edge("camera"))
+
+
+def test_an_edge_that_another_static_writer_places_is_refused_and_nothing_is_said(sessions):
+    with (
+        StaticPublisher(sessions[0], "r1", "mount", program="calibration") as mount,
+        StaticPublisher(sessions[1], "r2", "room") as room,
+        TransformListener(sessions[1], "*") as listener,
+    ):
+        mount.set(edge("camera"))
+        listener.buffer.wait("r1/base", "r1/camera", timeout_s=5.0)
+        with pytest.raises(SecondWriter) as raised:
+            room.set(Transform("r2/base", "r1/camera", [2, 0, 0], [0, 0, 0, 1]))
+        assert raised.value.first.program == "calibration"
+        assert raised.value.edge == ("r1/base", "r1/camera")
+        with pytest.raises(InvalidInput, match="its edges: none"):
+            room.withdraw("r1/camera")
+        mount.set(edge("camera"))  # its own it may replace
+        room.set(edge("laser"))
+        mount.withdraw("camera")
+        until(lambda: not listener.buffer.can_lookup("r1/base", "r1/camera"))
+        room.set(Transform("r2/base", "r1/camera", [2, 0, 0], [0, 0, 0, 1]))
+        listener.buffer.wait("r2/base", "r1/camera", timeout_s=5.0)
+
+
+def test_readers_are_told_of_an_edge_that_two_place_with_takeover(sessions):
+    with (
+        TransformListener(sessions[1], "r1") as listener,
+        StaticPublisher(sessions[0], "r1", "mount") as mount,
+        StaticPublisher(sessions[0], "r1", "room", takeover=True) as room,
+    ):
+        mount.set(edge("camera"))
+        listener.buffer.wait("base", "camera", timeout_s=5.0)
+        for _ in range(20):
+            room.set(edge("camera"))
+        until(lambda: [event.kind for event in listener.events()].count("conflict") == 1)
+        room.set(edge("laser"))
+        listener.buffer.wait("base", "laser", timeout_s=5.0)
+        assert [event.kind for event in listener.events()].count("conflict") == 1
+
+
+def test_two_static_writers_of_one_name_are_one_too_many(sessions):
+    with StaticPublisher(sessions[0], "r1", "mount"):
+        until(lambda: current_tokens(sessions[1], "zstate/r1/@writer/tf_static/*", 1.0))
+        with pytest.raises(SecondWriter, match="under the name 'mount'"):
+            StaticPublisher(sessions[1], "r1", "mount")
+        StaticPublisher(sessions[1], "r2", "mount").close()
+        StaticPublisher(sessions[1], "r1", "mount", takeover=True).close()

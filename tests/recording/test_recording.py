@@ -1,0 +1,187 @@
+"""Questions to a recorded file: what it is, a buffer of it, and many instants without holding it all."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.processes import Child
+from helpers.recording_builder import MS, START, Bag, S, Tale, pose, swing, swing_rates
+
+from zstate import Recording, TransformBuffer, UnknownFrame
+from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
+from zstate.transform import Transform
+
+
+def test_it_says_what_it_is(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap") as tale:
+        tale.describe("r1")
+        tale.joints("r1", START + S, swing(0), heard=START + 2 * S)
+        tale.describe("r2", at=START + 3 * S)
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.robots == ("r1", "r2")
+        assert recording.info.duration_s == 3.0
+        assert recording.info.complete
+
+
+def test_a_robot_that_is_not_in_it_is_refused(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap") as tale:
+        tale.describe("r1")
+    with pytest.raises(InvalidInput, match="'r1'"):
+        Recording(tmp_path / "r.mcap", "r2")
+
+
+def test_a_closed_recording_answers_no_more(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+    recording = Recording(tmp_path / "r.mcap")
+    recording.close()
+    recording.close()
+    with pytest.raises(RecordingError, match="closed"):
+        recording.buffer()
+
+
+def wild(path: Path, seed: int) -> None:
+    """Two writers after each other, late samples, repeated stamps, clocks set back, edges that move over."""
+    dice = random.Random(seed)
+    with Tale(path, "arm") as tale:
+        tale.describe("arm")
+        offset = 0
+        for n in range(600):
+            heard = START + n * 10 * MS
+            if n == 150:
+                offset = -3600 * S
+            session = 1 + (n > 300)
+            stamp = heard + offset - dice.choice([0, 0, 0, 35 * MS, 70 * MS])
+            tale.joints("arm", stamp, swing(dice.random()), swing_rates(n), session=session, heard=heard)
+            if n % 3 == 0:
+                world = pose(dice.random(), dice.random(), yaw=dice.random())
+                tale.edges("arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, heard=heard)
+            if n % 50 == 7:
+                tale.edges("arm", stamp, {("map", "odom"): pose(-n)}, heard=heard, session=5)
+            if n in {20, 400}:
+                tale.statics("arm", heard, {("tool", "tip"): pose(z=n)})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_many_instants_are_answered_as_a_buffer_of_it_all_answers(tmp_path: Path, seed: int, monkeypatch):
+    monkeypatch.setattr("zstate.recording.load._BATCH", 37)
+    wild(tmp_path / "r.mcap", seed)
+    dice = np.random.default_rng(seed)
+    begin = START - 3600 * S
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffer = recording.buffer()
+        known = [buffer.latest("map", "tip"), buffer.latest("world", "tool")]
+        stamps = np.concatenate((dice.integers(begin - S, begin + 7 * S, 30), known, [START, begin]))
+        for target, source in [("map", "tip"), ("world", "tool"), ("odom", "map"), ("tool", "tip")]:
+            poses, valid = buffer.lookup_many(target, source, stamps)
+            assert valid.sum() > 5
+            told, is_told = recording.lookup_many(target, source, stamps)
+            assert np.array_equal(is_told, valid)
+            assert np.array_equal(told, poses, equal_nan=True)
+
+
+def test_no_instants_have_no_answers(tmp_path: Path):
+    wild(tmp_path / "r.mcap", 1)
+    with Recording(tmp_path / "r.mcap") as recording:
+        poses, valid = recording.lookup_many("map", "tip", [])
+    assert (poses.shape, valid.shape) == ((0, 7), (0,))
+
+
+def test_frames_that_are_unknown_or_apart_are_errors(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        tale.joints("arm", START, swing(0))
+        tale.statics("arm", START, {("table", "cup"): pose()})
+    with Recording(tmp_path / "r.mcap") as recording:
+        with pytest.raises(UnknownFrame, match="tol"):
+            recording.lookup_many("world", "tol", [START])
+        with pytest.raises(Disconnected):
+            recording.lookup_many("world", "cup", [START])
+        with pytest.raises(InvalidInput, match="integer"):
+            recording.lookup_many("world", "tool", [0.5])
+
+
+def test_what_other_robots_and_wrong_edges_say_of_a_robot_counts_as_little_as_it_did_live(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap") as tale:
+        tale.statics("thief", START, {("thief/map", "arm/camera"): pose(x=9.0)})
+        tale.statics("thief", START, {("arm/base", "arm/laser"): pose(x=9.0)}, writer="laser")
+        tale.statics("arm", START + MS, {("lower", "world"): pose(x=9.0)}, writer="mix-up")
+        tale.statics("arm", START + 2 * MS, {("tool", "camera"): pose(x=1.0)})
+        tale.describe("arm", at=START + 3 * MS)
+        tale.joints("arm", START + 4 * MS, swing(0))
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffer = recording.buffer()
+    placed = {frame.name: frame.parent for frame in buffer.frames() if frame.parent is not None}
+    assert placed["arm/camera"] == "arm/tool"
+    assert not {"arm/world", "arm/laser"} & placed.keys()
+    assert buffer.can_lookup("world", "camera")
+
+
+def test_a_bag_is_a_recording_too(tmp_path: Path):
+    with Bag(tmp_path / "bag") as bag:
+        for n in range(20):
+            bag.tf(START + n, [Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1], START + n * S)])
+    with Recording(tmp_path / "bag") as recording:
+        poses, valid = recording.lookup_many("odom", "base", [START + 5 * S // 2, START - 1, START])
+    assert poses[:, 0].tolist()[::2] == [2.5, 0.0]
+    assert valid.tolist() == [True, False, True]
+
+
+MEMORY = """
+    import resource, sys
+    import numpy as np
+    from zstate import Recording
+    def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    small, large = sys.argv[1:]
+    stamps = np.arange(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 1_000_000)
+    for path in (small, large):
+        with Recording(path) as recording:
+            poses, valid = recording.lookup_many("odom", "base0", stamps)
+            assert valid.all()
+        print(peak())
+"""
+
+
+@pytest.mark.processes
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path, spawn):
+    # 40 edges of 64 bytes: the large recording would fill a buffer with 50 MB.
+    sizes = {"small": 1_000, "large": 20_000}
+    for name, count in sizes.items():
+        with Tale(tmp_path / name, "cart") as tale:
+            for n in range(count):
+                edges = {("odom", f"base{k}"): pose(n, k) for k in range(40)}
+                tale.edges("cart", START + n * 10 * MS, edges)
+    child: Child = spawn(MEMORY, str(tmp_path / "small"), str(tmp_path / "large"))
+    small, large = int(child.line(60)), int(child.line(60))
+    assert large - small < 20, (small, large)
+
+
+def test_the_buffer_keeps_what_it_is_asked_for():
+    buffer = TransformBuffer(1000.0)
+    for n in range(100):
+        buffer.insert(Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1], n * S))
+    wanted = np.array([10 * S + 1, 20 * S, 99 * S])
+    before = buffer.lookup_many("odom", "base", wanted)[0]
+    buffer.keep_only_around(wanted)
+    (base,) = (frame for frame in buffer.frames() if frame.name == "base")
+    # The first, 10 and 11, 20, and the last, which is 99.
+    assert (base.count, base.oldest, base.newest) == (5, 0, 99 * S)
+    assert np.array_equal(buffer.lookup_many("odom", "base", wanted)[0], before)
+
+
+def test_before_a_recording_begins_nobody_is_told_to_start_a_listener(tmp_path: Path):
+    with Tale(tmp_path / "r.mcap", "arm") as tale:
+        tale.describe("arm")
+        for n in range(3):
+            tale.joints("arm", START + n * S, swing(n))
+    with Recording(tmp_path / "r.mcap") as recording:
+        buffer = recording.buffer()
+    frames = [frame for frame in buffer.frames() if frame.kind == "joint"]
+    plan = buffer.plan(frames[0].parent, frames[0].name)
+    for call in (lambda: plan.at(START - S), lambda: plan.poses([START - S])):
+        with pytest.raises(InPast, match="the recording has nothing older of it") as caught:
+            call()
+        assert "listener" not in str(caught.value)

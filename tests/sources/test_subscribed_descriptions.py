@@ -1,0 +1,106 @@
+"""The models of robots as they are described on the network, on both wires."""
+
+import logging
+
+import pytest
+from helpers.processes import until
+from helpers.robots import RRBOT
+
+from zstate.model.load import load_model
+from zstate.net.latched import LatchedPublisher
+from zstate.net.session import Session
+from zstate.nodes.publisher import StatePublisher
+from zstate.sources.subscribed import DescriptionSubscriber
+from zstate.wire.messages import RobotDescription
+from zstate.wire.native import ENCODINGS, encode
+
+KEY = "zstate/r1/robot_description"
+ENCODING = ENCODINGS[RobotDescription]
+GRIPPER = load_model("gripper")
+EACH = "ros2:namespace=*"
+
+
+class Heard(list):
+    """Who was described, with the digest of the model."""
+
+    def note(self, robot, model):
+        self.append((robot, model.digest))
+
+
+def description(urdf: str, session: int = 1) -> bytes:
+    return encode(RobotDescription(session, urdf, "", (), ()))
+
+
+def latch(session: Session, *payloads: bytes, encoding: str = ENCODING) -> LatchedPublisher:
+    publisher = LatchedPublisher(session, KEY, encoding)
+    for payload in payloads:
+        publisher.set(payload)
+    return publisher
+
+
+@pytest.mark.parametrize("wire", ["native", "ros2", "ros2dds"])
+@pytest.mark.parametrize("publisher_is_first", [True, False], ids=["late", "early"])
+def test_the_model_is_heard_on_every_wire_by_early_and_late_joiners(sessions, wire, publisher_is_first):
+    writer, reader = sessions
+    heard = Heard()
+    opened = [
+        lambda: StatePublisher(writer, RRBOT, "r1", (wire,)),
+        lambda: DescriptionSubscriber(reader, "r1", heard.note, wire),
+    ]
+    first, second = opened if publisher_is_first else reversed(opened)
+    with first(), second():
+        until(lambda: heard)
+    assert heard == [("r1", RRBOT.digest)]
+
+
+@pytest.mark.parametrize("wire", ["native", EACH], ids=["native", "ros2"])
+def test_every_robot_is_heard_with_its_own_name(sessions, wire):
+    writer, reader = sessions
+    heard = Heard()
+    with (
+        StatePublisher(writer, RRBOT, "r1", (wire,)),
+        StatePublisher(writer, GRIPPER, "r2", (wire,)),
+        DescriptionSubscriber(reader, "*", heard.note, wire),
+    ):
+        until(lambda: len(heard) == 2)
+    assert sorted(heard) == [("r1", RRBOT.digest), ("r2", GRIPPER.digest)]
+
+
+def test_only_another_model_is_told_again(sessions):
+    writer, reader = sessions
+    heard = Heard()
+    with DescriptionSubscriber(reader, "r1", heard.note), latch(writer, description(RRBOT.urdf)) as publisher:
+        until(lambda: heard)
+        publisher.set(description(RRBOT.urdf, session=2))
+        publisher.withdraw()
+        publisher.set(description(GRIPPER.urdf))
+        until(lambda: len(heard) == 2)
+    assert heard == [("r1", RRBOT.digest), ("r1", GRIPPER.digest)]
+
+
+@pytest.mark.parametrize(
+    ("payload", "encoding", "reason"),
+    [
+        (description(RRBOT.urdf)[:20], ENCODING, "truncated"),
+        (b"<robot/>", "text/plain", "foreign"),
+        (description("<robot name='r'/>"), ENCODING, "model"),
+        (description("models/rrbot.urdf"), ENCODING, "model"),
+    ],
+    ids=["truncated", "foreign", "no links", "a path"],
+)
+def test_what_describes_no_robot_is_counted_and_logged_once(sessions, caplog, payload, encoding, reason):
+    writer, reader = sessions
+    heard = Heard()
+    with (
+        DescriptionSubscriber(reader, "r1", heard.note) as descriptions,
+        caplog.at_level(logging.WARNING, "zstate"),
+    ):
+        with latch(writer, payload, encoding=encoding) as publisher:
+            until(lambda: descriptions.refused[reason] == 1)
+            publisher.set(payload)
+            until(lambda: descriptions.refused[reason] == 2)
+        with latch(writer, description(RRBOT.urdf)):
+            until(lambda: heard)
+    assert [record.message.partition(":")[0] for record in caplog.records] == [
+        f"robot_description refused ({reason})"
+    ]

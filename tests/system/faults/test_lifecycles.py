@@ -1,0 +1,150 @@
+"""Processes that fork, and processes that open and close all day."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+from helpers.fault_processes import HERE, Start, assert_no_growth, client
+from helpers.processes import DEADLINE_S
+
+pytestmark = pytest.mark.processes
+
+STARTS = 200
+
+FORKING = """
+    import json, multiprocessing, os, select, sys, threading, time
+    from zstate import SineSource, StatePublisher, TransformListener, connect, discover, load_model
+    from zstate.errors import Closed, LookupFailed
+    from zstate.recording.recorder import Recorder
+
+    with (
+        connect(**json.loads(sys.argv[1])) as session,
+        StatePublisher(session, load_model("rrbot"), "r1") as publisher,
+        TransformListener(session, "r1") as listener,
+    ):
+        buffer, model = listener.buffer, publisher.model
+        running = threading.Thread(target=publisher.run, args=(SineSource(model), 2000.0), daemon=True)
+        running.start()
+        buffer.wait("world", "tool", timeout_s=10.0)
+
+        def refused(action):
+            try:
+                action()
+            except Closed as closed:
+                return "fork" in str(closed) and "connect()" in str(closed)
+            return False
+
+        def waits_in_vain():
+            began, said = time.monotonic(), []
+            far = buffer.latest("world", "tool") + 10**12
+            for ask in (buffer.lookup, buffer.wait):
+                for frames in (("world", "tool"), ("world", "nowhere")):
+                    try:
+                        ask(*frames, far, timeout_s=60.0)
+                    except LookupFailed as failed:
+                        said.append(str(failed))
+            return (
+                len(said) == 4
+                and time.monotonic() - began < 30.0
+                and all(f"belongs to process {os.getppid()} and does not run after" in one for one in said)
+                and not any("wait for it" in one for one in said)
+            )
+
+        def in_child(told):
+            sure = [
+                refused(lambda: session.zenoh),
+                refused(lambda: publisher.publish([0.0, 0.0])),
+                refused(lambda: StatePublisher(session, model, "r2")),
+                refused(lambda: TransformListener(session, "r2")),
+                refused(connect),
+                refused(lambda: discover(session)),
+                refused(lambda: buffer.watch("world", "tool", print)),
+                refused(lambda: Recorder(session, "never.mcap")),
+                waits_in_vain(),
+                buffer.lookup("world", "tool").stamp > 0,
+            ]
+            for one in (listener, publisher, session):
+                one.close()
+            os.write(told, (json.dumps(sure) + "\\n").encode())
+
+        def ends_by_itself(pid):
+            ended, _, _ = select.select([os.pidfd_open(pid)], [], [], 10.0)
+            if not ended:
+                os.kill(pid, 9)
+            status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+            return status if ended else "hangs"
+
+        def goes_on():
+            return buffer.wait("world", "tool", buffer.latest("world", "tool") + 1, timeout_s=5.0).stamp > 0
+
+        for way in ["os.fork", "multiprocessing"] * 5:
+            ear, mouth = os.pipe()
+            if way == "multiprocessing":
+                child = multiprocessing.get_context("fork").Process(target=in_child, args=(mouth,))
+                child.start()
+                child.join(10.0)
+                code = "hangs" if child.exitcode is None else child.exitcode
+            else:
+                pid = os.fork()
+                if pid == 0:
+                    in_child(mouth)
+                    sys.exit(0)
+                code = ends_by_itself(pid)
+            os.close(mouth)
+            said = json.loads(os.read(ear, 1000) or b"null")
+            print(json.dumps([way, said, code, goes_on()]))
+    print("closed")
+"""
+
+STARTING = """
+    import json, sys, time
+    sys.path.insert(0, sys.argv[3])
+    from helpers.fault_programs import census
+    from zstate import StatePublisher, TransformListener, connect, load_model
+
+    model, options, counts = load_model("rrbot"), json.loads(sys.argv[1]), []
+
+    def once():
+        with (
+            connect(**options) as session,
+            StatePublisher(session, model, "r1") as publisher,
+            TransformListener(session, "r1") as listener,
+        ):
+            publisher.publish([0.1, 0.2])
+            listener.buffer.wait("world", "tool", timeout_s=10.0)
+
+    for _ in range(20):
+        once()
+    before, began = census(), time.monotonic()
+    for _ in range(int(sys.argv[2]) - 20):
+        once()
+    print(json.dumps([before, census(), time.monotonic() - began]))
+"""
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_a_forked_child_is_told_to_connect_itself_and_harms_nobody(
+    spawn, start: Start, endpoint: str, mode: str
+):
+    start("router", listen=endpoint)
+    child = spawn(FORKING, json.dumps(client(endpoint) if mode == "client" else {}))
+    for _ in range(10):
+        way, refusals, code, goes_on = json.loads(child.line(30.0))
+        assert (refusals, code, goes_on) == ([True] * 10, 0, True), way
+    assert child.line() == "closed"
+    assert child.wait() == 0
+    assert not re.search("Traceback|panicked", child.stderr)
+
+
+@pytest.mark.parametrize("way", ["client", "peer"])
+def test_two_hundred_starts_and_stops_leave_nothing_behind(spawn, start: Start, endpoint: str, way: str):
+    count = STARTS if way == "client" else STARTS // 4
+    start("router", listen=endpoint)
+    child = spawn(STARTING, json.dumps(client(endpoint) if way == "client" else {}), str(count), HERE)
+    before, after, seconds = json.loads(child.line(6 * DEADLINE_S))
+    print(f"{count} starts as {way}: {before} grew to {after}; the last {count - 20} took {seconds:.1f} s")
+    assert_no_growth(before, after, rss_kb=15_000)
+    assert child.wait() == 0
+    assert child.stderr == ""

@@ -1,0 +1,122 @@
+"""Random bytes on every key there is: nothing crashes, and of what cannot be used nothing goes uncounted.
+
+ZSTATE_LONG=1 makes a minute of it.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+import time
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import pytest
+import zenoh
+from helpers.processes import until
+from helpers.robots import RRBOT, await_reader
+
+from zstate.net.presence import announce
+from zstate.net.session import Session, connect
+from zstate.nodes.listener import Follow, TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.wire.keys import Stream
+from zstate.wire.native import ENCODINGS
+from zstate.wire.registry import get_wire
+
+SECONDS = 60.0 if os.environ.get("ZSTATE_LONG") else 5.0
+BATCH = 150  # all four together fit into every ring: what a full one loses is another test's matter
+FOLLOWS: tuple[Follow, ...] = ("joint_states", "tf")
+ENCODED = (*ENCODINGS.values(), "", "text/plain", "zenoh/bytes", "application/cdr")
+NAMES = ("r1", "r2", "\u0440\u043e\u0431\u043e\u0442", "a" * 200, "%", "r 3", "-", "1")
+UNREAD = (
+    "zstate/r1/joint_commands",
+    "zstate/r1/lookup",
+    "zstate/clock",
+    "zstate/r1",
+    "zstate/r1/tf/x",
+    "other",
+)
+TYPE_HASH = "RIHS01_" + "0" * 64
+
+
+@dataclass(frozen=True)
+class Target:
+    """A listener, and the keys that it reads."""
+
+    listener: TransformListener
+    keys: tuple[str, ...]
+
+    def counted(self) -> int:
+        stats = self.listener.stats
+        return stats.received + stats.late + stats.dropped + sum(stats.refused.values())
+
+
+def native_keys(follow: Follow) -> tuple[str, ...]:
+    streams = (follow, "robot_description", "tf_static/w", "tf_static/\u00fc", "tf_static/" + "w" * 99)
+    return tuple(f"zstate/{name}/{stream}" for name in NAMES for stream in streams)
+
+
+def ros_keys(follow: Follow) -> tuple[str, ...]:
+    streams: tuple[Stream, ...] = (follow, "robot_description", "tf_static")
+    return tuple(get_wire("ros2").expression("r1", stream).replace("*", TYPE_HASH) for stream in streams)
+
+
+def put(session: Session, key: str, dice: random.Random) -> None:
+    payload = dice.randbytes(dice.choice((1, 2, 8, 60, 110, 1000, 20_000)))  # none is empty: a withdrawal
+    attachment = dice.choice((None, b"", dice.randbytes(33)))
+    session.zenoh.put(
+        key,
+        payload,
+        encoding=dice.choice(ENCODED),
+        attachment=attachment,
+        congestion_control=zenoh.CongestionControl.BLOCK,  # so that what was put does arrive
+    )
+
+
+def odd_tokens(dice: random.Random) -> list[str]:
+    """Announcements that nobody makes."""
+    letters = "abz019%~._-=;:|\\ \u00e9"
+    parts = ["".join(dice.choices(letters, k=dice.randrange(1, 60))) for _ in range(20)]
+    native = [f"zstate/{dice.choice(NAMES)}/@writer/{part}/{part[::-1]}" for part in parts]
+    return [*native, *(f"@ros2_lv/0/{part}/0/0/MP/%/%/{part}" for part in parts)]
+
+
+def test_random_bytes_on_every_key_are_counted_one_by_one_and_stop_nobody(monkeypatch: pytest.MonkeyPatch):
+    crashes: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", crashes.append)
+    dice, sent = random.Random(6), Counter[str]()
+    with ExitStack() as opened:
+        writer, reader = opened.enter_context(connect()), opened.enter_context(connect())
+        targets = [
+            Target(opened.enter_context(TransformListener(reader, wire=wire, follow=follow)), keys(follow))
+            for wire, keys in (("native", native_keys), ("ros2", ros_keys))
+            for follow in FOLLOWS
+        ]
+        for key in {key for target in targets for key in target.keys}:
+            await_reader(writer, key)
+        for token in odd_tokens(dice):
+            opened.enter_context(announce(writer, token))
+        deadline = time.monotonic() + SECONDS
+        while time.monotonic() < deadline:
+            for target in targets:
+                for key in dice.choices(target.keys, k=BATCH):
+                    put(writer, key, dice)
+                    sent[key] += 1
+            for key in UNREAD:
+                put(writer, key, dice)
+            for target in targets:
+                wanted = sum(sent[key] for key in target.keys)
+                until(lambda target=target, wanted=wanted: crashes or target.counted() >= wanted)
+        for target in targets:
+            assert target.counted() == sum(sent[key] for key in target.keys), target.listener.stats
+        print(f"{sent.total()} random payloads on {len(sent)} keys; refused: ")
+        print(*(target.listener.stats.refused for target in targets), sep="\n")
+        assert crashes == []
+        # And a robot that makes sense is followed as before.
+        with StatePublisher(writer, RRBOT, "fresh") as fresh:
+            await_reader(writer, "zstate/fresh/joint_states")
+            fresh.publish([0.1, 0.2])
+            targets[0].listener.buffer.wait("fresh/world", "fresh/tool", timeout_s=10.0)

@@ -1,0 +1,491 @@
+"""Two times that say nothing of each other are kept apart; steps of a clock are followed, and named."""
+
+from __future__ import annotations
+
+import logging
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+
+import pytest
+from helpers.processes import until
+from helpers.recording_builder import START, Tale
+from helpers.robots import RRBOT, await_reader, settle
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import ManualClock, SystemClock
+from zstate.errors import ClockMismatch, InvalidInput
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
+from zstate.ingest.stamp_checks import StampCheck, likely_cause
+from zstate.net.streams import StreamPublisher
+from zstate.nodes.clock import ClockPublisher, SimulatedClock
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.recording.player import Player
+from zstate.transform import Transform
+from zstate.wire.messages import JointState, RobotDescription, TransformSample, order_digest, to_block
+from zstate.wire.native import ENCODINGS, encode
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+HOUR = 3_600 * SECOND
+DAY = 24 * HOUR
+NOW = 1_790_000_000 * SECOND
+FOLLOW = pytest.mark.parametrize("follow", ["joint_states", "tf"])
+
+
+def simulated(stamp: int = 5 * SECOND) -> ManualClock:
+    return ManualClock(stamp, "sim")
+
+
+def test_a_description_tells_whose_time_a_robot_keeps(sessions):
+    writer, _ = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1") as real,
+        StatePublisher(writer, RRBOT, "r2", clock=simulated()) as virtual,
+    ):
+        assert (real.description().clock, virtual.description().clock) == ("system", "sim")
+
+
+@FOLLOW
+@pytest.mark.parametrize("given", ["system", "sim", None])
+def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_both_is_refused(sessions, follow, given):
+    writer, reader = sessions
+    clock = None if given is None else ManualClock(NOW, given)
+    with (
+        StatePublisher(writer, RRBOT, "r2", clock=simulated()) as virtual,
+        StatePublisher(writer, RRBOT, "r1", clock=ManualClock(NOW)) as real,
+        StaticPublisher(writer, "cell") as cell,
+        TransformListener(reader, follow=follow, clock=clock) as listener,
+    ):
+        buffer = listener.buffer
+        for robot in ("r1", "r2"):
+            cell.set(Transform("cell/map", f"{robot}/world", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
+            settle(writer, robot, follow)
+        until(lambda: (buffer.domain.domain_of("r1"), buffer.domain.domain_of("r2")) == ("system", "sim"))
+        for robot in (virtual, real):
+            robot.publish([0.5, 0.5])
+        assert buffer.wait("map", "r1/tool", timeout_s=5.0).stamp == NOW
+        assert buffer.wait("map", "r2/tool", timeout_s=5.0).stamp == 5 * SECOND
+        with pytest.raises(ClockMismatch) as caught:
+            buffer.lookup("r1/tool", "r2/tool")
+        assert listener.stats.refused == {}
+    error = caught.value
+    assert (error.robots, error.domains) == (("r1", "r2"), ("system", "sim"))
+    assert [child for _, child in error.edges] == ["r1/upper", "r2/upper"]
+    assert "of robot 'r1' is stamped in 'system' time, but" in str(error)
+    assert "start both robots with one clock" in str(error)
+
+
+def two_clocks() -> TransformBuffer:
+    """A buffer with r1 of the system's clock and r2 of a simulated one, joined by a static edge."""
+    buffer = TransformBuffer()
+    for robot, domain, stamp in (("r1", "system", NOW), ("r2", "sim", 5 * SECOND)):
+        track = buffer.add_robot(RRBOT, robot)
+        buffer.set_domain(robot, domain)
+        for number in range(2):
+            buffer.insert_joints(track, stamp + number * MS, [0.5, 0.5])
+    buffer.insert_static(Transform("r1/world", "r2/world", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
+    return buffer
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda b: b.lookup("r1/tool", "r2/tool"),
+        lambda b: b.lookup("r1/tool", "r2/tool", NOW),
+        lambda b: b.lookup_many("r1/tool", "r2/tool", [NOW]),
+        lambda b: b.lookup_between("r1/tool", NOW, "r2/tool", 5 * SECOND, "r1/world"),
+        lambda b: b.twist("r1/tool", "r2/tool"),
+        lambda b: b.plan("r1/tool", "r2/tool"),
+        lambda b: b.latest("r1/tool", "r2/tool"),
+        lambda b: b.wait("r1/tool", "r2/tool", timeout_s=0.01),
+    ],
+    ids=["newest", "lookup", "lookup_many", "lookup_between", "twist", "plan", "latest", "wait"],
+)
+def test_every_question_across_two_clocks_is_refused(ask):
+    buffer = two_clocks()
+    with pytest.raises(ClockMismatch):
+        ask(buffer)
+    assert isinstance(buffer.explain("r1/tool", "r2/tool"), ClockMismatch)
+    assert not buffer.can_lookup("r1/tool", "r2/tool")
+    assert buffer.can_lookup("r1/tool", "r2/world", NOW)
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "sim"), ("system", "system")])
+def test_a_time_line_is_that_of_one_domain(given, expected):
+    buffer = two_clocks()
+    for robot in ("r2", "r1"):
+        buffer.domain.join(robot)
+    buffer.domain.given = given
+    start = {"sim": 5 * SECOND, "system": NOW}[expected]
+    assert buffer.span() == (start, start + MS)
+
+
+def test_what_was_compiled_before_a_domain_changed_is_asked_again():
+    buffer = two_clocks()
+    buffer.set_domain("r2", "system")
+    buffer.lookup_many("r1/tool", "r2/tool", [NOW])
+    plan = buffer.plan("r1/tool", "r2/tool")
+    buffer.set_domain("r2", "sim")
+    with pytest.raises(ClockMismatch):
+        buffer.lookup_many("r1/tool", "r2/tool", [NOW])
+    with pytest.raises(ClockMismatch):
+        plan.at(NOW)
+
+
+def test_a_wait_across_two_clocks_ends_when_one_robot_changes_its_clock():
+    buffer = two_clocks()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(buffer.wait, "r1/tool", "r2/tool", NOW, 10.0)
+        until(lambda: buffer.waiter_count)
+        buffer.set_domain("r2", "system")
+        buffer.insert_joints(buffer.tree_snapshot().robots["r2"], NOW, [0.5, 0.5])
+        assert waiting.result(10.0).stamp == NOW
+
+
+def test_edges_that_a_robot_places_in_frames_of_another_keep_its_own_clock():
+    buffer = TransformBuffer()
+    buffer.set_domain("fleet", "sim")
+    buffer.set_domain("r1", "system")
+    buffer.domain.place("fleet", ["r1/odom"])
+    turn = [0.0, 0.0, 0.0, 1.0]
+    buffer.insert(Transform("fleet/map", "r1/odom", [0.0, 0.0, 0.0], turn, NOW))
+    buffer.insert(Transform("r1/odom", "r1/base", [0.0, 0.0, 0.0], turn, NOW))
+    with pytest.raises(ClockMismatch) as caught:
+        buffer.lookup("fleet/map", "r1/base")
+    assert caught.value.robots == ("fleet", "r1")
+
+
+def test_one_domain_where_one_is_needed_is_that_of_most_robots_with_samples(sessions):
+    writer, reader = sessions
+    names = {"v1": simulated(), "r1": ManualClock(NOW), "r2": ManualClock(NOW), "v2": simulated()}
+    with ExitStack() as opened:
+        robots = {
+            name: opened.enter_context(StatePublisher(writer, RRBOT, name, clock=clock))
+            for name, clock in names.items()
+        }
+        listener = opened.enter_context(TransformListener(reader))
+        domain = listener.buffer.domain
+        for name in names:
+            settle(writer, name)
+            until(lambda name=name: domain.domain_of(name) is not None)
+        assert domain.name is None
+        for name, expected in (("v1", "sim"), ("r1", "sim"), ("r2", "system"), ("v2", "system")):
+            before = listener.stats.received
+            robots[name].publish([0.5, 0.5])
+            until(lambda before=before: listener.stats.received > before)
+            if name != "v2":
+                assert domain.name == expected
+        # A robot that has left counts no more.
+        robots["r1"].close()
+        until(lambda: domain.name == "sim")
+        assert domain.domain_of("r1") == "system"
+
+
+def test_a_robot_may_change_its_clock(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener:
+        with StatePublisher(writer, RRBOT, "r1") as real:
+            settle(writer, "r1")
+            real.publish([0.5, 0.5])
+            listener.buffer.wait("world", "tool", timeout_s=5.0)
+        with StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual:
+            settle(writer, "r1")
+            virtual.publish([0.5, 0.5])
+            until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
+            until(lambda: listener.buffer.latest("world", "tool") == 5 * SECOND)
+        assert listener.stats.refused == {}
+
+
+def test_an_age_by_another_time_is_an_error_with_both_names(sessions):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual,
+        TransformListener(reader, "r1") as listener,
+    ):
+        settle(writer, "r1")
+        virtual.publish([0.5, 0.5])
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
+        for timeout_s in (0.0, 60.0):  # the clock that was given stays: nothing to wait for
+            with pytest.raises(ClockMismatch, match="max_age_s is measured by a clock of 'system'") as caught:
+                listener.buffer.lookup("world", "tool", max_age_s=1.0, timeout_s=timeout_s)
+        assert (caught.value.domains, caught.value.robots) == (("sim", "system"), ("r1",))
+        assert not isinstance(caught.value, TimeoutError)
+        listener.buffer.use_clock(simulated(6 * SECOND))
+        assert listener.buffer.lookup("world", "tool", max_age_s=1.0).stamp == 5 * SECOND
+
+
+def test_a_buffer_with_a_clock_takes_no_listener_with_another(sessions):
+    buffer = TransformBuffer(clock=ManualClock(NOW))
+    with pytest.raises(InvalidInput, match="given a clock of 'system' time, and now one of 'sim' time"):
+        TransformListener(sessions[0], "r1", buffer, clock=simulated())
+
+
+@FOLLOW
+def test_85_us_back_are_a_sorted_sample_and_nothing_else(sessions, caplog, follow):
+    writer, reader = sessions
+    clock = ManualClock(NOW)
+    with (
+        caplog.at_level(logging.WARNING, "zstate"),
+        StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
+        TransformListener(reader, "r1", follow=follow, clock=ManualClock(NOW)) as listener,
+    ):
+        settle(writer, "r1", follow)
+        stamps = [NOW, NOW + MS, NOW + MS - 85_000, NOW + MS - 85_000 + MS]
+        for number, stamp in enumerate(stamps):
+            clock.set(stamp)
+            publisher.publish([0.1 * number, 0.0])
+        until(lambda: listener.stats.received == 4)
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        for stamp in stamps:
+            assert listener.buffer.lookup("world", "tool", stamp).kind == "exact"
+        stats = listener.stats
+        assert (stats.late, stats.refused, stats.off_clock) == (0, {}, 0)
+    assert caplog.text == ""
+
+
+@FOLLOW
+def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot(sessions, caplog, follow):
+    writer, reader = sessions
+    clock = ManualClock(NOW)
+    with (
+        caplog.at_level(logging.WARNING, "zstate"),
+        StatePublisher(writer, RRBOT, "r1", clock=clock) as stepping,
+        StatePublisher(writer, RRBOT, "r2", clock=ManualClock(NOW)) as steady,
+        TransformListener(reader, follow=follow, clock=ManualClock(NOW)) as listener,
+    ):
+        settle(writer, "r1", follow)
+        settle(writer, "r2", follow)
+        buffer = listener.buffer
+
+        def publish(stamp: int) -> None:
+            before = listener.stats
+            clock.set(stamp)
+            stepping.publish([0.5, 0.5])
+            until(lambda: listener.stats.received + listener.stats.late > before.received + before.late)
+
+        steady.publish([0.5, 0.5])
+        until(lambda: listener.stats.received == 1)
+        publish(NOW)
+        until(lambda: buffer.domain.domain_of("r1") == "system")
+        buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        publish(NOW + HOUR)
+        publish(NOW + HOUR + MS)
+        assert buffer.latest("r1/world", "r1/tool") == NOW + HOUR + MS
+        assert buffer.can_lookup("r1/world", "r1/tool", NOW + HOUR)
+        until(lambda: (listener.stats.off_clock, listener.stats.late) == (2, 0))
+        publish(NOW + 2 * MS)
+        assert buffer.latest("r1/world", "r1/tool") == NOW + HOUR + MS
+        publish(NOW + 3 * MS)
+        assert buffer.latest("r1/world", "r1/tool") == NOW + 3 * MS
+        publish(NOW + 4 * MS)
+        assert (listener.stats.off_clock, listener.stats.late) == (2, 1)
+        assert buffer.latest("r2/world", "r2/tool") == NOW
+    assert caplog.text.count("3600.0 s after this machine's time") == 1
+    assert "whole hours: the writer takes its local time for UTC" in caplog.text
+    assert caplog.text.count("the clock of 'r1' went back by 3600.0 s: its history") == 1
+    assert "'r2'" not in caplog.text
+
+
+@FOLLOW
+def test_a_clock_set_back_by_less_than_the_history_begins_a_new_history_of_that_robot(
+    sessions, caplog, follow
+):
+    writer, reader = sessions
+    clock = ManualClock(NOW)
+    with (
+        caplog.at_level(logging.WARNING, "zstate"),
+        StatePublisher(writer, RRBOT, "r1", clock=clock) as stepping,
+        StatePublisher(writer, RRBOT, "r2", clock=ManualClock(NOW)) as steady,
+        TransformListener(reader, follow=follow, clock=ManualClock(NOW), history_s=10.0) as listener,
+    ):
+        buffer = listener.buffer
+        settle(writer, "r1", follow)
+        settle(writer, "r2", follow)
+        steady.publish([0.5, 0.5])
+        for number, stamp in enumerate((0, 10, 20, 30, -5_000, -4_990, -4_980)):
+            clock.set(NOW + stamp * MS)
+            stepping.publish([0.1 * number, 0.0])
+        until(lambda: listener.stats.received == 8)
+        buffer.wait("r1/world", "r1/tool", timeout_s=5.0)
+        assert buffer.latest("r1/world", "r1/tool") == NOW - 4_980 * MS
+        assert not buffer.can_lookup("r1/world", "r1/tool", NOW)
+        assert buffer.can_lookup("r2/world", "r2/tool", NOW)
+        until(lambda: [one.robot for one in listener.events() if one.kind == "set back"] == ["r1"])
+    assert caplog.text.count("the clock of 'r1' went back by 5.0 s: its history restarts") == 1
+    assert "'r2'" not in caplog.text
+
+
+def a_follower(history_s: float = 10.0) -> tuple[TransformBuffer, JointStateIngest]:
+    buffer = TransformBuffer(history_s)
+    ingest = JointStateIngest("r1", FrameOwnership(buffer, Counters()))
+    ingest.describe(RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ()))
+    return buffer, ingest
+
+
+def take(ingest: JointStateIngest, *samples: tuple[int, int]) -> None:
+    """Take samples of these numbers and stamps [ms after NOW]."""
+    for seq, stamp in samples:
+        order = order_digest(RRBOT.joint_names)
+        ingest.insert_sample(
+            JointState(NOW + stamp * MS, seq, 1, order, to_block([0.1, 0.2])), overflowed=False
+        )
+
+
+def test_samples_that_the_network_reorders_are_sorted_in():
+    buffer, ingest = a_follower()
+    take(ingest, (0, 0), (1, 1_000), (5, 5_000), (2, 2_000), (3, 3_000), (4, 4_000), (6, 6_000))
+    for stamp in range(0, 7_000, 1_000):
+        assert buffer.lookup("world", "tool", NOW + stamp * MS).kind == "exact"
+
+
+def test_one_wrong_stamp_does_not_end_a_history():
+    buffer, ingest = a_follower()
+    take(ingest, (0, 0), (1, 10), (2, -5_000), (3, 20), (4, 30))
+    assert buffer.can_lookup("world", "tool", NOW)
+    assert buffer.latest("world", "tool") == NOW + 30 * MS
+
+
+def test_a_clock_set_back_is_noticed_though_samples_are_lost_at_that_moment():
+    buffer, ingest = a_follower()
+    take(ingest, (0, 0), (1, 10), (9, -5_000), (10, -4_990))
+    assert buffer.latest("world", "tool") == NOW - 4_990 * MS
+    assert not buffer.can_lookup("world", "tool", NOW)
+
+
+@FOLLOW
+def test_a_simulation_that_begins_again_soon_is_a_new_epoch_at_its_second_sample(sessions, follow):
+    writer, reader = sessions
+    clock = simulated(0)
+    with (
+        StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
+        TransformListener(reader, "r1", follow=follow, history_s=10.0) as listener,
+    ):
+        settle(writer, "r1", follow)
+        # Eight seconds, well inside of the history, then the start again.
+        for stamp in (0, 4 * SECOND, 8 * SECOND, 0, 10 * MS):
+            clock.set(stamp)
+            publisher.publish([0.5, 0.5])
+        until(lambda: listener.stats.received == 5)
+        listener.buffer.wait("world", "tool", timeout_s=5.0)
+        assert listener.buffer.latest("world", "tool") == 10 * MS
+        assert not listener.buffer.can_lookup("world", "tool", 4 * SECOND)
+
+
+def test_stamps_far_off_are_used_counted_and_named_once_for_each_program(sessions, caplog):
+    writer, reader = sessions
+    with (
+        caplog.at_level(logging.WARNING, "zstate"),
+        TransformListener(reader, "r1") as listener,
+    ):
+        for start in (1, 2):
+            with StatePublisher(writer, RRBOT, "r1", program="driver") as publisher:
+                # Its model, and so whose time it keeps, and its name.
+                until(lambda: any("driver@" in (one.writer or "") for one in listener.buffer.frames()))
+                settle(writer, "r1")
+                for number in range(5):
+                    publisher.publish([0.5, 0.5], stamp=(time.time_ns() + number) // SECOND)
+                until(lambda start=start: listener.stats.off_clock == 5 * start)
+        assert listener.stats.received == 10
+        assert listener.stats.late == 0
+    assert caplog.text.count("the writer gives seconds where nanoseconds are meant") == 1
+    assert "samples of 'r1', which driver@" in caplog.text
+
+
+def test_a_writer_that_starts_again_with_each_sample_is_named_once(caplog):
+    buffer, counters = TransformBuffer(clock=ManualClock(NOW)), Counters()
+    buffer.set_domain("r1", "system")
+    off_clock = StampCheck(buffer, counters, is_described=True)
+    with caplog.at_level(logging.WARNING, "zstate"):
+        for session in range(100):
+            off_clock.check("r1", f"driver@host pid {session}", JointState(5, 0, session, b"", b""))
+    assert counters.stats().off_clock == 100
+    assert len(caplog.records) == 1
+
+
+def test_a_minute_off_is_not_far_and_a_little_more_is(sessions):
+    writer, reader = sessions
+    with (
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+        TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener,
+    ):
+        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        settle(writer, "r1")
+        for stamp in (NOW - 60 * SECOND, NOW + 60 * SECOND):
+            publisher.publish([0.5, 0.5], stamp=stamp)
+        until(lambda: listener.stats.received + listener.stats.late == 2)
+        assert listener.stats.off_clock == 0
+        for stamp in (NOW - 60 * SECOND - 1, NOW + 60 * SECOND + 1):
+            publisher.publish([0.5, 0.5], stamp=stamp)
+        until(lambda: listener.stats.off_clock == 2)
+
+
+def test_of_a_robot_that_is_never_described_named_transforms_are_looked_at_too(sessions):
+    writer, reader = sessions
+    edges = (("base", "hand"),)
+    pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    with (
+        StreamPublisher(writer, "zstate/r1/tf", ENCODINGS[TransformSample]) as stranger,
+        TransformListener(reader, "r1", follow="tf") as listener,
+    ):
+        until(lambda: stranger.has_readers)
+        stranger.put(encode(TransformSample(5, 0, 9, order_digest(edges), pose, edges)))
+        until(lambda: listener.stats.off_clock == 1)
+        assert listener.buffer.lookup("base", "hand").stamp == 5
+
+
+def test_simulated_time_is_never_far_off(sessions):
+    writer, reader = sessions
+    with (
+        ClockPublisher(writer) as told,
+        SimulatedClock(reader) as clock,
+        StatePublisher(writer, RRBOT, "r1", clock=simulated()) as publisher,
+        TransformListener(reader, "r1", clock=clock) as listener,
+    ):
+        await_reader(writer, "zstate/clock")
+        settle(writer, "r1")
+        told.publish(HOUR)
+        publisher.publish([0.5, 0.5])
+        until(lambda: listener.stats.received == 1)
+        assert listener.stats.off_clock == 0
+
+
+def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
+    writer, reader = sessions
+    with Tale(tmp_path / "run.mcap", "arm") as tale:
+        tale.describe("arm")
+        for number in range(10):
+            tale.joints("arm", START + number * 10 * MS, [0.1 * number, 0.0])
+        tale.edges("cart", START + 20 * MS, {("floor", "cart"): [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]})
+    with (
+        StatePublisher(writer, RRBOT, "r1"),
+        TransformListener(reader, "*", clock=SystemClock()) as listener,
+        Player(writer, tmp_path / "run.mcap", rate=0.5) as replayer,
+    ):
+        until(lambda: listener.buffer.domain.domain_of("r1") == "system")
+        replayer.run()
+        until(lambda: listener.buffer.domain.domain_of("arm") == "sim")
+        assert listener.buffer.can_lookup("arm/world", "arm/tool")
+
+
+@pytest.mark.parametrize(
+    ("stamp", "cause"),
+    [
+        (NOW // SECOND, "gives seconds where nanoseconds"),
+        (NOW // MS, "gives milliseconds where nanoseconds"),
+        (NOW // 1_000, "gives microseconds where nanoseconds"),
+        (0, "1970"),
+        (300 * DAY, "1970"),
+        (NOW - 2 * HOUR, "whole hours"),
+        (NOW + 5 * HOUR + HOUR // 2 - SECOND, "whole hours"),
+        (NOW - 37 * DAY, "never set"),
+        (NOW + 700 * SECOND, "never set"),
+    ],
+)
+def test_the_likely_cause_is_told_by_the_size(stamp, cause):
+    assert cause in likely_cause(stamp, NOW)

@@ -1,0 +1,219 @@
+"""The panels in a real browser: what a person types, drags and reads."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+
+import pytest
+from helpers.processes import until as until_then
+
+from zstate.model.load import load_model
+from zstate.model.urdf import parse_urdf
+from zstate.net.presence import discover
+from zstate.nodes.publisher import StatePublisher
+from zstate.view.sliders import SliderPublisher
+
+pytestmark = [pytest.mark.browser, pytest.mark.processes]
+
+SLOWLY_S = 45.0
+"""A browser without a graphics card, on a busy machine."""
+
+RRBOT = load_model("rrbot")
+SHOULDER, ELBOW = RRBOT.joint_names
+
+DRIVER = """
+    from zstate import SineSource, StatePublisher, connect, load_model
+    model = load_model("rrbot")
+    with connect() as session, StatePublisher(session, model, "r1", program="driver") as publisher:
+        publisher.publish([0.0, 0.0])
+        print("writing", flush=True)
+        publisher.run(SineSource(model), 50.0)
+"""
+
+
+def until(condition: Callable[[], object]) -> None:
+    until_then(condition, SLOWLY_S)
+
+
+class Panels:
+    """The panels of one page, by what stands beside their inputs."""
+
+    def __init__(self, looker) -> None:
+        self.looker = looker
+        self.tab = looker.tab
+        self.tab.set_default_timeout(SLOWLY_S * 1e3)
+        looker.text("Fixed frame")
+
+    def open(self, name: str) -> None:
+        """One of the tabs."""
+        self.tab.get_by_text(name, exact=True).first.click()
+
+    def field(self, label: str):
+        """The input with that label; of a slider the box with its number."""
+        beside = f'//label[normalize-space(.)="{label}"]/ancestor::div[2]//input[not(@type="hidden")]'
+        return self.tab.locator(f"xpath={beside}").last
+
+    def choose(self, label: str, option: str) -> None:
+        """One of a list, by typing a part of it."""
+        self.field(label).click()
+        self.field(label).fill(option)
+        self.tab.get_by_role("option", name=option, exact=True).click()
+
+    def press(self, button: str) -> None:
+        self.tab.get_by_role("button", name=button, exact=True).click()
+
+    def row(self, name: str, place: int = 0) -> str:
+        """The value beside a name in a table of the panels, or nothing."""
+        cells = self.tab.locator(f'xpath=//td[normalize-space(.)="{name}"]/following-sibling::td[1]')
+        return cells.nth(place).inner_text() if cells.count() > place else ""
+
+    def numbers(self, name: str, place: int = 0) -> list[float]:
+        return [float(text) for text in self.row(name, place).split()]
+
+
+@pytest.fixture
+def panels(look, show) -> Callable[..., Panels]:
+    def opened(session, *robots: str, sliders=()) -> Panels:
+        return Panels(look(show(session, *robots, sliders=sliders).page.url))
+
+    return opened
+
+
+def test_a_slider_moves_the_joint_and_what_is_read_of_the_link(panels, sessions):
+    with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
+        page = panels(sessions[1], "r1", sliders=[sliders])
+        page.open("Joints")
+        page.field(SHOULDER).fill("0.5")
+        page.field(ELBOW).fill("-0.25")
+        until(lambda: sliders.positions.tolist() == [0.5, -0.25])
+        page.open("Frames")
+        page.choose("Pose of", "r1/lower")
+        page.choose("in frame", "r1/base")
+        # Both turn about y: the angles add up to the pitch.
+        until(lambda: page.numbers("rpy [rad]", 1) == [0.0, 0.5 - 0.25, 0.0])
+        page.looker.keep("panels_readout")
+        page.open("Joints")
+        page.choose("Angles in", "deg")
+        until(lambda: page.field(SHOULDER).input_value() == f"{math.degrees(0.5):.1f}")
+        page.press("Home")
+        until(lambda: sliders.positions.tolist() == [0.0, 0.0])
+        until(lambda: page.field(SHOULDER).input_value() == "0")
+        page.press("Sine")
+        until(lambda: sliders.is_swinging)
+        page.choose("Joint", SHOULDER)
+        page.tab.locator(".uplot canvas").first.wait_for()
+        page.looker.keep("panels_joints")
+
+
+def test_a_slider_that_would_fight_another_writer_says_who_that_is(panels, sessions):
+    with (
+        StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver,
+        SliderPublisher(sessions[1], RRBOT, "r1") as sliders,
+    ):
+        driver.publish([0.0, 0.0])
+        page = panels(sessions[1], "r1", sliders=[sliders])
+        page.open("Joints")
+        assert "driver@" in page.looker.text("r1 is not published").inner_text()
+        page.looker.keep("panels_refused")
+        driver.close()
+        until(lambda: not discover(sessions[0], 0.2))
+        page.press("Try again")
+        page.looker.text("Publishing r1 at 50 Hz")
+
+
+def test_a_part_of_a_name_finds_the_frame_and_another_fixed_frame_shows_it_from_there(panels, sessions):
+    panda = load_model("panda")
+    with StatePublisher(sessions[0], panda, "panda", program="driver") as driver:
+        driver.publish(panda.neutral)
+        page = panels(sessions[1], "panda")
+        page.open("Frames")
+        page.field("Search").fill("leftfing")
+        until(lambda: page.field("Frame").input_value() == "panda/panda_leftfinger")
+        until(lambda: page.row("parent") == "panda/panda_hand")
+        assert page.row("in") == "panda/panda_link0"
+        assert page.row("kind") == "joint"
+        assert page.row("writer").startswith("driver@")
+        page.open("View")
+        page.choose("Fixed frame", "panda/panda_hand")
+        page.open("Frames")
+        until(lambda: page.row("in") == "panda/panda_hand")
+        (finger,) = [joint for joint in panda.joints if joint.child == "panda_leftfinger"]
+        # At home the finger has not left the place at which its joint puts it.
+        until(lambda: page.numbers("xyz [m]") == [round(value, 4) for value in finger.origin[:3]])
+        page.looker.keep("panels_frames")
+
+
+def test_a_robot_whose_publisher_is_killed_is_said_to_be_silent(panels, sessions, spawn):
+    driver = spawn(DRIVER)
+    assert driver.line() == "writing"
+    page = panels(sessions[1], "r1")
+    page.looker.text("live,")
+    driver.kill()
+    said = page.looker.text("silent for").inner_text()
+    assert re.search(r"silent for \d+ s, since \d\d:\d\d:\d\d", said)
+    page.looker.keep("panels_silent")
+
+
+def test_time_is_stopped_and_goes_on(panels, sessions, spawn):
+    assert spawn(DRIVER).line() == "writing"
+    page = panels(sessions[1], "r1")
+    page.open("Time")
+    page.press("Pause")
+    page.looker.text("Paused at")
+    page.open("Frames")
+    page.field("Search").fill("lower")
+    until(lambda: page.row("parent"))
+
+    def still() -> bool:
+        # As long as the page takes to be told ten times of something new.
+        before = page.row("quat xyzw")
+        page.tab.wait_for_timeout(1000)
+        return page.row("quat xyzw") == before
+
+    until(still)
+    page.open("Time")
+    page.press("Live")
+    page.looker.text("Live", exact=True)
+    page.open("Frames")
+    before = page.row("quat xyzw")
+    until(lambda: page.row("quat xyzw") != before)
+
+
+def test_what_is_ticked_in_one_browser_is_drawn_in_all(look, show, sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver:
+        driver.publish([0.0, 0.0])
+        shown = show(sessions[1], "r1")
+        mine, theirs = (Panels(look(shown.page.url, 640, 480)) for _ in range(2))
+        assert not theirs.field("Names").is_checked()
+        mine.field("Names").check()
+        mine.choose("Fixed frame", "r1/tool")
+        until(lambda: shown.view.scene.names)
+        until(lambda: theirs.field("Names").is_checked())
+        until(lambda: theirs.field("Fixed frame").input_value() == "r1/tool")
+
+
+def test_a_name_out_of_the_network_is_shown_and_not_run(panels, sessions):
+    name = "<img src=x onerror=document.title=1>"
+    quoted = name.replace("<", "&lt;").replace(">", "&gt;")
+    urdf = f"""<robot name="r1"><link name="base"/><link name="{quoted}"/>
+        <joint name="j" type="continuous"><parent link="base"/><child link="{quoted}"/></joint></robot>"""
+    with StatePublisher(sessions[0], parse_urdf(urdf, "r1.urdf"), "r1") as publisher:
+        publisher.publish([0.0])
+        page = panels(sessions[1], "r1")
+        page.open("Frames")
+        page.field("Search").fill("onerror")
+        until(lambda: "onerror" in page.field("Frame").input_value())
+        until(lambda: page.row("parent") == "r1/base")
+        assert page.tab.locator('img[src="x"]').count() == 0
+        assert page.tab.title() != "1"
+
+
+def test_the_graph_names_who_writes_and_who_reads(panels, sessions):
+    with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver:
+        driver.publish([0.0, 0.0])
+        page = panels(sessions[1], "r1")
+        page.open("Graph")
+        until(lambda: page.row("written by").startswith("driver@"))
+        page.looker.keep("panels_graph")

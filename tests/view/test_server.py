@@ -1,0 +1,151 @@
+"""The page is where it says, and shows itself through its door only."""
+
+from __future__ import annotations
+
+import socket
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+
+import pytest
+
+pytest.importorskip("viser")
+
+import viser
+from helpers.processes import SOON_S, a_free_port, until
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from zstate.errors import InvalidInput
+from zstate.view.server import ViewServer
+
+PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
+
+
+def status(url: str, headers: Mapping[str, str] | None = None) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=dict(headers or {}))) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def listens(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((host, port)) == 0
+
+
+def another_address() -> str | None:
+    """One of this machine that is not loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return None
+        return probe.getsockname()[0]
+
+
+def test_it_is_on_loopback_unless_somebody_says_otherwise():
+    with ViewServer(port=0) as page:
+        assert page.url == f"http://127.0.0.1:{page.port}"
+        assert status(page.url) == 200
+        assert status(page.url, {"Host": "evil.example"}) == 403
+        address = another_address()
+        assert address is None or not listens(address, page.port)
+    assert not listens("127.0.0.1", page.port)
+
+
+def test_a_websocket_comes_through_the_same_door():
+    with ViewServer(port=0) as page:
+        address = f"ws://127.0.0.1:{page.port}"
+        with connect(address, subprotocols=PROTOCOL, compression=None) as socket:
+            assert socket.recv(timeout=10)
+        with pytest.raises(InvalidStatus) as caught:
+            connect(address, subprotocols=PROTOCOL, origin="https://evil.example")
+        assert caught.value.response.status_code == 403
+
+
+def raw_status(port: int, *headers: str) -> int:
+    """Of an answer to a request with just these headers."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10.0) as connection:
+        lines = ["GET / HTTP/1.1", *headers, "", ""]
+        connection.sendall("\r\n".join(lines).encode())
+        return int(connection.makefile("rb").readline().split()[1])
+
+
+WEBSOCKET = (
+    "Connection: Upgrade",
+    "Upgrade: websocket",
+    "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+    f"Sec-WebSocket-Protocol: {PROTOCOL[0]}",
+)
+
+
+@pytest.mark.parametrize("upgrade", [(), WEBSOCKET])
+def test_a_name_that_leads_to_loopback_is_not_answered_and_no_request_is_an_error_here(upgrade):
+    with ViewServer(port=0) as page:
+        here, evil = (f"{name}:{page.port}" for name in ("127.0.0.1", "127.0.0.1.evil.example"))
+        expected = 101 if upgrade else 200
+        assert raw_status(page.port, f"Host: {here}", f"Origin: http://{here}", *upgrade) == expected
+        assert raw_status(page.port, f"Host: {evil}", f"Origin: http://{evil}", *upgrade) == 403
+        assert raw_status(page.port, f"Host: {here}", f"Host: {evil}", *upgrade) == 400
+        assert raw_status(page.port, f"Host: {here}", f"Host: {here}", *upgrade) == 400
+        assert raw_status(page.port, "Host: [::1", *upgrade) == 403
+        assert raw_status(page.port, *upgrade) == 403
+
+
+def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
+    with ViewServer("0.0.0.0", 0) as page:
+        here = f"127.0.0.1:{page.port}"
+        assert page.door.token is not None
+        assert page.url.endswith(f":{page.port}/?token={page.door.token}")
+        assert status(f"http://{here}") == 401
+        assert status(f"http://{here}/?token={page.door.token}") == 200
+        with pytest.raises(InvalidStatus) as caught:
+            connect(f"ws://{here}", subprotocols=PROTOCOL)
+        assert caught.value.response.status_code == 401
+        cookie = {"Cookie": f"zstate_view_{page.port}={page.door.token}"}
+        with connect(f"ws://{here}", subprotocols=PROTOCOL, additional_headers=cookie) as socket:
+            assert socket.recv(timeout=10)
+
+
+def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
+    page = ViewServer(port=0)
+    with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as vanished:
+        host = f"Host: 127.0.0.1:{page.port}"
+        vanished.sendall("\r\n".join(["GET / HTTP/1.1", host, *WEBSOCKET, "", ""]).encode())
+        assert vanished.recv(1).startswith(b"H")
+        started = time.monotonic()
+        page.close()
+        assert time.monotonic() - started < SOON_S
+
+
+def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
+    with ViewServer(port=a_free_port()) as first:
+        with pytest.raises(InvalidInput, match=f"port {first.port} is taken"):
+            ViewServer(port=first.port)
+        with ViewServer() as second, ViewServer() as third:
+            assert len({first.port, second.port, third.port}) == 3
+            assert [status(page.url) for page in (second, third)] == [200, 200]
+
+
+@pytest.mark.parametrize(("host", "port"), [("nowhere.invalid", 0), ("127.0.0.1", 99999)])
+def test_what_cannot_be_listened_at_is_an_error_of_the_user(host: str, port: int):
+    with pytest.raises(InvalidInput, match="nobody can listen"):
+        ViewServer(host, port)
+
+
+def test_nobody_is_shown_the_way_to_the_internet():
+    with ViewServer(port=0) as page:
+        assert page.server.request_share_url() is None
+
+
+def test_it_prints_nothing(capsys: pytest.CaptureFixture[str]):
+    with ViewServer(port=0) as page:
+        until(lambda: listens("127.0.0.1", page.port))
+    said = capsys.readouterr()
+    assert "viser" not in said.out + said.err

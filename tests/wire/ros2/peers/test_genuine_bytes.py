@@ -1,0 +1,152 @@
+"""What zstate says in CDR is, byte for byte, what a genuine ROS 2 says, and the other way round."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from helpers.processes import Child
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from peers import Program
+from ros_messages import (
+    CLOCK,
+    JOINT_STATE,
+    STRING,
+    TF_MESSAGE,
+    XYZ,
+    XYZW,
+    joint_state,
+    tf_message,
+    time,
+    transform_stamped,
+)
+
+from zstate.wire.messages import to_block
+from zstate.wire.ros2 import types
+from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
+from zstate.wire.ros2.simple_messages import decode_clock, decode_string, encode_clock, encode_string
+from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
+
+pytestmark = [pytest.mark.heavy, pytest.mark.processes]
+
+Piece = tuple[Literal["u32", "text", "f64"], Any]
+
+texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12)
+stamps = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
+numbers = st.floats(allow_nan=False)
+many = settings(max_examples=100, deadline=None)
+
+
+@pytest.fixture(scope="module")
+def kilted() -> Iterator[Program]:
+    children: list[Child] = []
+
+    def spawn(*arguments: str) -> Child:
+        children.append(Child(*arguments))
+        return children[-1]
+
+    try:
+        yield Program(spawn, "kilted", "rclpy_bytes.py")
+    finally:
+        for child in children:
+            child.kill()
+
+
+def mask(pieces: Sequence[Piece]) -> bytes:
+    """1 for each byte of a payload that says something, 0 for padding, which ROS leaves as it was."""
+    out = bytearray(b"\1\1\1\1")
+    for kind, value in pieces:
+        size = 8 if kind == "f64" else 4
+        out += bytes(-(len(out) - 4) % size)
+        out += bytes([1]) * (4 + len(value.encode()) + 1 if kind == "text" else size)
+    return bytes(out)
+
+
+def header(frame: str = "") -> list[Piece]:
+    return [("u32", 0), ("u32", 0), ("text", frame)]
+
+
+def sequence(kind: Literal["text", "f64"], values: Sequence[Any]) -> list[Piece]:
+    return [("u32", len(values)), *((kind, value) for value in values)]
+
+
+def assert_same(ours: bytes, genuine: bytes, meant: bytes) -> None:
+    """Equal but for padding; rmw_serialize may leave up to a word after the end."""
+    assert len(ours) == len(meant)
+    assert len(ours) <= len(genuine) < len(ours) + 16
+    wrong = [i for i, means in enumerate(meant) if means and ours[i] != genuine[i]]
+    assert not wrong, (wrong, ours.hex(), genuine.hex())
+
+
+def genuine_bytes(kilted: Program, type_name: str, message: dict[str, Any]) -> bytes:
+    return bytes.fromhex(kilted.ask("serialize", type=type_name, message=message))
+
+
+def genuine_message(kilted: Program, type_name: str, payload: bytes) -> dict[str, Any]:
+    return kilted.ask("deserialize", type=type_name, data=payload.hex())
+
+
+@st.composite
+def joint_states(draw: st.DrawFn) -> tuple[list[str], list[float], list[float] | None, list[float] | None]:
+    names = draw(st.lists(texts, max_size=5, unique=True))
+    block = st.lists(numbers, min_size=len(names), max_size=len(names))
+    return names, draw(block), draw(block | st.none()), draw(block | st.none())
+
+
+def test_type_hashes_are_those_that_ros_generates(kilted: Program):
+    for kind in (types.JOINT_STATE, types.TF_MESSAGE, types.STRING, types.CLOCK):
+        assert kind.hash == kilted.ask("hash", type_name=kind.name)
+
+
+@many
+@given(stamps, joint_states())
+def test_joint_states_are_the_same_bytes(kilted: Program, stamp: int, state: Any):
+    names, *blocks = state
+    message = joint_state(stamp, names, *(block or [] for block in blocks))
+    genuine = genuine_bytes(kilted, JOINT_STATE, message)
+    packed = [None if block is None else to_block(block) for block in blocks]
+    ours = JointStateEncoder(names).encode(stamp, *packed)
+    floats = [piece for block in blocks for piece in sequence("f64", block or [])]
+    assert_same(ours, genuine, mask([*header(), *sequence("text", names), *floats]))
+    assert genuine_message(kilted, JOINT_STATE, ours) == message
+    said = JointStateDecoder().decode(genuine)
+    assert (said.stamp, list(said.names), said.positions) == (stamp, names, packed[0])
+    assert [said.velocities or b"", said.efforts or b""] == [block or b"" for block in packed[1:]]
+
+
+@many
+@given(stamps, st.lists(st.tuples(texts, texts, st.lists(numbers, min_size=7, max_size=7)), max_size=4))
+def test_transforms_are_the_same_bytes(kilted: Program, stamp: int, transforms: Any):
+    message = tf_message(*(transform_stamped(stamp, *one) for one in transforms))
+    genuine = genuine_bytes(kilted, TF_MESSAGE, message)
+    edges = tuple((parent, child) for parent, child, _ in transforms)
+    poses = to_block(np.array([pose for _, _, pose in transforms], dtype=np.float64))
+    ours = TfMessageEncoder(edges).encode(stamp, poses)
+    pieces: list[Piece] = [("u32", len(edges))]
+    for parent, child in edges:
+        pieces += [*header(parent), ("text", child), *[("f64", 0.0)] * len(XYZ + XYZW)]
+    assert_same(ours, genuine, mask(pieces))
+    assert genuine_message(kilted, TF_MESSAGE, ours) == message
+    said = TfMessageDecoder().decode(genuine)
+    assert (said.stamps, said.edges, said.poses) == ((stamp,) * len(edges), edges, poses)
+
+
+@many
+@given(texts)
+def test_texts_are_the_same_bytes(kilted: Program, text: str):
+    genuine = genuine_bytes(kilted, STRING, {"data": text})
+    assert_same(encode_string(text), genuine, mask([("text", text)]))
+    assert genuine_message(kilted, STRING, encode_string(text)) == {"data": text}
+    assert decode_string(genuine) == text
+
+
+@many
+@given(stamps)
+def test_clocks_are_the_same_bytes(kilted: Program, stamp: int):
+    genuine = genuine_bytes(kilted, CLOCK, {"clock": time(stamp)})
+    assert_same(encode_clock(stamp), genuine, mask([("u32", 0), ("u32", 0)]))
+    assert genuine_message(kilted, CLOCK, encode_clock(stamp)) == {"clock": time(stamp)}
+    assert decode_clock(genuine) == stamp

@@ -1,0 +1,157 @@
+"""zstate and other implementations of ROS 2 over Zenoh hear each other, through a router process."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.processes import until
+from helpers.robots import RRBOT, SECOND, STAMP, assert_pose, kinematic_pose
+from peers import DOMAIN, Peer, repeat_until
+from ros_messages import (
+    JOINT_STATE,
+    STRING,
+    TF_MESSAGE,
+    edges_of,
+    joint_state,
+    tf_message,
+    transform_stamped,
+)
+
+from zstate.net.session import Session
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.transform import Transform
+
+WIRE = f"ros2:domain={DOMAIN}"
+POSITIONS, VELOCITIES = [0.4, -1.25], [0.5, 2.0]
+TURN = [0.1, -0.2, 0.3, 0.0, 0.0, 0.6, 0.8]
+
+SDK = pytest.param("sdk", marks=pytest.mark.ros2_peer)
+PYZEROS = pytest.param("pyzeros", marks=pytest.mark.heavy)
+KILTED = pytest.param("kilted", marks=pytest.mark.heavy)
+every_peer = pytest.mark.parametrize("peer", [SDK, PYZEROS, KILTED], indirect=True)
+# pyzeros has no transient local durability.
+every_peer_that_latches = pytest.mark.parametrize("peer", [SDK, KILTED], indirect=True)
+# zenoh-ros2-sdk signs with numbers of its own, not with the hash of its token.
+every_peer_that_signs = pytest.mark.parametrize("peer", [PYZEROS, KILTED], indirect=True)
+pytestmark = pytest.mark.processes
+
+
+def advertise_edges(peer: Peer) -> None:
+    peer.advertise("/tf_static", TF_MESSAGE, latched=peer.can_latch)
+    peer.advertise("/tf", TF_MESSAGE)
+
+
+def publish_edges(peer: Peer) -> None:
+    """world, hand and camera, each TURN from the one before; the hand moves."""
+    peer.publish("/tf_static", tf_message(transform_stamped(STAMP, "hand", "camera", TURN)))
+    peer.publish("/tf", tf_message(transform_stamped(STAMP, "world", "hand", TURN)))
+
+
+@every_peer
+def test_a_peer_hears_the_joint_states_as_they_were_published(peer: Peer, session: Session):
+    peer.subscribe("/joint_states", JOINT_STATE)
+    with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
+        heard = peer.hears("/joint_states", lambda: publisher.publish(POSITIONS, VELOCITIES, stamp=STAMP))
+    assert heard == joint_state(STAMP, RRBOT.joint_names, POSITIONS, VELOCITIES)
+
+
+@every_peer
+def test_a_peer_hears_the_moving_edges_of_a_robot(peer: Peer, session: Session):
+    peer.subscribe("/tf", TF_MESSAGE)
+    with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
+        heard = peer.hears("/tf", lambda: publisher.publish(POSITIONS, stamp=STAMP))
+        moving = publisher.description().moving_edges
+    assert {edge["header"]["stamp"]["nanosec"] for edge in heard["transforms"]} == {STAMP % SECOND}
+    assert set(edges_of(heard)) == set(moving)
+    for (parent, child), matrix in edges_of(heard).items():
+        assert np.allclose(matrix, kinematic_pose(RRBOT, POSITIONS, parent, child), rtol=0, atol=1e-12)
+
+
+@every_peer_that_latches
+def test_a_peer_that_joins_late_still_hears_the_model_and_the_fixed_edges(peer: Peer, session: Session):
+    with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)):
+        peer.subscribe("/robot_description", STRING, latched=True)
+        assert peer.hears("/robot_description") == {"data": RRBOT.urdf}
+        peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
+        heard = peer.hears("/tf_static")
+    assert edges_of(heard)
+    for (parent, child), matrix in edges_of(heard).items():
+        assert np.allclose(matrix, kinematic_pose(RRBOT, POSITIONS, parent, child), rtol=0, atol=1e-12)
+
+
+@every_peer_that_latches
+def test_a_peer_that_joins_late_still_hears_a_static_edge(peer: Peer, session: Session):
+    with StaticPublisher(session, "r1", "camera_mount", wires=WIRE) as statics:
+        statics.set(Transform.from_pose7("tool", "camera", TURN))
+        peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
+        assert peer.hears("/tf_static") == tf_message(transform_stamped(0, "tool", "camera", TURN))
+
+
+@every_peer
+def test_a_listener_computes_transforms_from_the_joint_states_of_a_peer(peer: Peer, session: Session):
+    peer.advertise("/robot_description", STRING, latched=peer.can_latch)
+    peer.advertise("/joint_states", JOINT_STATE)
+    state = joint_state(STAMP, RRBOT.joint_names, POSITIONS, VELOCITIES)
+
+    def say() -> None:
+        peer.publish("/robot_description", {"data": RRBOT.urdf})
+        peer.publish("/joint_states", state)
+
+    with TransformListener(session, "r1", wire=WIRE) as listener:
+        buffer = listener.buffer
+        repeat_until(say, lambda: buffer.can_lookup("world", "tool", STAMP))
+        expected = kinematic_pose(RRBOT, POSITIONS, "world", "tool")
+        assert_pose(buffer.lookup("world", "tool", STAMP), expected)
+        assert (listener.stats.refused, listener.stats.missed) == ({}, 0)
+
+
+@every_peer
+def test_a_listener_takes_moving_and_static_edges_from_a_peer(peer: Peer, session: Session):
+    advertise_edges(peer)
+    with TransformListener(session, "r1", wire=WIRE, follow="tf") as listener:
+        buffer = listener.buffer
+        repeat_until(lambda: publish_edges(peer), lambda: buffer.can_lookup("world", "camera", STAMP))
+        once = Transform.from_pose7("world", "hand", TURN).matrix
+        assert_pose(buffer.lookup("world", "camera", STAMP), once @ once)
+        assert (listener.stats.refused, listener.stats.missed) == ({}, 0)
+
+
+@every_peer_that_signs
+def test_a_listener_calls_the_writer_of_an_edge_by_its_node(peer: Peer, session: Session):
+    advertise_edges(peer)
+    with TransformListener(session, "r1", wire=WIRE, follow="tf") as listener:
+        wanted = {"r1/hand": f"/{peer.node}", "r1/camera": f"/{peer.node}"}
+
+        def writers() -> dict[str, str | None]:
+            return {frame.name: frame.writer for frame in listener.buffer.frames() if frame.parent}
+
+        repeat_until(lambda: publish_edges(peer), lambda: writers() == wanted)
+
+
+@pytest.mark.parametrize("peer", [KILTED], indirect=True)
+def test_a_listener_that_joins_late_still_hears_the_model_and_the_static_edges(peer: Peer, session: Session):
+    peer.advertise("/robot_description", STRING, latched=True)
+    advertise_edges(peer)
+    peer.publish("/robot_description", {"data": RRBOT.urdf})
+    publish_edges(peer)
+    # The bridge has them for sure when somebody else had them from it.
+    with TransformListener(session, "r1", wire=WIRE, follow="tf") as early:
+        until(lambda: early.buffer.can_lookup("hand", "camera"))
+    with TransformListener(session, "r1", wire=WIRE) as late:
+        until(lambda: {"r1/tool", "r1/camera"} <= {frame.name for frame in late.buffer.frames()})
+
+
+@every_peer
+def test_a_peer_hears_and_is_heard_in_a_namespace(peer: Peer, session: Session):
+    wire = f"{WIRE},namespace=*"
+    peer.subscribe("/r1/joint_states", JOINT_STATE)
+    peer.advertise("/r2/joint_states", JOINT_STATE)
+    state = joint_state(STAMP, RRBOT.joint_names, POSITIONS)
+    with (
+        StatePublisher(session, RRBOT, "r1", wires=(wire,)) as publisher,
+        TransformListener(session, "*", wire=wire) as listener,
+    ):
+        assert peer.hears("/r1/joint_states", lambda: publisher.publish(POSITIONS, stamp=STAMP)) == state
+        repeat_until(lambda: peer.publish("/r2/joint_states", state), lambda: "r2" in listener.robots())

@@ -1,0 +1,128 @@
+"""zstate and other implementations of ROS 2 over Zenoh find each other in the graph."""
+
+from __future__ import annotations
+
+import pytest
+import zenoh
+from helpers.processes import until
+from helpers.robots import RRBOT, STAMP
+from peers import DOMAIN, Peer, repeat_until
+from rmw_format import Attachment, gid
+from ros_messages import JOINT_STATE, STRING, TF_MESSAGE
+
+from zstate.net.session import Session
+from zstate.nodes.publisher import StatePublisher
+from zstate.wire.ros2.graph import EndpointToken, NodeToken, parse_token
+from zstate.wire.ros2.qos import Qos
+
+WIRE = f"ros2:domain={DOMAIN},namespace=r1,node=zstate"
+LATCHED = Qos(durability="transient_local", depth=1)
+OURS = {
+    "/r1/joint_states": (JOINT_STATE, Qos(depth=10)),
+    "/r1/robot_description": (STRING, LATCHED),
+    "/tf": (TF_MESSAGE, Qos(depth=100)),
+    "/tf_static": (TF_MESSAGE, LATCHED),
+}
+
+SDK = pytest.param("sdk", marks=pytest.mark.ros2_peer)
+PYZEROS = pytest.param("pyzeros", marks=pytest.mark.heavy)
+pytestmark = pytest.mark.processes
+
+
+def tokens(session: Session) -> set[str]:
+    """All that live in the domain. Zenoh tells a session its own ones twice."""
+    replies = session.zenoh.liveliness().get(f"@ros2_lv/{DOMAIN}/**")
+    return {str(reply.ok.key_expr) for reply in replies if reply.ok}
+
+
+def our_tokens(session: Session) -> list[str]:
+    return [token for token in tokens(session) if session.zid in token]
+
+
+def theirs(session: Session) -> list[NodeToken | EndpointToken]:
+    """What the tokens mean that are not ours."""
+    found = [parse_token(token) for token in tokens(session)]
+    assert None not in found, found
+    return [token for token in found if token and token.zid != session.zid]
+
+
+def endpoints(session: Session) -> dict[str, EndpointToken]:
+    """Their publisher and their subscription, by kind."""
+    return {token.kind: token for token in theirs(session) if isinstance(token, EndpointToken)}
+
+
+def dds_type(name: str) -> str:
+    package, kind, name = name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+@pytest.mark.parametrize("peer", [SDK], indirect=True)
+def test_a_peer_finds_what_we_publish_with_its_types_and_qos(peer: Peer, session: Session):
+    with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)):
+        until(lambda: set(OURS) <= set(peer.ask("graph")))
+        found = peer.ask("graph")
+    for topic, (type_name, qos) in OURS.items():
+        (endpoint,) = found[topic]["publishers"]
+        assert found[topic]["types"] == [type_name]
+        assert (endpoint["node"], endpoint["namespace"]) == ("zstate", "/r1")
+        assert endpoint["qos"] == qos.encode_rmw()
+        assert endpoint["hash"].startswith("RIHS01_")
+    until(lambda: not set(OURS) & set(peer.ask("graph")))
+
+
+@pytest.mark.parametrize("peer", [SDK, PYZEROS], indirect=True)
+def test_we_find_what_a_peer_publishes_and_subscribes(peer: Peer, session: Session):
+    peer.advertise("/r1/joint_states", JOINT_STATE)
+    peer.subscribe("/tf", TF_MESSAGE)
+    until(lambda: {"MP", "MS"} <= set(endpoints(session)))
+    published, subscribed = (endpoints(session)[kind] for kind in ("MP", "MS"))
+    (node,) = {token.name for token in theirs(session) if isinstance(token, NodeToken)}
+    assert {token.node for token in (published, subscribed)} == {node}
+    assert (published.topic, published.dds_type) == ("/r1/joint_states", dds_type(JOINT_STATE))
+    assert (subscribed.topic, subscribed.dds_type) == ("/tf", dds_type(TF_MESSAGE))
+    assert published.qos == subscribed.qos == Qos(depth=10)
+
+
+@pytest.mark.parametrize("peer", [PYZEROS], indirect=True)
+def test_a_peer_would_write_our_tokens_and_gids_as_we_do(peer: Peer, session: Session):
+    with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)):
+        until(lambda: len(our_tokens(session)) == 1 + len(OURS))
+        ours = our_tokens(session)
+    for token in ours:
+        what = parse_token(token)
+        assert what is not None
+        identity = {"domain": DOMAIN, "zid": session.zid, "namespace": "/r1"}
+        if isinstance(what, NodeToken):
+            assert token == peer.ask("node_token", node_id=what.nid, name="zstate", **identity)
+        else:
+            assert peer.ask("gid", token=token) == gid(token).hex()
+            type_name, qos = OURS[what.topic]
+            described = {"name": what.topic, "dds_type": dds_type(type_name), "hash": what.hash, **identity}
+            wanted = {"latched": qos.durability == "transient_local", "depth": qos.depth}
+            ids = (what.nid, what.eid)
+            assert token == peer.ask(
+                "endpoint_token", kind="MP", ids=ids, node_name="zstate", **described, **wanted
+            )
+
+
+def test_what_we_put_is_signed_by_the_publisher_that_the_graph_shows(router: str, session: Session):
+    config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{router}"]}}}}')
+    heard: dict[str, list[bytes]] = {"/r1/joint_states": [], "/tf": []}
+    with zenoh.open(config) as other, StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
+        for topic, attachments in heard.items():
+            other.declare_subscriber(
+                f"{DOMAIN}{topic}/*/*",
+                lambda sample, kept=attachments: kept.append(sample.attachment.to_bytes()),
+            )
+        repeat_until(
+            lambda: publisher.publish([0.1, 0.2], stamp=STAMP),
+            lambda: all(len(attachments) >= 5 for attachments in heard.values()),
+        )
+        writers = {gid(token): parse_token(token) for token in tokens(session)}
+    for topic, attachments in heard.items():
+        signed = [Attachment.parse(attachment) for attachment in attachments]
+        (identity,) = {attachment.gid for attachment in signed}
+        assert writers[identity].topic == topic
+        first = signed[0].seq
+        assert first >= 1
+        assert [attachment.seq for attachment in signed] == list(range(first, first + len(signed)))

@@ -1,0 +1,103 @@
+"""What ROS nodes write, as messages that listeners know."""
+
+import numpy as np
+import pytest
+from helpers.manual_cdr import rosbags_cdr, rosbags_joint_state, rosbags_tf_message, rosbags_time
+
+from zstate.errors import MessageError
+from zstate.wire.messages import (
+    ClockMessage,
+    JointState,
+    RobotDescription,
+    StaticTransforms,
+    TransformSample,
+    order_digest,
+    poses_from_block,
+    to_block,
+)
+from zstate.wire.ros2.decoder import RosDecoder
+from zstate.wire.ros2.frame_names import FrameNames
+from zstate.wire.ros2.options import Ros2Options
+
+STAMP = 1_700_000_000_123_456_789
+EDGES = (("map", "odom"), ("odom", "base"), ("base", "tool"))
+POSES = np.random.default_rng(2).normal(size=(3, 7))
+PLAIN = FrameNames(Ros2Options(), "r1")
+PREFIXED = FrameNames(Ros2Options(frame_prefix="r1/"), "r1")
+
+
+def heard(stream, payload: bytes, names: FrameNames = PLAIN):
+    return RosDecoder().messages(stream, payload, 77, 5, names)
+
+
+def test_a_joint_state_keeps_its_stamp_names_and_numbers_and_is_signed_by_its_writer():
+    payload = rosbags_joint_state(STAMP, "base", ("a", "b"), [1.0, 2.0], [3.0, 4.0], [])
+    numbers = to_block([1.0, 2.0]), to_block([3.0, 4.0])
+    order = order_digest(("a", "b"))
+    assert heard("joint_states", payload) == (JointState(STAMP, 5, 77, order, *numbers, None, ("a", "b")),)
+
+
+def test_transforms_of_one_instant_are_one_sample_that_names_its_edges():
+    (sample,) = heard("tf", rosbags_tf_message([STAMP] * 3, EDGES, POSES))
+    assert sample == TransformSample(STAMP, 5, 77, order_digest(EDGES), to_block(POSES), EDGES)
+
+
+def test_transforms_of_several_instants_are_several_samples_the_oldest_first():
+    samples = heard("tf", rosbags_tf_message([STAMP + 9, STAMP, STAMP + 9], EDGES, POSES))
+    assert [(sample.stamp, sample.edges) for sample in samples] == [
+        (STAMP, EDGES[1:2]),
+        (STAMP + 9, (EDGES[0], EDGES[2])),
+    ]
+    assert poses_from_block(samples[0].poses).tolist() == POSES[1:2].tolist()
+    assert poses_from_block(samples[1].poses).tolist() == POSES[[0, 2]].tolist()
+    assert {(sample.seq, sample.session) for sample in samples} == {(5, 77)}
+
+
+def test_no_transforms_are_no_sample():
+    assert heard("tf", rosbags_tf_message([], [], [])) == ()
+
+
+@pytest.mark.parametrize("stamps", [[0] * 3, [STAMP, 0, STAMP]])
+def test_a_moving_transform_without_a_stamp_is_refused(stamps):
+    with pytest.raises(MessageError, match=r"stamp is zero.*header\.stamp") as caught:
+        heard("tf", rosbags_tf_message(stamps, EDGES, POSES))
+    assert caught.value.reason == "no stamp"
+
+
+def test_a_joint_state_without_a_stamp_is_refused():
+    with pytest.raises(MessageError) as caught:
+        heard("joint_states", rosbags_joint_state(0, "", ("a",), [1.0], [], []))
+    assert caught.value.reason == "no stamp"
+
+
+@pytest.mark.parametrize("stamps", [[0, 0, 0], [STAMP, 0, STAMP + 1]])
+def test_static_transforms_hold_at_every_time_whatever_their_stamps(stamps):
+    (statics,) = heard("tf_static", rosbags_tf_message(stamps, EDGES, POSES))
+    assert statics == StaticTransforms(77, EDGES, to_block(POSES))
+
+
+def test_frames_are_called_as_in_zstate():
+    edges = (("map", "r1/odom"), ("r1/odom", "r1/base"))
+    expected = (("ros/map", "odom"), ("odom", "base"))
+    for stream in ("tf", "tf_static"):
+        (message,) = heard(stream, rosbags_tf_message([STAMP] * 2, edges, POSES[:2]), PREFIXED)
+        assert message.edges == expected
+
+
+def test_a_description_is_known_by_its_text():
+    one, same, other = (heard("robot_description", rosbags_cdr("std_msgs/msg/String", t))[0] for t in "xxy")
+    assert one == same == RobotDescription(77, "x", one.digest, (), (), clock="")
+    assert other.digest != one.digest
+
+
+def test_a_clock_may_stand_at_zero():
+    assert heard("clock", rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(0))) == (
+        ClockMessage(0, 5, 77),
+    )
+
+
+@pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description", "clock"])
+def test_what_is_cut_off_is_refused(stream):
+    with pytest.raises(MessageError) as caught:
+        heard(stream, b"\x00\x01\x00\x00\x01")
+    assert caught.value.reason == "truncated"

@@ -1,0 +1,297 @@
+"""A publisher and a listener on the ros2 wire, each against a bare Zenoh session and rosbags."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+
+import numpy as np
+import pytest
+from helpers.processes import until
+from helpers.raw_ros_nodes import (
+    DESCRIPTION,
+    HUMBLE,
+    JOINT_STATES,
+    TF,
+    TF_STATIC,
+    TOPICS,
+    Ear,
+    gid_of,
+    key_of,
+    tokens,
+)
+from helpers.robots import RRBOT, STAMP, await_reader
+
+from zstate.model.kinematics import Kinematics
+from zstate.model.robot import RobotModel
+from zstate.net.presence import discover
+from zstate.net.session import Session
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.transform import Transform
+
+SEC, NANOSEC = divmod(STAMP, 10**9)
+POSITIONS = np.linspace(-0.5, 0.7, RRBOT.position_count)
+JOINT_STATE_MSG, TF_MSG, STRING_MSG = (
+    "sensor_msgs/msg/JointState",
+    "tf2_msgs/msg/TFMessage",
+    "std_msgs/msg/String",
+)
+
+
+@pytest.fixture(autouse=True)
+def program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The name of the program, of which the node's is made."""
+    monkeypatch.setattr(sys, "argv", ["/home/me/arm_driver.py"])
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+def endpoints(session: Session, number: int, domain: int = 0) -> dict[str, list[str]]:
+    """The tokens of publishers that are alive by their topic, split into chunks, once there are so many."""
+    until(lambda: len([one for one in tokens(session, domain) if "/MP/" in one]) == number)
+    return {chunks[9]: chunks for one in tokens(session, domain) if (chunks := one.split("/"))[5] == "MP"}
+
+
+def moving_poses(model: RobotModel, positions) -> dict[tuple[str, str], list[float]]:
+    kinematics = Kinematics(model)
+    moving = {(joint.parent, joint.child) for joint in model.joints if joint.type != "fixed"}
+    poses = zip(kinematics.edges, kinematics.edge_poses(positions).tolist(), strict=True)
+    return {edge: pose for edge, pose in poses if edge in moving}
+
+
+def said_poses(message) -> dict[tuple[str, str], list[float]]:
+    return {
+        (one.header.frame_id, one.child_frame_id): [
+            *(getattr(one.transform.translation, axis) for axis in "xyz"),
+            *(getattr(one.transform.rotation, axis) for axis in "xyzw"),
+        ]
+        for one in message.transforms
+    }
+
+
+def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ros(sessions):
+    writer, reader = sessions
+    joints, transforms = Ear(reader, key_of(JOINT_STATES)), Ear(reader, key_of(TF))
+    rates, forces = POSITIONS * 2, POSITIONS * 3
+    with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
+        await_reader(writer, key_of(JOINT_STATES))
+        await_reader(writer, key_of(TF))
+        publisher.publish(POSITIONS, rates, forces, stamp=STAMP)
+        publisher.publish(POSITIONS, stamp=STAMP + 1)
+        full, bare = joints.messages(2, JOINT_STATE_MSG)
+        (said, _) = transforms.messages(2, TF_MSG)
+    assert (full.header.stamp.sec, full.header.stamp.nanosec) == (SEC, NANOSEC)
+    assert tuple(full.name) == RRBOT.joint_names
+    assert [block.tolist() for block in (full.position, full.velocity, full.effort)] == [
+        POSITIONS.tolist(),
+        rates.tolist(),
+        forces.tolist(),
+    ]
+    assert (bare.header.stamp.nanosec, len(bare.velocity), len(bare.effort)) == (NANOSEC + 1, 0, 0)
+    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in said.transforms} == {(SEC, NANOSEC)}
+    assert said_poses(said) == moving_poses(RRBOT, POSITIONS)
+
+
+def test_who_joins_late_is_given_the_description_and_the_fixed_edges(sessions):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, wires=("ros2",)):
+        (text,) = Ear(reader, key_of(DESCRIPTION), latched=True).messages(1, STRING_MSG)
+        (statics,) = Ear(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
+    assert text.data == RRBOT.urdf
+    fixed = {(j.parent, j.child): list(j.origin) for j in RRBOT.joints if j.type == "fixed"}
+    assert said_poses(statics) == fixed
+
+
+def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(sessions):
+    writer, reader = sessions
+    ears = {topic[0]: Ear(reader, key_of(topic)) for topic in (JOINT_STATES, TF)}
+    before = time.time_ns()
+    with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
+        ears |= {topic[0]: Ear(reader, key_of(topic), latched=True) for topic in (TF_STATIC, DESCRIPTION)}
+        for topic in (JOINT_STATES, TF):
+            await_reader(writer, key_of(topic))
+        for number in range(3):
+            publisher.publish(POSITIONS, stamp=STAMP + number)
+        alive = endpoints(reader, 4)
+        for topic, numbers in ((JOINT_STATES, 3), (TF, 3), (TF_STATIC, 1), (DESCRIPTION, 1)):
+            said = ears[topic[0]].attachments(numbers)
+            assert [seq for seq, _, _ in said] == list(range(1, numbers + 1))
+            assert all(before <= at <= time.time_ns() for _, at, _ in said)
+            assert {gid for _, _, gid in said} == {gid_of("/".join(alive[f"%{topic[0]}"]))}
+            # A ROS node does not look at the encoding; none is what ROS itself gives.
+            assert {str(sample.encoding) for sample in ears[topic[0]].samples} == {"zenoh/bytes"}
+
+
+def test_the_graph_has_one_node_with_four_publishers_as_ros_would_announce_them(sessions):
+    writer, reader = sessions
+    with StatePublisher(writer, RRBOT, wires=("ros2",)):
+        alive = endpoints(reader, 4)
+        nodes = [one.split("/") for one in tokens(reader) if "/NN/" in one]
+    (node,) = nodes
+    assert node[:3] == ["@ros2_lv", "0", writer.zid]
+    assert node[3] == node[4]
+    assert node[5:] == ["NN", "%", "%", "arm_driver"]
+    for name, dds, its_hash, qos in TOPICS:
+        chunks = alive[f"%{name}"]
+        assert chunks[:4] == node[:4]
+        assert chunks[5:] == ["MP", "%", "%", "arm_driver", f"%{name}", dds, its_hash, qos]
+    ids = [node[3], *(chunks[4] for chunks in alive.values())]
+    assert len(set(ids)) == 5
+    assert all(re.fullmatch(r"\d+", one) for one in ids)
+    until(lambda: tokens(reader) == [])
+
+
+def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
+    writer, reader = sessions
+    ears = [Ear(reader, key_of(topic)) for topic in TOPICS]
+    last = Ear(reader, "last")
+    for topic in TOPICS:
+        await_reader(writer, key_of(topic))
+    with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
+        publisher.publish(POSITIONS, stamp=STAMP)
+        for ear in ears:
+            ear.heard(1)
+    with StaticPublisher(writer, "rrbot", "mount", wires="ros2") as statics:
+        statics.set(Transform("tool", "camera", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+        statics.withdraw("camera")
+    await_reader(writer, "last")
+    writer.zenoh.put("last", b"x")
+    last.heard(1)
+    kinds = {str(sample.kind) for ear in ears for sample in ear.samples}
+    assert kinds == {"SampleKind.PUT"}
+    assert [len(message.transforms) for message in ears[2].messages(3, TF_MSG)][1:] == [1, 0]
+
+
+def test_humble_has_no_hashes(sessions):
+    writer, reader = sessions
+    ear = Ear(reader, key_of(JOINT_STATES, written=HUMBLE))
+    with StatePublisher(writer, RRBOT, wires=("ros2:hash=humble",)) as publisher:
+        await_reader(writer, key_of(JOINT_STATES, written=HUMBLE))
+        publisher.publish(POSITIONS, stamp=STAMP)
+        alive = endpoints(reader, 4)
+        assert {chunks[11] for chunks in alive.values()} == {HUMBLE}
+        ((_, _, gid),) = ear.attachments(1)
+        assert gid == gid_of("/".join(alive["%joint_states"]))
+        (late,) = Ear(reader, key_of(DESCRIPTION, written=HUMBLE), latched=True).messages(1, STRING_MSG)
+        assert late.data == RRBOT.urdf
+
+
+def test_iron_and_humble_are_said_side_by_side(sessions):
+    writer, reader = sessions
+    keys = [key_of(JOINT_STATES), key_of(JOINT_STATES, written=HUMBLE)]
+    ears = [Ear(reader, key) for key in keys]
+    with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:hash=humble")) as publisher:
+        for key in keys:
+            await_reader(writer, key)
+        publisher.publish(POSITIONS, stamp=STAMP)
+        iron, humble = (ear.heard(1)[0] for ear in ears)
+        nodes = [one.split("/")[3] for one in tokens(reader) if "/NN/" in one]
+    assert iron.payload.to_bytes() == humble.payload.to_bytes()
+    assert len(set(nodes)) == 2
+
+
+def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.MonkeyPatch):
+    writer, reader = sessions
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    ear = Ear(reader, key_of(JOINT_STATES, domain=7))
+    with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:domain=9")) as publisher:
+        await_reader(writer, key_of(JOINT_STATES, domain=7))
+        publisher.publish(POSITIONS, stamp=STAMP)
+        ear.heard(1)
+        for domain in (7, 9):
+            assert len(endpoints(reader, 4, domain)) == 4
+        assert tokens(reader, 0) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "namespace", "tf_in"),
+    [
+        ("namespace=fleet/r1", "fleet/r1", ""),
+        ("namespace=/r1/,tf=namespace", "r1", "r1"),
+        ("namespace=*", "rrbot", ""),
+    ],
+)
+def test_a_namespace_stands_before_the_topics_and_around_the_node(sessions, options, namespace, tf_in):
+    writer, reader = sessions
+    ears = {topic[0]: Ear(reader, key_of(topic, namespace), latched=topic == DESCRIPTION) for topic in TOPICS}
+    shared = [Ear(reader, key_of(topic, tf_in), latched=topic == TF_STATIC) for topic in (TF, TF_STATIC)]
+    with StatePublisher(writer, RRBOT, wires=(f"ros2:{options}",)) as publisher:
+        for key in (key_of(JOINT_STATES, namespace), key_of(TF, tf_in)):
+            await_reader(writer, key)
+        publisher.publish(POSITIONS, stamp=STAMP)
+        for ear in (ears["joint_states"], ears["robot_description"], *shared):
+            ear.heard(1)
+        alive = endpoints(reader, 4)
+    around = f"%{namespace.replace('/', '%')}"
+    assert {chunks[7] for chunks in alive.values()} == {around}
+    assert {topic for topic in alive if "tf" not in topic} == {
+        f"{around}%joint_states",
+        f"{around}%robot_description",
+    }
+
+
+def test_a_frame_prefix_stands_before_every_frame_of_the_robot(sessions):
+    writer, reader = sessions
+    transforms = Ear(reader, key_of(TF))
+    with StatePublisher(writer, RRBOT, "r1", wires=("ros2:frame_prefix=*/",)) as publisher:
+        (statics,) = Ear(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
+        await_reader(writer, key_of(TF))
+        publisher.publish([0.1, 0.2], stamp=STAMP)
+        (moving,) = transforms.messages(1, TF_MSG)
+    edges = {(f"r1/{joint.parent}", f"r1/{joint.child}") for joint in RRBOT.joints}
+    assert said_poses(statics).keys() | said_poses(moving).keys() == edges
+
+
+def test_two_robots_of_one_session_stand_in_two_namespaces(sessions):
+    writer, reader = sessions
+    wires = ("ros2:namespace=*,frame_prefix=*/",)
+    ears = {robot: Ear(reader, key_of(JOINT_STATES, robot)) for robot in ("r1", "r2")}
+    transforms = Ear(reader, key_of(TF))
+    with (
+        StatePublisher(writer, RRBOT, "r1", wires) as one,
+        StatePublisher(writer, RRBOT, "r2", wires) as two,
+    ):
+        for key in (key_of(JOINT_STATES, "r1"), key_of(JOINT_STATES, "r2"), key_of(TF)):
+            await_reader(writer, key)
+        one.publish([1.0, 1.0], stamp=STAMP)
+        two.publish([2.0, 2.0], stamp=STAMP)
+        assert ears["r1"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [1.0, 1.0]
+        assert ears["r2"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [2.0, 2.0]
+        said = transforms.messages(2, TF_MSG)
+        alive = tokens(reader)
+        robots = {robot.name for robot in discover(reader, wire=wires[0])}
+    assert {edge[1] for message in said for edge in said_poses(message)} == {
+        f"{robot}/{link}" for robot in ("r1", "r2") for link in ("upper", "lower")
+    }
+    assert robots == {"r1", "r2", "ros"}
+    nodes = {tuple(one.split("/")[6:9]) for one in alive if "/NN/" in one}
+    assert nodes == {("%", "%r1", "arm_driver"), ("%", "%r2", "arm_driver")}
+    ids = [one.split("/")[4] for one in alive]
+    assert len(set(ids)) == len(ids) == 10
+
+
+@pytest.mark.parametrize(
+    ("script", "node"),
+    [
+        ("/opt/my driver.v2.py", "my_driver_v2"),
+        ("/opt/3d_view.py", "_3d_view"),
+        ("/opt/größe.py", "gr__e"),
+        ("/usr/lib/zstate/__main__.py", "__main__"),
+        ("-c", "python"),
+        ("", "python"),
+        ("/", "_"),
+    ],
+)
+def test_the_node_is_called_as_the_program_by_a_name_that_ros_allows(sessions, monkeypatch, script, node):
+    monkeypatch.setattr(sys, "argv", [script])
+    with StatePublisher(sessions[0], RRBOT, wires=("ros2",)):
+        until(lambda: len(tokens(sessions[1])) == 5)
+        assert {one.split("/")[8] for one in tokens(sessions[1])} == {node}
+    assert re.fullmatch(r"[A-Za-z_]\w*", node, re.ASCII)
+
+
+def test_the_node_may_be_named(sessions):
+    with StatePublisher(sessions[0], RRBOT, wires=("ros2:node=state_publisher",)):
+        until(lambda: len(tokens(sessions[1])) == 5)
+        assert {one.split("/")[8] for one in tokens(sessions[1])} == {"state_publisher"}
