@@ -270,13 +270,13 @@ def started(spawn: Any, *arguments: str) -> Child:
 
 
 @pytest.mark.processes
-def test_keys_of_the_json_lines_of_listen(spawn: Any):
+def test_keys_of_the_json_lines_of_monitored_robots(spawn: Any):
     with standing_robot():
-        command = started(spawn, "listen", "rrbot", "--json")
+        command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json")
         line = json.loads(command.line())
         command.process.send_signal(signal.SIGINT)
         command.wait()
-    check_pin("json_listen", sorted(key_paths(line)))
+    check_pin("json_monitored_robots", sorted(key_paths(line)))
 
 
 @pytest.mark.processes
@@ -433,7 +433,9 @@ def test_names_of_metrics_and_their_labels(spawn: Any, tmp_path: Path, free_port
     commands = {
         "router": router,
         "publish": started(spawn, "publish", RRBOT, "--source", "sine", "--metrics", "0"),
-        "listen": started(spawn, "listen", "rrbot", "--metrics", "0"),
+        "monitor": started(
+            spawn, "monitor", "--robots", "--robot", "rrbot", "--metrics", "0"
+        ),
         "record": started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0"),
         "bridge": started(spawn, "bridge", "rrbot", "--ros", endpoint, "--metrics", "0"),
     }

@@ -16,8 +16,8 @@ SLACK = 3.0
 The figures are printed (``-rP``); hold them against the bounds where nothing else runs (``-n 0``).
 """
 
-HERE = str(Path(__file__).parent)
-_CODE = f"import sys; sys.path.insert(0, {HERE!r}); import roles; roles.main()"
+TESTS = str(Path(__file__).parents[1])
+_CODE = f"import sys; sys.path.insert(0, {TESTS!r}); from helpers import fault_programs; fault_programs.main()"
 
 
 class Party:

@@ -53,7 +53,7 @@ def why_no_tf2() -> str:
 def ask_tf2(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     """tf2's answers to every question of every scenario."""
     lines = "".join(json.dumps(scenario) + "\n" for scenario in scenarios)
-    command = [SYSTEM_PYTHON, str(Path(__file__).with_name("tf2_child.py"))]
+    command = [SYSTEM_PYTHON, str(Path(__file__).with_name("tf2_process.py"))]
     done = subprocess.run(command, input=lines, capture_output=True, timeout=60, check=False, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     return [json.loads(line) for line in done.stdout.splitlines()]

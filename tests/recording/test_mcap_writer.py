@@ -222,7 +222,7 @@ KILLED = """
 
 def test_a_killed_recorder_leaves_all_that_it_flushed(tmp_path: Path, spawn: Callable[..., Child]):
     path = tmp_path / "run.mcap"
-    child = spawn(KILLED, str(path), str(Path(__file__).parent))
+    child = spawn(KILLED, str(path), str(Path(__file__).parents[1]))
     assert child.line() == "written"
     child.kill()
     with RecordingReader(path) as reader:
@@ -259,7 +259,7 @@ FULL = """
 
 def test_a_file_that_cannot_grow_is_said_and_keeps_whole_chunks(tmp_path: Path, spawn: Callable[..., Child]):
     path = tmp_path / "run.mcap"
-    child = spawn(FULL, str(path), str(Path(__file__).parent))
+    child = spawn(FULL, str(path), str(Path(__file__).parents[1]))
     refusal, closed, written = child.line(), child.line(), int(child.line())
     assert "cannot grow" in refusal and "zstate recover" in refusal
     assert "is closed" in closed

@@ -6,7 +6,7 @@ import json
 import re
 
 import pytest
-from helpers.fault_processes import HERE, Start, assert_no_growth, client
+from helpers.fault_processes import TESTS, Start, assert_no_growth, client
 from helpers.processes import DEADLINE_S
 
 pytestmark = pytest.mark.processes
@@ -142,7 +142,7 @@ def test_a_forked_child_is_told_to_connect_itself_and_harms_nobody(
 def test_two_hundred_starts_and_stops_leave_nothing_behind(spawn, start: Start, endpoint: str, way: str):
     count = STARTS if way == "client" else STARTS // 4
     start("router", listen=endpoint)
-    child = spawn(STARTING, json.dumps(client(endpoint) if way == "client" else {}), str(count), HERE)
+    child = spawn(STARTING, json.dumps(client(endpoint) if way == "client" else {}), str(count), TESTS)
     before, after, seconds = json.loads(child.line(6 * DEADLINE_S))
     print(f"{count} starts as {way}: {before} grew to {after}; the last {count - 20} took {seconds:.1f} s")
     assert_no_growth(before, after, rss_kb=15_000)
