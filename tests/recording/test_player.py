@@ -415,7 +415,7 @@ def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_goes(sessions, tm
 
 def test_what_cannot_be_replayed_is_refused(sessions, arm: Path):
     session = sessions[0]
-    with pytest.raises(InvalidInput, match="nothing of 'leg'; its robots: 'arm'"):
+    with pytest.raises(InvalidInput, match="no robot 'leg'; its robots: 'arm'"):
         Player(session, arm, ["leg"])
     with pytest.raises(InvalidInput, match="start_s is 5"):
         Player(session, arm, start_s=5.0)
