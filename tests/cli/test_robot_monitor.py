@@ -43,7 +43,7 @@ def test_a_robot_that_writes_only_transforms_is_heard_all_the_same(spawn: Spawn)
 
 def test_it_says_what_it_waits_for(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot")
-    until(lambda: "waiting: nobody announces the robot 'rrbot'" in command.stderr)
+    until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing():
         assert command.line().startswith("rrbot  ")
     interrupted(command)

@@ -31,12 +31,12 @@ def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
 
 def test_tf_says_what_it_waits_for_in_the_words_of_ros(spawn: Spawn, ros_router: str):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
-    until(lambda: "waiting: nobody publishes /tf in domain 0" in command.stderr)
+    until(lambda: "waiting: no node publishes /tf in domain 0" in command.stderr)
     assert "`zstate ls --wire ros2`" in command.stderr
     with standing(wire="ros2", router=ros_router):
         assert command.line() == "pose of lower in base"
         assert command.line().startswith("At time ")
-        until(lambda: "heard /tf: " in command.stderr)
+        until(lambda: "receiving /tf: " in command.stderr)
     until(lambda: "no new sample of 'base' -> 'upper'" in command.stderr)
     interrupted(command)
     for unknown_to_ros in ("zstate joints", "zstate publish", "ros/"):
@@ -80,7 +80,7 @@ def test_tree_names_a_node_that_sends_nothing(ros_router: str):
 
 
 def test_tree_of_nobody_is_a_failure(ros_router: str):
-    assert "nobody publishes /tf in domain 5" in failure("tree", "--wire", "ros2:domain=5")
+    assert "no node publishes /tf in domain 5" in failure("tree", "--wire", "ros2:domain=5")
 
 
 def test_echo_needs_no_robot_and_no_description(ros_router: str):

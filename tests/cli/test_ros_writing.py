@@ -41,7 +41,7 @@ def test_publish_takes_the_place_of_robot_state_publisher(spawn: Spawn, ros_rout
     ):
         placed = listener.buffer.wait("base", "upper", timeout_s=10.0)
     assert math.isclose(placed.rpy[1], 0.5, abs_tol=1e-12)  # the shoulder turns about y
-    assert "heard ROS 2 topic /joint_states (domain 0): 2 positions" in command.stderr
+    assert "receiving ROS 2 topic /joint_states (domain 0): 2 positions" in command.stderr
     interrupted(command)
 
 

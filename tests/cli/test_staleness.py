@@ -8,11 +8,11 @@ import pytest
 
 from zstate import Transform, TransformBuffer, connect
 from zstate.buffer.frame_tree import FrameInfo
+from zstate.cli.commands.ls import robots_text
+from zstate.cli.commands.tree import tree_drawing
 from zstate.cli.doctor.samples import StreamSamples
 from zstate.cli.monitor import EdgeStatistics, Row, report_text
 from zstate.cli.output.drawing import ALARM, draw
-from zstate.cli.output.frames import tree_drawing
-from zstate.cli.output.robot_table import robots_text
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
 from zstate.metrics.buffer import MeteredBuffer

@@ -189,7 +189,7 @@ def group(ctx: click.Context, until_eof: bool) -> None:
 
 def main() -> NoReturn:
     """Run the command line and exit: 0, 1 for what failed, 2 for wrong usage, 130 after Ctrl-C."""
-    logs.use_format_of_environment()
+    logs.use_environment_format()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _end)
     try:

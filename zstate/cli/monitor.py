@@ -355,7 +355,7 @@ class MonitoredEdges(Monitored):
     def _reason(self) -> str:
         roster = self._roster
         return roster.words.missing_text(
-            self._listener.robot, "robot_description", roster.robots(), heard=False
+            self._listener.robot, "robot_description", roster.robots(), has_frames=False
         )
 
     def _rows(self) -> list[Row]:

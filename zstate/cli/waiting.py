@@ -285,7 +285,7 @@ class PoseWaiter:
         self._noted = None
         frames = self._listener.buffer.frames()
         for robot in self._listener.robots():
-            print_status(self._words.heard(robot, frames))
+            print_status(self._words.received_text(robot, frames))
 
     def _fail_in_past(self, reason: InPast) -> NoReturn:
         advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED
@@ -313,8 +313,8 @@ class PoseWaiter:
         robot, robots = self._listener.robot, self._directory.robots()
         if isinstance(reason, UnknownFrame) and not reason.near_misses:
             return self._words.missing_text(
-                robot, "robot_description", robots, heard=bool(reason.frame_count)
+                robot, "robot_description", robots, has_frames=bool(reason.frame_count)
             )
         if isinstance(reason, NoData):
-            return self._words.missing_text(robot, "joint_states", robots, heard=True)
+            return self._words.missing_text(robot, "joint_states", robots, has_frames=True)
         return ""

@@ -54,7 +54,7 @@ def test_somebody_else_cannot_write_the_robot_and_is_told_why(router: str, user:
 
 def test_the_names_are_checked():
     assert "cannot be the name of an identity" in failure("acl", "--robot", "a/b")
-    assert "name somebody" in failure("acl", code=2)
+    assert "give at least one of --robot NAME" in failure("acl", code=2)
 
 
 def test_a_placer_writes_static_edges_under_its_own_name():

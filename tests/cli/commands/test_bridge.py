@@ -35,7 +35,7 @@ def test_a_native_robot_is_heard_on_ros_and_both_its_coming_and_its_going_are_sa
             model = load_model("rrbot")
             poses = dict(zip(model.links, Kinematics(model).link_poses([SHOULDER, ELBOW]), strict=True))
             assert tool.translation == pytest.approx(poses["tool"][:3] - poses["world"][:3], abs=1e-12)
-        assert command.line() == "'rrbot' is carried no more"
+        assert command.line() == "'rrbot' is no longer carried"
     interrupted(command)
 
 

@@ -121,7 +121,7 @@ def test_only_those_that_listen_can_pose_as_a_router(tmp_path):
 
 def test_hosts_are_for_those_that_listen(tmp_path):
     folder = str(tmp_path / "pki")
-    assert "--host is for those that listen" in failure(
+    assert "--host needs an identity that listens" in failure(
         "certs", folder, "--identity", "r1", "--host", "10.0.0.1", code=2
     )
-    assert "say whom" in failure("certs", folder, code=2)
+    assert "no identity is named" in failure("certs", folder, code=2)

@@ -50,7 +50,7 @@ def test_what_to_write_instead_stands_below_each_finding(tmp_path: Path):
     file = tmp_path / "my arm.urdf"
     file.write_text(WITHOUT_LIMIT)
     *_, advice = zstate("check", str(file)).stdout.decode().splitlines()
-    assert advice == f"`zstate check '{file}' --fix-hints` says what to write instead"
+    assert advice == f"`zstate check '{file}' --fix-hints` prints corrections"
     _, _, fix = zstate("check", str(file), "--fix-hints").stdout.decode().splitlines()
     assert fix.strip().startswith('fix: <limit lower="-3.14" upper="3.14"')
     broken = zstate("check", "-", "--json", stdin=WITHOUT_LIMIT.encode())

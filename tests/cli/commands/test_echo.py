@@ -107,7 +107,9 @@ def test_news_is_a_number_that_differs_by_more_than_asked_for():
 
 @pytest.mark.parametrize("amount", ["-1", "nan"])
 def test_an_amount_that_is_none_is_wrong_usage(amount: str):
-    assert "an amount is" in failure("echo", "rrbot", "--changed", "--by", amount, code=2)
+    assert "an amount is finite and at least 0" in failure(
+        "echo", "rrbot", "--changed", "--by", amount, code=2
+    )
 
 
 def test_an_unknown_field_lists_what_there_is():
@@ -137,7 +139,7 @@ def test_without_a_description_the_numbers_come_without_names():
 
 def test_it_waits_for_a_robot_and_says_so(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
-    until(lambda: "waiting: nobody announces the robot 'rrbot'" in command.stderr)
+    until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing():
         assert command.line() == str(ELBOW)
     assert "heard zstate/rrbot/joint_states" in command.stderr
@@ -147,7 +149,7 @@ def test_it_waits_for_a_robot_and_says_so(spawn: Spawn):
 def test_once_gives_up_with_the_reason():
     with standing(streams=("robot_description",)):
         message = failure("echo", "rrbot", "--once", "--timeout", "1")
-    assert "zstate: gave up after 1 s: nobody writes joint_states of 'rrbot'" in message
+    assert "zstate: gave up after 1 s: joint_states of 'rrbot' has no writer" in message
 
 
 def test_sigterm_ends_it_as_well(spawn: Spawn):

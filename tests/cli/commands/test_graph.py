@@ -10,8 +10,8 @@ from helpers.cli_runner import RRBOT, Spawn, failure, standing, started, zstate
 from helpers.processes import until
 
 from zstate import StaticPublisher, TransformListener, connect, discover
+from zstate.cli.commands.graph import graph_drawing, graph_text
 from zstate.cli.output.drawing import dot, mermaid, svg
-from zstate.cli.output.graph_text import graph_drawing, graph_text
 from zstate.net.graph import Graph, StreamUse
 
 DRIVER, PUBLISH, VIEWER = "driver@jetson pid 4", "zstate-publish@nuc pid 5", "viewer@desk pid 6"
@@ -35,7 +35,7 @@ def test_streams_with_the_same_ends_stand_together():
         "  written by  zstate-publish@nuc pid 5",
         "  read by     viewer@desk pid 6",
         "base: joint_states",
-        "  written by  nobody",
+        "  written by  none",
         "  read by     viewer@desk pid 6",
     ]
 
@@ -71,7 +71,7 @@ def test_a_stream_that_is_read_and_not_written_stands_out(spawn: Spawn):
     with connect() as session:
         until(lambda: discover(session))
     lines = zstate("graph").stdout.decode().splitlines()
-    assert lines[:2] == ["rrbot: joint_states", "  written by  nobody"]
+    assert lines[:2] == ["rrbot: joint_states", "  written by  none"]
     assert lines[2].startswith("  read by     zstate-publish@")
 
 
@@ -85,7 +85,7 @@ def test_whoever_reads_all_robots_reads_each_of_them_and_static_writers_have_nam
     ):
         text = zstate("graph").stdout.decode()
     assert "left: tf_static/mount" in text
-    assert text.count("read by     nobody") == 1  # the transforms of the right one
+    assert text.count("read by     none") == 1  # the transforms of the right one
 
 
 @pytest.mark.processes
@@ -103,4 +103,4 @@ def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
         text = zstate("graph").stdout.decode()
     assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
     assert text.count("written by  /") == 1
-    assert text.count("read by     nobody") == 1
+    assert text.count("read by     none") == 1

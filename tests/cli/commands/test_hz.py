@@ -18,7 +18,7 @@ def test_it_measures_once_a_second_in_the_usual_words(spawn: Spawn):
             r"\tmin: \d+\.\d{3}s max: \d+\.\d{3}s std dev: \d+\.\d{5}s window: \d+", command.line()
         )
         assert command.line().startswith("average rate: ")
-    until(lambda: "nobody announces the robot 'rrbot'" in command.stderr)
+    until(lambda: "robot 'rrbot' is not announced" in command.stderr)
     interrupted(command)
 
 
@@ -40,13 +40,13 @@ def test_the_window_limits_what_is_measured():
 
 def test_once_gives_up_with_the_reason():
     message = failure("hz", "rrbot", "--once", "--timeout", "1")
-    assert "zstate: gave up after 1 s: nobody announces the robot 'rrbot'" in message
+    assert "zstate: gave up after 1 s: robot 'rrbot' is not announced" in message
 
 
 def test_a_stream_that_nobody_writes_is_named_with_who_would():
     with standing(streams=("robot_description",)):
         message = failure("hz", "rrbot", "--once", "--timeout", "1")
-    assert "nobody writes joint_states of 'rrbot'; `zstate joints rrbot` would" in message
+    assert "joint_states of 'rrbot' has no writer; start one: `zstate joints rrbot`" in message
 
 
 def test_a_window_of_one_is_wrong_usage():

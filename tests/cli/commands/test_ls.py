@@ -9,7 +9,7 @@ from helpers.cli_runner import EVERYTHING, Spawn, failure, interrupted, standing
 from helpers.processes import until
 
 from zstate import StaticPublisher, connect
-from zstate.cli.output.robot_table import robots_text
+from zstate.cli.commands.ls import robots_text
 from zstate.net.presence import RobotInfo
 from zstate.net.topic_statistics import TopicStatistics
 from zstate.wire.identity import WriterId

@@ -206,7 +206,7 @@ def test_without_frames_it_says_that_nobody_is_there():
 
 
 def test_one_frame_is_not_enough():
-    assert "'base' is one frame; give two of them, or none" in failure("monitor", "base", code=2)
+    assert "'base' is one frame; give two frames, or none" in failure("monitor", "base", code=2)
 
 
 @pytest.mark.processes

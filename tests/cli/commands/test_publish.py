@@ -74,7 +74,7 @@ def test_every_joint_state_becomes_transforms_of_the_same_stamp(spawn: Spawn):
         assert math.isclose(newest.rpy[1], 0.5, abs_tol=1e-12)
     interrupted(child)
     assert " published, " in child.line()
-    assert "heard zstate/rrbot/joint_states: 2 positions" in child.stderr
+    assert "receiving zstate/rrbot/joint_states: 2 positions" in child.stderr
 
 
 @pytest.mark.parametrize("source", ["joints", "sine"])
@@ -110,7 +110,7 @@ def test_at_a_rate_publish_tells_what_became_of_it():
 def test_joint_states_that_never_come_are_a_failure_with_a_hint():
     message = failure("publish", RRBOT, "--seconds", "0.3")
     assert "waiting for zstate/rrbot/joint_states" in message
-    assert "heard nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
+    assert "received nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
 
 
 def test_joint_states_of_another_model_are_told(spawn: Spawn):

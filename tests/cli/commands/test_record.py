@@ -52,7 +52,7 @@ def test_it_says_what_it_waits_for_and_when_that_comes(spawn: Spawn, tmp_path: P
         interrupted(command)
     waiting, recording = (
         next(number for number, line in enumerate(command.stderr.splitlines()) if line.startswith(word))
-        for word in ("waiting: nobody announces the robot 'rrbot'", "recording rrbot: ")
+        for word in ("waiting: robot 'rrbot' is not announced", "recording rrbot: ")
     )
     assert waiting < recording
 
@@ -60,7 +60,7 @@ def test_it_says_what_it_waits_for_and_when_that_comes(spawn: Spawn, tmp_path: P
 def test_a_recording_of_nobody_fails_with_the_reason(tmp_path: Path):
     message = failure("record", str(tmp_path / "run.mcap"), "--duration", "1")
     assert "nothing was recorded: no robot is announced" in message
-    assert "nothing was recorded: nobody announces the robot 'r1'" in failure(
+    assert "nothing was recorded: robot 'r1' is not announced" in failure(
         "record", str(tmp_path / "other.mcap"), "r1", "--duration", "1"
     )
 

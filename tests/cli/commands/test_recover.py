@@ -47,7 +47,7 @@ def test_a_target_may_be_named_and_one_that_exists_is_kept(cut: Path, tmp_path: 
 def test_a_complete_file_is_copied_and_said_to_be_complete(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(10))
     said = zstate("recover", str(tmp_path / "run.mcap")).stdout.decode()
-    assert "was complete: nothing was to be saved" in said
+    assert "was complete: nothing to recover" in said
 
 
 def test_a_file_that_lacks_its_end_only_has_lost_nothing(tmp_path: Path):

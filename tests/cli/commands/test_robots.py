@@ -18,7 +18,7 @@ def test_every_robot_of_the_catalog_is_listed_with_its_collection():
 
 def test_a_text_narrows_the_list_and_an_unknown_one_fails():
     assert all("arm" in line for line in zstate("robots", "ARM").stdout.decode().splitlines())
-    assert "no robot known by name contains 'nosuch'" in failure("robots", "nosuch")
+    assert "no name of a robot model contains 'nosuch'" in failure("robots", "nosuch")
 
 
 def test_json_has_the_paths():

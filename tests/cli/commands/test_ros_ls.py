@@ -56,7 +56,7 @@ def test_robots_in_namespaces_come_with_how_to_call_for_them(ros_router: str):
         called = zstate("ls", "--wire", "ros2:namespace=r1")
     assert b"/r1/joint_states" in ended.stdout
     assert b"humble" in ended.stdout
-    assert b"in namespaces: r1; for one of them say `--wire ros2:namespace=r1`" in ended.stderr
+    assert b"in namespaces: r1; to use one of them: `--wire ros2:namespace=r1`" in ended.stderr
     assert b"in namespaces" not in called.stderr
 
 

@@ -88,7 +88,11 @@ def test_it_runs_what_it_prints(spawn: Spawn, free_port: int, tmp_path):
     printed = zstate("router", "--listen", endpoint, "--print")
     file = tmp_path / "router.json5"
     file.write_bytes(printed.stdout)
-    assert started(spawn, "router", "--config", str(file)).line().endswith(f"listens at what '{file}' says")
+    assert (
+        started(spawn, "router", "--config", str(file))
+        .line()
+        .endswith(f"listens at the endpoints in '{file}'")
+    )
     with connect(mode="client", endpoints=endpoint) as session:
         assert session.zenoh.info.routers_zid()
 

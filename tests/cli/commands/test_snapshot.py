@@ -123,7 +123,7 @@ def test_a_snapshot_is_loaded_here_unless_it_is_asked_for_where_it_was_taken(
     with standing(router=router):
         assert zstate("snapshot", "save", str(file), "--connect", router).returncode == 0
     here = zstate("snapshot", "load", str(file), "--seconds", "0.1").stderr.decode()
-    assert f"with --mode client --connect {router}; --as-saved does the same here" in here
+    assert f"with --mode client --connect {router}; --as-saved uses the same options" in here
     child = started(spawn, "snapshot", "load", str(file), "--as-saved")
     child.line()
     with connect(mode="client", endpoints=router) as session:

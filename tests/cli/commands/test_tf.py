@@ -101,10 +101,10 @@ def test_it_says_what_it_waits_for_and_that_the_wait_is_over(spawn: Spawn):
     assert command.line() == "pose of lower in base"
     until(lambda: "waiting: no robot is announced" in command.stderr)
     with standing(streams=("joint_states",)):
-        until(lambda: "waiting: nobody writes robot_description of 'rrbot'" in command.stderr)
+        until(lambda: "waiting: robot_description of 'rrbot' has no writer" in command.stderr)
     with standing():
         assert command.line().startswith("At time ")
-    assert "heard rrbot: 7 frames, 2 joints" in command.stderr
+    assert "receiving rrbot: 7 frames, 2 joints" in command.stderr
     interrupted(command)
 
 

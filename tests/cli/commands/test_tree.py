@@ -95,7 +95,7 @@ def test_nobody_at_all_is_no_error_as_in_ls_and_it_is_said_how_to_begin():
     assert (ended.returncode, ended.stdout) == (0, b"")
     assert b"zstate publish" in ended.stderr
     assert json.loads(zstate("tree", "--json").stdout) == []
-    assert "nobody announces the robot 'rrbot'" in failure("tree", "rrbot")
+    assert "robot 'rrbot' is not announced" in failure("tree", "rrbot")
 
 
 def test_joint_states_alone_have_no_tree_and_it_is_said_who_would_make_one():

@@ -46,7 +46,7 @@ def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(
 def test_beyond_loopback_the_address_holds_a_token_and_a_word_of_warning(spawn):
     child = started(spawn, "view", "--host", "0.0.0.0", "--port", "0")
     assert re.search(r":\d+/\?token=[\w-]{20,}$", address(child.line()))
-    until(lambda: "in the clear" in child.stderr)
+    until(lambda: "unencrypted" in child.stderr)
     interrupted(child)
 
 
@@ -71,8 +71,8 @@ def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
     ("arguments", "code", "said"),
     [
         (["--snapshot", "picture.jpg"], 2, "'picture.jpg' does not end with .png"),
-        (["a.mcap", "b.mcap"], 2, "a recording is viewed alone; got a.mcap, b.mcap"),
-        (["a.mcap", "--sliders"], 2, "--sliders moves robots that are here"),
+        (["a.mcap", "b.mcap"], 2, "a recording must be the only argument; got a.mcap, b.mcap"),
+        (["a.mcap", "--sliders"], 2, "--sliders moves live robots"),
         (["nowhere.mcap"], 1, "nowhere.mcap"),
         (["--rate", "0"], 2, "a rate is above 0"),
         (["--host", "nowhere.invalid"], 1, "nobody can listen at 'nowhere.invalid'"),
@@ -142,7 +142,7 @@ def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_pa
         both = snapshot()
         assert both.stdout == f"wrote {picture}: mine, rrbot, 320 x 240 pixels\n"
         assert "the frames are in 2 trees (mine/base; rrbot/world)" in both.stderr
-        assert "1 file of the robots cannot be drawn: package://mine/meshes/base.stl" in both.stderr
+        assert "1 mesh file cannot be drawn: package://mine/meshes/base.stl" in both.stderr
         assert "ROS_PACKAGE_PATH" in both.stderr
         one = snapshot("--fixed-frame", "mine/base", "--camera", "0,0,9:0,0,10")
         assert one.stdout == f"wrote {picture}: no robot, 320 x 240 pixels\n"
@@ -155,4 +155,4 @@ def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_pa
 
 def test_a_snapshot_of_a_robot_that_is_not_there_says_who_is(tmp_path: Path):
     said = failure("view", "nobody", "--snapshot", str(tmp_path / "x.png"))
-    assert "waited 5 s for 'nobody'; robots that were heard: none" in said
+    assert "waited 5 s for 'nobody'; robots that were received: none" in said

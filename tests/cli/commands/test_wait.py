@@ -32,9 +32,9 @@ def test_a_robot_that_is_there_is_not_waited_for():
 
 def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
     child = started(spawn, "wait", "robot", "rrbot")
-    await_words(child, "nobody announces the robot 'rrbot'")
+    await_words(child, "robot 'rrbot' is not announced")
     with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
-        await_words(child, "nobody writes joint_states of 'rrbot'")
+        await_words(child, "joint_states of 'rrbot' has no writer")
         assert child.process.poll() is None
         with standing(streams=("joint_states",)):
             assert child.line() == "ready: 'rrbot' (7 frames)"
@@ -45,7 +45,7 @@ def test_every_robot_that_is_named_has_to_be_there():
     with standing("left"):
         said = waited("robot", "left", "right", "--timeout", "1", code=1)
     assert said["ready"] is False
-    assert "nobody announces the robot 'right'" in str(said["reason"])
+    assert "robot 'right' is not announced" in str(said["reason"])
     assert float(str(said["waited_s"])) >= 1.0
 
 
@@ -70,7 +70,7 @@ def test_a_pose_is_waited_for_with_the_reason():
 def test_a_router_may_come_late(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "router", endpoint)
-    await_words(child, f"waiting: nobody answers at '{endpoint}' yet")
+    await_words(child, f"waiting: no answer yet at '{endpoint}'")
     started(spawn, "router", "--listen", endpoint)
     assert child.line() == f"ready: the router at '{endpoint}'"
     assert child.wait() == 0
@@ -98,7 +98,7 @@ def test_ctrl_c_ends_a_wait(spawn: Spawn):
 
 
 def test_what_is_waited_for_is_checked():
-    assert "which robot?" in failure("wait", "robot", code=2)
+    assert "name a robot" in failure("wait", "robot", code=2)
     assert "two frames" in failure("wait", "frame", "base", code=2)
     assert "'robto' is not one of" in failure("wait", "robto", code=2)
     assert "contains '/'" in failure("wait", "robot", "a/b")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from zstate.buffer.frame_tree import FrameInfo
-from zstate.cli.output.frames import tree_text
+from zstate.cli.commands.tree import tree_text
 
 NOW = 5_000_000_000
 WRITER = "driver@jetson pid 412"

@@ -60,7 +60,7 @@ def test_a_format_that_is_none_is_refused():
 
 def test_every_line_of_a_command_that_goes_on_is_json(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
-    until(lambda: "waiting: nobody announces" in command.stderr)
+    until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing() as publisher:
         command.line()
         said = entries(command.stderr)

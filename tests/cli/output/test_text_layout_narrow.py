@@ -79,6 +79,6 @@ def test_settings_models_and_errors_are_told_within_the_width(tmp_path: Path):
 def test_the_comment_of_a_long_example_stands_above_it():
     lines = seen("tree", "--help")
     place = lines.index("  zstate tree --wire ros2")
-    assert lines[place - 1] == "  # hears /tf and /tf_static"
+    assert lines[place - 1] == "  # reads /tf and /tf_static"
     in_a_pipe = zstate("tree", "--help").stdout.decode().splitlines()
     assert any(line.startswith("  zstate tree --wire ros2  ") for line in in_a_pipe)

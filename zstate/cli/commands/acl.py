@@ -1,28 +1,33 @@
-"""zstate acl: the access control of a fleet, for its routers."""
+"""zstate acl: access control of a fleet, as a router's configuration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 import click
 
-from zstate.cli.options import Command
 from zstate.cli.output.console import print_result
 
+_ROLES = {
+    "robot": "A robot: writes its own keys; reads these and the clock",
+    "viewer": "Reads everything and writes nothing",
+    "operator": "A viewer that also commands joints",
+    "timekeeper": "A viewer that also writes the simulated time",
+    "placer": "Writes static edges as robot NAME and nothing else, for instance where robots are in a map",
+}
 
-def _named(option: str, what: str) -> Callable[[Command], Command]:
-    return click.option(option, multiple=True, metavar="NAME", help=f"{what}; may be repeated.")
+
+def _role_options(command: Any) -> Any:
+    for role, text in reversed(_ROLES.items()):
+        command = click.option(f"--{role}", multiple=True, metavar="NAME", help=f"{text}; may be repeated.")(
+            command
+        )
+    return command
 
 
 @click.command("acl")
-@_named("--robot", "A robot: writes its own keys, reads these and the clock")
-@_named("--viewer", "Somebody who reads everything, and writes nothing")
-@_named("--operator", "A viewer who also commands joints")
-@_named("--timekeeper", "A viewer who also writes the simulated time")
-@_named("--placer", "Writes static edges as robot NAME, and nothing else: where robots' roots are, in a map")
-@click.option(
-    "--namespace", default="", metavar="KEY", help="The namespace of their sessions, if they have one."
-)
+@_role_options
+@click.option("--namespace", default="", metavar="KEY", help="Zenoh namespace of their sessions, if any.")
 @click.option(
     "--wire",
     "wires",
@@ -31,30 +36,21 @@ def _named(option: str, what: str) -> Callable[[Command], Command]:
     show_default=True,
     metavar="WIRE",
     envvar="ZSTATE_WIRE",
-    help="What they speak, as in `--wire native --wire 'ros2:domain=5,namespace=*'`; may be repeated.",
+    help="Their wire format, as in `--wire native --wire 'ros2:domain=5,namespace=*'`; may be repeated.",
 )
-def acl_command(
-    *,
-    robot: tuple[str, ...],
-    viewer: tuple[str, ...],
-    operator: tuple[str, ...],
-    timekeeper: tuple[str, ...],
-    placer: tuple[str, ...],
-    namespace: str,
-    wires: tuple[str, ...],
-) -> None:
-    """Print who may do what in a fleet, as a router's configuration (JSON5).
+def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, ...]) -> None:
+    """Print the access control of a fleet as a router's configuration (JSON5).
 
-    What is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`), or a
-    user; that of a robot or a placer is also its name in the keys. Somebody may be several of these: a
-    robot that looks at the others is a viewer, too.
+    Everything that is not allowed there is denied. NAME is the common name of a certificate (`zstate certs`)
+    or a user; for a robot or a placer it is also the name in the keys. One NAME may have several roles: a
+    robot that reads other robots is also a viewer.
 
-    A router checks keys, readers check frames: r1 writes under zstate/r1/ alone, and readers take a frame
-    r1/... from those keys alone, but for the root of r1, which others may place in frames of theirs. With
-    TransformListener(session, placers=["site"]) only the placer `site` may.
+    The router checks keys, listeners check frames: r1 writes only under zstate/r1/, and listeners accept
+    frames r1/... only from those keys. The exception is the root of r1, which other writers may place in
+    their own frames; with TransformListener(session, placers=["site"]) only the placer `site` may.
 
-    Robots that speak ROS 2 (rmw_zenoh_cpp) have a namespace each: topics, services and nodes in it are
-    theirs, /tf and /tf_static everybody's unless tf=namespace. There an operator may call services.
+    Robots on ROS 2 (rmw_zenoh_cpp) have a namespace each and own the topics, services and nodes in it.
+    /tf and /tf_static are shared by all unless tf=namespace. An operator may also call services there.
 
     \b
     zstate acl --robot r1 --robot r2 --viewer desk >acl.json5
@@ -64,9 +60,16 @@ def acl_command(
     """
     from zstate.net.security.acl import AclRoles, access_text
 
-    if not any((robot, viewer, operator, timekeeper, placer)):
-        raise click.UsageError(
-            "name somebody: --robot NAME, --viewer NAME, --operator NAME, --timekeeper NAME or --placer NAME"
-        )
-    fleet = AclRoles(robot, viewer, operator, timekeeper, namespace, wires, placer)
+    if not any(roles.values()):
+        *others, last = (f"--{role} NAME" for role in _ROLES)
+        raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
+    fleet = AclRoles(
+        roles["robot"],
+        roles["viewer"],
+        roles["operator"],
+        roles["timekeeper"],
+        namespace,
+        wires,
+        roles["placer"],
+    )
     print_result(access_text(fleet).rstrip("\n"))

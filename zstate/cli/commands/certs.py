@@ -1,4 +1,4 @@
-"""zstate certs: a test authority, and the identities of robots, routers and people."""
+"""zstate certs: a test certificate authority, and certificates of robots, routers and users."""
 
 from __future__ import annotations
 
@@ -11,32 +11,31 @@ _ROUTER = "router"
 
 @click.command("certs")
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False))
-@click.option("--identity", "identities", multiple=True, metavar="NAME", help="Whom; may be repeated.")
+@click.option("--identity", "identities", multiple=True, metavar="NAME", help="A client; may be repeated.")
 @click.option(
     "--server",
     "servers",
     multiple=True,
     metavar="NAME",
-    help="An identity that others connect to, as they do to one called router; may be repeated.",
+    help="An identity that listens, as `router` always does; may be repeated.",
 )
 @click.option(
     "--host",
     "hosts",
     multiple=True,
     metavar="HOST",
-    help="Where servers are reached, besides localhost, 127.0.0.1 and ::1; may be repeated.",
+    help="Address of the servers, in addition to localhost, 127.0.0.1 and ::1; may be repeated.",
 )
-@click.option(
-    "--days", type=click.IntRange(min=1), default=365, show_default=True, help="How long they are valid."
-)
+@click.option("--days", type=click.IntRange(min=1), default=365, show_default=True, help="Validity in days.")
 def certs_command(
     folder: str, identities: tuple[str, ...], servers: tuple[str, ...], hosts: tuple[str, ...], days: int
 ) -> None:
     """Make certificates for tests: an authority in DIR, and an identity for each NAME.
 
-    A second call adds identities to the authority that is there. Nothing is ever overwritten. Those of
-    --server, and one called router, may listen, and are checked by the host they are reached at, so give
-    a router its --host. The others connect, and cannot pose as a router; a peer that listens is a --server.
+    A second call adds identities to the existing authority. Files are never overwritten. Only the
+    identities of --server, and one called router, may listen. Clients check the host name of a server, so
+    pass the addresses of a router as --host. Other identities only connect and cannot pose as a router; a
+    peer that listens is a --server.
 
     \b
     zstate certs fleet --identity router --host 192.168.1.10
@@ -51,16 +50,18 @@ def certs_command(
     authority = CertificateFiles.for_name(folder, AUTHORITY)
     names = (*identities, *(name for name in servers if name not in identities))
     if not names:
-        raise click.UsageError("say whom: --identity NAME, or --server NAME for whoever listens")
+        raise click.UsageError("no identity is named; give --identity NAME, or --server NAME for a listener")
     may_listen = {_ROUTER, *servers}.intersection(names)
     if hosts and not may_listen:
-        raise click.UsageError(f"--host is for those that listen: --server NAME, or --identity {_ROUTER}")
+        raise click.UsageError(
+            f"--host needs an identity that listens: --server NAME or --identity {_ROUTER}"
+        )
     issued = issue_identities(folder, names, hosts=hosts, servers=may_listen, days=days)
     for name, files in issued.items():
         print_wrapped(f"{name}: {files.certificate} and {files.key}, for {days} days")
     print_status(
-        f"These are for tests: whoever has {authority.key} can be anybody. In production keep it off every "
-        "robot and router, or better, let your own authority sign (common name = identity, for TLS servers "
-        f"and clients). A machine needs {authority.certificate}, its own .pem and its own .key, and new ones "
-        "before these expire."
+        f"These are for tests: with {authority.key} anyone can issue any identity. In production keep it off "
+        "every robot and router, or better, let your own authority sign (common name = identity, for TLS "
+        f"servers and clients). A machine needs {authority.certificate}, its own .pem and its own .key, and "
+        "new ones before these expire."
     )

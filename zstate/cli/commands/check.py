@@ -1,4 +1,4 @@
-"""zstate check: what is right and wrong with a robot model."""
+"""zstate check: findings about a robot model, and its tree of links or table of joints."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "vel
 @click.command("check")
 @click.argument("file")
 @xacro_arguments
-@click.option("--fix-hints", is_flag=True, help="Below each finding, what to write instead.")
-@click.option("--joints", "joint_table", is_flag=True, help="The joints as a table, instead of the tree.")
+@click.option("--fix-hints", is_flag=True, help="Print a correction below each finding.")
+@click.option(
+    "--joints", "joint_table", is_flag=True, help="Print the joints as a table instead of the tree."
+)
 @json_option("One JSON object.")
 def check_command(
     file: str, xacro_args: dict[str, str], fix_hints: bool, joint_table: bool, as_json: bool
 ) -> None:
-    """Say what is right and wrong with the robot model in FILE.
+    """Check the robot model in FILE: print its findings, then its tree of links and joints.
 
-    FILE is URDF or xacro, "-" for standard input, or a name such as "panda"; NAME:=VALUE are
-    xacro arguments. Prints every finding with
-    its line, then the tree of links and joints. Exit code 1 when the model cannot be used; warnings do
-    not count.
+    FILE is URDF or xacro, "-" for standard input, or a name such as "panda"; NAME:=VALUE are xacro
+    arguments. Each finding has its line. Exit code 1 if the model cannot be used; warnings do not count.
 
     \b
     zstate check arm.urdf --fix-hints
@@ -90,7 +90,7 @@ def _report(
     if model is not None:
         lines += _joint_lines(model) if joint_table else _link_lines(model)
     elif not fix_hints and name != _STDIN and any(finding.fix for finding in findings):
-        lines += [f"`zstate check {shlex.quote(name)} --fix-hints` says what to write instead"]
+        lines += [f"`zstate check {shlex.quote(name)} --fix-hints` prints corrections"]
     return "\n".join(lines)
 
 

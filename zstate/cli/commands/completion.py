@@ -1,4 +1,4 @@
-"""zstate completion: what teaches a shell to complete commands."""
+"""zstate completion: completion scripts for bash, zsh and fish."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import click
 
 from zstate.cli.output.console import print_result
 
-# What click's functions lack. In zsh, who has not asked for completion yet has no compdef; in fish, all of
-# a help after its first comma would be lost.
-_MENDED = {
+# Corrections of click's scripts: zsh without completion has no compdef yet; in fish, everything after the
+# first comma of a help text would be lost.
+_CORRECTIONS = {
     "zsh": (
         "#compdef zstate\n",
         "#compdef zstate\n\n(( $+functions[compdef] )) || { autoload -Uz compinit && compinit -i }\n",
@@ -20,7 +20,7 @@ _MENDED = {
 @click.command("completion")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion_command(shell: str) -> None:
-    """Print what makes SHELL complete commands, options, models, files and announced robots.
+    """Print the script with which SHELL completes commands, options, models, files and announced robots.
 
     \b
     eval "$(zstate completion bash)"                   # now; in ~/.bashrc for good
@@ -34,4 +34,4 @@ def completion_command(shell: str) -> None:
     kind = get_completion_class(shell)
     assert kind is not None
     source = kind(group, {}, "zstate", COMPLETION_VARIABLE).source().strip("\n")
-    print_result(source.replace(*_MENDED[shell]) if shell in _MENDED else source)
+    print_result(source.replace(*_CORRECTIONS[shell]) if shell in _CORRECTIONS else source)

@@ -24,9 +24,9 @@ def config_command(context: click.Context, /, *, as_zenoh: bool, as_json: bool, 
     """Show the effective settings of commands, and where each value comes from.
 
     Precedence: options, environment, Zenoh configuration file, defaults. Pass the options of another command
-    to see their effect. Every option of every command can be set in the environment: ZSTATE_COMMAND_OPTION,
-    as in ZSTATE_TF_RATE. Passwords are not shown. Exit code 1 if there is a problem, such as a variable
-    that nothing reads.
+    to see their effect. Every option of every command can be set in the environment as
+    ZSTATE_COMMAND_OPTION, for instance ZSTATE_TF_RATE. Passwords are not shown. Exit code 1 if there is a
+    problem, such as a variable that nothing reads.
 
     \b
     zstate config

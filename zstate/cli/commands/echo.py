@@ -1,4 +1,4 @@
-"""zstate echo: joint states, one document each."""
+"""zstate echo: joint states as documents."""
 
 from __future__ import annotations
 
@@ -19,26 +19,30 @@ if TYPE_CHECKING:
 
 def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> float:
     if not (math.isfinite(amount) and amount >= 0.0):
-        raise click.BadParameter(f"an amount is a number from 0 on; got {amount}")
+        raise click.BadParameter(f"an amount is finite and at least 0; got {amount}")
     return amount
 
 
 @click.command("echo")
 @click.argument("robot", required=False)
-@click.option("--once", is_flag=True, help="Print one; give up after --timeout with the reason.")
-@timeout_option("How long --once waits.")
-@click.option("--field", metavar="NAME", help="Only this: stamp, positions, positions.JOINT, or just JOINT.")
-@click.option("--changed", is_flag=True, help="Only what differs from what was printed last, stamps aside.")
+@click.option("--once", is_flag=True, help="Print one document; fail after --timeout with the reason.")
+@timeout_option("How long --once waits [s].")
+@click.option("--field", metavar="NAME", help="Print only this: stamp, positions, positions.JOINT, or JOINT.")
+@click.option(
+    "--changed",
+    is_flag=True,
+    help="Skip documents that differ from the last printed one only in stamp and seq.",
+)
 @click.option(
     "--by",
     type=float,
     default=0.0,
     callback=_checked_amount,
     metavar="AMOUNT",
-    help="Only where at least one number differs by more than this.",
+    help="Skip documents without a number that changed by more than this since the last printed one.",
 )
-@click.option("--csv", "form", flag_value="csv", help="Comma-separated values below one line of names.")
-@click.option("--json", "form", flag_value="json", help="One JSON value a line.")
+@click.option("--csv", "form", flag_value="csv", help="Comma-separated values below a line of names.")
+@click.option("--json", "form", flag_value="json", help="One JSON value per line.")
 @wire_option
 @session_options
 def echo_command(
@@ -53,9 +57,9 @@ def echo_command(
     form: str | None,
     wire: str,
 ) -> None:
-    """Print the joint states of ROBOT as they come in, as YAML documents.
+    """Print the joint states of ROBOT as they arrive, as YAML documents.
 
-    ROBOT may be left out while one robot is announced.
+    ROBOT may be left out if only one robot is announced.
 
     \b
     zstate echo
@@ -75,20 +79,20 @@ def echo_command(
         session = opened.enter_context(open_session(network, (wire,)))
         selected = named_robot(session, robot, wire)
         states = opened.enter_context(DescribedJointStates(session, selected, wire))
-        tap = opened.enter_context(StreamReader(session, selected, "joint_states", wire))
+        reader = opened.enter_context(StreamReader(session, selected, "joint_states", wire))
         show = _printer(form, field, ChangeFilter(by) if changed or by else None)
-        tapped = tap.first(timeout if once else None)
+        received = reader.first(timeout if once else None)
         while True:
-            if tapped is not None:
-                assert isinstance(tapped.sample, JointState)
-                show(states.document(tapped.sample))
+            if received is not None:
+                assert isinstance(received.sample, JointState)
+                show(states.document(received.sample))
             if once:
                 return
-            tapped = tap.next(LONGEST_WAIT_S)
+            received = reader.next(LONGEST_WAIT_S)
 
 
 def _with_nulls(value: Any) -> Any:
-    """NaN as null, which JSON has. ROS drivers send NaN for a quantity they do not measure."""
+    """``value`` with null for NaN, which ROS drivers send for quantities they do not measure."""
     if isinstance(value, dict):
         return {name: _with_nulls(inner) for name, inner in cast("dict[str, Any]", value).items()}
     if isinstance(value, list):
@@ -97,12 +101,12 @@ def _with_nulls(value: Any) -> Any:
 
 
 def _printer(form: str | None, field: str | None, changes: ChangeFilter | None) -> Callable[[Any], None]:
-    from zstate.cli.output.joint_state_text import CsvFormatter, field_of, yaml_text
+    from zstate.cli.output.joint_state_text import CsvFormatter, select_field, yaml_text
 
     table = CsvFormatter()
 
     def show(document: Any) -> None:
-        value = document if field is None else field_of(document, field)
+        value = document if field is None else select_field(document, field)
         if changes is not None and not changes.accepts(value):
             return
         if form == "json":

@@ -1,9 +1,9 @@
-"""zstate graph: who writes and reads what."""
+"""zstate graph: writers and readers of each stream, as text, JSON or a drawing."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,7 @@ from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
+    from zstate.cli.output.drawing import Drawing
     from zstate.net.graph import Graph
     from zstate.net.session import Session
     from zstate.wire.identity import WriterId
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _MEASURED_WITHIN_S = 0.4
 _READERS_WITHIN_S = 0.15
+_PROGRAM_FILL = "#eef2ff"
 
 
 @click.command("graph")
@@ -29,10 +31,10 @@ _READERS_WITHIN_S = 0.15
 @wire_option
 @session_options
 def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
-    """Show who writes and who reads the streams of ROBOT, or of all robots.
+    """Show the writers and readers of the streams of ROBOT, or of all robots.
 
-    Programs that use zstate announce themselves; whoever subscribes to keys on its own does not. What is
-    read but written by nobody stands out. On ROS's side: the nodes and the topics that carry robots'
+    Programs that use zstate announce what they read and write; subscribers to raw keys do not appear.
+    Streams that are read but have no writer stand out. On a ROS wire: the nodes and the topics of robot
     states, in all namespaces.
 
     \b
@@ -41,22 +43,37 @@ def graph_command(network: SessionOptions, robot: str, form: str | None, wire: s
     zstate graph --json | jq '.streams[] | select(.writers == [])'
     zstate graph --wire ros2
     """
-    from zstate.cli.output.graph_text import graph_facts
-
     with open_session(network, (wire,)) as session:
-        graph = _ros_graph(session, wire) if is_ros(wire) else _measured_graph(session)
+        if is_ros(wire):
+            from zstate.net.graph import discover_ros_graph
+            from zstate.wire.registry import get_wire
+            from zstate.wire.ros2.wire import Ros2Wire
+
+            wire_format = get_wire(wire)
+            assert isinstance(wire_format, Ros2Wire)
+            graph = discover_ros_graph(session, wire_format).graph
+        else:
+            graph = _discover_measured_graph(session)
     if robot != "*" and not is_ros(wire):
-        graph = _of_robot(graph, robot)
+        streams = tuple(one for one in graph.streams if one.robot in (robot, "*"))
+        if not streams:
+            hint = did_you_mean(robot, {one.robot for one in graph.streams})
+            fail(f"no stream of {robot!r} has a writer or a reader{hint}")
+        graph = replace(graph, streams=streams)
     if form == "json":
         print_json(graph_facts(graph))
-    elif graph.streams:
-        title = "Who writes and reads what" if robot == "*" else f"Who writes and reads what of {robot}"
-        _print(graph, form, title)
-    else:
+    elif not graph.streams:
         print_status(messages_for(wire).announced(()))
+    elif form is None:
+        print_wrapped(graph_text(graph))
+    else:
+        from zstate.cli.output.drawing import draw
+
+        title = "Writers and readers" if robot == "*" else f"Writers and readers of {robot}"
+        print_result(draw(graph_drawing(graph), form, title))
 
 
-def _measured_graph(session: Session) -> Graph:
+def _discover_measured_graph(session: Session) -> Graph:
     """The graph of the native wire, with the rates of the streams that move."""
     from zstate.net.graph import graph_of
     from zstate.net.presence import discover, discover_readers
@@ -83,37 +100,65 @@ def _measured_graph(session: Session) -> Graph:
         ]
         statistics.wait(expected, _MEASURED_WITHIN_S)
 
-        def rate_of(robot: str, stream: Stream, writer: WriterId) -> float | None:
+        def rate_hz(robot: str, stream: Stream, writer: WriterId) -> float | None:
             source = statistics.get(WriterKey(robot, stream, writer.session))
             return None if source is None else source.published_hz()
 
-        return graph_of(robots, readers, rate_of)
+        return graph_of(robots, readers, rate_hz)
 
 
-def _ros_graph(session: Session, wire: str) -> Graph:
-    from zstate.net.graph import discover_ros_graph
-    from zstate.wire.registry import get_wire
-    from zstate.wire.ros2.wire import Ros2Wire
-
-    wire_format = get_wire(wire)
-    assert isinstance(wire_format, Ros2Wire)
-    return discover_ros_graph(session, wire_format).graph
-
-
-def _of_robot(graph: Graph, robot: str) -> Graph:
-    streams = tuple(one for one in graph.streams if one.robot in (robot, "*"))
-    if not streams:
-        hint = did_you_mean(robot, {one.robot for one in graph.streams})
-        fail(f"nobody writes or reads anything of {robot!r}{hint}")
-    return replace(graph, streams=streams)
+def graph_text(graph: Graph) -> str:
+    """Each group of streams, with its writers and readers."""
+    lines: list[str] = []
+    for group in graph.groups:
+        names = ", ".join(stream.label for stream in group.streams)
+        lines.append(f"{group.robot}: {names}" if group.robot else names)
+        for role, programs in (("written by", group.writers), ("read by", group.readers)):
+            shown = programs or ("none",)
+            heads = (role, *[""] * (len(shown) - 1))
+            lines += [f"  {head:<10}  {program}" for head, program in zip(heads, shown, strict=True)]
+    return "\n".join(lines)
 
 
-def _print(graph: Graph, form: str | None, title: str) -> None:
-    from zstate.cli.output.graph_text import graph_drawing, graph_text
+def graph_drawing(graph: Graph) -> Drawing:
+    """Programs and groups of streams, with edges in the direction of the data.
 
-    if form is None:
-        print_wrapped(graph_text(graph))
-        return
-    from zstate.cli.output.drawing import draw
+    The edges of each writer have a colour. A group without a writer has a dashed red box.
+    """
+    from zstate.cli.output.drawing import ALARM, INK, LINE, PALETTE, Drawing, Edge, Node
 
-    print_result(draw(graph_drawing(graph), form, title))
+    nodes: list[Node] = []
+    writes: list[tuple[str, str]] = []
+    reads: list[tuple[str, str]] = []
+    for number, group in enumerate(graph.groups):
+        name, labels = f"streams {number}", [stream.label for stream in group.streams]
+        lines, unwritten = [group.robot, *labels] if group.robot else labels, not group.writers
+        stroke = ALARM if unwritten else LINE
+        nodes.append(Node(name, lines, stroke=stroke, dashed=unwritten, text_color=INK))
+        writes += [(f"program {one}", name) for one in group.writers]
+        reads += [(name, f"program {one}") for one in group.readers]
+    for program in graph.programs:
+        name, at, place = program.partition("@")
+        lines = [name, place] if at and name else [program]
+        nodes.append(Node(f"program {program}", lines, rounded=True, fill=_PROGRAM_FILL))
+    writers = dict.fromkeys(writer for writer, _ in writes)
+    colors = {writer: PALETTE[number % len(PALETTE)] for number, writer in enumerate(writers)}
+    edges = [
+        Edge(start, end, stroke=colors.get(start, colors.get(end, LINE))) for start, end in (*writes, *reads)
+    ]
+    return Drawing("zstate", "flow", nodes, edges)
+
+
+def graph_facts(graph: Graph) -> dict[str, Any]:
+    """The graph as JSON."""
+    streams = [
+        {
+            "robot": stream.robot,
+            "stream": stream.name,
+            "rate_hz": stream.rate_hz,
+            "writers": list(stream.writers),
+            "readers": list(stream.readers),
+        }
+        for stream in graph.streams
+    ]
+    return {"programs": graph.programs, "streams": streams}

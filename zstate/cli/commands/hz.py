@@ -1,10 +1,10 @@
-"""zstate hz: the rate at which samples come in."""
+"""zstate hz: rate of arriving samples."""
 
 from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -40,8 +40,8 @@ _SETTLING_S = 0.1
     show_default=True,
     help="Measure the last N samples.",
 )
-@click.option("--once", is_flag=True, help="Print one measurement, of the first second.")
-@timeout_option("How long --once waits for the first sample.")
+@click.option("--once", is_flag=True, help="Print one measurement, of the first second, and exit.")
+@timeout_option("How long --once waits for the first sample [s].")
 @json_option()
 @wire_option
 @session_options
@@ -56,10 +56,10 @@ def hz_command(
     as_json: bool,
     wire: str,
 ) -> None:
-    """Measure, once a second, the rate at which samples of ROBOT arrive here.
+    """Print once a second the rate at which samples of ROBOT arrive.
 
-    ROBOT may be left out while one robot is announced. On ROS's side that is the rate of a topic's messages,
-    of all nodes together.
+    ROBOT may be left out if only one robot is announced. On a ROS wire this is the rate of the messages of a
+    topic, from all nodes together.
 
     \b
     zstate hz
@@ -72,18 +72,26 @@ def hz_command(
     refuse_topic(robot, wire)
     with ExitStack() as opened:
         session = opened.enter_context(open_session(network, (wire,)))
-        tap = opened.enter_context(StreamReader(session, named_robot(session, robot, wire), stream, wire))
+        reader = opened.enter_context(StreamReader(session, named_robot(session, robot, wire), stream, wire))
         statistics = MessageStatistics(window, of_all=is_ros(wire))
-        tap.first(timeout if once else None)
-        _listen(tap, MessageStatistics(2), _SETTLING_S)  # what queued up while this process was starting
-        if once:
-            _show(_measured_once(tap, statistics, timeout), as_json=as_json)
-        else:
-            _follow(tap, statistics, as_json=as_json)
+        reader.first(timeout if once else None)
+        _read_for(_SETTLING_S, reader, MessageStatistics(2))  # what queued up while this process was starting
+        deadline, silent = time.monotonic() + timeout, False
+        while True:
+            count, facts = _read_for(1.0, reader, statistics), statistics.facts()
+            if facts is not None and (count or once):
+                _print_facts(facts, as_json=as_json)
+                if once:
+                    return
+            elif once and time.monotonic() > deadline:
+                fail(f"gave up after {timeout:g} s: fewer than two samples arrived, so there is no rate")
+            elif not once and not count and not silent:
+                print_status(reader.silence())
+            silent = not count
 
 
 class MessageStatistics:
-    """Rate and spread of the last ``window`` messages: of the newest writer or, if ``of_all``, of all."""
+    """Rate and spread of the last ``window`` messages: from the newest writer, or from all if ``of_all``."""
 
     def __init__(self, window: int, *, of_all: bool = False) -> None:
         from zstate.net.topic_statistics import IntervalStatistics, SequenceGaps
@@ -91,18 +99,18 @@ class MessageStatistics:
         self._statistics, self._gaps = IntervalStatistics(window), SequenceGaps()
         self._of_all = of_all
 
-    def add(self, tapped: TimedSample) -> None:
-        """Count a sample. Several samples of one message are one."""
+    def add(self, received: TimedSample) -> None:
+        """Add a sample. Several samples of one message count once."""
         from zstate.net.topic_statistics import Received
 
-        sample, statistics = tapped.sample, self._statistics
+        sample, statistics = received.sample, self._statistics
         if self._gaps.add(sample.session, sample.seq):
             if sample.session != statistics.session and not self._of_all:
                 statistics.clear()
-            statistics.add(Received(tapped.came, sample.stamp, sample.seq, 0), sample.session)
+            statistics.add(Received(received.came, sample.stamp, sample.seq, 0), sample.session)
 
     def facts(self) -> dict[str, Any] | None:
-        """What is printed; None before two messages. ``missed`` counts since the start."""
+        """The printed figures; None before two messages. ``missed`` counts since the start."""
         window = self._statistics.window()
         if window is None or window.rate_hz is None:
             return None
@@ -116,40 +124,18 @@ class MessageStatistics:
         }
 
 
-def _measured_once(tap: StreamReader, statistics: MessageStatistics, timeout_s: float) -> dict[str, Any]:
-    deadline = time.monotonic() + timeout_s
-    while True:
-        _listen(tap, statistics, 1.0)
-        facts = statistics.facts()
-        if facts is not None:
-            return facts
-        if time.monotonic() > deadline:
-            fail(f"gave up after {timeout_s:g} s: samples came, but no two to measure between")
-
-
-def _follow(tap: StreamReader, statistics: MessageStatistics, *, as_json: bool) -> NoReturn:
-    silent = False
-    while True:
-        count, facts = _listen(tap, statistics, 1.0), statistics.facts()
-        if count and facts is not None:
-            _show(facts, as_json=as_json)
-        elif not count and not silent:
-            print_status(tap.silence())
-        silent = not count
-
-
-def _listen(tap: StreamReader, statistics: MessageStatistics, seconds: float) -> int:
-    """Count what arrives within ``seconds``; how many samples that were."""
+def _read_for(seconds: float, reader: StreamReader, statistics: MessageStatistics) -> int:
+    """Add the samples that arrive within ``seconds``, and return their number."""
     deadline, count = time.monotonic() + seconds, 0
     while (left_s := deadline - time.monotonic()) > 0.0:
-        tapped = tap.next(left_s)
-        if tapped is not None:
-            statistics.add(tapped)
+        received = reader.next(left_s)
+        if received is not None:
+            statistics.add(received)
             count += 1
     return count
 
 
-def _show(facts: dict[str, Any], *, as_json: bool) -> None:
+def _print_facts(facts: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print_json(facts)
         return

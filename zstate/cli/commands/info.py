@@ -1,4 +1,4 @@
-"""zstate info: what is in a recording."""
+"""zstate info: contents of a recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zstate.cli.options import json_option
-from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped, rate_text
+from zstate.cli.output.console import (
+    count_text,
+    files_text,
+    output_width,
+    print_json,
+    print_wrapped,
+    rate_text,
+    size_text,
+)
 from zstate.cli.output.text_layout import Table, in_columns
 
 if TYPE_CHECKING:
@@ -23,11 +31,10 @@ _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of w
 @click.argument("file")
 @json_option("One JSON object.")
 def info_command(file: str, as_json: bool) -> None:
-    """Say what is in the recording FILE: its robots, their streams and models, when, how much.
+    """Show the contents of the recording FILE: robots, streams, models, times and counts.
 
-    FILE is an MCAP file, the first of several that belong together, or a bag of ROS 2. Rates are means
-    over the whole recording. What holds until further notice (robot_description, tf_static) is written
-    again every 10 s, which is counted.
+    FILE is an MCAP file, the first of several split files, or a ROS 2 bag. Rates are means over the whole
+    recording. Latched messages (robot_description, tf_static) are written again every 10 s, and counted.
     """
     from zstate.recording.info import read_info, recorded_robots
 
@@ -41,8 +48,6 @@ def info_command(file: str, as_json: bool) -> None:
 
 
 def _head(info: RecordingInfo) -> Iterator[str]:
-    from zstate.cli.output.recording_text import files_text, size_text
-
     libraries = f" by {', '.join(info.libraries)}" if info.libraries else ""
     storage = ", ".join((*info.formats, *info.compressions))
     yield f"{files_text(info.files)}: {size_text(info.size)} ({storage}){libraries}"
@@ -60,7 +65,7 @@ def _head(info: RecordingInfo) -> Iterator[str]:
 
 
 def _recoverable(info: RecordingInfo) -> list[str]:
-    """The files that ``zstate recover`` mends."""
+    """The files that ``zstate recover`` can complete."""
     from zstate.recording.reader import RecordingReader
 
     with RecordingReader(info.path) as reader:

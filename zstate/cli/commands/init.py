@@ -1,11 +1,11 @@
-"""zstate init: writes a commented first file for `zstate up`."""
+"""zstate init: a commented first file for `zstate up`."""
 
 from __future__ import annotations
 
 import json
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 @click.command("init")
 @click.argument("robot", default="rrbot", metavar="[ROBOT]")
 @xacro_arguments
-@click.option("-o", "--output", metavar="FILE", help="Where to; default: NAME.toml, - for standard output.")
-@click.option("--force", is_flag=True, help="Also where there is such a file already.")
+@click.option("-o", "--output", metavar="FILE", help="Default: NAME.toml; - is standard output.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
 @name_option
 def init_command(
     robot: str, xacro_args: dict[str, str], output: str | None, force: bool, name: str | None
 ) -> None:
-    """Write a commented file for ROBOT, which `zstate up` runs as it is.
+    """Write a commented file for ROBOT that `zstate up` runs as it is.
 
-    ROBOT is a name such as panda, or a URDF or xacro file; rrbot, which comes with zstate, unless given.
+    ROBOT is a name such as panda, or a URDF or xacro file; default: rrbot, which comes with zstate.
     NAME:=VALUE are xacro arguments.
 
     \b
@@ -41,10 +41,23 @@ def init_command(
     """
     from zstate.model.load import is_path
 
-    model, called = load_robot(robot, name, xacro_args)
-    file = Path(output if output not in (None, "-") else f"{called}.toml")
+    model, robot_name = load_robot(robot, name, xacro_args)
+    file = Path(output if output not in (None, "-") else f"{robot_name}.toml")
     source = os.path.relpath(robot, file.parent) if is_path(robot) else robot
-    text = _cell_file_text(shlex.quote(file.name), source, called, model, xacro_args)
+    args = ", ".join(f"{json.dumps(key)} = {json.dumps(value)}" for key, value in xacro_args.items())
+    depths = {model.root: 0}
+    for joint in model.joints:
+        depths[joint.child] = depths.get(joint.parent, 0) + 1
+    text = _TEMPLATE.format(
+        file=shlex.quote(file.name),
+        model=json.dumps(source),
+        name=json.dumps(robot_name),
+        robot=robot_name,
+        joints="\n".join(f"#   {row}" for row in _joint_rows(model)),
+        # The deepest link: a tool or a camera is likely to be mounted there.
+        tip=json.dumps(max(depths, key=lambda link: depths[link])),
+        xacro_args=f"xacro_args = {{ {args} }}\n" * bool(args),
+    )
     if output == "-":
         print_result(text.rstrip("\n"))
         return
@@ -56,22 +69,6 @@ def init_command(
     except OSError as error:
         fail(f"{str(file)!r} cannot be written: {error.strerror}")
     print_status(f"wrote {file}; start it with `zstate up {shlex.quote(str(file))}`")
-
-
-def _cell_file_text(
-    file: str, source: str, robot: str, model: RobotModel, xacro_args: Mapping[str, str]
-) -> str:
-    """The text of ``file`` for one robot; ``source`` is its model as a child process finds it."""
-    args = ", ".join(f"{json.dumps(name)} = {json.dumps(value)}" for name, value in xacro_args.items())
-    return _TEMPLATE.format(
-        file=file,
-        model=json.dumps(source),
-        name=json.dumps(robot),
-        robot=robot,
-        joints="\n".join(f"#   {row}" for row in _joint_rows(model)),
-        tip=json.dumps(_tip(model)),
-        xacro_args=f"xacro_args = {{ {args} }}\n" * bool(args),
-    )
 
 
 def _joint_rows(model: RobotModel) -> Sequence[str]:
@@ -90,21 +87,13 @@ def _joint_rows(model: RobotModel) -> Sequence[str]:
     return list(in_columns(rows)) if rows else ["none"]
 
 
-def _tip(model: RobotModel) -> str:
-    """The link furthest from the root, where a tool or a camera is likely to be mounted."""
-    depths = {model.root: 0}
-    for joint in model.joints:
-        depths[joint.child] = depths.get(joint.parent, 0) + 1
-    return max(depths, key=lambda link: depths[link])
-
-
 _TEMPLATE = """\
-# What `zstate up {file}` starts; Ctrl-C ends all of it. `zstate up --help` explains every key.
-# Lines that begin with # and no blank are examples: take the # away, and they count.
+# Processes that `zstate up {file}` starts; Ctrl-C ends all of them. `zstate up --help` explains every key.
+# Lines that start with # and no blank are examples: remove the # to use them.
 
 [parameters]                        # `zstate up {file} rate=500` changes one
-source = "sine"                     # every joint swings; "joints": as your driver says on joint_states
-rate = 100.0                        # samples a second
+source = "sine"                     # every joint swings; "joints": the joint_states of your driver
+rate = 100.0                        # samples per second
 
 [[robot]]
 model = {model}
@@ -112,14 +101,14 @@ model = {model}
 source = "${{source}}"
 rate = "${{rate}}"
 #wires = ["native", "ros2"]          # also for rviz2 and other ROS 2 nodes; needs a [router] with ros2 = true
-# xacro_args = {{ NAME = "VALUE" }}  # where the model is a xacro file
+# xacro_args = {{ NAME = "VALUE" }}  # if the model is a xacro file
 #metrics = 9100                      # http://127.0.0.1:9100/metrics for Prometheus
-#restart = "on-failure"              # else a failure ends everything
+#restart = "on-failure"              # by default a failure ends everything
 
 # Its joints, in the order of their positions:
 {joints}
 
-# Something that is fixed to the robot: the pose of source in target.
+# An edge fixed to the robot: the pose of source in target.
 #[[static]]
 #robot = {name}
 #target = {tip}
@@ -127,23 +116,23 @@ rate = "${{rate}}"
 #xyz = [0.05, 0.0, 0.04]             # [m]
 #rpy_deg = [0.0, -90.0, 0.0]
 
-# The same from a calibration of easy_handeye.
+# The same from an easy_handeye calibration.
 #[[static]]
 #robot = {name}
 #file = "handeye.yaml"
 
-# A program of your own, such as the driver; anything that runs in a terminal runs here.
+# A program of your own, such as the driver: any terminal command.
 #[[program]]
 #run = "python driver.py"
 #after = {name}
 #restart = "on-failure"
 
-# Other machines come to a router; without one, everything meets on this host.
+# A router for other machines; without one, everything stays on this host.
 #[router]
 #listen = ["tcp/0.0.0.0:7447"]
 #ros2 = true
 
-# Or this machine goes to a router that runs elsewhere.
+# Or a connection to a router on another machine.
 #[network]
 #mode = "client"
 #connect = ["tcp/192.168.1.10:7447"]

@@ -1,4 +1,4 @@
-"""zstate joints: something that moves."""
+"""zstate joints: test publisher of joint states."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def joints_command(
     metrics: BindAddress | None,
     network: SessionOptions,
 ) -> None:
-    """Publish a sine on every joint of ROBOT, inside its limits, and nothing else.
+    """Publish a sine on every joint of ROBOT, within its limits, and nothing else.
 
-    ROBOT is a name such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. `zstate
-    publish ROBOT` makes transforms of it.
+    ROBOT is a name such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. `zstate publish
+    ROBOT` publishes the transforms.
 
     \b
     zstate joints panda
@@ -66,16 +66,16 @@ def joints_command(
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
 
-    model, called = load_robot(robot, name, xacro_args)
+    model, robot_name = load_robot(robot, name, xacro_args)
     with (
         open_session(network, (wire,)) as session,
         open_clock(session, clock, wire) as time,
         StatePublisher(
-            session, model, called, (wire,), streams=("joint_states",), clock=time, takeover=takeover
+            session, model, robot_name, (wire,), streams=("joint_states",), clock=time, takeover=takeover
         ) as publisher,
         served(metrics, of_publishers(publisher)),
     ):
         joints = count_text(len(model.joint_names), "joint")
-        place = messages_for(wire).place(called, ("joint_states",))
-        print_wrapped(f"{called}: a sine on {joints}, {rate:g} Hz, on {place}")
+        place = messages_for(wire).place(robot_name, ("joint_states",))
+        print_wrapped(f"{robot_name}: a sine on {joints}, {rate:g} Hz, on {place}")
         run_publisher(publisher, SineSource(model), rate, seconds)

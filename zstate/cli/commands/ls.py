@@ -1,15 +1,18 @@
-"""zstate ls: the announced robots and who writes for them."""
+"""zstate ls: announced robots with their streams, or the nodes and topics of a ROS graph."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
 from zstate.cli.options import json_option, session_options, wire_option
 from zstate.cli.output.console import (
+    count_text,
     is_terminal,
     keep_showing,
     output_width,
@@ -17,34 +20,42 @@ from zstate.cli.output.console import (
     print_result,
     print_status,
     print_wrapped,
+    rate_text,
 )
+from zstate.cli.output.text_layout import Table, first_fitting, in_columns
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import format_duration
 
 if TYPE_CHECKING:
+    from zstate.net.graph import RosEndpoint, RosGraph
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
+    from zstate.net.topic_statistics import TopicStatistics
+    from zstate.wire.ros2.wire import Ros2Wire
 
 T = TypeVar("T")
 
 _MEASURED_WITHIN_S = 0.3
-_AGAIN_S, _JSON_PERIOD_S = 0.5, 1.0
-# Meeting everybody takes less.
-_MEETING_S = 0.5
+_REFRESH_S, _JSON_PERIOD_S = 0.5, 1.0
+# Discovery takes less.
+_DISCOVERY_S = 0.5
+_HEADINGS = ("robot, stream", "rate", "age", "writer", "since")
+_OPTIONAL = ("since", "age")
 
 
 @click.command("ls")
-@click.option("--watch", is_flag=True, help="Keep the list up to date, until Ctrl-C.")
-@json_option("One JSON array; on ROS's side one object.")
+@click.option("--watch", is_flag=True, help="Keep the list up to date until Ctrl-C.")
+@json_option("One JSON array; on a ROS wire one object.")
 @wire_option
 @session_options
 def ls_command(network: SessionOptions, *, watch: bool, as_json: bool, wire: str) -> None:
-    """List the announced robots and, for each stream, who writes it since when.
+    """List the announced robots and, for each stream, its writer and since when it writes.
 
-    Of joint states also the rate, by their own stamps, and how long ago the last one came. On ROS's side:
-    the nodes, and who publishes and subscribes the topics of robots' states, with QoS. With --watch a
-    pipe gets the list anew whenever somebody comes or goes; with --json, one document a second. With nobody
-    announced the list is empty, and the exit code 0. A terminal gets headings.
+    Joint states also have their rate, from their stamps, and the age of the newest sample. On a ROS wire:
+    the nodes, and the publishers and subscribers of the topics of robot states, with QoS. A terminal gets
+    headings. With --watch a pipe gets the list after each change; with --json, once a second. If no robot
+    is announced the list is empty and the exit code is 0.
 
     \b
     zstate ls
@@ -60,13 +71,7 @@ def ls_command(network: SessionOptions, *, watch: bool, as_json: bool, wire: str
 
 
 def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.output.graph_text import (
-        empty_ros_graph_text,
-        namespaces_hint,
-        ros_graph_facts,
-        ros_graph_text,
-    )
-    from zstate.net.graph import RosGraph, discover_ros_graph
+    from zstate.net.graph import discover_ros_graph
     from zstate.wire.registry import get_wire
     from zstate.wire.ros2.wire import Ros2Wire
 
@@ -76,29 +81,29 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
     def discover() -> RosGraph:
         return discover_ros_graph(session, wire_format)
 
-    def text(graph: RosGraph) -> str:
-        is_empty = not graph.nodes and not graph.topics
-        return empty_ros_graph_text(wire_format) if is_empty else ros_graph_text(graph, wire_format)
-
     if watch:
-        _watch(discover, text, lambda graph: ros_graph_facts(graph, wire_format), as_json=as_json)
+        _watch(
+            discover,
+            lambda graph: ros_graph_text(graph, wire_format),
+            lambda graph: ros_graph_facts(graph, wire_format),
+            as_json=as_json,
+        )
     graph = discover()
     if as_json:
         print_json(ros_graph_facts(graph, wire_format))
     elif graph.nodes or graph.topics:
-        print_wrapped(text(graph))
-        hint = namespaces_hint(graph, wire_format)
+        print_wrapped(ros_graph_text(graph, wire_format))
+        hint = _namespaces_hint(graph, wire_format)
         if hint:
             print_status(hint)
     else:
-        print_status(text(graph))
+        print_status(ros_graph_text(graph, wire_format))
 
 
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
-    from zstate.cli.output.robot_table import robots_facts, robots_text, sources
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.net.presence import discover
-    from zstate.net.topic_statistics import FEW, TopicStatistics
+    from zstate.net.topic_statistics import FEW, TopicStatistics, WriterKey
     from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:
@@ -109,11 +114,20 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     with TopicStatistics(session, get_wire("native"), window=FEW) as statistics:
         statistics.subscribe("joint_states")
         if watch:
-            with RobotDirectory(session) as roster:
-                time.sleep(_MEETING_S)
-                _watch(roster.robots, text, lambda robots: robots_facts(robots, statistics), as_json=as_json)
+            with RobotDirectory(session) as directory:
+                time.sleep(_DISCOVERY_S)
+                _watch(
+                    directory.robots, text, lambda robots: robots_facts(robots, statistics), as_json=as_json
+                )
         robots = discover(session)
-        statistics.wait(sources(robots), _MEASURED_WITHIN_S)
+        # Only joint states are measured: a reader of transforms would make a publisher send more.
+        measured = [
+            WriterKey(robot.name, stream, writer.session)
+            for robot in robots
+            for stream, writer in robot.writers
+            if stream == "joint_states"
+        ]
+        statistics.wait(measured, _MEASURED_WITHIN_S)
         if as_json:
             print_json(robots_facts(robots, statistics))
         elif robots:
@@ -136,4 +150,154 @@ def _watch(
         elif now != shown:
             print_result(f"{text(now)}\n")
         shown = now
-        time.sleep(_JSON_PERIOD_S if as_json else _AGAIN_S)
+        time.sleep(_JSON_PERIOD_S if as_json else _REFRESH_S)
+
+
+def robots_text(robots: Sequence[RobotInfo], statistics: TopicStatistics, *, width: int | None = None) -> str:
+    """Each robot, and below it each stream: rate, age of the newest sample, writer, start of the writer.
+
+    If that is wider than ``width``, first the date is left out, then the columns "since" and "age", then the
+    headings; at last writers become letters. Without ``width`` there are no headings.
+    """
+    from zstate.net.topic_statistics import WriterKey
+    from zstate.wire.keys import MODEL_WRITER
+
+    full: list[tuple[str, ...]] = []
+    undated: list[tuple[str, ...]] = []
+    for robot in robots:
+        full.append((robot.name, "", "", "", ""))
+        undated.append(full[-1])
+        for stream, writer in robot.writers:
+            names = [
+                name for name in robot.names_of(writer) if stream == "tf_static" and name != MODEL_WRITER
+            ]
+            shown, rate, age = f"  {stream}/{','.join(names)}" if names else f"  {stream}", "", ""
+            source = statistics.get(WriterKey(robot.name, stream, writer.session))
+            if source is not None:
+                rate = "silent" if source.is_stale() else rate_text(source.published_hz())
+                age = format_duration(round(source.silent_s() * 1e9))
+            start = datetime.fromtimestamp(writer.since // 1_000_000_000).astimezone()
+            lasting = _lasting_text(time.time_ns() - writer.since)
+            full.append((shown, rate, age, str(writer), f"since {start:%Y-%m-%d %H:%M:%S}, {lasting}"))
+            undated.append((*full[-1][:-1], lasting))
+    headed = width is not None
+    tables = (
+        Table(_HEADINGS, full, headed=headed),
+        Table(_HEADINGS, undated, _OPTIONAL, headed=headed),
+        Table(_HEADINGS, undated, _OPTIONAL, headed=False),
+        Table(_HEADINGS, undated, _OPTIONAL, abbreviate="writer", headed=False),
+    )
+    return "\n".join(first_fitting(tables, width))
+
+
+def _lasting_text(nanoseconds: int) -> str:
+    minutes, seconds = divmod(nanoseconds // 1_000_000_000, 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {seconds:02d} s" if minutes else format_duration(nanoseconds)
+
+
+def robots_facts(robots: Sequence[RobotInfo], statistics: TopicStatistics) -> list[dict[str, Any]]:
+    """The same as JSON."""
+    from zstate.net.topic_statistics import WriterKey
+
+    found: list[dict[str, Any]] = []
+    for robot in robots:
+        writers: list[dict[str, Any]] = []
+        for stream, writer in robot.writers:
+            source = statistics.get(WriterKey(robot.name, stream, writer.session))
+            writers.append(
+                {
+                    "stream": stream,
+                    **asdict(writer),
+                    "names": robot.names_of(writer) if stream == "tf_static" else (),
+                    "rate_hz": None if source is None else source.published_hz(),
+                    "silent_s": None if source is None else source.silent_s(),
+                }
+            )
+        found.append({"robot": robot.name, "writers": writers})
+    return found
+
+
+def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
+    """Nodes, then topics with their publishers and subscribers; a hint if there are none."""
+    from zstate.wire.ros2.topics import HUMBLE_HASH, ros_type
+
+    if not graph.nodes and not graph.topics:
+        if wire.name == "ros2dds":
+            return "no ros2dds bridge carries the state of a robot; check the router (--connect)"
+        return (
+            f"no ROS 2 node in domain {wire.options.domain}; check that nodes run with "
+            "RMW_IMPLEMENTATION=rmw_zenoh_cpp and this ROS_DOMAIN_ID, and that this is their router"
+        )
+    lines: list[str] = []
+    if wire.name == "ros2":
+        lines += [f"{count_text(len(graph.nodes), 'node')} in domain {wire.options.domain}"]
+        lines += [f"  {node.full_name}" for node in graph.nodes]
+    for topic in graph.topics:
+        type_of_topic = ros_type(topic.stream)
+        ends = [("  publisher", end) for end in topic.publishers]
+        ends += [("  subscriber", end) for end in topic.subscribers]
+        rows: list[tuple[str, ...]] = []
+        for role, end in ends:
+            qos = end.qos
+            depth = f"keep last {qos.depth}" if qos.history == "keep_last" else "keep all"
+            is_usual = end.hash in ("", type_of_topic.hash)
+            other = "" if is_usual else "another version of the type"
+            rows.append(
+                (
+                    role,
+                    end.full_name,
+                    f"{qos.reliability}, {qos.durability}, {depth}".replace("_", " "),
+                    "humble" if end.hash == HUMBLE_HASH else other,
+                )
+            )
+        lines += [f"{topic.name}  {type_of_topic.name}", *in_columns(rows)]
+    return "\n".join(lines)
+
+
+def _namespaces_hint(graph: RosGraph, wire: Ros2Wire) -> str:
+    """The ``--wire`` options for robots in other namespaces; empty if there are none."""
+    others = sorted({topic.namespace for topic in graph.topics} - {"", wire.options.namespace})
+    if not others or wire.options.namespace == "*":
+        return ""
+    domain = f"domain={wire.options.domain}," if wire.options.domain else ""
+    spec = f"{wire.name}:{domain}namespace="
+    # Quoted, because shells expand the star to file names.
+    every = f", or for each by its name `--wire '{spec}*'`" if any("/" not in name for name in others) else ""
+    return f"in namespaces: {', '.join(others)}; to use one of them: `--wire {spec}{others[0]}`{every}"
+
+
+def ros_graph_facts(graph: RosGraph, wire: Ros2Wire) -> dict[str, Any]:
+    """The ROS graph as JSON."""
+    from zstate.wire.ros2.topics import ros_type
+
+    def ends_facts(ends: Sequence[RosEndpoint]) -> list[dict[str, Any]]:
+        return [
+            {
+                "node": end.full_name,
+                "zid": end.zid,
+                "type_hash": end.hash,
+                "reliability": end.qos.reliability,
+                "durability": end.qos.durability,
+                "history": end.qos.history,
+                "depth": end.qos.depth,
+            }
+            for end in ends
+        ]
+
+    return {
+        "wire": wire.name,
+        "domain": wire.options.domain if wire.name == "ros2" else None,
+        "nodes": [{"node": node.full_name, "zid": node.zid, "enclave": node.enclave} for node in graph.nodes],
+        "topics": [
+            {
+                "topic": topic.name,
+                "type": ros_type(topic.stream).name,
+                "publishers": ends_facts(topic.publishers),
+                "subscribers": ends_facts(topic.subscribers),
+            }
+            for topic in graph.topics
+        ],
+    }

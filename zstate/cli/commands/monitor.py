@@ -1,4 +1,4 @@
-"""zstate monitor: how the samples of edges, or of robots, come in."""
+"""zstate monitor: rate, latency, jitter and losses of edges or robots."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
 
 _FIRST_AFTER_S = 1.0
-# Meeting everybody takes less.
-_MEETING_S = 0.3
+# Discovery takes less.
+_DISCOVERY_S = 0.3
 
 
 @click.command("monitor")
 @click.argument("target", metavar="[A]", required=False)
 @click.argument("source", metavar="B", required=False)
-@click.option("--robots", is_flag=True, help="Monitor robots rather than edges: one line for each.")
-@click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
-@timeout_option("How long --once waits for the pose, or for a robot.")
+@click.option("--robots", is_flag=True, help="Monitor robots instead of edges: one line for each.")
+@click.option("--once", is_flag=True, help="Print one report, of the first second; fail after --timeout.")
+@timeout_option("How long --once waits for the pose, or for a robot [s].")
 @heard_robot_option
 @json_option()
 @wire_option
@@ -60,18 +60,18 @@ def monitor_command(
     metrics: BindAddress | None,
     as_json: bool,
 ) -> None:
-    """Watch each edge between the frames A and B, or all that are heard, until Ctrl-C.
+    """Monitor each edge between the frames A and B, or all edges, until Ctrl-C.
 
-    The table goes from A to B: each line tells of the edge from the line above. Of all edges those whose
-    samples come together have one line, such as the joints of a robot. Rate, latency (from a
-    sample's stamp until it is here: the median and the longest) and jitter (the standard deviation of the
-    time between arrivals) are those of the last five seconds; missed are gaps in the writer's numbers;
-    clock is how far the writer's clock is ahead of the one here, measured over the network.
+    The table goes from A to B; each line is the edge from the frame of the line above. Without A and B,
+    edges whose samples arrive together share a line, such as the joints of a robot. Figures of the last 5 s:
+    rate; latency, from a sample's stamp to its arrival (median and maximum); jitter, the standard deviation
+    of the time between arrivals. "missed" counts gaps in the writer's sequence numbers. "clock" is how far
+    the writer's clock is ahead of this one, measured over the network.
 
-    With --robots each robot has a line a second: rate, age of its newest sample, latency until a sample can
+    With --robots each robot has a line per second: rate, age of its newest sample, latency until a sample can
     be looked up, and counts since the start: received, dropped here, missed on the way, late (older than the
-    history), refused, and off the clock (stamped more than a minute away from the time here). On ROS's side
-    that is /tf, all nodes together; with --robot the joint states of a robot that is described.
+    history), refused, and off the clock (stamped more than a minute away from the time here). On a ROS wire
+    this is /tf, all nodes together; with --robot, the joint states of a robot that has a description.
 
     \b
     zstate monitor
@@ -82,50 +82,47 @@ def monitor_command(
     zstate monitor --robots --robot panda --json --metrics 9100
     """
     from zstate.cli.monitor import EdgeStatistics, MonitoredEdges, MonitoredPose, RobotMonitor
+    from zstate.clock import SystemClock
     from zstate.nodes.listener import TransformListener
+    from zstate.rate import Rate
 
     if robots and target is not None:
         raise click.UsageError("--robots takes no frames; --robot NAME selects a robot")
     if metrics is not None and not robots:
         raise click.UsageError("--metrics needs --robots")
     if target is not None and source is None:
-        raise click.UsageError(f"{target!r} is one frame; give two of them, or none for all that are heard")
+        raise click.UsageError(f"{target!r} is one frame; give two frames, or none for all edges")
     follow, once_s = default_stream(wire), timeout if once else None
     with (
         open_session(network, (wire,)) as session,
-        RobotDirectory(session, robot, wire) as roster,
-        open_clock(session, clock, wire, timeout_s=once_s) as kept,
+        RobotDirectory(session, robot, wire) as directory,
+        open_clock(session, clock, wire, timeout_s=once_s) as selected_clock,
         ExitStack() as opened,
     ):
         if robots:
-            monitor = opened.enter_context(RobotMonitor(session, roster, robot, wire, kept))
-            opened.enter_context(served(metrics, of_listeners(monitor.robots), of_writers(roster)))
+            monitor = opened.enter_context(RobotMonitor(session, directory, robot, wire, selected_clock))
+            opened.enter_context(served(metrics, of_listeners(monitor.robots), of_writers(directory)))
             _report_robots(monitor, once_s, as_json=as_json)
             return
         listener = opened.enter_context(
-            TransformListener(session, robot, wire=wire, follow=follow, clock=kept, history_on_join=False)
+            TransformListener(
+                session, robot, wire=wire, follow=follow, clock=selected_clock, history_on_join=False
+            )
         )
         statistics = opened.enter_context(EdgeStatistics(session, robot, wire, follow, listener.buffer.clock))
         if target is None or source is None:
-            _report_edges(MonitoredEdges(listener, statistics, roster), once_s, as_json=as_json)
+            edges: Monitored = MonitoredEdges(listener, statistics, directory)
         else:
-            frames = (target, source)
-            _report_edges(MonitoredPose(listener, statistics, roster, frames), once_s, as_json=as_json)
-
-
-def _report_edges(monitored: Monitored, once_s: float | None, *, as_json: bool) -> None:
-    from zstate.clock import SystemClock
-    from zstate.rate import Rate
-
-    monitored.wait(once_s)
-    Event().wait(_FIRST_AFTER_S)
-    if once_s is not None:
-        monitored.say(as_json=as_json)
-    elif as_json or not is_terminal():
-        for _ in Rate(1.0, SystemClock(), Event()):
-            monitored.say(as_json=as_json)
-    else:
-        monitored.show()
+            edges = MonitoredPose(listener, statistics, directory, (target, source))
+        edges.wait(once_s)
+        Event().wait(_FIRST_AFTER_S)
+        if once_s is not None:
+            edges.say(as_json=as_json)
+        elif as_json or not is_terminal():
+            for _ in Rate(1.0, SystemClock(), Event()):
+                edges.say(as_json=as_json)
+        else:
+            edges.show()
 
 
 def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool) -> None:
@@ -133,7 +130,7 @@ def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool
     from zstate.rate import Rate
 
     forever = Event()
-    forever.wait(_MEETING_S)
+    forever.wait(_DISCOVERY_S)
     if once_s is None:
         for _ in Rate(1.0, SystemClock(), forever):
             monitor.report(as_json=as_json)
@@ -143,6 +140,6 @@ def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool
     while reason := monitor.update():
         if time.monotonic() > deadline:
             fail(f"gave up after {once_s:g} s: {reason}")
-        forever.wait(_MEETING_S)
+        forever.wait(_DISCOVERY_S)
     forever.wait(_FIRST_AFTER_S)
     monitor.report(as_json=as_json)

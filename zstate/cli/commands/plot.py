@@ -62,7 +62,7 @@ def plot_command(
 ) -> None:
     """Draw the joint positions of ROBOT over time, or the path of a frame, into a file.
 
-    Plots live data of the next seconds, or a recording. ROBOT may be left out if there is only one.
+    Plots live data of the next seconds, or a recording. ROBOT may be left out if there is only one robot.
     Needs Matplotlib: pip install 'zstate[plot]'.
 
     \b
@@ -75,9 +75,9 @@ def plot_command(
 
     plot.new_figure("", 1.0)  # reports a missing Matplotlib before it collects data
     if joints and frames:
-        raise click.UsageError("--joint and --path are two different pictures; give one of them")
+        raise click.UsageError("--joint and --path exclude each other: they are different plots")
     if file is None and start is not None:
-        raise click.UsageError("--start is for recordings: --file RECORDING")
+        raise click.UsageError("--start needs --file RECORDING")
     if file is not None:
         name, start_s = robot or Path(file).stem, start or 0.0
         if frames:
@@ -93,7 +93,7 @@ def plot_command(
                 series = plot.live_joints(session, name, wire, seconds or _LIVE_S)
     series = series.select(joints)
     if len(series.stamps) < 2:
-        fail("one sample makes no curve; give it more time: --seconds")
+        fail("fewer than two samples arrived, so there is no curve; use a longer --seconds")
     path = output or Path(f"{(frames[1] if frames else name).replace('/', '_')}.png")
     if frames:
         plot.draw_path(series, f"{frames[1]} in {frames[0]}", path)

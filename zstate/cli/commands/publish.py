@@ -1,12 +1,9 @@
-"""zstate publish: the state publisher.
-
-Joint states of somebody else, with a word when they begin.
-"""
+"""zstate publish: the state publisher of a robot."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +16,7 @@ from zstate.cli.options import (
     load_robot,
     metrics_option,
     name_option,
+    open_clock,
     seconds_option,
     session_options,
     takeover_option,
@@ -27,19 +25,13 @@ from zstate.cli.options import (
 )
 from zstate.cli.output.console import count_text, fail, print_status, print_wrapped, report_text
 from zstate.cli.output.wire_text import is_ros, messages_for
-from zstate.cli.processes import BackgroundCall
 from zstate.cli.session import SessionOptions, open_session
-from zstate.model.robot import RobotModel
-from zstate.net.session import Session
-from zstate.net.topic_statistics import mean_rate_hz
-from zstate.nodes.publisher import StatePublisher
-from zstate.sources import JointReading, SubscribedSource
 
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
-    from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.nodes.publisher import StatePublisher
+    from zstate.sources import JointReading
     from zstate.sources.joint_source import JointSource
     from zstate.wire.keys import Stream
 
@@ -48,7 +40,7 @@ _DERIVED: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
 _EVERYTHING: tuple[Stream, ...] = ("joint_states", *_DERIVED)
 
 
-def _source(_: click.Context, __: click.Parameter, source: str) -> str:
+def _checked_source(_: click.Context, __: click.Parameter, source: str) -> str:
     if source not in ("joints", "sine") and not Path(source).exists():
         raise click.BadParameter(f"{source!r} is neither 'joints' nor 'sine' nor a recording that exists")
     return source
@@ -59,19 +51,19 @@ def _source(_: click.Context, __: click.Parameter, source: str) -> str:
 @xacro_arguments
 @click.option(
     "--source",
-    callback=_source,
+    callback=_checked_source,
     default="joints",
     show_default=True,
     metavar="joints|sine|FILE",
-    help="joints: what somebody else writes on joint_states; sine: every joint swings; FILE: the motion of a "
-    "recording, once, as if it were now.",
+    help="joints: the joint_states of another writer; sine: every joint swings; FILE: the motion of a "
+    "recording, once, with new stamps.",
 )
 @click.option(
     "--rate",
     type=float,
     callback=checked_rate,
     metavar="HZ",
-    help="Samples a second, exactly; default: every sample that comes in, and 100 for another source.",
+    help="Exact rate of samples. Default: every sample of joint_states; 100 for other sources.",
 )
 @wires_option
 @clock_option
@@ -97,74 +89,65 @@ def publish_command(
     """Publish the state of ROBOT: its model, its fixed edges, and transforms.
 
     ROBOT is a name such as panda, or a URDF or xacro file; NAME:=VALUE are xacro arguments. By default
-    follows its joint_states, which a driver or `zstate joints ROBOT` writes, and publishes every sample.
-    With another source writes joint_states as well.
+    subscribes to the robot's joint_states, which a driver or `zstate joints ROBOT` publishes, and publishes
+    the transforms of every sample. With another source it publishes joint_states as well.
 
-    On the native wire it remembers the last seconds for whoever joins, and answers lookups on
-    zstate/ROBOT/lookup, for devices without a buffer.
+    On the native wire it keeps the last seconds for late joiners, and answers lookups on zstate/ROBOT/lookup
+    for devices without a buffer.
 
-    With several wires joint_states are heard on the first, and the others get everything. ROS 2 nodes
-    are met at their router: where ROS 2 is spoken alone, that of this host is found; otherwise say
-    --connect, or let `zstate bridge` carry the robot over.
+    With several wires joint_states are read from the first, and the others get everything. ROS 2 nodes are
+    reached through their router. With ROS wires only, the router of this host is the default; otherwise pass
+    --connect, or run `zstate bridge`.
 
     \b
     zstate publish panda --source sine
     zstate publish arm.urdf --rate 250
     zstate publish arm.urdf.xacro prefix:=left_
     zstate publish panda --source run.mcap
-    zstate publish panda --source sine --clock sim     # as time goes on in a simulation or a replay
-    zstate publish arm.urdf --wire ros2                # in the place of robot_state_publisher
+    zstate publish panda --source sine --clock sim     # in the time of a simulation or a replay
+    zstate publish arm.urdf --wire ros2                # instead of robot_state_publisher
     zstate publish panda --wire native --wire ros2 --connect tcp/127.0.0.1:7447
     """
-    from zstate.cli.options import open_clock
     from zstate.nodes.publisher import StatePublisher
     from zstate.sources import SineSource
 
-    model, called = load_robot(robot, name, xacro_args)
-    followed = wires[:1] if source == "joints" else ()
+    model, robot_name = load_robot(robot, name, xacro_args)
+    # Joint states are read from the first wire, which gets only what is derived from them.
+    derived_wires = wires[:1] if source == "joints" else ()
+    whole_wires = wires[len(derived_wires) :]
     with (
         open_session(network, wires) as session,
         open_clock(session, clock, wires[0]) as time,
         StatePublisher(
-            session, model, called, followed, streams=_DERIVED, clock=time, takeover=takeover
+            session, model, robot_name, derived_wires, streams=_DERIVED, clock=time, takeover=takeover
         ) as derived,
-        StatePublisher(
-            session, model, called, wires[len(followed) :], clock=time, takeover=takeover
-        ) as whole,
+        StatePublisher(session, model, robot_name, whole_wires, clock=time, takeover=takeover) as whole,
         served(metrics, of_publishers(derived, whole)),
     ):
-        places = [messages_for(wire).place(called, _DERIVED) for wire in followed]
-        places += [messages_for(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]
-        _introduce(whole, places)
-        _mention_router(network, wires)
-        if followed:
-            _follow(session, followed[0], derived, whole, rate, seconds)
+        places = [messages_for(wire).place(robot_name, _DERIVED) for wire in derived_wires]
+        places += [messages_for(wire).place(robot_name, _EVERYTHING) for wire in whole_wires]
+        size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
+        print_wrapped(f"publishing {robot_name!r} ({size}) on {' and on '.join(places)}")
+        if model.findings:
+            print_status(
+                f"{count_text(len(model.findings), 'warning')} about the model; `zstate check` shows them"
+            )
+        if not network.is_given and len(set(map(is_ros, wires))) == 2:
+            print_status("ROS 2 nodes are behind their router; pass --connect, such as tcp/127.0.0.1:7447")
+        if derived_wires:
+            _publish_joint_states(session, derived_wires[0], derived, whole, rate, seconds)
         elif source == "sine":
             run_publisher(whole, SineSource(model), rate or _RATE_HZ, seconds)
         else:
-            _publish_recording(whole, source, rate or _RATE_HZ, seconds)
+            from zstate.recording.source import RecordedSource
+
+            rate_hz = rate or _RATE_HZ
+            with RecordedSource(source, None, model) as recorded:
+                # One tick more than the recording is long, for its last sample.
+                run_publisher(whole, recorded, rate_hz, seconds or recorded.duration_s + 1.0 / rate_hz)
 
 
-def _introduce(publisher: StatePublisher, places: list[str]) -> None:
-    model = publisher.model
-    size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
-    print_wrapped(f"publishing {publisher.robot!r} ({size}) on {' and on '.join(places)}")
-    _mention_warnings(model)
-
-
-def _mention_router(network: SessionOptions, wires: tuple[str, ...]) -> None:
-    if not network.is_given and len(set(map(is_ros, wires))) == 2:
-        print_status("ROS 2 nodes are met at their router: say --connect, for instance tcp/127.0.0.1:7447")
-
-
-def _mention_warnings(model: RobotModel) -> None:
-    if model.findings:
-        print_status(
-            f"{count_text(len(model.findings), 'warning')} about the model; `zstate check` shows them"
-        )
-
-
-def _follow(  # noqa: PLR0917 - one use, in the order of what happens
+def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
     session: Session,
     wire: str,
     derived: StatePublisher,
@@ -172,101 +155,72 @@ def _follow(  # noqa: PLR0917 - one use, in the order of what happens
     rate_hz: float | None,
     seconds: float | None,
 ) -> None:
+    """Publish the joint states of ``wire``: what they imply with ``derived``, everything with ``whole``."""
+    from zstate.net.topic_statistics import mean_rate_hz
+    from zstate.sources import SubscribedSource
 
-    words, robot = messages_for(wire), derived.robot
-    place = words.place(robot, ("joint_states",))
+    messages, robot = messages_for(wire), derived.robot
+    place = messages.place(robot, ("joint_states",))
+    count = first = last = 0
+
+    def on_reading(reading: JointReading) -> None:
+        nonlocal count, first, last
+        assert reading.stamp is not None
+        if not count:
+            first = reading.stamp
+            print_status(f"receiving {place}: {len(reading.positions)} positions")
+        count, last = count + 1, reading.stamp
+        whole.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
+
     print_status(f"waiting for {place} ...")
-    with HeardSource(session, derived.model, robot, wire, further=whole) as source:
+    with SubscribedSource(session, derived.model, robot, wire=wire) as source:
         if rate_hz is not None:
-            run_publisher(derived, source, rate_hz, seconds)
+            run_publisher(derived, _ObservedSource(source, on_reading), rate_hz, seconds)
         else:
-            _publish_every_sample(derived, source, seconds)
-        if not source.count:
-            who = words.translate("`zstate ls` shows who writes what")
-            fail(f"heard nothing on {place} in {seconds:g} s; {who}")
+            if seconds is not None:
+                timer = threading.Timer(seconds, source.close)
+                timer.daemon = True
+                timer.start()
+            try:
+                for reading in source:
+                    on_reading(reading)
+                    derived.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
+            finally:
+                if count:
+                    mean_hz = mean_rate_hz(count, last - first) or 0.0
+                    print_wrapped(f"{count_text(count, 'sample')} published, {mean_hz:.2f} Hz")
+        if not count:
+            advice = messages.translate("`zstate ls` shows the writers")
+            fail(f"received nothing on {place} in {seconds:g} s; {advice}")
+
+
+class _ObservedSource:
+    """A joint source whose readings are also passed to ``on_reading``."""
+
+    def __init__(self, source: JointSource, on_reading: Callable[[JointReading], None]) -> None:
+        self._source, self._on_reading = source, on_reading
+
+    def read(self, stamp: int) -> JointReading | None:
+        reading = self._source.read(stamp)
+        if reading is not None:
+            self._on_reading(reading)
+        return reading
 
 
 def run_publisher(
     publisher: StatePublisher, source: JointSource, rate_hz: float, seconds: float | None
 ) -> None:
-    """``publisher.run``, and its report at the end, also after a signal.
+    """``publisher.run``, with its report at the end, also after a signal.
 
     A signal interrupts only the calling thread, which waits, so that the loop of the publisher ends in order.
     """
+    from zstate.cli.processes import BackgroundCall
 
-    worker = BackgroundCall("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
+    call = BackgroundCall("zstate publish", lambda: publisher.run(source, rate_hz, seconds=seconds))
     try:
-        report = worker.result()
+        report = call.result()
     except SystemExit:
         publisher.close()
-        print_wrapped(report_text(worker.result(1.0)))
+        print_wrapped(report_text(call.result(1.0)))
         raise
     print_wrapped(report_text(report))
-
-
-def _publish_recording(publisher: StatePublisher, path: str, rate_hz: float, seconds: float | None) -> None:
-    from zstate.recording.source import RecordedSource
-
-    with RecordedSource(path, None, publisher.model) as source:
-        # One tick more than the recording is long, for its last sample.
-        run_publisher(publisher, source, rate_hz, seconds or source.duration_s + 1.0 / rate_hz)
-
-
-def _publish_every_sample(publisher: StatePublisher, source: HeardSource, seconds: float | None) -> None:
-    if seconds is not None:
-        timer = threading.Timer(seconds, source.close)
-        timer.daemon = True
-        timer.start()
-    try:
-        for reading in source:
-            publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
-    finally:
-        if source.count:
-            print_wrapped(f"{count_text(source.count, 'sample')} published, {source.rate_hz:.2f} Hz")
-
-
-class HeardSource(SubscribedSource):
-    """A SubscribedSource that announces the first reading and counts them all.
-
-    Each one is published by ``further`` as well.
-    """
-
-    def __init__(
-        self,
-        session: Session,
-        model: RobotModel,
-        robot: str,
-        wire: str,
-        *,
-        further: StatePublisher,
-    ) -> None:
-        super().__init__(session, model, robot, wire=wire)
-        self.count = 0
-        self._further = further
-        self._place = messages_for(wire).place(robot, ("joint_states",))
-        self._first = self._last = 0
-
-    @property
-    def rate_hz(self) -> float:
-        """The rate of the readings so far, by their stamps; 0 for fewer than two."""
-        return mean_rate_hz(self.count, self._last - self._first) or 0.0
-
-    def read(self, stamp: int) -> JointReading | None:
-        reading = super().read(stamp)
-        if reading is not None:
-            self._note(reading)
-        return reading
-
-    def __iter__(self) -> Iterator[JointReading]:
-        for reading in super().__iter__():
-            self._note(reading)
-            yield reading
-
-    def _note(self, reading: JointReading) -> None:
-        assert reading.stamp is not None
-        if not self.count:
-            self._first = reading.stamp
-            print_status(f"heard {self._place}: {len(reading.positions)} positions")
-        self._last = reading.stamp
-        self.count += 1
-        self._further.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)

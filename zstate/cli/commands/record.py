@@ -1,32 +1,42 @@
-"""zstate record: what robots say, into MCAP files."""
+"""zstate record: robots into MCAP files."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import click
 
 from zstate.cli.metrics import of_recorder, of_writers, served
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
-from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
+from zstate.cli.output.console import (
+    count_text,
+    fail,
+    files_text,
+    is_terminal,
+    print_status,
+    print_wrapped,
+    size_text,
+)
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
-    from zstate.cli.output.recording_text import RecordProgress
     from zstate.metrics.endpoint import BindAddress
-    from zstate.recording.recorder import Recorder
+    from zstate.recording.recorder import Recorder, RecorderStats
 
 _LINE_S = 1.0
 _REFRESH_S = 0.25
 _INDEX_WITHIN_S = 10.0
+# Discovery takes less.
+_DISCOVERY_S = 0.5
 
 
 def _checked_megabytes(_: click.Context, __: click.Parameter, size: float | None) -> float | None:
     if size is not None and not (math.isfinite(size) and size >= 0.1):
-        raise click.BadParameter(f"a file has 0.1 MB or more; got {size}")
+        raise click.BadParameter(f"a file has at least 0.1 MB; got {size}")
     return size
 
 
@@ -34,22 +44,22 @@ def _checked_megabytes(_: click.Context, __: click.Parameter, size: float | None
 @click.argument("file")
 @click.argument("robots", metavar="[ROBOT]...", nargs=-1)
 @wire_option
-@click.option("--duration", type=float, callback=checked_seconds, metavar="S", help="End after so long [s].")
+@click.option("--duration", type=float, callback=checked_seconds, metavar="S", help="Stop after S seconds.")
 @click.option(
     "--split-size",
     type=float,
     callback=_checked_megabytes,
     metavar="MB",
-    help="Begin another file (FILE_1, FILE_2 ...) when one has grown so large.",
+    help="Start a new file (FILE_1, FILE_2 ...) when one reaches this size.",
 )
 @click.option(
     "--split-seconds",
     type=click.FloatRange(min=1.0),
     callback=checked_seconds,
     metavar="S",
-    help="Begin another file after so long.",
+    help="Start a new file every S seconds.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace a FILE that exists.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing FILE.")
 @metrics_option
 @session_options
 def record_command(
@@ -64,11 +74,11 @@ def record_command(
     metrics: BindAddress | None,
     network: SessionOptions,
 ) -> None:
-    """Record ROBOTs, or all there are, into the MCAP file FILE, until Ctrl-C.
+    """Record ROBOTs, by default all, into the MCAP file FILE until Ctrl-C.
 
-    ROS 2's messages, which Foxglove, PlotJuggler, Rerun and rosbags read as they are. Each file can be
-    understood by itself: it holds the model and the fixed edges, and again every 10 s. After a crash
-    what is older than half a second is there; `zstate recover` makes a complete file of it.
+    Writes ROS 2 messages, which Foxglove, PlotJuggler, Rerun and rosbags read directly. Each file of a split
+    recording is complete by itself: the model and the fixed edges are written at its start and every 10 s.
+    After a crash all but the last 0.5 s is in the file; `zstate recover` makes a complete file of it.
 
     \b
     zstate record run.mcap
@@ -96,33 +106,31 @@ def record_command(
             fail(str(error).replace("overwrite=True", "--overwrite"))
         with (
             recorder,
-            RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as roster,
-            served(metrics, of_recorder(recorder), of_writers(roster)),
+            RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
+            served(metrics, of_recorder(recorder), of_writers(directory)),
         ):
-            _run(recorder, roster, robots, duration)
-
-
-def _run(recorder: Recorder, roster: RobotDirectory, robots: tuple[str, ...], duration: float | None) -> None:
-    from zstate.cli.output.recording_text import RecordProgress
-
-    progress = RecordProgress(recorder, roster, robots)
-    try:
-        _show(recorder, progress, duration)
-    finally:
-        recorder.close()
-        recorder.wait(_INDEX_WITHIN_S)  # on a busy machine, the index of a large file takes its time
-        print_wrapped(progress.summary())
-    if recorder.failure is not None:
-        raise recorder.failure
-    if not recorder.stats.messages:
-        fail(f"nothing was recorded: {progress.no_message_text}")
+            progress = RecordProgress(recorder, directory, robots)
+            try:
+                _show(recorder, progress, duration)
+            finally:
+                recorder.close()
+                recorder.wait(_INDEX_WITHIN_S)  # the index of a large file takes its time on a busy machine
+                print_wrapped(progress.summary())
+            if recorder.failure is not None:
+                raise recorder.failure
+            if not recorder.stats.messages:
+                fail(f"nothing was recorded: {progress.no_message_text}")
 
 
 def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) -> None:
-    """Until the recording has ended, or for ``duration`` seconds."""
+    """Show progress until the recording has ended, or for ``duration`` seconds."""
     until = math.inf if duration is None else time.monotonic() + duration
+
+    def is_over(pause_s: float) -> bool:
+        return recorder.wait(min(pause_s, max(0.0, until - time.monotonic()))) or time.monotonic() >= until
+
     if not is_terminal():
-        while not _is_over(recorder, until, _LINE_S):
+        while not is_over(_LINE_S):
             for change in progress.changes():
                 print_status(change)
             print_wrapped(progress.line())
@@ -131,12 +139,81 @@ def _show(recorder: Recorder, progress: RecordProgress, duration: float | None) 
     from rich.text import Text
 
     with Live(auto_refresh=False, transient=True) as live:
-        while not _is_over(recorder, until, _REFRESH_S):
+        while not is_over(_REFRESH_S):
             for change in progress.changes():
                 live.console.print(change, markup=False, highlight=False, soft_wrap=True)
             live.update(Text(progress.line()), refresh=True)
 
 
-def _is_over(recorder: Recorder, until: float, pause_s: float) -> bool:
-    """Wait ``pause_s``, then return whether the recording has ended."""
-    return recorder.wait(min(pause_s, max(0.0, until - time.monotonic()))) or time.monotonic() >= until
+class RecordProgress:
+    """Progress of a recorder: its streams, its rate, and the robots it waits for."""
+
+    def __init__(self, recorder: Recorder, directory: RobotDirectory, robots: Sequence[str]) -> None:
+        self._recorder = recorder
+        self._directory = directory
+        self._robots = robots
+        self._listed: set[tuple[str, str]] = set()
+        self._waiting = ""
+        self._start = time.monotonic()
+        self._before = (self._start, 0)
+
+    def line(self) -> str:
+        """Duration, messages, rate since the last call, size and robots."""
+        stats, now = self._recorder.stats, time.monotonic()
+        count = sum(stats.messages.values())
+        before, count_before = self._before
+        self._before = (now, count)
+        rate = (count - count_before) / max(now - before, 1e-9)
+        robots = ", ".join(_robots(stats)) or "no robot yet"
+        lost = f"  lost {_lost(stats)}" if _lost(stats) else ""
+        took = f"{now - self._start:.0f} s"
+        return f"{took}  {count} messages  {rate:.1f}/s  {size_text(stats.bytes)}  {robots}{lost}"
+
+    def changes(self) -> Iterator[str]:
+        """Streams recorded since the last call, and robots that are missing."""
+        streams = set(self._recorder.stats.messages)
+        for robot in sorted({robot for robot, _ in streams - self._listed}):
+            new = sorted(stream for name, stream in streams - self._listed if name == robot)
+            yield "recording the clock" if new == ["clock"] else f"recording {robot}: {', '.join(new)}"
+        self._listed |= streams
+        waiting = self._missing({robot for robot, stream in streams if stream != "clock"})
+        if waiting and waiting != self._waiting and time.monotonic() - self._start > _DISCOVERY_S:
+            yield f"waiting: {waiting}"
+            self._waiting = waiting
+
+    @property
+    def no_message_text(self) -> str:
+        """The reason why nothing was recorded, as far as it can be determined here."""
+        announced = self._directory.robots()
+        return self._missing(set()) or f"{self._directory.words.announced(announced)}, but no message came"
+
+    def _missing(self, recorded: set[str]) -> str:
+        announced, messages = self._directory.robots(), self._directory.words
+        if not self._robots:
+            return "" if recorded or announced else messages.announced(announced)
+        missing = set(self._robots) - recorded - {info.name for info in announced}
+        return "; ".join(messages.unknown(robot, announced) for robot in sorted(missing))
+
+    def summary(self) -> str:
+        """Messages, robots, files and losses at the end."""
+        stats, took = self._recorder.stats, time.monotonic() - self._start
+        messages = count_text(sum(stats.messages.values()), "message")
+        robots = f" of {', '.join(_robots(stats))}" if _robots(stats) else ""
+        lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
+        where = f"{files_text(stats.files)} ({size_text(stats.bytes)})"
+        return f"recorded {messages}{robots} in {took:.1f} s into {where}; {lost}"
+
+
+def _robots(stats: RecorderStats) -> list[str]:
+    return sorted({robot for robot, stream in stats.messages if stream != "clock"})
+
+
+def _lost(stats: RecorderStats) -> str:
+    reasons = ", ".join(f"{reason} {count}" for reason, count in stats.refused.items())
+    parts = (
+        (stats.dropped, "dropped here"),
+        (stats.missed, "missed on the way"),
+        (stats.unwritten, "without a description that fits"),
+        (sum(stats.refused.values()), f"refused ({reasons})"),
+    )
+    return ", ".join(f"{count} {what}" for count, what in parts if count)

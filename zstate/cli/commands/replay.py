@@ -1,19 +1,21 @@
-"""zstate replay: what was recorded, said again."""
+"""zstate replay: playback of a recording."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import click
 
 from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
-from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
+from zstate.cli.output.console import count_text, fail, is_terminal, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, format_duration
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
+    from zstate.net.session import Session
     from zstate.recording.player import Player, PlayerReport
 
 _LINE_S = 1.0
@@ -39,19 +41,19 @@ def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
     show_default=True,
     callback=_checked_rate,
     metavar="X",
-    help="Recorded seconds a second; inf: as fast as it can.",
+    help="Playback speed, 1 is real time; inf: as fast as possible.",
 )
 @click.option(
     "--start",
     type=click.FloatRange(min=0.0),
     default=0.0,
     metavar="S",
-    help="Begin so long after the recording's beginning [s].",
+    help="Start S seconds after the start of the recording.",
 )
 @click.option(
-    "--duration", type=float, callback=checked_seconds, metavar="S", help="Replay so much of it [s]."
+    "--duration", type=float, callback=checked_seconds, metavar="S", help="Replay S seconds of the recording."
 )
-@click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
+@click.option("--loop", is_flag=True, help="Start again at the end, until Ctrl-C.")
 @wires_option
 @takeover_option
 @session_options
@@ -67,17 +69,17 @@ def replay_command(
     takeover: bool,
     network: SessionOptions,
 ) -> None:
-    """Publish what FILE holds of ROBOTs, or of all there are, with the stamps it was recorded with.
+    """Publish the ROBOTs in FILE, by default all, with their recorded stamps.
 
-    FILE is an MCAP file of `zstate record`, or a bag of ROS 2. The time of the recording is said on
-    zstate/clock, and on /clock. Not where somebody else writes the same robots now.
+    FILE is an MCAP file of `zstate record`, or a ROS 2 bag. The time of the recording is published on
+    zstate/clock, and on /clock for a ROS wire. Fails if the same robots have live writers, unless --takeover.
 
     \b
     zstate replay run.mcap
     zstate replay run.mcap panda --rate 0.5 --start 30 --duration 10 --loop
     zstate replay bag_folder --wire ros2:domain=5
     """
-    from zstate.cli.output.recording_text import conflicting_writers, replay_heading
+    from zstate.cli.processes import BackgroundCall
     from zstate.recording.player import Player
 
     with (
@@ -92,48 +94,98 @@ def replay_command(
             duration_s=duration,
             loop=loop,
             takeover=takeover,
-        ) as replayer,
+        ) as player,
     ):
-        live = conflicting_writers(session, replayer.robots, wires)
-        if live and not takeover:
-            fail(f"there is {'; '.join(live)} on the network already; end that first, or use --takeover")
-        print_wrapped(replay_heading(replayer, file))
-        _run(replayer)
+        conflicts = _conflicting_writers(session, player.robots, wires)
+        if conflicts and not takeover:
+            fail(f"already published on the network: {'; '.join(conflicts)}; stop that, or use --takeover")
+        print_wrapped(_heading(player, file))
+        call = BackgroundCall("zstate replay", player.run)
+        try:
+            report = _show(player, call)
+        except SystemExit:
+            player.close()
+            print_wrapped(_summary(player.report()))
+            raise
+        print_wrapped(_summary(report))
+        if not report.samples:
+            fail("no sample was published; `zstate info` shows the contents of the file")
 
 
-def _run(replayer: Player) -> None:
-    from zstate.cli.output.recording_text import replay_summary
+def _show(player: Player, call: BackgroundCall[PlayerReport]) -> PlayerReport:
+    """Show progress until the playback has ended."""
 
-    worker = BackgroundCall("zstate replay", replayer.run)
-    try:
-        report = _show(replayer, worker)
-    except SystemExit:
-        replayer.close()
-        print_wrapped(replay_summary(replayer.report()))
-        raise
-    print_wrapped(replay_summary(report))
-    if not report.samples:
-        fail("no sample was published; `zstate info` shows what the file holds")
-
-
-def _show(replayer: Player, worker: BackgroundCall[PlayerReport]) -> PlayerReport:
-    """Until it has ended."""
-    from zstate.cli.output.recording_text import replay_line
+    def wait(timeout_s: float) -> PlayerReport | None:
+        with suppress(TimeoutError):
+            return call.result(timeout_s)
+        return None
 
     if not is_terminal():
-        while (report := _result(worker, _LINE_S)) is None:
-            print_status(replay_line(replayer))
+        while (report := wait(_LINE_S)) is None:
+            print_status(_line(player))
         return report
     from rich.live import Live
     from rich.text import Text
 
     with Live(auto_refresh=False, transient=True) as live:
-        while (report := _result(worker, _REFRESH_S)) is None:
-            live.update(Text(replay_line(replayer)), refresh=True)
+        while (report := wait(_REFRESH_S)) is None:
+            live.update(Text(_line(player)), refresh=True)
     return report
 
 
-def _result(worker: BackgroundCall[PlayerReport], timeout_s: float) -> PlayerReport | None:
-    with suppress(TimeoutError):
-        return worker.result(timeout_s)
-    return None
+def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequence[str]) -> list[str]:
+    """Writers on the network of streams that a replay of ``robots`` would publish."""
+    from zstate.net.presence import discover
+    from zstate.wire.registry import get_wire
+
+    conflicts: list[str] = []
+    for name in wires:
+        wire = get_wire(name)
+        # The name of a replayed robot on this wire: ROS has only namespaces.
+        names = {wire.robot_of(wire.expression(robot, "joint_states")): robot for robot in robots}
+        replayed = {"joint_states", "robot_description", "tf"} - wire.shared
+        for info in discover(session, wire=name):
+            writers = {str(writer) for stream, writer in info.writers if stream in replayed}
+            if info.name in names and writers:
+                conflicts.append(f"{names[info.name]!r} by {', '.join(sorted(writers))}")
+    return conflicts
+
+
+def _heading(player: Player, file: str) -> str:
+    """Robots, time span and rate."""
+    from zstate.clock import format_stamp
+
+    first, last = player.span
+    robots = ", ".join(map(repr, player.robots))
+    rate = "as fast as possible" if player.rate == float("inf") else f"at {player.rate:g} times its speed"
+    duration = f"{(last - first) / 1e9:.1f} s"
+    return (
+        f"replaying {robots} from {file}: {duration}, {format_stamp(first)} to {format_stamp(last)}, {rate}"
+    )
+
+
+def _line(player: Player) -> str:
+    """Position, rate and lateness."""
+    from zstate.clock import format_stamp
+
+    first, last = player.span
+    now, report = player.position, player.report()
+    position = f"{(now - first) / 1e9:.1f} of {(last - first) / 1e9:.1f} s"
+    late = format_duration(report.lateness_p99)
+    return f"{position}  {format_stamp(now)}  {report.samples} samples  {report.rate:.2f}x  late {late}"
+
+
+def _summary(report: PlayerReport) -> str:
+    """Samples, rate, lateness and refusals at the end."""
+    late = (
+        f"late by {format_duration(report.lateness_p50)} (median), {format_duration(report.lateness_p99)} "
+        f"(p99), {format_duration(report.lateness_max)} (maximum)"
+    )
+    passes = f" in {report.passes} passes" if report.passes > 1 else ""
+    delays = f"; fell {count_text(report.delays, 'time')} more than a second behind" if report.delays else ""
+    reasons = ", ".join(f"{reason} {count}" for reason, count in report.refused.items())
+    refused = f"; not published: {reasons}" if reasons else ""
+    return (
+        f"replayed {count_text(report.samples, 'sample')}{passes} at {report.rate:.3f} times the speed, "
+        f"{late}{delays}{refused}"
+    )

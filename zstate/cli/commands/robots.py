@@ -1,4 +1,4 @@
-"""zstate robots: the robots that are known by name."""
+"""zstate robots: the catalog of robot models."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from zstate.cli.output.console import count_text, fail, print_json, print_result
 @click.argument("name", metavar="[TEXT]", default="")
 @json_option("One JSON array of objects with name, path and origin.")
 def robots_command(name: str, *, as_json: bool) -> None:
-    """List the robots that every command takes by name, or those whose name contains TEXT.
+    """List the robot models that commands accept by name, or those whose name contains TEXT.
 
     They come with zstate, from the package example-robot-data (pip install 'zstate[robots]'), and from
-    what robot_descriptions has downloaded before. Any other robot is a path to its URDF or xacro file.
-    For robots that run now, see `zstate ls`.
+    earlier downloads of robot_descriptions. For any other robot, pass the path of its URDF or xacro file.
+    `zstate ls` lists running robots.
 
     \b
     zstate robots
@@ -29,7 +29,7 @@ def robots_command(name: str, *, as_json: bool) -> None:
     everything = catalog()
     entries = [entry for entry in everything if name.lower() in entry.name]
     if not entries and not as_json:
-        fail(f"no robot known by name contains {name!r}; `zstate robots` lists all {len(everything)}")
+        fail(f"no name of a robot model contains {name!r}; `zstate robots` lists all {len(everything)}")
     if as_json:
         print_json([{"name": one.name, "path": str(one.path), "origin": one.origin} for one in entries])
         return

@@ -1,4 +1,4 @@
-"""zstate router: a place where clients and other routers meet."""
+"""zstate router: Zenoh router for clients and other routers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from zstate.cli.session import SessionOptions, open_session
 if TYPE_CHECKING:
     from zstate.metrics.endpoint import BindAddress
     from zstate.net.security.credentials import Credentials
-    from zstate.net.security.router_config import Downsampling, RouterConfig
 
 
 @click.command("router")
@@ -25,36 +24,39 @@ if TYPE_CHECKING:
     "--listen",
     multiple=True,
     metavar="ENDPOINT",
-    help="Where clients come to; default: tcp/127.0.0.1:7447. May be repeated.",
+    help="Endpoint for clients; default: tcp/127.0.0.1:7447. May be repeated.",
 )
-@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router to join; may be repeated.")
+@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router; may be repeated.")
 @click.option(
     "--acl",
     type=click.Path(exists=True, dir_okay=False),
     metavar="FILE",
-    help="Who may do what: what `zstate acl` prints.",
+    help="Access control: the output of `zstate acl`.",
 )
 @click.option(
     "--downsample",
     multiple=True,
     metavar="STREAM=HZ",
-    help="At most HZ samples a second of joint_states or tf to each neighbour; may be repeated.",
+    help="At most HZ samples per second of joint_states or tf to each neighbour; may be repeated.",
 )
-@click.option("--robot", multiple=True, metavar="NAME", help="Whose streams those are; may be repeated.")
+@click.option("--robot", multiple=True, metavar="NAME", help="Downsample this robot; may be repeated.")
 @click.option(
-    "--wan", multiple=True, metavar="INTERFACE", help="Downsample there only, such as wwan0; may be repeated."
+    "--wan",
+    multiple=True,
+    metavar="INTERFACE",
+    help="Downsample only on this interface, such as wwan0; may be repeated.",
 )
-@click.option("--namespace", default="", metavar="KEY", help="The namespace of those robots' sessions.")
-@click.option("--ros2", is_flag=True, help="With the settings of rmw_zenohd, in its place.")
+@click.option("--namespace", default="", metavar="KEY", help="Zenoh namespace of the --robot sessions.")
+@click.option("--ros2", is_flag=True, help="Use the settings of rmw_zenohd, to replace it.")
 @router_identity_options
 @config_option
 @metrics_option
-@click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5), and run nothing.")
+@click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5) and exit.")
 @click.option(
     "--output",
     type=click.Path(dir_okay=False),
     metavar="FILE",
-    help="Write it into a new FILE that only you can read, with the password of --user.",
+    help="Write the configuration, with the password of --user, to a new FILE that only you can read.",
 )
 def router_command(
     *,
@@ -74,88 +76,62 @@ def router_command(
 ) -> None:
     """Run a Zenoh router until Ctrl-C.
 
-    By default it serves this host alone; `--listen tcp/0.0.0.0:7447` opens it to the network. Other
-    commands reach it with `--connect tcp/HOST:7447`. What `--print` prints, zenohd takes as it is; for the
-    password of --user it prints asterisks, and `--output FILE` has it.
+    By default it serves only this host; `--listen tcp/0.0.0.0:7447` opens it to the network. Other commands
+    use it with `--connect tcp/HOST:7447`. zenohd accepts the output of `--print`; the password of --user is
+    masked there, but not with `--output FILE`.
 
     \b
     zstate router --listen tls/0.0.0.0:7447 --certs fleet --identity router --acl acl.json5
     zstate router --connect tcp/fleet.example:7447 --downsample joint_states=10 --robot r1 --wan wwan0
     zstate router --listen tcp/0.0.0.0:7447 --print >router.json5
     zstate router --ros2                               # for ROS 2 nodes of this host
-    zstate router --ros2 --listen "tcp/[::]:7447"      # for everybody, as rmw_zenohd
+    zstate router --ros2 --listen "tcp/[::]:7447"      # for all hosts, as rmw_zenohd
     """
+    from zstate.net.config import check_credentials, listen_endpoints
+    from zstate.net.security.acl import read_access_control
+    from zstate.net.security.router_config import Downsampling, RouterConfig
+
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
     if file:
-        made = {
+        exclusive = {
             "--ros2": ros2,
             "--acl": acl,
             "--downsample": downsample,
             "--print": only_print,
             "--output": output,
         }
-        _refuse_beside(file, [option for option, is_given in made.items() if is_given])
+        conflicts = [option for option, value in exclusive.items() if value]
+        if conflicts:
+            raise click.UsageError(
+                f"{' and '.join(conflicts)} and the file {file!r} (--config, ZENOH_CONFIG) exclude each "
+                "other: the file is the whole configuration; change it there"
+            )
         _run(SessionOptions("router", connect, listen, config, credentials), listen, metrics, file)
         return
-    thinning = _thinning(downsample, robot, wan, namespace)
-    router = _router(listen, connect, credentials, acl, thinning, ros2=ros2)
+    downsampling = None
+    if downsample:
+        rates = dict(map(_parse_stream_rate, downsample))
+        downsampling = Downsampling(rates, robot, wan, namespace)
+    elif robot or wan or namespace:
+        raise click.UsageError("--robot, --wan and --namespace need --downsample STREAM=HZ")
+    endpoints = listen_endpoints("router", listen, credentials)
+    check_credentials("router", credentials, endpoints)
+    access = read_access_control(acl) if acl else {}
+    router = RouterConfig(endpoints, connect, credentials, downsampling, access, ros2)
     if only_print:
         print_result(router.text(masked=True).rstrip("\n"))
     if output is not None:
-        _write_private(output, router.text())
+        try:
+            with os.fdopen(os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
+                opened.write(router.text())
+        except OSError as error:
+            fail(f"{output!r} cannot be written: {error.strerror}")
     if not only_print and output is None:
         network = SessionOptions("router", config=router.settings(), credentials=credentials)
         _run(network, router.listen, metrics)
 
 
-def _write_private(file: str, text: str) -> None:
-    try:
-        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as opened:
-            opened.write(text)
-    except OSError as error:
-        fail(f"{file!r} cannot be written: {error.strerror}")
-
-
-def _refuse_beside(file: str, options: list[str]) -> None:
-    if options:
-        raise click.UsageError(
-            f"{' and '.join(options)} and the file {file!r} (--config, ZENOH_CONFIG) exclude each other: the "
-            "file is the whole configuration; write it into that"
-        )
-
-
-def _router(
-    listen: tuple[str, ...],
-    connect: tuple[str, ...],
-    credentials: Credentials | None,
-    acl: str | None,
-    thinning: Downsampling | None,
-    *,
-    ros2: bool,
-) -> RouterConfig:
-    from zstate.net.config import check_credentials, listen_endpoints
-    from zstate.net.security.acl import read_access_control
-    from zstate.net.security.router_config import RouterConfig
-
-    where = listen_endpoints("router", listen, credentials)
-    check_credentials("router", credentials, where)
-    access = read_access_control(acl) if acl else {}
-    return RouterConfig(where, connect, credentials, thinning, access, ros2)
-
-
-def _thinning(
-    downsample: tuple[str, ...], robots: tuple[str, ...], interfaces: tuple[str, ...], namespace: str
-) -> Downsampling | None:
-    from zstate.net.security.router_config import Downsampling
-
-    if not downsample:
-        if robots or interfaces or namespace:
-            raise click.UsageError("--robot, --wan and --namespace say what --downsample STREAM=HZ is for")
-        return None
-    return Downsampling(dict(map(_stream_rate, downsample)), robots, interfaces, namespace)
-
-
-def _stream_rate(text: str) -> tuple[str, float]:
+def _parse_stream_rate(text: str) -> tuple[str, float]:
     stream, _, rate = text.partition("=")
     try:
         return stream, float(rate)
@@ -171,11 +147,12 @@ def _run(
 
     with (
         open_session(network) as session,
-        RobotDirectory(session) as roster,
-        served(metrics, of_connections(session), of_writers(roster)),
+        RobotDirectory(session) as directory,
+        served(metrics, of_connections(session), of_writers(directory)),
     ):
-        print_wrapped(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
+        place = ", ".join(listen) or f"the endpoints in {file!r}"
+        print_wrapped(f"router {session.zid} listens at {place}")
         if listen == (default := listen_endpoints("router", (), network.credentials)):
             opened = default[0].replace("127.0.0.1", "0.0.0.0")
-            print_status(f"it serves this host alone; --listen {opened} opens it to the network")
+            print_status(f"it serves only this host; --listen {opened} opens it to the network")
         wait_interruptible(threading.Event())

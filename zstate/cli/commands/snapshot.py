@@ -1,4 +1,4 @@
-"""zstate snapshot: saves robots to a file, and publishes them from it."""
+"""zstate snapshot: robots saved to a file and published from it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def snapshot_command() -> None:
 @click.argument("file", metavar="FILE")
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
 @click.option("--force", is_flag=True, help="Replace an existing FILE.")
-@timeout_option("How long to wait for what is announced.", 3.0)
+@timeout_option("How long to wait for announced streams [s].", 3.0)
 @wire_option
 @session_options
 def save_command(
@@ -111,12 +111,12 @@ def load_command(
 ) -> None:
     """Publish the robots of FILE, or the named ones, until Ctrl-C, with the saved joint positions.
 
-    Joint states are stamped with the current time. Nothing leaves this host, wherever FILE was saved, unless
-    you pass options or --as-saved. Passwords and certificates are not in FILE.
+    Joint states are stamped with the current time. Nothing leaves this host unless you pass session options
+    or --as-saved. Passwords and certificates are not in FILE.
 
     \b
     zstate snapshot load cell.toml
-    zstate snapshot load cell.toml --as-saved          # back to where it was taken
+    zstate snapshot load cell.toml --as-saved          # with the session options it was saved with
     zstate snapshot load cell.toml panda --wire ros2
     """
     from zstate.cli.snapshot import SnapshotPublisher, read_snapshot
@@ -124,8 +124,8 @@ def load_command(
     snapshot = read_snapshot(Path(file))
     selected, edges = snapshot.select(robots)
     if not selected and not edges:
-        fail(f"{file!r} has no robot in it")
-    network, wires = _joining(snapshot.configuration, network, wires, as_saved=as_saved)
+        fail(f"{file!r} contains no robot")
+    network, wires = _session_options(snapshot.configuration, network, wires, as_saved=as_saved)
     with (
         open_session(network, wires) as session,
         SnapshotPublisher(session, selected, edges, wires, takeover=takeover) as publisher,
@@ -133,17 +133,17 @@ def load_command(
         publisher.run(rate, seconds)
 
 
-def _joining(
+def _session_options(
     saved: Configuration, network: SessionOptions, wires: tuple[str, ...], *, as_saved: bool
 ) -> tuple[SessionOptions, tuple[str, ...]]:
     """The session options and wires to use. Logs a note if they differ from the saved ones or repeat them."""
-    is_wire_given = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
+    has_wire_option = click.get_current_context().get_parameter_source("wires") != ParameterSource.DEFAULT
     if as_saved:
         if not saved.is_default:
             print_status(f"as saved on {saved.host!r}: {saved.options()}")
-        return saved.network(network), wires if is_wire_given else (saved.wire,)
-    if not (saved.is_default or network.is_given or is_wire_given):
-        print_status(f"it was saved on {saved.host!r} with {saved.options()}; --as-saved does the same here")
+        return saved.network(network), wires if has_wire_option else (saved.wire,)
+    if not (saved.is_default or network.is_given or has_wire_option):
+        print_status(f"saved on {saved.host!r} with {saved.options()}; --as-saved uses the same options")
     return network, wires
 
 

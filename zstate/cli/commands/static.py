@@ -1,4 +1,4 @@
-"""zstate static: edges that never move."""
+"""zstate static: publisher of static edges."""
 
 from __future__ import annotations
 
@@ -26,31 +26,25 @@ if TYPE_CHECKING:
 @click.command("static")
 @click.argument("target", required=False)
 @click.argument("source", required=False)
-@click.option("--xyz", type=float, nargs=3, metavar="X Y Z", help="Where SOURCE is in TARGET [m].")
-@click.option(
-    "--rpy-deg",
-    type=float,
-    nargs=3,
-    metavar="R P Y",
-    help="How it is turned, as in URDF [deg].",
-)
-@click.option("--rpy", type=float, nargs=3, metavar="R P Y", help="The same in radians.")
-@click.option("--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="The same as a unit quaternion.")
+@click.option("--xyz", type=float, nargs=3, metavar="X Y Z", help="Position of SOURCE in TARGET [m].")
+@click.option("--rpy-deg", type=float, nargs=3, metavar="R P Y", help="Rotation as in URDF, but in degrees.")
+@click.option("--rpy", type=float, nargs=3, metavar="R P Y", help="Rotation as in URDF, in radians.")
+@click.option("--quat-xyzw", type=float, nargs=4, metavar="X Y Z W", help="Rotation as a unit quaternion.")
 @click.option(
     "--file",
     type=click.Path(exists=True, dir_okay=False),
-    help="All [[static]] of a file of `zstate up`, or a calibration in YAML or JSON.",
+    help="All [[static]] of a `zstate up` file, or a calibration in YAML or JSON.",
 )
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter of --file.")
+@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter of --file.")
 @click.option(
     "--robot",
     metavar="NAME",
-    help="Whose edge it is; default: that of a full name, or the only one there is.",
+    help="The robot that owns the edge; default: that of a full frame name, or the only announced one.",
 )
-@click.option("--writer", metavar="NAME", help="Under which name; default: this program and its process id.")
 @click.option(
-    "--new", is_flag=True, help="TARGET is a new frame: do not warn that the robot has none of that name."
+    "--writer", metavar="NAME", help="Name of the writer; default: this program and its process id."
 )
+@click.option("--new", is_flag=True, help="TARGET is a new frame: do not warn that the robot lacks it.")
 @takeover_option
 @wire_option
 @session_options
@@ -71,14 +65,14 @@ def static_command(
     wire: str,
     network: SessionOptions,
 ) -> None:
-    """Publish the pose of SOURCE in TARGET until Ctrl-C; then it is withdrawn.
+    """Publish the pose of SOURCE in TARGET until Ctrl-C, which withdraws it.
 
-    SOURCE becomes a child of TARGET. Late joiners have it at once. Without --xyz it is at the origin of
-    TARGET, without a rotation it is not turned; say at least one. Bare frame names are the robot's own;
-    `robot/frame` names a frame in full. Warns when the robot has no frame TARGET, with near misses.
+    SOURCE becomes a child of TARGET; late joiners receive it at once. Give --xyz, a rotation, or both; each
+    defaults to zero. Bare frame names belong to the robot; `robot/frame` is a full name. Warns if the robot
+    has no frame TARGET, with near misses.
 
-    A frame that several robots share, such as a map, belongs to none of them and is named in full: with
-    fleet/map, r1 and r2 stand in one map; a bare map would be r1/map and r2/map, which are two.
+    A frame that several robots share, such as a map, belongs to none of them and needs a full name: with
+    fleet/map, r1 and r2 are in one map; a bare `map` would be two frames, r1/map and r2/map.
 
     \b
     zstate static panda_hand camera --xyz 0.05 0 0.04 --rpy-deg 0 -90 0
@@ -86,7 +80,7 @@ def static_command(
     zstate static fleet/map r2/odom --xyz 5 1 0                    # two robots
     zstate static --file cell.toml --set site=lab
     zstate static --file handeye.yaml                              # of easy_handeye
-    zstate static panda_hand camera --file handeye.yaml            # with frames called otherwise
+    zstate static panda_hand camera --file handeye.yaml            # with other frame names
     zstate static base_link laser --xyz 0.2 0 0.1 --wire ros2      # on /tf_static
     """
     from zstate.cli.frame_checks import unknown_target_warnings
@@ -94,7 +88,7 @@ def static_command(
     from zstate.nodes.static_publisher import StaticPublisher
 
     if file is not None:
-        edges = _edges_of_file(file, settings, target, source)
+        edges = _read_edges(file, settings, target, source)
     elif target is None or source is None or (xyz, rpy_deg, rpy, quat_xyzw) == (None,) * 4:
         raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
@@ -103,25 +97,25 @@ def static_command(
 
         edge = StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform()
         edges = [OwnedEdge(edge, robot)]
-    spoken = {wire_of for edge in edges for wire_of in edge.wires or (wire,)}
-    with open_session(network, tuple(sorted(spoken))) as session, ExitStack() as publishers:
-        published: list[tuple[StaticPublisher, list[Transform]]] = []
+    all_wires = {name for edge in edges for name in edge.wires or (wire,)}
+    with open_session(network, tuple(sorted(all_wires))) as session, ExitStack() as publishers:
+        to_check: list[tuple[StaticPublisher, list[Transform]]] = []
         for (owner, wires), owned in _by_owner(session, edges, robot, wire).items():
             publisher = publishers.enter_context(
                 StaticPublisher(session, owner, writer, wires, takeover=takeover)
             )
             for edge in owned:
                 publisher.set(edge)
-                print_wrapped(_sentence(edge, publisher, wires))
+                print_wrapped(_edge_text(edge, publisher, wires))
             if "native" in wires and not new:
-                published.append((publisher, owned))
-        for publisher, owned in published:
+                to_check.append((publisher, owned))
+        for publisher, owned in to_check:
             for text in unknown_target_warnings(session, publisher, owned):
                 print_status(f"warning: {text}", event="warning", robot=publisher.robot)
         wait_interruptible(threading.Event())
 
 
-def _edges_of_file(
+def _read_edges(
     file: str, settings: tuple[str, ...], target: str | None, source: str | None
 ) -> list[OwnedEdge]:
     from zstate.cli.up.cell import read_cell
@@ -131,7 +125,7 @@ def _edges_of_file(
 
     if not file.endswith(".toml"):
         if settings:
-            raise click.UsageError(f"--set is for parameters of a .toml file, which {file!r} is not")
+            raise click.UsageError(f"--set needs a .toml file; {file!r} has no parameters")
         edges = read_calibration(Path(file))
         if target is not None and len(edges) > 1:
             raise click.UsageError(f"{file!r} has {len(edges)} transforms; leave out TARGET and SOURCE")
@@ -147,41 +141,33 @@ def _edges_of_file(
 def _by_owner(
     session: Session, edges: list[OwnedEdge], default: str | None, wire: str
 ) -> dict[tuple[str, tuple[str, ...]], list[Transform]]:
-    """The edges of each robot that are said on the same wires."""
+    """The edges by the robot that owns them and the wires they are published on."""
+    from zstate.net.presence import discover
+
     owned: dict[tuple[str, tuple[str, ...]], list[Transform]] = {}
-    for edge in edges:
-        wires = edge.wires or (wire,)
-        owner = edge.robot or _owner_by_name(edge.edge, wires) or default
-        if owner is None:
-            owner = default = _only_robot(session) if "native" in wires else _robot_of_wire(wires[0])
-        owned.setdefault((owner, wires), []).append(edge.edge)
+    for one in edges:
+        wires, frames = one.wires or (wire,), (one.edge.source, one.edge.target)
+        # On a ROS wire frames have no owner, and a slash in a frame name has no meaning.
+        by_name = [frame.partition("/")[0] for frame in frames if "/" in frame and "native" in wires]
+        owner = one.robot or next(iter(by_name), None) or default
+        if owner is None and "native" in wires:
+            print_status("looking for the robot that owns this edge ...")
+            robots = discover(session)
+            if len(robots) != 1:
+                announced = messages_for("native").announced(robots)
+                fail(f"cannot tell which robot owns this edge; pass --robot NAME ({announced})")
+            owner = default = robots[0].name
+        elif owner is None:
+            owner = default = messages_for(wires[0]).robot
+            if owner is None:
+                raise click.UsageError(
+                    "pass --robot NAME; on this wire each robot has a namespace of its name"
+                )
+        owned.setdefault((owner, wires), []).append(one.edge)
     return owned
 
 
-def _owner_by_name(edge: Transform, wires: tuple[str, ...]) -> str | None:
-    # On ROS's side frames are nobody's, and a slash in the name of one is just that.
-    named = [frame.partition("/")[0] for frame in (edge.source, edge.target) if "/" in frame]
-    return named[0] if named and "native" in wires else None
-
-
-def _robot_of_wire(wire: str) -> str:
-    robot = messages_for(wire).robot
-    if robot is None:
-        raise click.UsageError("say --robot NAME; on this wire each robot has a namespace of its name")
-    return robot
-
-
-def _only_robot(session: Session) -> str:
-    from zstate.net.presence import discover
-
-    print_status("looking for the robot this belongs to ...")
-    robots = discover(session)
-    if len(robots) != 1:
-        fail(f"whose edge is this? Say --robot NAME ({messages_for('native').announced(robots)})")
-    return robots[0].name
-
-
-def _sentence(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...]) -> str:
+def _edge_text(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...]) -> str:
     x, y, z = edge.translation
     # Adding zero turns -0 into 0.
     roll, pitch, yaw = (round(degrees(angle), 6) + 0.0 for angle in edge.rpy)
@@ -193,6 +179,6 @@ def _sentence(edge: Transform, publisher: StaticPublisher, wires: tuple[str, ...
         messages_for(wire).place(publisher.robot, ("tf_static",)) for wire in wires if is_ros(wire)
     )
     if "native" not in wires:
-        return f"{pose}, on {places}; Ctrl-C ends it for those who join later"
+        return f"{pose}, on {places}; after Ctrl-C late joiners do not receive it"
     also = f", also on {places}" if places else ""
     return f"{pose}{also}, until Ctrl-C (robot {publisher.robot!r}, writer {publisher.writer!r})"

@@ -1,11 +1,12 @@
-"""zstate tf: the pose of one frame in another, as it comes in."""
+"""zstate tf: the pose of one frame in another."""
 
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -26,19 +27,17 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import LookupFailed
 
 if TYPE_CHECKING:
-    from zstate.cli.waiting import PoseWaiter
     from zstate.nodes.listener import TransformListener
     from zstate.transform import Transform, Twist
 
-# Without a second answer the period is not known: so long without one is worth a note.
+# Silence is reported after this time while the period is unknown, before the second answer.
 _UNKNOWN_S = 2.0
-
 # Without velocities a twist needs a second sample, which arrives sooner.
 _TWIST_WITHIN_S = 1.0
 
 
 def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | None:
-    """Nanoseconds, or seconds with a point as they are printed here; exact either way."""
+    """An exact stamp [ns], from nanoseconds or from seconds with a point, as this command prints them."""
     if text is None:
         return None
     try:
@@ -48,8 +47,8 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
         number, stamp = Decimal(), None
     if stamp is None or stamp != number or abs(stamp) >= 2**63:
         raise click.BadParameter(
-            f"{text!r} is no stamp: give nanoseconds since the Unix epoch, or seconds with a point and at "
-            "most nine digits behind it"
+            f"{text!r} is not a stamp: give nanoseconds since the Unix epoch, or seconds with a point and at "
+            "most nine decimals"
         )
     return stamp
 
@@ -57,25 +56,25 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
 @click.command("tf")
 @click.argument("target", metavar="A")
 @click.argument("source", metavar="B")
-@click.option("--once", is_flag=True, help="Print one answer; give up after --timeout with the reason.")
-@click.option("--at", callback=_stamp, metavar="STAMP", help="One answer, for this instant.")
-@timeout_option("How long --once and --at wait.")
+@click.option("--once", is_flag=True, help="Print one pose; fail after --timeout with the reason.")
+@click.option("--at", callback=_stamp, metavar="STAMP", help="Print one pose, at this stamp.")
+@timeout_option("How long --once and --at wait [s].")
 @click.option(
     "--rate",
     type=float,
     callback=checked_rate,
     default=1.0,
     metavar="HZ",
-    help="At most so many answers a second.",
+    help="Maximum rate of printed poses; default: 1.",
 )
-@click.option("--twist", is_flag=True, help="Also how fast B moves in A.")
+@click.option("--twist", is_flag=True, help="Also print the velocity of B in A.")
 @click.option(
     "--precision",
     type=click.IntRange(0, 15),
     default=3,
     metavar="DIGITS",
     show_default=True,
-    help="Digits behind the point; JSON has them all.",
+    help="Number of decimals; JSON has all digits.",
 )
 @heard_robot_option
 @json_option()
@@ -98,27 +97,30 @@ def tf_command(
     clock: str | None,
     as_json: bool,
 ) -> None:
-    """The pose of frame B in frame A, until Ctrl-C.
+    """Print the pose of frame B in frame A, each time it changes, until Ctrl-C.
 
-    Says what it waits for, and prints each new answer. Frames are called by their bare names while these
-    are unique, or ROBOT/FRAME. STAMP is in nanoseconds, or in seconds as printed.
+    While there is no pose, prints the reason. A frame is a bare name if that is unique, or ROBOT/FRAME.
+    STAMP is in nanoseconds, or in seconds as printed.
 
     \b
     zstate tf panda_link0 panda_hand
     zstate tf left/panda_link0 right/panda_hand --once --json
     zstate tf panda_link0 panda_hand --twist --precision 6
-    zstate tf base_link tool0 --wire ros2              # hears /tf and /tf_static
+    zstate tf base_link tool0 --wire ros2              # reads /tf and /tf_static
     """
     from zstate.cli.waiting import PoseWaiter
+    from zstate.clock import SystemClock
+    from zstate.ingest.deadline import Deadline
     from zstate.nodes.listener import TransformListener
+    from zstate.rate import Rate
 
     ends = once or at is not None
     with (
         open_session(network, (wire,)) as session,
         RobotDirectory(session, robot, wire) as directory,
-        open_clock(session, clock, wire, timeout_s=timeout if ends else None) as time_kept,
+        open_clock(session, clock, wire, timeout_s=timeout if ends else None) as selected_clock,
         TransformListener(
-            session, robot, wire=wire, follow=default_stream(wire), clock=time_kept
+            session, robot, wire=wire, follow=default_stream(wire), clock=selected_clock
         ) as listener,
     ):
         waiter = PoseWaiter(listener, directory, target, source)
@@ -126,61 +128,47 @@ def tf_command(
         def show(transform: Transform) -> None:
             velocity = _wait_for_twist(listener, transform) if twist else None
             if as_json:
-                _show_json(transform, waiter.age_s(transform), velocity)
+                facts = {**transform.to_dict(), "rpy": transform.rpy.tolist()}
+                facts["age_s"] = waiter.age_s(transform)
+                if velocity is not None:
+                    facts |= {"linear": velocity.linear.tolist(), "angular": velocity.angular.tolist()}
+                print_json(facts)
             else:
                 print_result(transform_text(transform, precision))
                 if twist:
-                    print_result(twist_text(velocity, precision))
+                    print_result(_twist_text(velocity, precision))
 
         if not as_json:
             print_result(f"pose of {source} in {target}")
         if ends:
             show(waiter.answer(at, timeout_s=timeout))
-        else:
-            _follow(waiter, rate, show)
-
-
-def _follow(waiter: PoseWaiter, rate_hz: float, show: Any) -> None:
-    """Show each answer that is new. Never returns."""
-    from zstate.clock import SystemClock
-    from zstate.ingest.deadline import Deadline
-    from zstate.rate import Rate
-
-    shown: Transform | None = None
-    deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
-    for _ in Rate(rate_hz, SystemClock(), Event()):
-        transform = waiter.answer()
-        if transform != shown:
-            show(transform)
-            deadline.on_sample(time.monotonic())
-            shown, silent = transform, False
-        elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
-            silent = True
-            print_status(waiter.silence())
+            return
+        shown: Transform | None = None
+        deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
+        for _ in Rate(rate, SystemClock(), Event()):
+            transform = waiter.answer()
+            if transform != shown:
+                show(transform)
+                deadline.on_sample(time.monotonic())
+                shown, silent = transform, False
+            elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
+                silent = True
+                print_status(waiter.silence())
 
 
 def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:
     """The twist of the source in the target; None if it is still unknown after 1 s."""
     from zstate.cli.waiting import ConditionWaiter
 
-    waiter = ConditionWaiter()
-    with listener.buffer.watch(transform.target, transform.source, waiter.notify):
-        waiter.wait_for(lambda: _twist(listener, transform) is not None, _TWIST_WITHIN_S)
-    return _twist(listener, transform)
-
-
-def _twist(listener: TransformListener, transform: Transform) -> Twist | None:
-    try:
-        return listener.buffer.twist(transform.source, transform.target, transform.stamp)
-    except LookupFailed:
+    def twist() -> Twist | None:
+        with suppress(LookupFailed):
+            return listener.buffer.twist(transform.source, transform.target, transform.stamp)
         return None
 
-
-def _show_json(transform: Transform, age_s: float | None, speed: Twist | None) -> None:
-    facts = {**transform.to_dict(), "rpy": transform.rpy.tolist(), "age_s": age_s}
-    if speed is not None:
-        facts |= {"linear": speed.linear.tolist(), "angular": speed.angular.tolist()}
-    print_json(facts)
+    waiter = ConditionWaiter()
+    with listener.buffer.watch(transform.target, transform.source, waiter.notify):
+        waiter.wait_for(lambda: twist() is not None, _TWIST_WITHIN_S)
+    return twist()
 
 
 def transform_text(transform: Transform, precision: int = 3) -> str:
@@ -204,11 +192,10 @@ def transform_text(transform: Transform, precision: int = 3) -> str:
     return "\n".join(lines)
 
 
-def twist_text(speed: Twist | None, precision: int = 3) -> str:
-    """A twist in the manner of ``transform_text``."""
-    if speed is None:
+def _twist_text(twist: Twist | None, precision: int) -> str:
+    if twist is None:
         return "- Twist: not known yet"
-    linear, angular = (_listed(vector.tolist(), precision) for vector in (speed.linear, speed.angular))
+    linear, angular = (_listed(vector.tolist(), precision) for vector in (twist.linear, twist.angular))
     return f"- Twist: linear {linear} m/s\n- Twist: angular {angular} rad/s"
 
 
@@ -217,4 +204,4 @@ def _listed(values: list[float], precision: int) -> str:
 
 
 def _digits(value: float, precision: int) -> str:
-    return f"{round(value, precision) + 0.0:.{precision}f}"  # adding 0.0 takes the sign off a negative zero
+    return f"{round(value, precision) + 0.0:.{precision}f}"  # adding zero turns -0 into 0

@@ -1,22 +1,47 @@
-"""zstate tree: the frames of the announced robots, as a tree."""
+"""zstate tree: the frames of the announced robots, as text, JSON or a drawing."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from zstate.cli.options import form_options, session_options, wire_option
-from zstate.cli.output.console import output_width, print_json, print_result
+from zstate.cli.output.console import (
+    count_text,
+    fail,
+    output_width,
+    print_json,
+    print_result,
+    print_status,
+    rate_text,
+    sample_age_text,
+)
+from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, tree_lines
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.buffer.frame_tree import FrameInfo
-    from zstate.cli.output.wire_text import WireMessages
+    from zstate.cli.output.drawing import Drawing
+    from zstate.net.presence import RobotInfo
+    from zstate.net.session import Session
+    from zstate.nodes.listener import TransformListener
+
+_MODELS_WITHIN_S = 3.0
+_SAMPLES_WITHIN_S = 1.0
+# The rate of two samples may be far off.
+_RATE_OVER_NS = 100_000_000
+# ROS nodes publish transforms at 1 Hz at least; nodes without a message in this time are named.
+_MESSAGES_WITHIN_S = 2.0
+_NODES_WITHIN_S = 1.0
+_QUIET_S = 0.15
+
+_HEADINGS = ("frame", "edge", "rate", "age", "writer")
+_NARROW_HEADINGS = ("frame", "rate and age", "writer")
 
 
 @click.command("tree")
@@ -27,48 +52,240 @@ if TYPE_CHECKING:
 def tree_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 
-    For each edge: its kind, the rate of its samples, the age of the newest one, and who writes it. In a
-    terminal that is too narrow, writers are letters, and "↓" is before an only child. With nobody announced
-    there is no tree, and the exit code is 0 as that of ls and graph; it is 1 for a ROBOT that is not there.
+    Each edge has its kind, the rate of its samples, the age of the newest one, and its writer. In a narrow
+    terminal writers are abbreviated to letters, and "↓" marks an only child. Exit code 1 if ROBOT is not
+    announced; without ROBOT the tree may be empty, as with ls and graph.
 
     \b
     zstate tree
     zstate tree panda --svg > panda.svg
     zstate tree --json | jq '.[] | select(.age_s > 1)'
-    zstate tree --wire ros2                            # hears /tf and /tf_static
+    zstate tree --wire ros2                            # reads /tf and /tf_static
     """
-    from zstate.cli.output.frames import collect_frames, collect_ros_frames
-
+    is_native, messages = not is_ros(wire), messages_for(wire)
     with open_session(network, (wire,)) as session:
-        is_native = not is_ros(wire)
-        frames = collect_frames(session, robot) if is_native else collect_ros_frames(session, robot, wire)
+        frames = _collect_frames(session, robot) if is_native else _collect_ros_frames(session, robot, wire)
         now = time.time_ns()
     if form == "json":
-        print_json([_facts(frame, now) for frame in frames])
-    elif frames:
-        title = "Frames" if robot == "*" else f"Frames of {robot}"
-        named = [_named(frame, messages_for(wire)) for frame in frames]
-        print_result(_drawn(named, now, form, in_full=not is_native, title=title))
+        from zstate.clock import SYSTEM  # loads numpy
 
-
-def _named(frame: FrameInfo, words: WireMessages) -> FrameInfo:
-    """The frame with the names that its wire format uses."""
-    parent = None if frame.parent is None else words.translate(frame.parent)
-    return replace(frame, name=words.translate(frame.name), parent=parent)
-
-
-def _drawn(frames: Sequence[FrameInfo], now: int, form: str | None, *, in_full: bool, title: str) -> str:
-    from zstate.cli.output.frames import tree_drawing, tree_text
-
+        newest = [frame.newest_in(SYSTEM) for frame in frames]
+        ages_s = [None if stamp is None else (now - stamp) * 1e-9 for stamp in newest]
+        print_json([{**asdict(one), "age_s": age_s} for one, age_s in zip(frames, ages_s, strict=True)])
+        return
+    if not frames:
+        return
+    frames = [
+        replace(
+            frame,
+            name=messages.translate(frame.name),
+            parent=None if frame.parent is None else messages.translate(frame.parent),
+        )
+        for frame in frames
+    ]
     if form is None:
-        return tree_text(frames, now, in_full=in_full, width=output_width())
+        print_result(tree_text(frames, now, in_full=not is_native, width=output_width()))
+        return
     from zstate.cli.output.drawing import draw
 
-    return draw(tree_drawing(frames, now, in_full=in_full), form, title)
+    title = "Frames" if robot == "*" else f"Frames of {robot}"
+    print_result(draw(tree_drawing(frames, now, in_full=not is_native), form, title))
 
 
-def _facts(frame: FrameInfo, now: int) -> dict[str, Any]:
-    from zstate.clock import SYSTEM  # loads numpy
+def _collect_frames(session: Session, robot: str) -> tuple[FrameInfo, ...]:
+    """Every frame of ``robot``, or of all robots for "*", with rates and stamps of received samples.
 
-    newest = frame.newest_in(SYSTEM)
-    return {**asdict(frame), "age_s": None if newest is None else (now - newest) * 1e-9}
+    Prints on standard error which announced models and static edges did not arrive, or that no robot is
+    announced. Fails if ``robot`` is not announced.
+    """
+    from zstate.cli.processes import BackgroundCall
+    from zstate.cli.robot_directory import announced_robots
+    from zstate.cli.waiting import ConditionWaiter
+    from zstate.net.presence import discover
+    from zstate.wire.keys import ANY, MODEL_WRITER
+
+    # Models and static edges arrive during discovery, which is mostly waiting.
+    discovery = BackgroundCall(
+        "zstate announced",
+        lambda: discover(session) if robot == ANY else announced_robots(session, robot),
+    )
+    from zstate.nodes.listener import TransformListener
+
+    waiter = ConditionWaiter()
+    with TransformListener(session, robot) as listener:
+        listener.add_observer(waiter.notify)
+        robots = discovery.result()
+        if not robots:
+            print_status(messages_for("native").announced(()))
+            return ()
+        static_writers = [name for one in robots for name, _ in one.static_names if name != MODEL_WRITER]
+
+        def has_models(stable: bool) -> bool:
+            if not stable:
+                arrived = {frame.writer for frame in listener.buffer.frames() if frame.kind == "static"}
+                # Never equal if two robots have a writer of the same name.
+                if len(static_writers) != len(arrived.intersection(static_writers)):
+                    return False
+            return not _missing(listener, robots)
+
+        waiter.wait_until_stable(
+            lambda: len(listener.buffer.frames()), has_models, quiet_s=_QUIET_S, timeout_s=_MODELS_WITHIN_S
+        )
+        for text in _missing(listener, robots):
+            print_status(text)
+        moving = {robot.name for robot in robots if "joint_states" in _streams(robot)}
+
+        def has_rate(frame: FrameInfo) -> bool:
+            if frame.kind != "joint" or frame.name.partition("/")[0] not in moving:
+                return True  # no samples are expected
+            return frame.count > 1 and (frame.newest or 0) - (frame.oldest or 0) >= _RATE_OVER_NS
+
+        waiter.wait_for(lambda: all(map(has_rate, listener.buffer.frames())), _SAMPLES_WITHIN_S)
+        frames = listener.buffer.frames()
+    if not frames:
+        print_status("announced, but without any frame: no model is published; `zstate publish ROBOT` does")
+    return frames
+
+
+def _missing(listener: TransformListener, robots: tuple[RobotInfo, ...]) -> list[str]:
+    owners = {frame.name.partition("/")[0] for frame in listener.buffer.frames()}
+    known = {*owners, *listener.robots()}
+    missing: list[str] = []
+    for robot in robots:
+        streams = _streams(robot)
+        if "robot_description" in streams and robot.name not in owners:
+            missing.append(f"{robot.name}: its model has not arrived within {_MODELS_WITHIN_S:g} s")
+        elif "tf_static" in streams and robot.name not in known:
+            missing.append(f"{robot.name}: its static edges have not arrived within {_MODELS_WITHIN_S:g} s")
+    return missing
+
+
+def _streams(robot: RobotInfo) -> set[str]:
+    return {stream for stream, _ in robot.writers}
+
+
+def _collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameInfo, ...]:
+    """Every frame on /tf and /tf_static, with rates and stamps.
+
+    Prints on standard error which nodes announce transforms but have sent none. Fails if there is no node.
+    """
+    from zstate.cli.robot_directory import RobotDirectory
+    from zstate.cli.waiting import ConditionWaiter
+    from zstate.nodes.listener import TransformListener
+
+    waiter = ConditionWaiter()
+    with (
+        RobotDirectory(session, robot, wire, waiter.notify) as directory,
+        TransformListener(session, robot, wire=wire, follow="tf") as listener,
+    ):
+        listener.add_observer(waiter.notify)
+
+        def nodes() -> set[str]:
+            writers = (pair for info in directory.robots() for pair in info.writers)
+            return {str(writer) for stream, writer in writers if stream == "tf"}
+
+        def without_samples(frames: tuple[FrameInfo, ...], least: int) -> set[str]:
+            return nodes() - {one.writer for one in frames if one.kind == "pose" and one.count >= least}
+
+        if not waiter.wait_for(lambda: listener.buffer.frames() or nodes(), _NODES_WITHIN_S):
+            fail(directory.words.no_sample_text(robot, "tf", directory.robots(), ended=False))
+        waiter.wait_until_stable(
+            lambda: len(listener.buffer.frames()),
+            lambda stable: stable and not without_samples(listener.buffer.frames(), 2),
+            quiet_s=_QUIET_S,
+            timeout_s=_MESSAGES_WITHIN_S,
+        )
+        frames = listener.buffer.frames()
+        for node in sorted(without_samples(frames, 1)):
+            topic = directory.words.place(robot, ("tf",))
+            print_status(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
+        return frames
+
+
+def tree_text(frames: Sequence[FrameInfo], now: int, *, in_full: bool, width: int | None = None) -> str:
+    """The tree with a line for each frame: kind, rate, age and writer of its edge; ``now`` [ns] is for ages.
+
+    If that is wider than ``width``, writers become letters that are explained below, then a frame that is its
+    parent's only child is not indented, and at last moving edges have no kind.
+    """
+
+    def rows(guides: Guides, *, with_kind: bool = True) -> list[tuple[str, ...]]:
+        found: list[tuple[str, ...]] = []
+        for guide, frame in _walk(frames, guides):
+            rate, age = _rate_and_age(frame, now)
+            cells = (frame.kind, rate, age) if with_kind else (f"{rate} {age}" if rate else frame.kind,)
+            found.append((guide + _shown_name(frame, in_full), *cells, frame.writer or ""))
+        return found
+
+    tables = (
+        Table(_HEADINGS, rows(tree_lines), abbreviate="writer"),
+        Table(_HEADINGS, rows(chain_lines), abbreviate="writer"),
+        Table(_NARROW_HEADINGS, rows(chain_lines, with_kind=False), abbreviate="writer", headed=False),
+    )
+    return "\n".join(first_fitting(tables, width))
+
+
+def _walk(frames: Sequence[FrameInfo], guides: Guides = tree_lines) -> list[tuple[str, FrameInfo]]:
+    """(guide, frame) of all frames, parents first; roots and siblings in alphabetical order."""
+    by_name = {frame.name: frame for frame in sorted(frames, key=lambda frame: frame.name)}
+    children: dict[str, list[str]] = {}
+    for frame in by_name.values():
+        if frame.parent is not None:
+            children.setdefault(frame.parent, []).append(frame.name)
+    roots = [frame.name for frame in by_name.values() if frame.parent is None]
+    return [(guide, by_name[name]) for root in roots for guide, name in guides(root, children)]
+
+
+def _shown_name(frame: FrameInfo, in_full: bool) -> str:
+    """The name, without the robot's if the parent belongs to the same robot and not ``in_full``."""
+    robot, slash, bare = frame.name.partition("/")
+    is_short = not in_full and slash and (frame.parent or "").startswith(f"{robot}/")
+    return bare if is_short else frame.name
+
+
+def _rate_and_age(frame: FrameInfo, now: int) -> tuple[str, str]:
+    if frame.kind not in ("joint", "pose"):
+        return "", ""
+    return rate_text(frame.rate_hz), sample_age_text(frame, now)
+
+
+def tree_drawing(frames: Sequence[FrameInfo], now: int, *, in_full: bool) -> Drawing:
+    """The tree; each edge has its kind, rate, age, and the colour of its writer. ``now`` [ns] is for ages."""
+    from zstate.cli.output.drawing import ALARM, LINE, MUTED, PALETTE, Drawing, Edge, Node
+    from zstate.clock import SYSTEM
+    from zstate.ingest.deadline import is_stale
+
+    writers = [frame.writer for frame in frames if frame.writer]
+    colors = {writer: PALETTE[n % len(PALETTE)] for n, writer in enumerate(dict.fromkeys(writers))}
+    nodes: list[Node] = []
+    edges: list[Edge] = []
+    for _, frame in _walk(frames):
+        is_static, newest = frame.kind == "static", frame.newest_in(SYSTEM)
+        lines, text_color = [_shown_name(frame, in_full)], MUTED
+        if frame.kind in ("joint", "pose"):
+            rate, age = _rate_and_age(frame, now)
+            lines.append(
+                f"{frame.kind}, no sample" if frame.newest is None else f"{frame.kind} · {rate} · {age}"
+            )
+            is_old = newest is not None and is_stale((now - newest) * 1e-9, frame.rate_hz)
+            text_color = ALARM if is_old or frame.newest is None else MUTED
+        elif not is_static:
+            lines.append(frame.kind)
+        nodes.append(
+            Node(
+                frame.name,
+                lines,
+                label=frame.name,
+                stroke=colors.get(frame.writer or "", LINE),
+                dashed=is_static,
+                bar=not is_static,
+                text_color=text_color,
+            )
+        )
+        if frame.parent is not None:
+            label = frame.kind if frame.rate_hz is None else f"{frame.kind} {rate_text(frame.rate_hz)}"
+            edges.append(Edge(frame.parent, frame.name, label, dashed=is_static))
+    legend = [
+        (color, f"{writer}: {count_text(writers.count(writer), 'edge')}") for writer, color in colors.items()
+    ]
+    return Drawing("frames", "tree", nodes, edges, legend)

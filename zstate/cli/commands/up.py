@@ -1,4 +1,4 @@
-"""zstate up: starts and supervises the processes of one file."""
+"""zstate up: supervisor of the processes in one file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -14,54 +13,51 @@ from zstate.cli.output import logs
 from zstate.cli.output.console import fail, print_result
 from zstate.cli.output.text_layout import in_columns
 
-if TYPE_CHECKING:
-    from zstate.cli.up.processes import ProcessSpec
-
 _COLORS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
 
 
 @click.command("up")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False))
 @click.argument("parameters", nargs=-1, metavar="[KEY=VALUE]...")
-@click.option("--check", "only_check", is_flag=True, help="Print what would start, and start nothing.")
+@click.option("--check", "only_check", is_flag=True, help="Print the commands without starting them.")
 def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None:
-    """Start the processes of FILE, and end all of them with Ctrl-C, or when one fails.
+    """Start the processes in FILE. Ctrl-C ends all of them, and so does the failure of one.
 
-    The lines of each process begin with its name. `zstate init panda` writes a file to begin with.
-    KEY=VALUE changes one of its [parameters].
+    Each output line starts with the name of its process. `zstate init panda` writes a first file. KEY=VALUE
+    sets one of its [parameters].
 
     \b
     zstate up cell.toml
     zstate up cell.toml rate=500 robots="left right third"
     zstate up cell.toml --check
 
-    With a [router] the rest starts when that is ready, and comes to it unless [network] says otherwise: so
-    does a program's zstate.connect() that is given nothing. Paths are beside FILE, which is TOML:
+    With a [router] the other processes start once it is ready. They connect to it unless [network] says
+    otherwise, and so does zstate.connect() without arguments in a program. Paths are relative to FILE (TOML):
 
     \b
     include = ["network.toml"]        # more such files
-    [parameters]                      # "${rate}" below, "${HOME}" for others
+    [parameters]                      # "${rate}" below; "${HOME}" is the environment
     rate = 100.0
-    robots = "${ROBOTS:-left right}"  # left right where ROBOTS is not set
+    robots = "${ROBOTS:-left right}"  # left right if ROBOTS is not set
     [router]                          # options of `zstate router`
     listen = ["tcp/0.0.0.0:7447"]
-    ros2 = true                       # in the place of rmw_zenohd
-    [network]                         # session options of all below
+    ros2 = true                       # replaces rmw_zenohd
+    [network]                         # session options of all processes
     mode = "client"
     connect = ["tcp/127.0.0.1:7447"]
-    certs = "fleet"                   # with identity = here, or with each robot
+    certs = "fleet"                   # with identity = here, or for each robot
     [[robot]]                         # options of `zstate publish`
     model = "panda"                   # a name, or a file
-    names = "${robots}"               # a robot each; "${name}" is who it is
+    names = "${robots}"               # one robot for each name, "${name}" below
     identity = "${name}"
-    source = "sine"                   # "joints" unless given; or a recording
+    source = "sine"                   # default: "joints"; or a recording
     rate = "${rate}"
-    wires = ["native", "ros2"]        # "native" unless given
+    wires = ["native", "ros2"]        # default: "native"
     metrics = 9100                    # 9101 for the second robot of a loop
-    restart = "on-failure"            # or "always"; else a failure ends all
+    restart = "on-failure"            # or "always"; default: a failure ends all
     [[robot]]
     model = "panda"                   # xacro_args = {NAME = "VALUE"} for xacro
-    count = 3                         # a robot each, "${number}" is 1, 2, 3
+    count = 3                         # three robots, "${number}" is 1, 2, 3
     name = "arm${number}"
     when = "${SITE:-lab} != lab"      # or "${SITE} == lab", true, false
     identity = "${name}"
@@ -74,12 +70,12 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     wires = ["native", "ros2"]
     [[static]]
     robot = "right"
-    file = "handeye.yaml"             # of easy_handeye, or ROS's TransformStamped
-    [[program]]                       # anything else, such as a driver
+    file = "handeye.yaml"             # of easy_handeye, or a TransformStamped
+    [[program]]                       # any other program, such as a driver
     run = "python driver.py ${rate}"  # or "zstate record run.mcap"
     identity = "left"
     after = ["left", "static"]        # starts when these are ready
-    ready = "driver runs"             # what it says when it is ready itself
+    ready = "driver runs"             # text it prints when it is ready itself
     """
     from zstate.cli.up.cell import read_cell
     from zstate.cli.up.processes import plan_processes
@@ -89,15 +85,13 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
     settings = parse_settings(parameters)
     specs = plan_processes(read_cell(file, settings), Path(file), settings)
     if only_check:
-        print_result("\n".join(in_columns([(spec.name, _command_line(spec)) for spec in specs])))
-    else:
-        failure = Supervisor(specs, _line_printer([spec.name for spec in specs])).run()
-        if failure:
-            fail(failure)
-
-
-def _command_line(spec: ProcessSpec) -> str:
-    return shlex.join(spec.arguments if spec.is_program else ("zstate", *spec.arguments))
+        commands = [(one.arguments if one.is_program else ("zstate", *one.arguments)) for one in specs]
+        rows = [(spec.name, shlex.join(command)) for spec, command in zip(specs, commands, strict=True)]
+        print_result("\n".join(in_columns(rows)))
+        return
+    failure = Supervisor(specs, _line_printer([spec.name for spec in specs])).run()
+    if failure:
+        fail(failure)
 
 
 def _line_printer(names: Sequence[str]) -> Callable[[str, str, bool], None]:

@@ -1,7 +1,4 @@
-"""zstate view: the robots, drawn in a browser.
-
-What `zstate view` does around the view itself: whom it shows, whom it moves, and where.
-"""
+"""zstate view: robots drawn in a browser, or in a picture file."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -27,25 +24,26 @@ from zstate.cli.options import (
     wire_option,
 )
 from zstate.cli.output.console import count_text, fail, print_result, print_status
-from zstate.cli.processes import BackgroundCall
 from zstate.cli.session import SessionOptions, open_session
-from zstate.cli.waiting import ConditionWaiter
-from zstate.model.catalog import find_entry
-from zstate.model.load import is_path
-from zstate.model.robot import RobotModel
-from zstate.net.presence import discover
-from zstate.net.session import Session
-from zstate.view.access import is_loopback
-from zstate.view.camera import Sight
-from zstate.view.data_source import ViewSource
-from zstate.view.screenshot import save_screenshot
-from zstate.view.server import ViewServer
-from zstate.view.sliders import SliderPublisher
-from zstate.view.view import View
 
 if TYPE_CHECKING:
+    from zstate.cli.processes import BackgroundCall
+    from zstate.model.robot import RobotModel
+    from zstate.net.session import Session
     from zstate.view.camera import Camera
+    from zstate.view.data_source import ViewSource
+    from zstate.view.server import ViewServer
     from zstate.view.sliders import SliderPublisher
+    from zstate.view.view import View
+
+_RECORDINGS = (".mcap", ".db3")
+_DISCOVERY_S = 0.3
+_ANNOUNCED_WITHIN_S = 5.0
+# Several robots are rarely announced at once.
+_OTHERS_WITHIN_S = 0.5
+_SAMPLES_WITHIN_S = 1.0
+_ENDS_WITHIN_S = 0.8
+_MAX_NAMED = 3
 
 
 def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) -> Path | None:
@@ -78,14 +76,12 @@ def _point(text: str) -> tuple[float, float, float]:
 
 @click.command("view")
 @click.argument("robots", nargs=-1, metavar="[ROBOT [NAME:=VALUE]...]...")
-@click.option("--sliders", is_flag=True, help="Move the robots from the page, and publish what they do.")
+@click.option("--sliders", is_flag=True, help="Move robots from the page, and publish their joint states.")
 @click.option(
-    "--host", default="127.0.0.1", show_default=True, help="Where to listen; 0.0.0.0 is everywhere."
+    "--host", default="127.0.0.1", show_default=True, help="Listen at this address; 0.0.0.0 is all of them."
 )
 @click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    help="0 is any that is free; default: the first free one from 8080 on.",
+    "--port", type=click.IntRange(0, 65535), help="0: any free port; default: the first free one from 8080."
 )
 @click.option(
     "--rate",
@@ -93,9 +89,9 @@ def _point(text: str) -> tuple[float, float, float]:
     default=30.0,
     show_default=True,
     callback=checked_rate,
-    help="Pictures a second [Hz].",
+    help="Updates per second [Hz].",
 )
-@click.option("--snapshot", callback=_checked_picture, metavar="FILE.png", help="Write one picture, and end.")
+@click.option("--snapshot", callback=_checked_picture, metavar="FILE.png", help="Write one picture and exit.")
 @click.option(
     "--size",
     nargs=2,
@@ -103,15 +99,15 @@ def _point(text: str) -> tuple[float, float, float]:
     default=(1280, 800),
     show_default=True,
     metavar="WIDTH HEIGHT",
-    help="Of that picture, in pixels.",
+    help="Size of that picture in pixels.",
 )
-@click.option("--fixed-frame", default="", metavar="FRAME", help="See everything from this frame at first.")
+@click.option("--fixed-frame", default="", metavar="FRAME", help="Initial fixed frame.")
 @click.option(
     "--camera",
     callback=_checked_camera,
     metavar="X,Y,Z[:X,Y,Z]",
-    help="Where the camera stands at first, and after a colon the point it looks at, in the fixed frame [m]; "
-    "default: so that all robots are seen.",
+    help="Initial position of the camera and, after the colon, the point it looks at [m, fixed frame]; "
+    "default: all robots in sight.",
 )
 @wire_option
 @reading_clock_option
@@ -131,21 +127,19 @@ def view_command(
     wire: str,
     clock: str | None,
 ) -> None:
-    """Draw the announced robots, or those that are named, in a browser.
+    """Show the announced robots, or ROBOTs, in a browser.
 
-    Prints the address to open. It is for this machine only; from another one, forward its port:
-    ssh -L 8080:127.0.0.1:8080 HOST. With --host others may open it too, who have the token in the
-    address that is printed; what they see travels in the clear.
+    Prints the address to open. By default only this host can open it; from another host forward the port with
+    ssh -L 8080:127.0.0.1:8080 HOST. With --host, other hosts can open it with the token in the printed
+    address; the connection is not encrypted.
 
-    With --sliders each ROBOT is moved from the page. It is a robot that is announced, or a name or file
-    as `zstate publish` takes it, with NAME:=VALUE for xacro, and nobody else may write its joints. A ROBOT
-    may also be a recording. --snapshot draws with an installed Chromium, without a screen.
-    Needs viser: pip install 'zstate[view]'.
+    With --sliders you move each ROBOT from the page: an announced robot, or a name or file as for `zstate
+    publish`, with NAME:=VALUE for xacro. It must have no other writer of joint states. A ROBOT may also be a
+    recording. --snapshot needs an installed Chromium, but no screen. Needs viser: pip install 'zstate[view]'.
 
-    Meshes named package://NAME/... are found below the folders in ROS_PACKAGE_PATH, in share/ of those in
-    AMENT_PREFIX_PATH, and in example-robot-data. Other files are drawn only for a robot whose URDF file is
-    given as ROBOT: then also relative paths, and packages around the file. Robots that share no frame are
-    drawn beside each other.
+    Meshes package://NAME/... are searched below the folders in ROS_PACKAGE_PATH, in share/ of those in
+    AMENT_PREFIX_PATH, and in example-robot-data. Relative paths, and packages around the URDF file, are used
+    only if that file is given as ROBOT. Robots without a common frame are drawn next to each other.
 
     \b
     zstate view
@@ -154,221 +148,204 @@ def view_command(
     zstate view run.mcap
     zstate view --wire ros2                 # robots of ROS 2 nodes that run rmw_zenoh
     zstate view panda --snapshot panda.png --camera 2,1,1:0,0,0.5
-    zstate view urdf/arm.urdf               # 'arm' on the network, with the meshes beside this file
+    zstate view urdf/arm.urdf               # announced robot 'arm', with the meshes near this file
     zstate view --host 0.0.0.0 --port 9000
     """
-    import_module("zstate.view.library")  # told before anything is heard when it is missing
+    import_module("zstate.view.library")  # reports a missing viser before anything starts
 
+    from zstate.model.load import is_path
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
 
     models = named_models(robots)
-    recording = recording_among(tuple(models))
-    if recording is not None and sliders:
-        raise click.UsageError("--sliders moves robots that are here, not those of a recording")
-    named = [] if recording is not None else named_robots(models)
+    files = [Path(one) for one in models if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
+    if files and len(models) > 1:
+        raise click.UsageError(f"a recording must be the only argument; got {', '.join(models)}")
+    if files and sliders:
+        raise click.UsageError("--sliders moves live robots, not those of a recording")
+    named: list[NamedRobot] = []
+    if not files:
+        named = [
+            _load_named(one, xacro_args)[0] if xacro_args or is_path(one) else NamedRobot(one)
+            for one, xacro_args in models.items()
+        ]
     with ExitStack() as opened:
-        moved: list[SliderPublisher] = []
-        if recording is None:
+        publishers: list[SliderPublisher] = []
+        if files:
+            source = opened.enter_context(ViewSource.of_recording(files[0]))
+        else:
             session = opened.enter_context(open_session(network, (wire,)))
             if sliders:
-                chosen = [
-                    (one, opened.enter_context(its)) for one, its in chosen_sliders(session, named, wire)
-                ]
-                named, moved = [one for one, _ in chosen], [its for _, its in chosen]
-            kept = opened.enter_context(open_clock(session, clock, wire))
-            world = opened.enter_context(
-                ViewSource(session, [one.robot for one in named], wire=wire, clock=kept)
+                moved = [(one, opened.enter_context(its)) for one, its in _open_sliders(session, named, wire)]
+                named, publishers = [one for one, _ in moved], [its for _, its in moved]
+            selected_clock = opened.enter_context(open_clock(session, clock, wire))
+            source = opened.enter_context(
+                ViewSource(session, [one.robot for one in named], wire=wire, clock=selected_clock)
             )
-        else:
-            world = opened.enter_context(ViewSource.of_recording(recording))
         page = opened.enter_context(ViewServer(port=0) if snapshot else ViewServer(host, port))
         view = opened.enter_context(
             View(
-                world,
+                source,
                 page,
-                sliders=moved,
+                sliders=publishers,
                 rate_hz=rate,
-                folders=folders_of(named),
+                folders={one.model.urdf: one.folder for one in named if one.model and one.folder},
                 fixed_frame=fixed_frame,
                 camera=camera,
                 aspect=size[0] / size[1] if snapshot else 1.0,
             )
         )
-        with running(view) as worker:
+        with _running(view) as call:
             if snapshot is None:
-                show_address(page)
-                worker.result()
+                _print_address(page)
+                call.result()
             else:
-                robots = tuple(one.robot for one in named)
-                take_snapshot(world, view, page, robots, path=snapshot, size=size, fixed_frame=fixed_frame)
+                names = tuple(one.robot for one in named)
+                _write_snapshot(source, view, page, names, path=snapshot, size=size, fixed_frame=fixed_frame)
 
 
-_RECORDINGS = (".mcap", ".db3")
-_MEETING_S = 0.3
-_ANNOUNCED_WITHIN_S = 5.0
-# Several robots are rarely announced at once.
-_OTHERS_WITHIN_S = 0.5
-_SAMPLES_WITHIN_S = 1.0
-_ENDS_WITHIN_S = 0.8
-_MOST_NAMED = 3
-
-
-def recording_among(robots: Sequence[str]) -> Path | None:
-    """The recording that is meant instead of robots."""
-    files = [Path(one) for one in robots if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
-    if files and len(robots) > 1:
-        raise click.UsageError(f"a recording is viewed alone; got {', '.join(robots)}")
-    return files[0] if files else None
-
-
-class Named(NamedTuple):
-    """A ROBOT argument: the robot's name, with its model and the folder of its file where it is local."""
+class NamedRobot(NamedTuple):
+    """A ROBOT argument: the robot's name; for a local model also the model and the folder of its file."""
 
     robot: str
     model: RobotModel | None = None
     folder: Path | None = None
 
 
-def named_robots(models: Mapping[str, Mapping[str, str]]) -> list[Named]:
-    """The robots behind ROBOT arguments and their xacro arguments: files that are read now, and names."""
-    return [
-        _local(one, xacro_args)[0] if xacro_args or is_path(one) else Named(one)
-        for one, xacro_args in models.items()
-    ]
+def _load_named(argument: str, xacro_args: Mapping[str, str] | None = None) -> tuple[NamedRobot, RobotModel]:
+    from zstate.model.catalog import find_entry
+    from zstate.model.load import is_path
 
-
-def folders_of(named: Iterable[Named]) -> dict[str, Path]:
-    """The folders of local robots by the text of their URDF."""
-    return {one.model.urdf: one.folder for one in named if one.model is not None and one.folder is not None}
-
-
-def _local(argument: str, xacro_args: Mapping[str, str] | None = None) -> tuple[Named, RobotModel]:
     model, robot = load_robot(argument, None, xacro_args)
     path = Path(argument) if is_path(argument) else find_entry(argument).path
-    return Named(robot, model, path.parent), model
+    return NamedRobot(robot, model, path.parent), model
 
 
-def chosen_sliders(
-    session: Session, named: Sequence[Named], wire: str
-) -> Iterator[tuple[Named, SliderPublisher]]:
-    """Each robot that is named, or all that are announced, with its sliders.
+def _open_sliders(
+    session: Session, named: Sequence[NamedRobot], wire: str
+) -> Iterator[tuple[NamedRobot, SliderPublisher]]:
+    """Each of the ``named`` robots, by default all announced ones, with its sliders.
 
-    A name is an announced robot's; only where nobody announces it, it is one of the catalog.
+    A name is that of an announced robot; if no such robot is announced, that of a catalog model.
     """
-    within_s = _MEETING_S if named else _ANNOUNCED_WITHIN_S
+    from zstate.net.presence import discover
+    from zstate.view.sliders import SliderPublisher
+
+    within_s = _DISCOVERY_S if named else _ANNOUNCED_WITHIN_S
     announced = [info.name for info in discover(session, within_s, wire=wire)]
     if not named and not announced:
         fail("no robot is announced that could be moved; name one, as in `zstate view panda --sliders`")
-    for one in named or map(Named, announced):
-        chosen, model = one, one.model
+    for one in named or map(NamedRobot, announced):
+        selected, model = one, one.model
         if model is None and one.robot in announced:
-            model = _announced_model(session, one.robot, wire)
+            model = _receive_model(session, one.robot, wire)
         elif model is None:
-            chosen, model = _local(one.robot)
-        sliders = SliderPublisher(session, model, chosen.robot, wires=(wire,))
+            selected, model = _load_named(one.robot)
+        sliders = SliderPublisher(session, model, selected.robot, wires=(wire,))
         if sliders.refusal:
-            print_status(f"{chosen.robot!r} is not moved: {sliders.refusal}", robot=chosen.robot)
-        yield chosen, sliders
+            print_status(f"{selected.robot!r} is not moved: {sliders.refusal}", robot=selected.robot)
+        yield selected, sliders
 
 
-def _announced_model(session: Session, robot: str, wire: str) -> RobotModel:
-    with ViewSource(session, (robot,), wire=wire) as world:
-        if not _wait_for(world, lambda: robot in world.models, _ANNOUNCED_WITHIN_S):
-            fail(f"{robot!r} is announced, but not what it looks like; `zstate doctor {robot}` says more")
-        return world.models[robot]
+def _receive_model(session: Session, robot: str, wire: str) -> RobotModel:
+    from zstate.view.data_source import ViewSource
+
+    with ViewSource(session, (robot,), wire=wire) as source:
+        if not _wait_for(source, lambda: robot in source.models, _ANNOUNCED_WITHIN_S):
+            fail(f"{robot!r} is announced, but its model does not arrive; `zstate doctor {robot}` shows why")
+        return source.models[robot]
 
 
 @contextmanager
-def running(view: View) -> Generator[BackgroundCall[None]]:
-    """The view at work, until this is left."""
+def _running(view: View) -> Generator[BackgroundCall[None]]:
+    from zstate.cli.processes import BackgroundCall
+
     stop = threading.Event()
-    worker = BackgroundCall("zstate view", lambda: view.run(stop))
+    call = BackgroundCall("zstate view", lambda: view.run(stop))
     try:
-        yield worker
+        yield call
     finally:
         stop.set()
         with suppress(TimeoutError):
-            worker.result(_ENDS_WITHIN_S)
+            call.result(_ENDS_WITHIN_S)
 
 
-def show_address(page: ViewServer) -> None:
-    """Say what to open, and how that is reached from elsewhere."""
+def _print_address(page: ViewServer) -> None:
+    from zstate.view.access import is_loopback
+
     print_result(f"the view is at {page.url}")
     if not is_loopback(page.host):
-        print_status("whoever has this address may look, and move what has sliders; it travels in the clear")
+        print_status("anyone with this address can see the view and move sliders; it is sent unencrypted")
     elif os.environ.get("SSH_CONNECTION"):
         print_status(f"from your own machine: ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}")
 
 
-def take_snapshot(
-    world: ViewSource,
+def _write_snapshot(
+    source: ViewSource,
     view: View,
     page: ViewServer,
     robots: Sequence[str],
     *,
     path: Path,
     size: tuple[int, int],
-    fixed_frame: str = "",
+    fixed_frame: str,
 ) -> None:
-    """Write one picture, once the robots are there, and name those that are in it, and not, and why."""
-    if not _wait_for(world, lambda: _is_there(world, robots), _ANNOUNCED_WITHIN_S):
-        there = ", ".join(map(repr, world.robots())) or "none"
-        whom = " and ".join(map(repr, robots)) or "any robot"
-        fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {whom}; robots that were heard: {there}")
+    """Write a picture once ``robots`` have arrived, and print which robots and meshes are not in it."""
+    from zstate.view.screenshot import save_screenshot
+
+    def has_models() -> bool:
+        models = source.models
+        return all(robot in models for robot in robots) if robots else bool(models)
+
+    if not _wait_for(source, has_models, _ANNOUNCED_WITHIN_S):
+        received = ", ".join(map(repr, source.robots())) or "none"
+        expected = " and ".join(map(repr, robots)) or "any robot"
+        fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {expected}; robots that were received: {received}")
     if fixed_frame and not _wait_for(
-        world, lambda: fixed_frame in world.moment().tree.index, _ANNOUNCED_WITHIN_S
+        source, lambda: fixed_frame in source.moment().tree.index, _ANNOUNCED_WITHIN_S
     ):
-        world.moment().tree.row(fixed_frame)  # raises, with near misses
-    if not robots and world.session is not None:
+        source.moment().tree.row(fixed_frame)  # raises, with near misses
+    if not robots and source.session is not None:
         time.sleep(_OTHERS_WITHIN_S)
-    _wait_for(world, lambda: not world.moment().reasons, _SAMPLES_WITHIN_S)
+    _wait_for(source, lambda: not source.moment().reasons, _SAMPLES_WITHIN_S)
     width, height = size
     save_screenshot(page, path, width=width, height=height, hold=view.hold)
     sights = view.sights()
     seen = ", ".join(one.robot for one in sights if one.is_seen) or "no robot"
     print_result(f"wrote {path}: {seen}, {width} x {height} pixels")
-    _note_what_is_missing(view, sights)
-
-
-def _note_what_is_missing(view: View, sights: Sequence[Sight]) -> None:
-    """Notes on robots that are not in a picture, on those without a place of their own, and on meshes."""
     for one in sights:
         if one.reason:
-            part = "in the picture in part" if one.is_seen else "not in the picture"
+            part = "partly in the picture" if one.is_seen else "not in the picture"
             print_status(f"{one.robot!r} is {part}: {one.reason}", robot=one.robot)
     roots = sorted({one.root for one in sights if one.is_seen})
     if len(roots) > 1:
-        joined = f"zstate static {roots[0]} {roots[1]} --xyz 1 0 0"
+        command = f"zstate static {roots[0]} {roots[1]} --xyz 1 0 0"
         print_status(
-            f"the frames are in {len(roots)} trees ({_first_few(roots)}), drawn beside each other: their "
-            f"relative place is not known; join them, for instance with: {joined}"
+            f"the frames are in {len(roots)} trees ({_first_few(roots)}), drawn next to each other because "
+            f"their relative pose is unknown; join them, for instance with: {command}"
         )
     missing = {uri: why for one in sights for uri, why in view.scene.missing_meshes(one.robot)}
     if missing:
-        count = count_text(len(missing), "file")
-        named = _first_few([f"{uri} ({why})" for uri, why in missing.items()])
-        print_status(f"{count} of the robots cannot be drawn: {named}")
+        count = count_text(len(missing), "mesh file")
+        files = _first_few([f"{uri} ({why})" for uri, why in missing.items()])
+        print_status(f"{count} cannot be drawn: {files}")
         print_status(
-            "packages are found below ROS_PACKAGE_PATH and in share/ of AMENT_PREFIX_PATH; a URDF file that "
-            "is named, as in `zstate view arm.urdf`, is drawn with the files around it"
+            "packages are searched below ROS_PACKAGE_PATH and in share/ of AMENT_PREFIX_PATH; for a URDF "
+            "file given as argument, as in `zstate view arm.urdf`, also around that file"
         )
 
 
 def _first_few(lines: Sequence[str]) -> str:
-    more = len(lines) - _MOST_NAMED
-    return "; ".join(lines[:_MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+    more = len(lines) - _MAX_NAMED
+    return "; ".join(lines[:_MAX_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
 
-def _is_there(world: ViewSource, robots: Sequence[str]) -> bool:
-    models = world.models
-    return all(robot in models for robot in robots) if robots else bool(models)
+def _wait_for(source: ViewSource, condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Wait until ``condition()``, on the contents of ``source``, is true; False after ``timeout_s``."""
+    from zstate.cli.waiting import ConditionWaiter
 
-
-def _wait_for(world: ViewSource, condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Wait until ``condition()``, on what the world shows, is true; False after ``timeout_s``."""
     waiter = ConditionWaiter()
-    if world.listener is not None:
-        world.listener.add_observer(waiter.notify)
+    if source.listener is not None:
+        source.listener.add_observer(waiter.notify)
     return waiter.wait_for(condition, timeout_s)

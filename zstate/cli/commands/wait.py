@@ -16,18 +16,18 @@ from zstate.errors import Unreachable, ZStateError
 @click.command("wait")
 @click.argument("what", type=click.Choice(["robot", "frame", "router"]), metavar="robot|frame|router")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
-@timeout_option("Give up after so long, with the reason.", 30.0)
+@timeout_option("Fail after this time, with the reason [s].", 30.0)
 @json_option("One JSON object, also after the timeout.")
 @wire_option
 @session_options
 def wait_command(
     *, network: SessionOptions, what: str, names: tuple[str, ...], timeout: float, as_json: bool, wire: str
 ) -> None:
-    """Wait until something is there, and end.
+    """Wait until a robot, a frame or a router is available.
 
-    A robot is there when its poses can be looked up: it has a model, and samples come. A frame is there
-    when its pose in another one is known. A router is there when it lets this command in; it is the one of
-    --connect, or of this host. Exit code 0 when it is there, 1 when it is not in time: the reason is said.
+    A robot is available when its poses can be looked up: it has a model and samples. A frame B is available
+    when its pose in frame A is known. A router is available when it accepts a session of this command;
+    without NAME it is that of --connect, or of this host. Exit code 0, or 1 with the reason after --timeout.
 
     \b
     zstate wait robot panda && python my_program.py
@@ -35,8 +35,11 @@ def wait_command(
     zstate wait frame panda_link0 panda_hand
     zstate wait router tcp/192.168.1.10:7447
     """
-    _check_count(what, names)
-    began = time.monotonic()
+    if what == "robot" and not names:
+        raise click.UsageError("name a robot, for instance `zstate wait robot panda`")
+    if what == "frame" and len(names) != 2:
+        raise click.UsageError("a pose has two frames: `zstate wait frame A B` waits for the pose of B in A")
+    began, reason, text = time.monotonic(), None, ""
     waits = {"robot": _wait_for_robots, "frame": _wait_for_pose, "router": _wait_for_router}
     try:
         text = waits[what](network, names, wire, timeout)
@@ -45,26 +48,16 @@ def wait_command(
     except (ZStateError, click.ClickException) as failure:
         if not as_json:
             raise
-        _print_outcome(what, names, began, str(failure))
-        raise SystemExit(1) from None
-    if as_json:
-        _print_outcome(what, names, began, None)
-    else:
+        reason = str(failure)
+    if not as_json:
         print_result(text)
-
-
-def _check_count(what: str, names: tuple[str, ...]) -> None:
-    if what == "robot" and not names:
-        raise click.UsageError("which robot? For instance `zstate wait robot panda`")
-    if what == "frame" and len(names) != 2:
-        raise click.UsageError("a pose has two frames: `zstate wait frame A B` waits for that of B in A")
-
-
-def _print_outcome(what: str, names: tuple[str, ...], began: float, reason: str | None) -> None:
+        return
     waited_s = round(time.monotonic() - began, 3)
     print_json(
         {"what": what, "names": names, "ready": reason is None, "waited_s": waited_s, "reason": reason}
     )
+    if reason is not None:
+        raise SystemExit(1)
 
 
 def _wait_for_robots(network: SessionOptions, names: tuple[str, ...], wire: str, timeout_s: float) -> str:
@@ -122,6 +115,6 @@ def _wait_for_router(network: SessionOptions, names: tuple[str, ...], wire: str,
     except Unreachable:
         raise
     except TimeoutError:
-        print_status(f"waiting: nobody answers at {where} yet", event="waiting")
+        print_status(f"waiting: no answer yet at {where}", event="waiting")
         call.result()
     return f"ready: the router at {where}"

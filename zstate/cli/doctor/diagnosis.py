@@ -25,7 +25,7 @@ from zstate.cli.doctor.network_checks import (
     with_options,
 )
 from zstate.cli.output.console import colored, count_text, is_terminal
-from zstate.cli.output.wire_text import RosWords, is_ros, messages_for, publish_command_for
+from zstate.cli.output.wire_text import RosMessages, is_ros, messages_for, publish_command_for
 from zstate.cli.session import SessionOptions, open_session
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import ZStateError
@@ -139,7 +139,7 @@ def _of_robots(
             for ear in ears:
                 if ear.description is not None:
                     clocks[ear.info.name] = ear.description.clock
-                if isinstance(words, RosWords):
+                if isinstance(words, RosMessages):
                     checks = ros_checks(ear, session, words, called)
                 else:
                     checks = robot_checks(ear, session)

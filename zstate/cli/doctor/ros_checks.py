@@ -18,7 +18,7 @@ from zstate.cli.doctor.robot_checks import (
 )
 from zstate.cli.doctor.samples import StreamSamples, WriterSamples
 from zstate.cli.output.console import count_text, rate_text
-from zstate.cli.output.wire_text import RosWords
+from zstate.cli.output.wire_text import RosMessages
 from zstate.errors import format_duration
 from zstate.model.robot import RobotModel
 from zstate.net.session import Session
@@ -26,13 +26,13 @@ from zstate.net.session import Session
 _FEW = 6
 
 
-def ros_checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterator[Check]:
+def ros_checks(ear: Ear, session: Session, words: RosMessages, called: str) -> Iterator[Check]:
     """Every link of what ``ear`` has heard for a while; ``called`` is the model that is meant, "*" any."""
     for check in _checks(ear, session, words, called):
         yield replace(check, text=words.translate(check.text), next=words.translate(check.next))
 
 
-def _checks(ear: Ear, session: Session, words: RosWords, called: str) -> Iterator[Check]:
+def _checks(ear: Ear, session: Session, words: RosMessages, called: str) -> Iterator[Check]:
     yield _writers_check(ear)
     if ear.is_mute and not any(nodes.writers for nodes in ear.nodes.values()):
         yield _mute_check(ear)
@@ -70,7 +70,7 @@ def _mute_check(ear: Ear) -> Check:
     return broken("writers", f"{text} keeps it from whoever asks here", "zstate ls")
 
 
-def _model_check(ear: Ear, words: RosWords, called: str) -> tuple[RobotModel | None, Check]:
+def _model_check(ear: Ear, words: RosMessages, called: str) -> tuple[RobotModel | None, Check]:
     topic = words.topic(ear.info.name, "robot_description")
     if not (ear.description or ear.writers("robot_description") or ear.nodes["tf"].writers):
         return None, broken("model", f"nobody publishes {topic}", _publish(ear, words))
@@ -81,16 +81,16 @@ def _model_check(ear: Ear, words: RosWords, called: str) -> tuple[RobotModel | N
     return model, warning("model", text, "zstate ls  # which domain and namespace is it in?")
 
 
-def _named(ear: Ear, words: RosWords) -> str:
+def _named(ear: Ear, words: RosMessages) -> str:
     """The robot as commands want to be told, which they are not where the wire can mean only one."""
     return "" if words.robot else f" {ear.info.name}"
 
 
-def _publish(ear: Ear, words: RosWords) -> str:
+def _publish(ear: Ear, words: RosMessages) -> str:
     return "zstate publish FILE" if words.robot else f"zstate publish FILE --name {ear.info.name}"
 
 
-def _joints_check(ear: Ear, model: RobotModel | None, words: RosWords) -> Check:
+def _joints_check(ear: Ear, model: RobotModel | None, words: RosMessages) -> Check:
     topic = words.topic(ear.info.name, "joint_states")
     writers, heard = ear.writers("joint_states"), ear.nodes["joint_states"].writers
     if not heard and not writers:
@@ -146,7 +146,7 @@ def _shared_check(
     return ok("joint_states", rates)
 
 
-def _transforms_check(ear: Ear, words: RosWords) -> Check:
+def _transforms_check(ear: Ear, words: RosMessages) -> Check:
     heard = ear.nodes["tf"].writers
     if not heard:
         return _no_transforms_check(ear, words)
@@ -164,7 +164,7 @@ def _transforms_check(ear: Ear, words: RosWords) -> Check:
     return ok("tf", rates)
 
 
-def _no_transforms_check(ear: Ear, words: RosWords) -> Check:
+def _no_transforms_check(ear: Ear, words: RosMessages) -> Check:
     topic, writers = words.topic(ear.info.name, "tf"), ear.writers("tf")
     if not writers:
         text = f"nobody publishes {topic}: no node makes transforms of the joints"

@@ -7,7 +7,8 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from zstate.rate import RateReport
 
 GRACE_S = 0.5
-"""Most waits end sooner; a longer one is mentioned."""
+"""A wait that takes longer than this is reported [s]; most end sooner."""
 
 
 def print_result(text: str = "") -> None:
@@ -110,6 +111,23 @@ def rate_text(rate_hz: float | None) -> str:
 def count_text(count: int, what: str) -> str:
     """``count`` of ``what``: "1 joint", "7 joints"."""
     return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def size_text(size: int) -> str:
+    """A number of bytes with a unit."""
+    amount = float(size)
+    for unit in ("B", "kB", "MB"):
+        if amount < 1000.0:
+            return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.3g} {unit}"
+        amount /= 1000.0
+    return f"{amount:,.2f} GB"
+
+
+def files_text(files: Sequence[Path]) -> str:
+    """The names of the files of a recording."""
+    if len(files) < 3:
+        return " and ".join(map(str, files))
+    return f"{len(files)} files, {files[0]} to {files[-1].name}"
 
 
 def report_text(report: RateReport) -> str:

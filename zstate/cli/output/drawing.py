@@ -58,7 +58,7 @@ class Node:
 class Edge:
     """An edge from one node to another, by their names; its ``label`` is not in SVG."""
 
-    begin: str
+    start: str
     end: str
     label: str = ""
     stroke: str = LINE
@@ -99,10 +99,10 @@ def svg(drawing: Drawing, title: str) -> str:
     is_tree = drawing.form == "tree"
     sizes = {node.name: node.size for node in drawing.nodes}
     layout = (tree_layout if is_tree else layered_layout)(
-        sizes, [(one.begin, one.end) for one in drawing.edges]
+        sizes, [(one.start, one.end) for one in drawing.edges]
     )
     for edge in drawing.edges:
-        points = [(x + _MARGIN, y + top) for x, y in layout.routes[edge.begin, edge.end]]
+        points = [(x + _MARGIN, y + top) for x, y in layout.routes[edge.start, edge.end]]
         canvas.line(points, stroke=edge.stroke, dashed=edge.dashed, smooth=not is_tree)
         if not is_tree:
             canvas.arrowhead(points[-2], points[-1], edge.stroke)
@@ -134,7 +134,7 @@ def dot(drawing: Drawing) -> str:
         lines.append(f"  {_quoted(node.name)}{_attributes(attributes)};")
     for edge in drawing.edges:
         label = _attributes([f"label={_quoted(edge.label)}"] * bool(edge.label))
-        lines.append(f"  {_quoted(edge.begin)} -> {_quoted(edge.end)}{label};")
+        lines.append(f"  {_quoted(edge.start)} -> {_quoted(edge.end)}{label};")
     return "\n".join([*lines, "}"])
 
 
@@ -155,21 +155,21 @@ def mermaid(drawing: Drawing) -> str:
         lines.append(f"  {numbers[node.name]}" + (f'(["{label}"])' if node.rounded else f'["{label}"]'))
     for edge in drawing.edges:
         label = f"|{edge.label}|" if edge.label else ""
-        lines.append(f"  {numbers[edge.begin]} -->{label} {numbers[edge.end]}")
+        lines.append(f"  {numbers[edge.start]} -->{label} {numbers[edge.end]}")
     return "\n".join(lines)
 
 
 def text_width(text: str, size: float) -> float:
     """About the greatest width of ``text`` in the fonts of the drawings."""
-    return size * sum(map(_letter_width, text))
-
-
-def _letter_width(letter: str) -> float:
-    if letter in _NARROW:
-        return 0.40
-    if letter in _WIDE or unicodedata.east_asian_width(letter) in "WF":
-        return 1.0
-    return 0.72 if letter.isupper() else 0.62
+    width = 0.0
+    for letter in text:
+        if letter in _NARROW:
+            width += 0.40
+        elif letter in _WIDE or unicodedata.east_asian_width(letter) in "WF":
+            width += 1.0
+        else:
+            width += 0.72 if letter.isupper() else 0.62
+    return size * width
 
 
 def _number(value: float) -> str:
@@ -201,7 +201,7 @@ class _Canvas:
     def text(
         self, x: float, y: float, text: str, *, size: float, color: str = INK, bold: bool = False
     ) -> None:
-        """A line of text whose baseline begins at (x, y)."""
+        """A line of text whose baseline starts at (x, y)."""
         weight = ' font-weight="600"' if bold else ""
         self._shapes.append(
             f'<text x="{_number(x)}" y="{_number(y)}" font-size="{_number(size)}" fill="{color}"{weight}>'
@@ -213,9 +213,9 @@ class _Canvas:
         """A line through ``points``; a smooth one leaves and enters each of them horizontally."""
         at = [f"{_number(x)} {_number(y)}" for x, y in points]
         path = f"M{at[0]}"
-        for (before, _), (after, _), begin, end in zip(points, points[1:], at, at[1:], strict=False):
+        for (before, _), (after, _), start, end in zip(points, points[1:], at, at[1:], strict=False):
             middle = _number((before + after) / 2)
-            path += f"C{middle} {begin.split()[1]} {middle} {end.split()[1]} {end}" if smooth else f"L{end}"
+            path += f"C{middle} {start.split()[1]} {middle} {end.split()[1]} {end}" if smooth else f"L{end}"
         self._shapes.append(
             f'<path d="{path}" fill="none" stroke="{stroke}" stroke-width="1.4"{_DASHES * dashed}/>'
         )

@@ -1,4 +1,4 @@
-"""Joint states as documents by joint name, and documents as YAML, one field or CSV."""
+"""Joint states as documents with joint names, and documents as YAML, CSV or a single field."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _BLOCKS = ("positions", "velocities", "efforts")
 _DESCRIPTION_WITHIN_S = 1.0
 # Keys that YAML reads as text without quotes.
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
-_YAML_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
+_YAML_CONSTANTS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 _ALWAYS_NEW = {"stamp", "seq"}
 
 
 class JointStateFormatter:
     """Formats joint states as documents.
 
-    A document has "stamp" [ns], "seq", and each of "positions", "velocities" and "efforts" that was sent: by
-    joint name, a list for a joint with several numbers. Without known names each is a bare list.
+    A document has "stamp" [ns], "seq", and those of "positions", "velocities" and "efforts" that were
+    sent, by joint name; a joint with several numbers has a list. If the names are unknown each is a plain list.
     """
 
     def __init__(self) -> None:
@@ -123,9 +123,9 @@ class DescribedJointStates(Closeable):
             wait_interruptible(self._described, _DESCRIPTION_WITHIN_S)
             if not self._formatter.has_names(state):
                 self._warned = True
-                reason = "is of another model" if self._described.is_set() else "is missing"
+                reason = "is for another model" if self._described.is_set() else "is missing"
                 print_status(
-                    f"the description of {self._robot!r} {reason}, so its joints have no names here; "
+                    f"the description of {self._robot!r} {reason}, so its joints are shown without names; "
                     f"`zstate publish {self._robot}` publishes it"
                 )
         return self._formatter.document(state)
@@ -149,7 +149,7 @@ def yaml_text(value: Any, indent: str = "") -> str:
         return json.dumps(value)
     lines: list[str] = []
     for key, inner in cast("dict[str, Any]", value).items():
-        is_plain = _PLAIN.fullmatch(key) and key.lower() not in _YAML_WORDS
+        is_plain = _PLAIN.fullmatch(key) and key.lower() not in _YAML_CONSTANTS
         is_block = isinstance(inner, dict) and inner != {}
         text = f"\n{yaml_text(inner, indent + '  ')}" if is_block else f" {json.dumps(inner)}"
         lines.append(f"{indent}{key if is_plain else json.dumps(key)}:{text}")
@@ -198,7 +198,7 @@ class CsvFormatter:
         self._names: list[str] = []
 
     def lines(self, value: Any, name: str) -> list[str]:
-        """The lines for one document, or for the part of one called ``name``."""
+        """The lines for one document, or for its part ``name``."""
         numbers = flatten(value, name)
         header = [] if list(numbers) == self._names else [_csv_line(numbers)]
         self._names = list(numbers)
@@ -211,10 +211,10 @@ def _csv_line(cells: Iterable[Any]) -> str:
     return line.getvalue()
 
 
-def field_of(document: Document, field: str) -> Any:
-    """The part of a document called "stamp", "positions" or "positions.elbow"; "elbow" is its position.
+def select_field(document: Document, field: str) -> Any:
+    """The part of a document named "stamp", "positions" or "positions.elbow"; "elbow" means the position.
 
-    Raises InvalidInput, which lists the fields, if there is none.
+    Raises InvalidInput with the list of fields if there is no such field.
     """
     fields: dict[str, Any] = dict(document)
     for block, numbers in document.items():

@@ -1,14 +1,14 @@
-"""Where the nodes of a graph are placed, and along which points its edges run.
+"""Layouts of graphs: positions of nodes and routes of edges.
 
 ``layered_layout`` draws any graph from left to right. ``tree_layout`` draws trees from the top down and folds
 them to the shape of a page: in layers, the 60 frames of a humanoid would be 4000 pixels wide and 370 high.
-Both take the size of each node as (width, height), and edges between different nodes, each once. The drawing
-begins at (0, 0).
+Both take the size of each node as (width, height), and edges between different nodes, each once. The origin
+is the upper left corner.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from itertools import combinations, pairwise
@@ -48,17 +48,22 @@ def layered_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
     layers is changed to reduce crossings, and nodes then move up and down towards their neighbours.
     """
     order, forward = _break_cycles(sizes, edges)
-    ranks = _ranks(order, forward.values())
+    before, after = _successors(map(_reversed, forward.values())), _successors(forward.values())
+    ranks: dict[str, int] = {}
+    for node in order:  # right of all predecessors
+        ranks[node] = max((ranks[other] + 1 for other in before.get(node, ())), default=0)
+    for node in after.keys() - before.keys():  # close to the successors
+        ranks[node] = min(ranks[end] for end in after[node]) - 1
     layers: list[list[str]] = [[] for _ in range(max(ranks.values(), default=-1) + 1)]
     for node in sizes:
         layers[ranks[node]].append(node)
     # A long edge has a placeholder without size in each layer that it passes.
     chains: list[list[str]] = []
-    for number, (begin, end) in enumerate(forward.values()):
-        passed = {rank: f"\0{number} {rank}" for rank in range(ranks[begin] + 1, ranks[end])}
+    for number, (start, end) in enumerate(forward.values()):
+        passed = {rank: f"\0{number} {rank}" for rank in range(ranks[start] + 1, ranks[end])}
         for rank, placeholder in passed.items():
             layers[rank].append(placeholder)
-        chains.append([begin, *passed.values(), end])
+        chains.append([start, *passed.values(), end])
     links = [link for chain in chains for link in pairwise(chain)]
     layers = _reduce_crossings(layers, links)
     heights = {node: sizes.get(node, (0.0, 0.0))[1] for layer in layers for node in layer}
@@ -74,7 +79,7 @@ def layered_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
     }
     leaving = [(chain[0], middles[chain[1]]) for chain in chains]
     entering = [(chain[-1], middles[chain[-2]]) for chain in chains]
-    begins, ends = _ports(leaving, places, sizes, side=1), _ports(entering, places, sizes, side=0)
+    starts, ends = _ports(leaving, places, sizes, side=1), _ports(entering, places, sizes, side=0)
     routes = dict[Pair, list[Point]]()
     for number, (chain, (edge, along)) in enumerate(zip(chains, forward.items(), strict=True)):
         between = [
@@ -82,7 +87,7 @@ def layered_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
             for rank, node in enumerate(chain[1:-1], ranks[chain[0]] + 1)
             for x in (lefts[rank], rights[rank])
         ]
-        route = [begins[number], *between, ends[number]]
+        route = [starts[number], *between, ends[number]]
         routes[edge] = route if along == edge else route[::-1]
     return Layout(places, routes)
 
@@ -95,8 +100,8 @@ def _break_cycles(nodes: Iterable[str], edges: Sequence[Pair]) -> tuple[list[str
     kept = list(edges)
     while True:
         predecessors: dict[str, list[str]] = {node: [] for node in nodes}
-        for begin, end in kept:
-            predecessors[end].append(begin)
+        for start, end in kept:
+            predecessors[end].append(start)
         try:
             order = list(TopologicalSorter(predecessors).static_order())
         except CycleError as error:
@@ -111,24 +116,13 @@ def _break_cycles(nodes: Iterable[str], edges: Sequence[Pair]) -> tuple[list[str
 
 def _successors(edges: Iterable[Pair]) -> dict[str, list[str]]:
     after: dict[str, list[str]] = {}
-    for begin, end in edges:
-        after.setdefault(begin, []).append(end)
+    for start, end in edges:
+        after.setdefault(start, []).append(end)
     return after
 
 
 def _reversed(edge: Pair) -> Pair:
     return edge[1], edge[0]
-
-
-def _ranks(order: Iterable[str], edges: Collection[Pair]) -> dict[str, int]:
-    """The layer of each node: right of all its predecessors, and close to its successors."""
-    before, after = _successors(map(_reversed, edges)), _successors(edges)
-    ranks: dict[str, int] = {}
-    for node in order:
-        ranks[node] = max((ranks[other] + 1 for other in before.get(node, ())), default=0)
-    for node in after.keys() - before.keys():
-        ranks[node] = min(ranks[end] for end in after[node]) - 1
-    return ranks
 
 
 def _reduce_crossings(layers: list[list[str]], links: Sequence[Pair]) -> list[list[str]]:
@@ -148,7 +142,7 @@ def _reduce_crossings(layers: list[list[str]], links: Sequence[Pair]) -> list[li
 
 def _crossings(layers: Sequence[Sequence[str]], links: Sequence[Pair]) -> int:
     place = {node: (rank, at) for rank, layer in enumerate(layers) for at, node in enumerate(layer)}
-    spans = sorted((place[begin], place[end][1]) for begin, end in links)
+    spans = sorted((place[start], place[end][1]) for start, end in links)
     return sum(
         one[0][0] == other[0][0] and one[0][1] < other[0][1] and one[1] > other[1]
         for one, other in combinations(spans, 2)
@@ -158,7 +152,7 @@ def _crossings(layers: Sequence[Sequence[str]], links: Sequence[Pair]) -> int:
 def _middles(
     layers: Sequence[Sequence[str]], heights: Mapping[str, float], links: Sequence[Pair]
 ) -> dict[str, float]:
-    """The y of the middle of each node; the highest node begins at 0."""
+    """The y of the middle of each node; the top of the highest node is 0."""
     neighbours = _successors([*map(_reversed, links), *links])
     middles: dict[str, float] = {}
     for layer in layers:
@@ -214,9 +208,9 @@ def _ports(
 
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
-    """One way to draw a subtree: its size, and the (x, width, height) of its root in it.
+    """One way to place a subtree: its size, and the (x, width, height) of its root in it.
 
-    A ``name`` of None is no node: its ``parts`` are children of one node that share a rail.
+    Without a ``name`` there is no root: the ``parts`` are children of one node that share a rail.
     """
 
     name: str | None
@@ -236,14 +230,18 @@ class _Arrangement:
 def tree_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
     """Layout of trees from the top down, on a page that is not too wide.
 
-    A node is drawn with its children side by side below it, or under each other along a rail, or with its
-    leaves along a rail beside the other children. Of all combinations, from the leaves up, those are kept
-    that no other one beats in both width and height; the one that fits the smallest page is drawn.
+    The children of a node are placed side by side below it, or under each other along a rail, or side by side
+    with only the leaves along a rail. From the leaves up, arrangements that are both wider and higher than
+    another are discarded; the one that fits the smallest page is used.
     """
     children = _successors(edges)
     entered = {end for _, end in edges}
     roots = [name for name in sizes if name not in entered]
-    trees = [min(_arrangements(root, children, sizes), key=_page_size) for root in roots]
+
+    def page_size(way: _Arrangement) -> tuple[float, float]:
+        return max(way.width / _PAGE_SHAPE, way.height), way.width
+
+    trees = [min(_arrangements(root, children, sizes), key=page_size) for root in roots]
     area = sum((tree.width + _TREE_GAP) * (tree.height + _TREE_GAP) for tree in trees)
     page_width = max([sqrt(area * _PAGE_SHAPE), *(tree.width for tree in trees)])
     layout = Layout({}, {})
@@ -256,15 +254,10 @@ def tree_layout(sizes: Mapping[str, Size], edges: Sequence[Pair]) -> Layout:
     return layout
 
 
-def _page_size(way: _Arrangement) -> tuple[float, float]:
-    """The height of the page that an arrangement fits on, then its own width."""
-    return max(way.width / _PAGE_SHAPE, way.height), way.width
-
-
 def _arrangements(
     root: str, children: Mapping[str, Sequence[str]], sizes: Mapping[str, Size]
 ) -> list[_Arrangement]:
-    """The ways to draw a tree that no other one beats; not recursive, so that depth has no limit."""
+    """The arrangements of a tree that are not both wider and higher than another. Not recursive."""
     found: dict[str, list[_Arrangement]] = {}
     order = [root]
     for name in order:
@@ -359,11 +352,11 @@ def _place(tree: _Arrangement, corner: Point, sizes: Mapping[str, Size], layout:
 def _connect(parent: tuple[Point, Size], child: tuple[Point, Size], rail: float | None) -> list[Point]:
     """From the lower edge of the parent to the upper edge of the child, or along a rail to its left edge."""
     ((left, top), (width, height)), ((x, y), (child_width, child_height)) = parent, child
-    begin, bottom = left + width / 2, top + height
+    start, bottom = left + width / 2, top + height
     bus = bottom + _BELOW / 2
     if rail is None:
         middle = x + child_width / 2
-        return [(begin, bottom), (begin, bus), (middle, bus), (middle, y)]
+        return [(start, bottom), (start, bus), (middle, bus), (middle, y)]
     is_below_parent = left < rail < left + width
-    start = [(rail, bottom)] if is_below_parent else [(begin, bottom), (begin, bus), (rail, bus)]
+    start = [(rail, bottom)] if is_below_parent else [(start, bottom), (start, bus), (rail, bus)]
     return [*start, (rail, y + child_height / 2), (x, y + child_height / 2)]

@@ -1,4 +1,4 @@
-"""What goes on, line by line on standard error: in words, or as JSON for programs."""
+"""Lines on standard error, as text for users or as JSON objects for programs."""
 
 from __future__ import annotations
 
@@ -20,19 +20,17 @@ import click
 FORMAT_VARIABLE = "ZSTATE_LOG_FORMAT"
 FORMATS = ("text", "json")
 
-# What a record of the library may carry besides its text, as ``extra``.
+# ``extra`` attributes that a log record of the library may have.
 _FACTS = ("robot", "writer", "reason")
-
-
-# What a terminal acts on, but for line ends and tabs: escape sequences, C1 controls, overrides of direction.
+# Characters that control a terminal, except line ends and tabs: escape, C1 controls, direction overrides.
 _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 _COLORS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def without_controls(text: str, *, colors: bool = False) -> str:
-    """``text`` with escapes such as ``\\x1b`` for control characters: what prints it may come from anywhere.
+    """``text`` with control characters escaped, such as ``\\x1b``: printed names may come from the network.
 
-    With ``colors`` the sequences that change colours stay: our own, for a terminal.
+    With ``colors``, colour sequences stay; they are this program's own, for a terminal.
     """
     if not _CONTROLS.search(text):
         return text
@@ -48,24 +46,24 @@ class _Settings:
 
 
 def use_format(name: str) -> None:
-    """Say everything in one of ``FORMATS`` from now on, also what a thread ends with."""
+    """Write all lines in one of ``FORMATS``, including unhandled exceptions of any thread."""
     _Settings.format = name
     if name == "json":
-        sys.excepthook = lambda kind, error, trace: _note_crash(error)
-        threading.excepthook = lambda given: _note_crash(given.exc_value)
+        sys.excepthook = lambda kind, error, trace: _log_crash(error)
+        threading.excepthook = lambda crash: _log_crash(crash.exc_value)
 
 
-def use_format_of_environment() -> None:
-    """The format that the environment names, if it is one; the option says what is wrong with others."""
+def use_environment_format() -> None:
+    """Use the format in ``FORMAT_VARIABLE`` if it is valid; otherwise the option reports it."""
     name = os.environ.get(FORMAT_VARIABLE, "")
     if name in FORMATS:
         use_format(name)
 
 
-def _use_chosen(_: click.Context, __: click.Parameter, name: str | None) -> None:
+def _on_format_option(_: click.Context, __: click.Parameter, name: str | None) -> None:
     if name is not None:
         use_format(name)
-        os.environ[FORMAT_VARIABLE] = name  # also for the commands that this one starts
+        os.environ[FORMAT_VARIABLE] = name  # also for child processes
 
 
 log_format_option = click.Option(
@@ -74,60 +72,48 @@ log_format_option = click.Option(
     envvar=FORMAT_VARIABLE,
     is_eager=True,
     expose_value=False,
-    callback=_use_chosen,
-    help="What goes on, on standard error: in words, or as one JSON object a line; default: text.",
+    callback=_on_format_option,
+    help="Format of standard error: text, or one JSON object per line; default: text.",
 )
 """Every command has it."""
 
 
-def write(text: str, *, level: str = "info", event: str = "note", **facts: object) -> None:
-    """One line on standard error, there at once: ``text``, or a JSON object that has it and the rest.
+def is_json() -> bool:
+    """Whether the format is JSON."""
+    return _Settings.format == "json"
 
-    In words, warnings and errors begin with the program's name. ``facts`` that are None are left out.
+
+def write(text: str, *, level: str = "info", event: str = "note", **facts: object) -> None:
+    """Write one line to standard error, flushed: ``text``, or a JSON object with all arguments.
+
+    As text, warnings and errors begin with the program's name. ``facts`` that are None are left out.
     """
-    if _Settings.format == "json":
+    if is_json():
         line = as_json(text, level=level, event=event, **facts)
     else:
-        line = _as_wide_as_seen(without_controls(text if level == "info" else f"zstate: {text}"))
+        line = without_controls(text if level == "info" else f"zstate: {text}")
+        if _standard_error().isatty():
+            from zstate.cli.output.text_layout import wrap
+
+            line = wrap(line, shutil.get_terminal_size().columns)
     _write_line(line)
 
 
 def as_json(text: str, *, level: str = "info", event: str = "note", **facts: object) -> str:
-    """A line of the JSON format: now, and ``facts`` that are not None."""
+    """A line of the JSON format, with the current time and the ``facts`` that are not None."""
     known = {name: fact for name, fact in facts.items() if fact is not None}
     return json.dumps({"time": _time_text(), "level": level, "event": event, **known, "text": text})
 
 
-def _as_wide_as_seen(text: str) -> str:
-    if not _standard_error().isatty():
-        return text
-    from zstate.cli.output.text_layout import wrap
-
-    return wrap(text, shutil.get_terminal_size().columns)
-
-
-def _write_line(line: str) -> None:
-    with suppress(OSError):  # nobody reads it any more
-        stream = _standard_error()
-        stream.write(line + "\n")
-        stream.flush()
-
-
-def is_json() -> bool:
-    """Whether what goes on is said as JSON."""
-    return _Settings.format == "json"
-
-
 def forward_line(line: str, *, is_error: bool, **facts: object) -> None:
-    """As JSON, a line that another program wrote: an object of ours with ``facts`` besides, or any text."""
+    """Write a line of another program as JSON: an object of zstate with ``facts`` added, or any text."""
     try:
-        said = json.loads(line)
+        entry = json.loads(line)
     except ValueError:
-        said = None
-    if isinstance(said, dict):
-        written = json.dumps({**cast("dict[str, object]", said), **facts})
-    else:
-        written = json.dumps({"time": _time_text(), "event": "line", "text": line, **facts})
+        entry = None
+    if not isinstance(entry, dict):
+        entry = {"time": _time_text(), "event": "line", "text": line}
+    written = json.dumps({**cast("dict[str, object]", entry), **facts})
     if is_error:
         _write_line(written)
     else:
@@ -135,25 +121,25 @@ def forward_line(line: str, *, is_error: bool, **facts: object) -> None:
 
 
 def text_in(line: str) -> str:
-    """The text of a line that another zstate wrote, in either format."""
+    """The text of a line that another zstate process wrote, in either format."""
     try:
-        said = json.loads(line)
+        entry = json.loads(line)
     except ValueError:
         return line
-    text = cast("dict[str, object]", said).get("text") if isinstance(said, dict) else None
+    text = cast("dict[str, object]", entry).get("text") if isinstance(entry, dict) else None
     return line if text is None else str(text)
 
 
 def warn_on_standard_error() -> None:
-    """Warnings of the library go to standard error from now on."""
+    """Write warnings of the library to standard error."""
     logger = logging.getLogger("zstate")
     if not any(isinstance(handler, _Lines) for handler in logger.handlers):
         logger.addHandler(_Lines(logging.WARNING))
         logger.propagate = False
 
 
-def keep_warnings_back() -> None:
-    """Warnings of the library go nowhere from now on: the command says them itself."""
+def suppress_library_warnings() -> None:
+    """Suppress warnings of the library, for a command that reports the same facts itself."""
     logging.getLogger("zstate").setLevel(logging.CRITICAL)
 
 
@@ -164,19 +150,26 @@ class _Lines(logging.Handler):
         write(self.format(record), level=record.levelname.lower(), event=event, **facts)
 
 
+def _write_line(line: str) -> None:
+    with suppress(OSError):  # the reader has gone
+        stream = _standard_error()
+        stream.write(line + "\n")
+        stream.flush()
+
+
 def _standard_error() -> TextIO:
-    # A live table stands in for standard error, so that lines come above it: right where both are on
-    # one terminal, while a file or a pipe is to have its lines itself.
+    # rich's live display replaces sys.stderr so that lines appear above it. That is right on a terminal; a
+    # file or a pipe gets its lines directly.
     behind = getattr(sys.stderr, "rich_proxied_file", sys.stderr)
     return sys.stderr if behind.isatty() else behind
 
 
-def _note_crash(error: BaseException | None) -> None:
+def _log_crash(error: BaseException | None) -> None:
     if not isinstance(error, SystemExit):
         write("".join(traceback.format_exception(error)), level="error", event="crash")
 
 
 def _time_text() -> str:
-    """Now, as RFC 3339 has it, to the nanosecond."""
+    """The current time in RFC 3339, with nanoseconds."""
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     return f"{datetime.fromtimestamp(seconds, timezone.utc):%Y-%m-%dT%H:%M:%S}.{nanoseconds:09d}Z"

@@ -29,19 +29,19 @@ def tree_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tup
 
 
 def chain_lines(root: str, children: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
-    """As ``tree_lines``, but two columns deep, and only where the tree forks; "↓" is before an only child."""
+    """As ``tree_lines``, but indented by two and only at forks; "↓" marks an only child."""
     stack = [(root, "", "")]
     while stack:
         name, guide, rail = stack.pop()
         yield guide, name
-        children_here = children.get(name, ())
-        if len(children_here) == 1:
-            stack.append((children_here[0], f"{rail}↓ ", rail))
+        below = children.get(name, ())
+        if len(below) == 1:
+            stack.append((below[0], f"{rail}↓ ", rail))
             continue
-        for position in reversed(range(len(children_here))):
-            is_last = position == len(children_here) - 1
+        for position in reversed(range(len(below))):
+            is_last = position == len(below) - 1
             fork, below_it = ("└ ", "  ") if is_last else ("├ ", "│ ")
-            stack.append((children_here[position], rail + fork, rail + below_it))
+            stack.append((below[position], rail + fork, rail + below_it))
 
 
 def in_columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -1,11 +1,11 @@
-"""Words: what a person is told of robots and their streams, in the terms of the wire that is spoken."""
+"""Messages about robots and streams in the vocabulary of a wire format: zstate's or ROS 2's."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 from zstate._util.suggestions import did_you_mean
 from zstate.cli.output.console import count_text
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 
 def is_ros(wire: str) -> bool:
-    """Whether the wire that a user calls so is one of ROS's."""
+    """Whether ``wire``, a value of --wire, is a ROS wire format."""
     return not wire.startswith("native")
 
 
 def default_stream(wire: str) -> Literal["joint_states", "tf"]:
-    """The stream that tells where frames are: what everybody writes, and needs no model on ROS's side."""
+    """The stream from which poses are computed. On a ROS wire tf, which needs no model."""
     return "tf" if is_ros(wire) else "joint_states"
 
 
 @lru_cache(maxsize=64)
 def publish_command_for(command: str, robot: str) -> str:
-    """`zstate publish` or `zstate joints` for ``robot``: by its name where that is a known model's too."""
+    """`zstate publish` or `zstate joints` for ``robot``, which may have the name of a catalog model."""
     from zstate.errors import ModelError
     from zstate.model.catalog import find_entry
 
@@ -38,58 +38,24 @@ def publish_command_for(command: str, robot: str) -> str:
         return f"zstate {command} FILE --name {robot}"
 
 
-def messages_for(wire: str) -> WireMessages:
-    """The words for the wire that a user calls so. Raises InvalidInput for one that there is not."""
-    return RosWords(wire) if is_ros(wire) else NativeWords()
+def messages_for(wire: str) -> NativeMessages | RosMessages:
+    """The messages for ``wire``, a value of --wire. Raises InvalidInput if there is no such wire format."""
+    return RosMessages(wire) if is_ros(wire) else NativeMessages()
 
 
-class WireMessages(Protocol):
-    """How one wire calls things."""
+class NativeMessages:
+    """Messages for the native wire: robots have names and announce themselves."""
 
-    @property
-    def robot(self) -> str | None:
-        """Whose state a command shows that names no robot; None where it must name one."""
-        ...
+    robot: str | None = None
+    """The robot of a command that names none; None if it must name one."""
 
     def place(self, robot: str, streams: Sequence[Stream]) -> str:
-        """Where ``streams`` are to be heard."""
-        ...
+        """The keys or topics of ``streams``."""
+        names = streams[0] if len(streams) == 1 else f"{{{','.join(streams)}}}"
+        return f"zstate/{robot}/{names}"
 
     def announced(self, robots: Sequence[RobotInfo]) -> str:
-        """Who is there, for the end of a message about one that is not."""
-        ...
-
-    def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:
-        """That nobody announces ``robot``, and who is there."""
-        ...
-
-    def no_sample_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:
-        """Why no sample of ``stream`` comes (any more, if ``ended``)."""
-        ...
-
-    def missing_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, heard: bool) -> str:
-        """Who lacks ``stream``, or its like, so that a pose is not known; ``heard``: some frames are."""
-        ...
-
-    def heard(self, robot: str, frames: Sequence[FrameInfo]) -> str:
-        """That waiting for ``robot`` is over."""
-        ...
-
-    def translate(self, text: str) -> str:
-        """An explanation of the library, with the names and commands that serve here."""
-        ...
-
-
-class NativeWords:
-    """Robots have names and say so."""
-
-    robot = None
-
-    def place(self, robot: str, streams: Sequence[Stream]) -> str:
-        said = streams[0] if len(streams) == 1 else f"{{{','.join(streams)}}}"
-        return f"zstate/{robot}/{said}"
-
-    def announced(self, robots: Sequence[RobotInfo]) -> str:
+        """The announced robots; with advice if there is none."""
         if not robots:
             from zstate.model.catalog import example_name
             from zstate.net.rendezvous import silent_addresses
@@ -97,57 +63,66 @@ class NativeWords:
 
             start = f"start one, for instance with `zstate publish {example_name()} --source sine`"
             silent = check_rendezvous(silent_addresses())
-            advice = f"{silent.text}; `zstate doctor` says more" if silent else start
+            advice = f"{silent.text}; `zstate doctor` shows more" if silent else start
             return f"no robot is announced; {advice}"
         return f"announced: {', '.join(repr(robot.name) for robot in robots)}"
 
     def unknown(self, robot: str, robots: Sequence[RobotInfo]) -> str:
+        """That ``robot`` is not announced, and which robots are."""
         hint = did_you_mean(robot, [info.name for info in robots])
-        return f"nobody announces the robot {robot!r}{hint} ({self.announced(robots)})"
+        return f"robot {robot!r} is not announced{hint} ({self.announced(robots)})"
 
     def no_sample_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:
-        streams = {said for info in robots if info.name == robot for said, _ in info.writers}
+        """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
+        streams = {written for info in robots if info.name == robot for written, _ in info.writers}
         if not streams:
             return self.unknown(robot, robots)
         if stream in streams:
-            what = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample comes"
-            return f"{what}; `zstate doctor {robot}` says why"
-        command = "joints" if stream == "joint_states" else "publish"
-        hint = publish_command_for(command, robot)
-        return f"nobody writes {stream} of {robot!r}{' any more' * ended}; `{hint}` would"
+            fact = f"{robot!r} is announced with {stream}, but no {'new ' * ended}sample arrives"
+            return f"{fact}; `zstate doctor {robot}` finds the reason"
+        command = publish_command_for("joints" if stream == "joint_states" else "publish", robot)
+        return f"{stream} of {robot!r} has no writer{' any more' * ended}; start one: `{command}`"
 
-    def missing_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, heard: bool) -> str:
-        wanted = [info for info in robots if robot in ("*", info.name)]
-        if not wanted:
+    def missing_text(
+        self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, has_frames: bool
+    ) -> str:
+        """Which robots lack ``stream`` so that a pose is unknown; ``has_frames`` if some frames are known."""
+        selected = [info for info in robots if robot in ("*", info.name)]
+        if not selected:
             return self.announced(robots) if robot == "*" else self.unknown(robot, robots)
-        without = [info for info in wanted if stream not in {said for said, _ in info.writers}]
+        without = [info for info in selected if stream not in {written for written, _ in info.writers}]
         reasons = [self.no_sample_text(info.name, stream, robots, ended=False) for info in without]
-        return "; ".join(reasons) or self.announced(wanted)
+        return "; ".join(reasons) or self.announced(selected)
 
-    def heard(self, robot: str, frames: Sequence[FrameInfo]) -> str:
+    def received_text(self, robot: str, frames: Sequence[FrameInfo]) -> str:
+        """That ``robot`` has arrived."""
         own = [frame for frame in frames if frame.name.startswith(f"{robot}/")]
         joints = sum(frame.kind == "joint" for frame in own)
-        return f"heard {robot}: {count_text(len(own), 'frame')}, {count_text(joints, 'joint')}"
+        return f"receiving {robot}: {count_text(len(own), 'frame')}, {count_text(joints, 'joint')}"
 
     def translate(self, text: str) -> str:
+        """``text`` of the library, with the names and commands of this wire format."""
         return text
 
 
-class RosWords:
-    """ROS has topics and nodes, and one flat tree of frames."""
+class RosMessages:
+    """The same messages for ROS wires: topics, nodes, and one flat tree of frames."""
 
     def __init__(self, wire: str) -> None:
         from zstate.wire.registry import get_wire
         from zstate.wire.ros2.topics import DdsKeys, RmwKeys
         from zstate.wire.ros2.wire import Ros2Wire
 
-        spoken = get_wire(wire)
-        assert isinstance(spoken, Ros2Wire)
+        wire_format = get_wire(wire)
+        assert isinstance(wire_format, Ros2Wire)
         self._spec = wire
-        self._options = spoken.options
-        over_dds = spoken.name == "ros2dds"
-        self._topics = DdsKeys(spoken.options) if over_dds else RmwKeys(spoken.options)
-        self._where = "behind the ros2dds bridge" if over_dds else f"in domain {spoken.options.domain}"
+        self._options = wire_format.options
+        over_dds = wire_format.name == "ros2dds"
+        self._topics = DdsKeys(self._options) if over_dds else RmwKeys(self._options)
+        self._where = "behind the ros2dds bridge" if over_dds else f"in domain {self._options.domain}"
+        self._advice = (
+            f"check the domain and the router; `zstate ls --wire {wire}` shows all nodes and topics"
+        )
 
     @property
     def robot(self) -> str | None:
@@ -157,7 +132,7 @@ class RosWords:
         return None if namespace == "*" else namespace.rpartition("/")[2] or SHARED
 
     def topic(self, robot: str, stream: Stream) -> str:
-        """The topic that carries ``stream`` of ``robot``, or of whoever there is for "*"."""
+        """The topic that carries ``stream`` of ``robot``; for "*" with NAMESPACE as the robot."""
         return self._topics.topic("NAMESPACE" if robot == "*" else robot, stream)
 
     def place(self, robot: str, streams: Sequence[Stream]) -> str:
@@ -166,7 +141,7 @@ class RosWords:
 
     def announced(self, robots: Sequence[RobotInfo]) -> str:
         if not robots:
-            return f"nobody publishes the state of a robot {self._where}; {self._advice}"
+            return f"no node publishes the state of a robot {self._where}; {self._advice}"
         topics = {self.topic(info.name, stream) for info in robots for stream, _ in info.writers}
         return f"published {self._where}: {', '.join(sorted(topics))}"
 
@@ -176,15 +151,17 @@ class RosWords:
     def no_sample_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, ended: bool) -> str:
         topic, writers = self.topic(robot, stream), self._writers(robot, stream, robots)
         if writers:
-            return f"{', '.join(writers)} publishes {topic}, but no {'new ' * ended}message comes"
-        return f"nobody publishes {topic} {self._where}{' any more' * ended}; {self._advice}"
+            return f"{', '.join(writers)} publishes {topic}, but no {'new ' * ended}message arrives"
+        return f"no node publishes {topic} {self._where}{' any more' * ended}; {self._advice}"
 
-    def missing_text(self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, heard: bool) -> str:
+    def missing_text(
+        self, robot: str, stream: Stream, robots: Sequence[RobotInfo], *, has_frames: bool
+    ) -> str:
         is_written = bool(self._writers(robot, "tf", robots))
-        return "" if heard and is_written else self.no_sample_text(robot, "tf", robots, ended=False)
+        return "" if has_frames and is_written else self.no_sample_text(robot, "tf", robots, ended=False)
 
-    def heard(self, robot: str, frames: Sequence[FrameInfo]) -> str:
-        return f"heard {self.topic(robot, 'tf')}: {count_text(len(frames), 'frame')}"
+    def received_text(self, robot: str, frames: Sequence[FrameInfo]) -> str:
+        return f"receiving {self.topic(robot, 'tf')}: {count_text(len(frames), 'frame')}"
 
     def translate(self, text: str) -> str:
         from zstate.wire.ros2.topics import SHARED
@@ -194,8 +171,4 @@ class RosWords:
 
     def _writers(self, robot: str, stream: Stream, robots: Sequence[RobotInfo]) -> list[str]:
         infos = [info for info in robots if robot in ("*", info.name)]
-        return sorted({str(writer) for info in infos for said, writer in info.writers if said == stream})
-
-    @property
-    def _advice(self) -> str:
-        return f"are the domain and the router right? `zstate ls --wire {self._spec}` shows who is there"
+        return sorted({str(writer) for info in infos for one, writer in info.writers if one == stream})
