@@ -73,7 +73,7 @@ def test_beside_the_native_wire_the_way_to_a_ros_router_is_told():
         *("publish", RRBOT, "--source", "sine", "--seconds", "0.1", "--wire", "native", "--wire", "ros2")
     )
     assert said.returncode == 0
-    assert b"say --connect" in said.stderr
+    assert b"pass --connect" in said.stderr
 
 
 def test_joints_names_its_topic(spawn: Spawn, client: Session):

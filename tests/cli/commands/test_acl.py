@@ -1,4 +1,4 @@
-"""The access control of a fleet, by commands as people run them: robots r1 and r2, and the viewer desk."""
+"""Access control of a fleet with robots r1 and r2 and viewer desk, through the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.processes
 
 @pytest.fixture
 def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Where the router of the fleet listens; whoever names a user has the right password."""
+    """The endpoint of the fleet's router; ZSTATE_PASSWORD is right for every user."""
     acl, users = tmp_path / "acl.json5", tmp_path / "users.txt"
     acl.write_bytes(zstate("acl", "--robot", "r1", "--robot", "r2", "--viewer", "desk").stdout)
     users.write_text("r1:secret\nr2:secret\ndesk:secret\n")
@@ -30,7 +30,7 @@ def router(spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.Mon
     return endpoint
 
 
-def test_a_viewer_who_comes_late_sees_the_robot_move(spawn: Spawn, router: str):
+def test_late_viewer_receives_the_poses_of_the_robot(spawn: Spawn, router: str):
     started(spawn, "publish", RRBOT, "--name", "r1", "--source", "sine", "--user", "r1").line()
     seen = zstate("tf", "base", "lower", "--once", "--json", "--user", "desk")
     assert seen.returncode == 0, seen.stderr
@@ -40,16 +40,16 @@ def test_a_viewer_who_comes_late_sees_the_robot_move(spawn: Spawn, router: str):
 
 
 @pytest.mark.parametrize("user", ["r2", "desk"])
-def test_somebody_else_cannot_write_the_robot_and_is_told_why(router: str, user: str):
+def test_other_user_cannot_write_the_robot_and_the_error_names_the_reason(router: str, user: str):
     credentials = Credentials(user="desk", password="secret")
-    heard: list[SerializedSample] = []
+    received: list[SerializedSample] = []
     with connect(mode="client", endpoints=router, credentials=credentials) as session:
-        ear = StreamSubscriber(session, "zstate/r1/**", heard.extend)
-        told = failure("publish", RRBOT, "--name", "r1", "--source", "sine", "--user", user)
-        ear.close()
-    assert f"the router does not let user '{user}' write as robot 'r1'" in told
-    assert "`zstate acl --robot r1`" in told
-    assert heard == []
+        subscriber = StreamSubscriber(session, "zstate/r1/**", received.extend)
+        message = failure("publish", RRBOT, "--name", "r1", "--source", "sine", "--user", user)
+        subscriber.close()
+    assert f"the router does not let user '{user}' write as robot 'r1'" in message
+    assert "`zstate acl --robot r1`" in message
+    assert received == []
 
 
 def test_the_names_are_checked():
@@ -70,13 +70,13 @@ def test_a_file_without_access_control_is_not_taken_for_one(tmp_path: Path):
     assert "has no access_control" in failure("router", "--acl", str(file))
 
 
-def test_access_control_for_nobody_is_refused(tmp_path: Path):
+def test_access_control_without_authentication_is_refused(tmp_path: Path):
     file = tmp_path / "acl.json5"
     file.write_bytes(zstate("acl", "--robot", "r1").stdout)
     assert "nobody is asked for a name" in failure("router", "--acl", str(file))
 
 
-def test_robots_of_ros_are_told_apart_by_their_namespaces():
+def test_ros_robots_are_separated_by_namespaces():
     robots = ("--robot", "r1", "--robot", "r2")
     printed = zstate(
         "acl", *robots, "--wire", "native", "--wire", "ros2:domain=5,namespace=*"

@@ -19,7 +19,7 @@ def ros(spawn: Spawn, free_port: int) -> str:
 
 
 @pytest.mark.parametrize("given", [["rrbot"], [], ["--wire", EACH]], ids=["named", "alone", "all"])
-def test_a_native_robot_is_heard_on_ros_and_both_its_coming_and_its_going_are_said(
+def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
     spawn: Spawn, ros: str, given: list[str]
 ):
     wire = EACH if EACH in given else "ros2"
@@ -39,7 +39,7 @@ def test_a_native_robot_is_heard_on_ros_and_both_its_coming_and_its_going_are_sa
     interrupted(command)
 
 
-def test_a_robot_on_ros_is_heard_natively(spawn: Spawn, ros: str):
+def test_ros_robot_is_carried_to_native(spawn: Spawn, ros: str):
     command = started(spawn, "bridge", "arm", "--ros", ros)
     command.line()
     client = ("--mode", "client", "--connect", ros, "--wire", "ros2")
@@ -52,22 +52,22 @@ def test_a_robot_on_ros_is_heard_natively(spawn: Spawn, ros: str):
 
 def test_several_robots_do_not_share_the_root_namespace(ros: str):
     with standing("left"), standing("right"):
-        said = failure("bridge", "--ros", ros)
-    assert "room for one robot, not for 'left' and 'right'" in said
-    assert "zstate bridge panda" in said
-    assert EACH in said
+        message = failure("bridge", "--ros", ros)
+    assert "room for one robot, not for 'left' and 'right'" in message
+    assert "zstate bridge panda" in message
+    assert EACH in message
 
 
-def test_without_a_robot_it_says_how_to_name_one(ros: str):
+def test_bridge_without_a_robot_prints_how_to_name_one(ros: str):
     assert "zstate bridge panda" in failure("bridge", "--ros", ros)
 
 
-def test_a_router_that_is_not_there_is_named_with_how_to_start_one(free_port: int):
-    said = failure("bridge", "panda", "--ros", f"tcp/127.0.0.1:{free_port}")
-    assert f"'tcp/127.0.0.1:{free_port}'" in said
-    assert "ros2 run rmw_zenoh_cpp rmw_zenohd" in said
-    assert "zstate router --ros2" in said
+def test_missing_router_error_names_it_and_how_to_start_one(free_port: int):
+    message = failure("bridge", "panda", "--ros", f"tcp/127.0.0.1:{free_port}")
+    assert f"'tcp/127.0.0.1:{free_port}'" in message
+    assert "ros2 run rmw_zenoh_cpp rmw_zenohd" in message
+    assert "zstate router --ros2" in message
 
 
-def test_a_wire_that_there_is_not_is_refused_before_anything_is_opened():
+def test_unknown_wire_is_refused_before_a_session_opens():
     assert "no wire 'ros3'" in failure("bridge", "panda", "--wire", "ros3")

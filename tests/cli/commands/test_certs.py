@@ -16,7 +16,7 @@ pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zst
 pytestmark = pytest.mark.processes
 
 
-def test_it_says_what_it_made_and_what_not_to_do_with_it(tmp_path: Path):
+def test_certs_prints_its_files_and_a_warning(tmp_path: Path):
     folder = tmp_path / "fleet"
     done = zstate("certs", str(folder), "--identity", "router", "--identity", "r1", "--host", "10.0.0.1")
     assert done.returncode == 0
@@ -96,7 +96,7 @@ def test_a_router_that_listens_unencrypted_with_certificates_is_refused(tmp_path
     assert "'tls/127.0.0.1:7447'" in zstate("router", "--print", *identity).stdout.decode().replace('"', "'")
 
 
-def test_only_those_that_listen_can_pose_as_a_router(tmp_path):
+def test_only_server_certificates_can_listen(tmp_path):
     folder = str(tmp_path / "pki")
     assert (
         zstate("certs", folder, "--identity", "router", "--identity", "r1", "--server", "peer").returncode
@@ -119,7 +119,7 @@ def test_only_those_that_listen_can_pose_as_a_router(tmp_path):
     assert caught.value.reason == "not a server"
 
 
-def test_hosts_are_for_those_that_listen(tmp_path):
+def test_host_needs_a_server_identity(tmp_path):
     folder = str(tmp_path / "pki")
     assert "--host needs an identity that listens" in failure(
         "certs", folder, "--identity", "r1", "--host", "10.0.0.1", code=2

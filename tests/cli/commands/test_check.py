@@ -46,7 +46,7 @@ def test_each_error_stands_with_its_line():
     assert "'wrist'" in finding
 
 
-def test_what_to_write_instead_stands_below_each_finding(tmp_path: Path):
+def test_fix_hints_print_a_correction_below_each_finding(tmp_path: Path):
     file = tmp_path / "my arm.urdf"
     file.write_text(WITHOUT_LIMIT)
     *_, advice = zstate("check", str(file)).stdout.decode().splitlines()
@@ -64,7 +64,7 @@ def test_the_joints_are_a_table_in_the_order_of_their_positions():
     assert [(row[0], row[4]) for row in moving] == [("shoulder", "0"), ("elbow", "1")]
 
 
-def test_a_warning_is_told_but_does_not_fail():
+def test_warning_is_printed_and_exit_code_is_0():
     ended = zstate("check", "-", stdin=HEAVY.encode())
     assert ended.returncode == 0
     assert ended.stdout.decode().splitlines()[1].split()[:3] == ["line", "3", "warning"]
@@ -78,7 +78,7 @@ def test_a_name_that_nothing_has_is_met_with_near_misses():
     assert "rrbot" in failure("check", "rrbt")
 
 
-def test_json_says_all_of_it():
+def test_json_has_all_facts():
     facts = json.loads(zstate("check", RRBOT, "--json").stdout)
     assert facts["usable"] is True
     assert facts["digest"] == load_model(RRBOT).digest

@@ -41,7 +41,7 @@ def test_commands_and_their_options_are_offered():
     assert "plain,--fix-hints" in offered("check", "--f")
 
 
-def test_models_are_offered_by_name_and_files_besides():
+def test_completion_offers_models_by_name_and_files():
     assert "plain,rrbot" in offered("publish", "rr")
     assert offered("check", "./models/rr") == ["file,./models/rr"]
 
@@ -52,7 +52,7 @@ def test_robots_are_offered_that_are_announced():
         assert offered("snapshot", "save", "a.toml", "r") == ["plain,right"]
 
 
-def test_where_nobody_is_announced_nothing_is_offered_and_nothing_said():
+def test_completion_without_robots_offers_and_prints_nothing():
     assert offered("echo", "l") == []
 
 
@@ -73,7 +73,7 @@ class Typist:
         os.close(theirs)
         os.set_blocking(self._terminal, False)
         self._screen = ""
-        # Wide, since shells draw a line anew that reaches the edge.
+        # Wide, because shells redraw a line that reaches the edge.
         self.type("stty columns 200\r")
         self.type(f'eval "$(zstate completion {Path(shell[0]).name})" && echo taught $((40 + 2))\r')
         self.sees("taught 42")
@@ -142,7 +142,7 @@ def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypat
     lines = ("sn", "check --f", "tree le", "publish rr", "up ce")
     asked = "; ".join(f"complete -C 'zstate {line}'" for line in lines)
     with standing("lefty"):
-        said = subprocess.run(
+        completed = subprocess.run(
             ["fish", "--no-config", "-c", f"zstate completion fish | source; {asked}"],
             env=with_zstate(),
             capture_output=True,
@@ -150,14 +150,14 @@ def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypat
             check=True,
             timeout=30.0,
         )
-    snapshot, fix_hints, *others = said.stdout.splitlines()
+    snapshot, fix_hints, *others = completed.stdout.splitlines()
     assert snapshot.split("\t") == ["snapshot", group_help("snapshot")]
     assert fix_hints.startswith("--fix-hints\t")
     assert others == ["lefty", "rrbot", "cell.toml"]
 
 
 def group_help(command: str) -> str:
-    """What `zstate --help` says of ``command``; one with a comma in it."""
+    """The description of ``command`` in `zstate --help`; it has a comma."""
     (line,) = (
         line for line in zstate("--help").stdout.decode().splitlines() if line.split()[:1] == [command]
     )
@@ -166,5 +166,5 @@ def group_help(command: str) -> str:
     return text
 
 
-def test_another_shell_is_told_which_there_are():
+def test_unsupported_shell_error_lists_the_supported_ones():
     assert "'bash', 'zsh', 'fish'" in failure("completion", "tcsh", code=2)

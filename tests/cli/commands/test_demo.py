@@ -28,26 +28,26 @@ def is_gone(pid: int) -> bool:
 
 
 def test_it_shows_transforms_and_ends_with_a_summary():
-    said = zstate("demo", RRBOT, "--seconds", "1.5", "--rate", "50").stdout.decode()
-    first, *lines, summary = said.splitlines()
+    output = zstate("demo", RRBOT, "--seconds", "1.5", "--rate", "50").stdout.decode()
+    first, *lines, summary = output.splitlines()
     assert first.startswith("rrbot (2 joints, 7 links): process ")
     assert "lower in world: xyz [" in lines[0]
-    told = re.fullmatch(
+    summary_match = re.fullmatch(
         r"(?P<count>\d+) samples received in (?P<seconds>\d+\.\d\d) s: (?P<rate>[\d.]+) Hz, \d+ missed, "
         r"median latency [\d.]+ [mu]s from stamp to lookup",
         summary,
     )
-    assert told
-    assert float(told["seconds"]) >= 1.5  # and not before, but a busy machine may come to it later
+    assert summary_match
+    assert float(summary_match["seconds"]) >= 1.5  # and not before, but a busy machine may come to it later
     # The three numbers agree to the last digit shown.
-    rounded = 0.05 * float(told["seconds"]) + 0.005 * float(told["rate"])
-    assert float(told["rate"]) * float(told["seconds"]) == pytest.approx(
-        int(told["count"]), abs=rounded + 1e-6
+    rounded = 0.05 * float(summary_match["seconds"]) + 0.005 * float(summary_match["rate"])
+    assert float(summary_match["rate"]) * float(summary_match["seconds"]) == pytest.approx(
+        int(summary_match["count"]), abs=rounded + 1e-6
     )
-    assert "\x1b" not in said
+    assert "\x1b" not in output
 
 
-def test_without_panda_it_shows_a_robot_of_our_own_and_says_how_to_get_more():
+def test_without_panda_demo_shows_rrbot_and_prints_how_to_install_more():
     code = (
         "from zstate.model import catalog\n"
         "catalog._COLLECTIONS.pop('example-robot-data')\n"
@@ -92,5 +92,5 @@ def test_it_is_alone_with_its_publisher_wherever_the_user_is(monkeypatch: pytest
     assert zstate("demo", RRBOT, "--seconds", "0.5").returncode == 0
 
 
-def test_an_unknown_robot_is_told_with_one_that_always_works():
+def test_unknown_robot_error_names_one_that_always_works():
     assert "`zstate demo rrbot`" in failure("demo", "no_such_robot")

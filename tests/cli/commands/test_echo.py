@@ -78,7 +78,7 @@ def test_a_field_is_printed_alone(field: str, printed: str):
         assert zstate("echo", "rrbot", "--once", "--field", field).stdout.decode() == f"{printed}\n"
 
 
-def test_changed_prints_only_what_is_news(spawn: Spawn):
+def test_changed_prints_only_changed_documents(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--changed", "--json")
     with standing():
         first = json.loads(command.line())
@@ -93,7 +93,7 @@ def test_changed_prints_only_what_is_news(spawn: Spawn):
     interrupted(command)
 
 
-def test_news_is_a_number_that_differs_by_more_than_asked_for():
+def test_by_accepts_only_larger_differences():
     changes = ChangeFilter(by=0.1)
     states = [
         {"stamp": stamp, "seq": stamp, "positions": {"elbow": elbow}, "velocities": {"elbow": velocity}}
@@ -112,7 +112,7 @@ def test_an_amount_that_is_none_is_wrong_usage(amount: str):
     )
 
 
-def test_an_unknown_field_lists_what_there_is():
+def test_unknown_field_error_lists_the_fields():
     with standing():
         message = failure("echo", "rrbot", "--once", "--field", "elbo")
     assert "did you mean 'elbow'?" in message
@@ -137,7 +137,7 @@ def test_without_a_description_the_numbers_come_without_names():
     assert b"`zstate publish rrbot` publishes it" in ended.stderr
 
 
-def test_it_waits_for_a_robot_and_says_so(spawn: Spawn):
+def test_echo_waits_for_a_robot_and_prints_the_reason(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing():
@@ -171,7 +171,7 @@ def test_a_reader_that_leaves_ends_it_quietly():
         assert process.stderr.read() == b""
 
 
-def test_messages_that_are_not_ours_are_told_once_and_the_stream_goes_on(spawn: Spawn):
+def test_undecodable_messages_are_reported_once_and_skipped(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     with standing(), connect() as stranger:
         command.line()

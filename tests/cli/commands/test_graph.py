@@ -26,7 +26,7 @@ GRAPH = Graph(
 )
 
 
-def test_streams_with_the_same_ends_stand_together():
+def test_streams_with_equal_writers_and_readers_are_grouped():
     assert graph_text(GRAPH).splitlines() == [
         "arm: joint_states (500.0 Hz)",
         "  written by  driver@jetson pid 4",
@@ -40,7 +40,7 @@ def test_streams_with_the_same_ends_stand_together():
     ]
 
 
-def test_pictures_have_a_node_for_each_program_and_bundle_and_an_edge_for_each_use():
+def test_drawings_have_nodes_for_programs_and_stream_groups_and_edges_for_uses():
     root = ElementTree.fromstring(svg(graph_drawing(GRAPH), "A & B"))
     name = "{http://www.w3.org/2000/svg}"
     texts = [element.text for element in root.iter(f"{name}text")]
@@ -76,7 +76,7 @@ def test_a_stream_that_is_read_and_not_written_stands_out(spawn: Spawn):
 
 
 @pytest.mark.processes
-def test_whoever_reads_all_robots_reads_each_of_them_and_static_writers_have_names():
+def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
     with (
         connect() as session,
         StaticPublisher(session, "left", "mount"),
@@ -89,7 +89,7 @@ def test_whoever_reads_all_robots_reads_each_of_them_and_static_writers_have_nam
 
 
 @pytest.mark.processes
-def test_a_robot_that_nobody_speaks_of_is_an_error_and_no_robot_at_all_is_none():
+def test_unknown_robot_is_an_error_but_an_empty_network_is_not():
     with standing():
         assert "did you mean 'rrbot'?" in failure("graph", "rbot")
     ended = zstate("graph")

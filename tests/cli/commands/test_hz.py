@@ -10,7 +10,7 @@ from helpers.processes import until
 pytestmark = pytest.mark.processes
 
 
-def test_it_measures_once_a_second_in_the_usual_words(spawn: Spawn):
+def test_hz_prints_rostopic_style_figures_once_a_second(spawn: Spawn):
     command = started(spawn, "hz", "rrbot")
     with standing():
         assert re.fullmatch(r"average rate: \d+\.\d{3}", command.line())
@@ -43,7 +43,7 @@ def test_once_gives_up_with_the_reason():
     assert "zstate: gave up after 1 s: robot 'rrbot' is not announced" in message
 
 
-def test_a_stream_that_nobody_writes_is_named_with_who_would():
+def test_stream_without_writer_is_named_with_a_command_that_publishes_it():
     with standing(streams=("robot_description",)):
         message = failure("hz", "rrbot", "--once", "--timeout", "1")
     assert "joint_states of 'rrbot' has no writer; start one: `zstate joints rrbot`" in message

@@ -36,21 +36,21 @@ def facts(path: Path) -> dict:
     return json.loads(zstate("info", str(path), "--json").stdout)
 
 
-def test_a_recording_is_told_as_others_count_it(run: Path):
-    said = facts(run)
+def test_info_agrees_with_rosbags(run: Path):
+    info = facts(run)
     with AnyReader([run]) as reader:
-        assert (said["start"], said["end"]) == (reader.start_time, reader.end_time - 1)
-        assert said["messages"] == reader.message_count
+        assert (info["start"], info["end"]) == (reader.start_time, reader.end_time - 1)
+        assert info["messages"] == reader.message_count
         counts = {name: topic.msgcount for name, topic in reader.topics.items()}
-    (robot,) = said["robots"]
+    (robot,) = info["robots"]
     assert {stream["topic"]: stream["count"] for stream in robot["streams"]} == counts
-    assert (said["size"], said["complete"], said["losses"]) == (run.stat().st_size, True, [])
-    assert said["files"] == [str(run)]
+    assert (info["size"], info["complete"], info["losses"]) == (run.stat().st_size, True, [])
+    assert info["files"] == [str(run)]
 
 
-def test_a_robot_is_told_with_its_model_streams_rates_and_writers(run: Path):
-    said = facts(run)
-    (robot,) = said["robots"]
+def test_info_has_model_streams_rates_and_writers_of_a_robot(run: Path):
+    info = facts(run)
+    (robot,) = info["robots"]
     assert robot["robot"] == "r1"
     assert robot["model"] == {
         "name": RRBOT.name,
@@ -58,19 +58,19 @@ def test_a_robot_is_told_with_its_model_streams_rates_and_writers(run: Path):
         "joints": list(RRBOT.joint_names),
     }
     streams = {stream["stream"]: stream for stream in robot["streams"]}
-    assert streams["joint_states"]["rate_hz"] == pytest.approx(49 / said["duration_s"])
+    assert streams["joint_states"]["rate_hz"] == pytest.approx(49 / info["duration_s"])
     assert streams["tf_static"]["rate_hz"] is None
     assert all(" pid " in stream["writer"] for stream in streams.values())
 
 
-def test_people_read_the_same_in_lines(run: Path):
+def test_text_has_the_same_facts_as_json(run: Path):
     text = zstate("info", str(run)).stdout.decode()
-    said = facts(run)
+    info = facts(run)
     head, start, end, *_ = text.splitlines()
     assert re.fullmatch(rf"{re.escape(str(run))}: [\d.]+ kB \(mcap, zstd\) by zstate \S+", head)
-    assert start.split()[-1] == str(said["start"])
-    assert end.split()[-1] == str(said["end"])
-    assert f"\n{said['messages']} messages in {said['duration_s']:.3f} s\ncomplete\n" in text
+    assert start.split()[-1] == str(info["start"])
+    assert end.split()[-1] == str(info["end"])
+    assert f"\n{info['messages']} messages in {info['duration_s']:.3f} s\ncomplete\n" in text
     links, joints = len(RRBOT.links), len(RRBOT.joints)
     assert f"r1: model '{RRBOT.name}', {links} links, {joints} joints (2 driven)" in text
     assert re.search(
@@ -78,32 +78,32 @@ def test_people_read_the_same_in_lines(run: Path):
     )
 
 
-def test_one_that_was_cut_off_is_told_with_the_command_that_mends_it(run: Path):
+def test_truncated_recording_is_reported_with_the_recover_command(run: Path):
     run.write_bytes(run.read_bytes()[:-40])
     text = zstate("info", str(run)).stdout.decode()
     assert "\nnot complete\n" in text
     assert f"`zstate recover {run}`" in text
     assert "r1: model " in text
-    said = facts(run)
-    assert (said["complete"], said["recoverable"]) == (False, [str(run)])
+    info = facts(run)
+    assert (info["complete"], info["recoverable"]) == (False, [str(run)])
 
 
-def test_a_bag_of_ros_is_told_too_with_topics_that_are_not_a_robots_state(tmp_path: Path):
+def test_info_of_a_ros_bag_lists_other_topics(tmp_path: Path):
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, kind in (("/arm/joint_states", "JointState"), ("/image", "Image")):
             name = f"sensor_msgs/msg/{kind}"
             writer.write(writer.add_connection(topic, name, typestore=store), 5, b"\0\1\0\0")
-    said = facts(tmp_path / "bag")
-    (robot,) = said["robots"]
+    info = facts(tmp_path / "bag")
+    (robot,) = info["robots"]
     assert (robot["robot"], robot["model"]) == ("arm", None)
-    assert [(other["topic"], other["count"]) for other in said["others"]] == [("/image", 1)]
+    assert [(other["topic"], other["count"]) for other in info["others"]] == [("/image", 1)]
     text = zstate("info", str(tmp_path / "bag")).stdout.decode()
     assert "arm: no model" in text
     assert re.search(r"other topics\n  /image +sensor_msgs/msg/Image +1 +-", text)
 
 
-def test_what_is_no_recording_is_told_in_words(tmp_path: Path):
+def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     assert "No such file" in failure("info", str(tmp_path / "nothing.mcap"))
     (tmp_path / "notes.txt").write_text("hello, this is a note")
     assert "is not a recording" in failure("info", str(tmp_path / "notes.txt"))

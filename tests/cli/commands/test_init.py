@@ -10,7 +10,7 @@ from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zsta
 pytestmark = pytest.mark.processes
 
 
-def test_up_runs_what_init_has_written(spawn: Spawn, tmp_path: Path):
+def test_up_runs_the_file_that_init_writes(spawn: Spawn, tmp_path: Path):
     file = tmp_path / "cell.toml"
     written = zstate("init", "rrbot", "-o", str(file))
     assert written.returncode == 0
@@ -60,7 +60,7 @@ def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path):
     assert zstate("init", "rrbot", "-o", str(file), "--force").returncode == 0
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path):
+def test_missing_folder_error_names_the_reason(tmp_path: Path):
     assert "cannot be written: No such file" in failure(
         "init", "rrbot", "-o", str(tmp_path / "gone" / "a.toml")
     )

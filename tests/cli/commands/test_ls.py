@@ -45,7 +45,7 @@ def test_static_edges_stand_with_the_name_under_which_they_are_written():
     assert [writer["names"] for writer in robot["writers"]] == [["mount"]]
 
 
-def test_nobody_is_no_error():
+def test_empty_network_is_no_error():
     ended = zstate("ls")
     assert (ended.returncode, ended.stdout) == (0, b"")
     assert b"no robot is announced" in ended.stderr
@@ -56,7 +56,7 @@ def test_an_endpoint_that_cannot_be_is_named():
     assert "nonsense" in failure("ls", "--connect", "nonsense")
 
 
-def test_joint_states_have_a_rate_and_an_age_and_nothing_is_made_to_say_more():
+def test_ls_measures_joint_states_and_starts_no_other_stream():
     with standing():
         lines = {line.split()[0]: line for line in zstate("ls").stdout.decode().splitlines()}
         (robot,) = json.loads(zstate("ls", "--json").stdout)
@@ -67,7 +67,7 @@ def test_joint_states_have_a_rate_and_an_age_and_nothing_is_made_to_say_more():
     assert 0.0 <= joints["silent_s"] < 1.0
 
 
-def test_watched_the_list_comes_anew_when_somebody_comes_or_goes(spawn: Spawn):
+def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
     command = started(spawn, "ls", "--watch")
     assert command.line().startswith("no robot is announced")
     with standing(streams=("joint_states",)):

@@ -57,7 +57,7 @@ def test_the_path_goes_up_and_down_over_the_frame_that_both_hang_on():
     assert path_between(TREE, "base", "base") == ("r1/base", [])
 
 
-def test_joints_of_one_robot_come_together_and_are_told_once():
+def test_joints_of_one_robot_share_the_figures_of_one_row():
     assert report_text(rows(ClockOffset(10_000, 200_000))).splitlines() == [
         "frame  edge    rate      latency   max     jitter    missed  clock  writer",
         "base",
@@ -67,7 +67,7 @@ def test_joints_of_one_robot_come_together_and_are_told_once():
     ]
 
 
-def test_a_clock_that_is_off_is_told_with_what_that_means():
+def test_clock_offset_is_reported_with_its_effect_on_latencies():
     *table, note = report_text(rows(ClockOffset(-1_200_000_000, 100_000))).splitlines()
     assert "  -1.2 s  " in table[3]
     assert note == (
@@ -86,7 +86,7 @@ def test_a_narrow_terminal_has_fewer_columns_and_letters_for_the_writers():
     assert lines[3].endswith(" a")
 
 
-def test_silence_is_told_instead_of_a_rate():
+def test_stale_edge_shows_silent_instead_of_a_rate():
     silent = EdgeMeasure(100.0, 0.0004, 0.0021, 0.00011, 0, 12.0, is_stale=True)
     text = report_text([Row("r1/left", frame("r1/left", "r1/base"), silent, None)])
     assert "silent 12.0 s" in text
@@ -120,7 +120,7 @@ def test_fixed_edges_stand_under_the_writer_of_the_model(spawn: Spawn):
 
 
 @pytest.mark.processes
-def test_it_goes_on_and_names_who_has_gone_silent(spawn: Spawn):
+def test_monitor_continues_and_marks_a_writer_that_stops_as_silent(spawn: Spawn):
     command = started(spawn, "monitor", "base", "tool")
     until(lambda: "waiting: " in command.stderr)
     with standing():
@@ -165,22 +165,22 @@ def test_on_ros_side_each_edge_is_measured(ros_router: str):
 
 def test_of_all_edges_the_joints_of_a_robot_are_one_line_and_its_fixed_edges_another():
     frames = (*TREE[1:], frame("r2/odom", "map", "pose", "odometry"), frame("r2/laser", "r2/odom", "static"))
-    heard = [Row(one.name, one, MEASURE if one.kind != "static" else None, None) for one in frames]
-    assert overview_text(heard).splitlines() == [
+    edge_rows = [Row(one.name, one, MEASURE if one.kind != "static" else None, None) for one in frames]
+    assert overview_text(edge_rows).splitlines() == [
         "frame    edge      rate      latency   max     jitter    missed  clock  writer",
         f"r1/*     3 joints  100.0 Hz  400.0 us  2.1 ms  110.0 us  3              {DRIVER}",
         f"r1/*     1 static                                                       {DRIVER}",
         "r2/odom  pose      100.0 Hz  400.0 us  2.1 ms  110.0 us  3              odometry",
         f"r2/*     1 static                                                       {DRIVER}",
     ]
-    narrow = overview_text(heard, width=52).splitlines()
+    narrow = overview_text(edge_rows, width=52).splitlines()
     assert max(map(len, narrow)) <= 52
     assert narrow[0].split()[:2] == ["frame", "edge"]
     assert narrow[-2:] == [f"a: {DRIVER}", "b: odometry"]
 
 
 @pytest.mark.processes
-def test_without_frames_it_monitors_all_that_is_heard():
+def test_without_frames_all_received_edges_are_monitored():
     with standing("left"), standing("right"):
         lines = zstate("monitor", "--once").stdout.decode().splitlines()
         edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
@@ -200,7 +200,7 @@ def test_without_frames_it_monitors_all_that_is_heard():
 
 
 @pytest.mark.processes
-def test_without_frames_it_says_that_nobody_is_there():
+def test_without_frames_and_robots_the_error_names_the_reason():
     message = failure("monitor", "--once", "--timeout", "0.7")
     assert "gave up after 0.7 s: no robot is announced" in message
 

@@ -41,7 +41,7 @@ def test_with_a_source_of_its_own_publish_writes_joint_states_too(spawn: Spawn):
     assert streams_of("rrbot") == DERIVED | {"joint_states"}
 
 
-def test_writers_are_known_by_the_command_that_they_are(spawn: Spawn):
+def test_writers_have_the_name_of_their_command(spawn: Spawn):
     child = started(spawn, "joints", RRBOT)
     child.line()
     with connect() as session:
@@ -86,25 +86,25 @@ def test_publish_answers_lookups_for_devices_without_a_buffer(spawn: Spawn, sour
 
     answers: list[Transform] = []
 
-    def is_told_what_was_heard() -> bool:
+    def has_reply_in_buffer() -> bool:
         try:
             answers.append(query_lookup(session, "rrbot", "world", "tool"))
-        except (NoData, Unreachable):  # nobody of that name is known yet, or nothing was said
+        except (NoData, Unreachable):  # not discovered yet, or without a sample
             return False
         return listener.buffer.can_lookup("world", "tool", answers[-1].stamp)
 
     with connect() as session, TransformListener(session, "rrbot") as listener:
-        until(is_told_what_was_heard)
-        told = answers[-1]
-        heard = listener.buffer.lookup("world", "tool", told.stamp)
-        assert np.allclose(told.pose7, heard.pose7, rtol=0.0, atol=1e-12)
+        until(has_reply_in_buffer)
+        reply = answers[-1]
+        expected = listener.buffer.lookup("world", "tool", reply.stamp)
+        assert np.allclose(reply.pose7, expected.pose7, rtol=0.0, atol=1e-12)
     interrupted(publisher)
 
 
-def test_at_a_rate_publish_tells_what_became_of_it():
-    said = zstate("publish", RRBOT, "--source", "sine", "--rate", "50", "--seconds", "0.2").stdout.decode()
+def test_publish_at_a_rate_reports_the_achieved_rate():
+    output = zstate("publish", RRBOT, "--source", "sine", "--rate", "50", "--seconds", "0.2").stdout.decode()
     # Ten ticks, 20 ms apart; a busy machine may skip some, which are then counted.
-    assert "; commanded 50 Hz, achieved " in said.splitlines()[-1]
+    assert "; commanded 50 Hz, achieved " in output.splitlines()[-1]
 
 
 def test_joint_states_that_never_come_are_a_failure_with_a_hint():
@@ -113,7 +113,7 @@ def test_joint_states_that_never_come_are_a_failure_with_a_hint():
     assert "received nothing on zstate/rrbot/joint_states in 0.3 s; `zstate ls`" in message
 
 
-def test_joint_states_of_another_model_are_told(spawn: Spawn):
+def test_joint_states_of_another_model_are_reported(spawn: Spawn):
     child = started(spawn, "publish", RRBOT)
     child.line()
     gripper = load_model("gripper")
@@ -126,7 +126,7 @@ def test_joint_states_of_another_model_are_told(spawn: Spawn):
         until(refused)
 
 
-def test_an_unknown_wire_is_told_with_those_there_are():
+def test_unknown_wire_error_lists_known_wires():
     message = failure("publish", RRBOT, "--source", "sine", "--wire", "carrier-pigeon", code=2)
     assert "'carrier-pigeon'" in message
     assert "'native'" in message

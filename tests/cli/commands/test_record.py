@@ -43,7 +43,7 @@ def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path
         }
 
 
-def test_it_says_what_it_waits_for_and_when_that_comes(spawn: Spawn, tmp_path: Path):
+def test_record_prints_the_reason_while_it_waits_and_the_start(spawn: Spawn, tmp_path: Path):
     command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot")
     assert command.line().endswith("  no robot yet")
     with standing("rrbot"):
@@ -57,7 +57,7 @@ def test_it_says_what_it_waits_for_and_when_that_comes(spawn: Spawn, tmp_path: P
     assert waiting < recording
 
 
-def test_a_recording_of_nobody_fails_with_the_reason(tmp_path: Path):
+def test_empty_recording_fails_with_the_reason(tmp_path: Path):
     message = failure("record", str(tmp_path / "run.mcap"), "--duration", "1")
     assert "nothing was recorded: no robot is announced" in message
     assert "nothing was recorded: robot 'r1' is not announced" in failure(
@@ -86,13 +86,13 @@ def test_a_recording_is_split_by_time_and_all_files_are_named(tmp_path: Path):
     assert len(read_info(path).files) == 3
 
 
-def test_losses_are_told(tmp_path: Path):
+def test_losses_are_reported(tmp_path: Path):
     with standing(streams=("joint_states",)):
         ended = zstate("record", str(tmp_path / "run.mcap"), "rrbot", "--duration", "1")
     assert re.search(r"lost \d+ without a description that fits", ended.stdout.decode())
 
 
-def test_what_ros_says_is_recorded_over_its_wire(tmp_path: Path):
+def test_ros_robot_is_recorded_over_its_wire(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with connect() as session, StatePublisher(session, load_model("rrbot"), "r1", wires=("ros2",)):
         ended = zstate("record", str(path), "--wire", "ros2", "--mode", "peer", "--duration", "1.5")

@@ -21,14 +21,14 @@ def cut(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_was_saved_and_lost_is_told_and_stands_beside_the_original(cut: Path):
+def test_recover_reports_savings_and_losses_and_keeps_the_original(cut: Path):
     before = cut.read_bytes()
-    said = zstate("recover", str(cut)).stdout.decode()
+    output = zstate("recover", str(cut)).stdout.decode()
     saved = cut.with_name("run_recovered.mcap")
     count = read_info(saved).message_count
-    assert said.startswith(f"saved {count} messages in ")
-    assert f"into {saved} (/robot_description 1, /joint_states {count - 1})" in said
-    assert "\nlost " in said
+    assert output.startswith(f"saved {count} messages in ")
+    assert f"into {saved} (/robot_description 1, /joint_states {count - 1})" in output
+    assert "\nlost " in output
     assert read_info(saved).complete
     assert cut.read_bytes() == before
 
@@ -44,22 +44,22 @@ def test_a_target_may_be_named_and_one_that_exists_is_kept(cut: Path, tmp_path: 
     assert zstate("recover", str(cut), str(target), "--overwrite").returncode == 0
 
 
-def test_a_complete_file_is_copied_and_said_to_be_complete(tmp_path: Path):
+def test_complete_file_is_copied_and_reported_as_complete(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(10))
-    said = zstate("recover", str(tmp_path / "run.mcap")).stdout.decode()
-    assert "was complete: nothing to recover" in said
+    output = zstate("recover", str(tmp_path / "run.mcap")).stdout.decode()
+    assert "was complete: nothing to recover" in output
 
 
 def test_a_file_that_lacks_its_end_only_has_lost_nothing(tmp_path: Path):
     path = tmp_path / "run.mcap"
     write_run(path, joint_states(10), flush_every=10)
     path.write_bytes(path.read_bytes()[:-8])
-    said = zstate("recover", str(path)).stdout.decode()
-    assert "saved 11 messages" in said
-    assert "nothing lost" in said
+    output = zstate("recover", str(path)).stdout.decode()
+    assert "saved 11 messages" in output
+    assert "nothing lost" in output
 
 
-def test_what_is_no_recording_is_refused_and_no_target_made(tmp_path: Path):
+def test_file_that_is_not_a_recording_is_refused_without_a_target(tmp_path: Path):
     (tmp_path / "notes.mcap").write_text("hello, this is a note")
     assert "is not a recording" in failure("recover", str(tmp_path / "notes.mcap"))
     assert "No such file" in failure("recover", str(tmp_path / "nothing.mcap"))

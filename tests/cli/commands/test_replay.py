@@ -22,7 +22,7 @@ def file(tmp_path: Path) -> str:
     return str(tmp_path / "run.mcap")
 
 
-def test_it_says_what_it_replays_and_what_became_of_it(file: str):
+def test_replay_prints_a_heading_and_a_summary(file: str):
     ended = zstate("replay", file)
     first, last = ended.stdout.decode().splitlines()
     # The first message is the description, the last one a sample half a second after it.
@@ -36,7 +36,7 @@ def test_it_says_what_it_replays_and_what_became_of_it(file: str):
     assert "not published" not in last
 
 
-def test_a_listener_hears_the_recorded_stamps(file: str, spawn: Spawn):
+def test_listener_receives_the_recorded_stamps(file: str, spawn: Spawn):
     with connect() as session, TransformListener(session, "arm") as listener:
         child = started(spawn, "replay", file, "arm", "--loop", "--rate", "5")
         until(lambda: listener.buffer.can_lookup("world", "tool"))
@@ -49,7 +49,7 @@ def test_a_listener_hears_the_recorded_stamps(file: str, spawn: Spawn):
     assert child.line().startswith("replayed ")
 
 
-def test_writers_are_known_by_the_command_that_they_are(file: str, spawn: Spawn):
+def test_writers_have_the_name_of_their_command(file: str, spawn: Spawn):
     child = started(spawn, "replay", file, "--rate", "0.001")
     child.line()
     with connect() as session:
@@ -59,14 +59,14 @@ def test_writers_are_known_by_the_command_that_they_are(file: str, spawn: Spawn)
     assert {writer.program for _, writer in robot.writers} == {"zstate-replay"}
 
 
-def test_progress_is_told_each_second(file: str, spawn: Spawn):
+def test_replay_prints_progress_each_second(file: str, spawn: Spawn):
     child = started(spawn, "replay", file, "--rate", "0.1", "--duration", "0.2")
     child.line()
     until(lambda: "of 0.2 s" in child.stderr)
     assert "samples" in child.stderr
 
 
-def test_a_robot_that_is_live_is_left_alone_unless_one_insists(file: str):
+def test_live_robot_is_not_replayed_without_takeover(file: str):
     with standing("arm"):
         message = failure("replay", file)
         assert "already published on the network: 'arm' by " in message
@@ -75,36 +75,38 @@ def test_a_robot_that_is_live_is_left_alone_unless_one_insists(file: str):
 
 
 def test_a_part_can_be_replayed(file: str):
-    # From 200 to 300 ms: the samples of 200 to 290 ms were heard a little later than they were made.
+    # From 200 to 300 ms: the samples of 200 to 290 ms arrived a little later than their stamps.
     last = zstate("replay", file, "--start", "0.2", "--duration", "0.1", "--rate", "inf").stdout.decode()
     assert "as fast as possible" in last
     assert "replayed 10 samples" in last
 
 
-def test_a_bag_of_ros_is_replayed_as_far_as_it_is_understood(tmp_path: Path):
+def test_readable_topics_of_a_ros_bag_are_replayed(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.describe()
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.5, "elbow": 0.1})
             bag.joints(START + n, {"knee": 0.5}, "/dog/joint_states")
-    said = zstate("replay", str(tmp_path / "bag"), "--rate", "inf").stdout.decode()
-    assert "replaying 'dog', 'ros'" in said
-    assert "replayed 10 samples" in said
+    output = zstate("replay", str(tmp_path / "bag"), "--rate", "inf").stdout.decode()
+    assert "replaying 'dog', 'ros'" in output
+    assert "replayed 10 samples" in output
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "text"),
     [
-        (("leg",), 1, "nothing of 'leg'; its robots: 'arm'"),
+        (("leg",), 1, "has no robot 'leg'; its robots: 'arm'"),
         (("--rate", "0"), 2, "rate above 0"),
         (("--start", "100"), 1, "start_s is 100; the recording is 0.5"),
         (("--wire", "pigeon"), 2, "no wire 'pigeon'"),
     ],
 )
-def test_what_is_not_there_is_told(file: str, arguments: tuple[str, ...], code: int, says: str):
-    assert says in failure("replay", file, *arguments, code=code)
+def test_missing_robot_rate_start_or_wire_is_refused(
+    file: str, arguments: tuple[str, ...], code: int, text: str
+):
+    assert text in failure("replay", file, *arguments, code=code)
 
 
-def test_what_is_no_recording_is_told(tmp_path: Path):
+def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     assert "is not a recording" in failure("replay", str(tmp_path / "x.mcap"))

@@ -72,7 +72,7 @@ def test_topics_behind_a_bridge_of_ros2dds_are_listed(ros_router: str):
     }
 
 
-def test_nobody_is_no_error(ros_router: str):
+def test_empty_network_is_no_error(ros_router: str):
     ended = zstate("ls", "--wire", "ros2:domain=7")
     assert (ended.returncode, ended.stdout) == (0, b"")
     assert b"no ROS 2 node in domain 7" in ended.stderr

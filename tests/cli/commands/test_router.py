@@ -17,7 +17,7 @@ from zstate.net.session import Session
 pytestmark = pytest.mark.processes
 
 
-def test_clients_meet_at_it(spawn: Spawn, free_port: int):
+def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--listen", endpoint)
     assert router.line().endswith(f" listens at {endpoint}")
@@ -31,7 +31,7 @@ def test_clients_meet_at_it(spawn: Spawn, free_port: int):
     interrupted(router)
 
 
-def test_a_busy_port_is_told_at_once(spawn: Spawn, free_port: int):
+def test_busy_port_is_reported_at_once(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
     assert f"somebody listens at '{endpoint}' already" in failure("router", "--listen", endpoint)
@@ -53,27 +53,27 @@ def ros_node(port: int) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def test_ros_nodes_and_clients_hear_each_other_through_it(spawn: Spawn, free_port: int):
+def test_ros_nodes_and_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--ros2", "--listen", endpoint)
     assert router.line().endswith(f" listens at {endpoint}")
-    heard: set[tuple[str, str]] = set()
+    received: set[tuple[str, str]] = set()
     with ExitStack() as opened:
         sessions = {name: opened.enter_context(ros_node(free_port)) for name in ("node", "other")}
         sessions["client"] = opened.enter_context(connect(mode="client", endpoints=endpoint)).zenoh
         for name, session in sessions.items():
 
-            def note(sample: zenoh.Sample, reader: str = name) -> None:
-                heard.add((str(sample.key_expr), reader))
+            def on_sample(sample: zenoh.Sample, reader: str = name) -> None:
+                received.add((str(sample.key_expr), reader))
 
-            session.declare_subscriber("from/**", note)
+            session.declare_subscriber("from/**", on_sample)
 
-        def all_hear_all() -> bool:
+        def all_received_all() -> bool:
             for name, session in sessions.items():
                 session.put(f"from/{name}", b"something")
-            return len(heard) == len(sessions) ** 2
+            return len(received) == len(sessions) ** 2
 
-        until(all_hear_all)
+        until(all_received_all)
     interrupted(router)
 
 
@@ -83,7 +83,7 @@ def test_its_settings_for_ros_and_a_file_exclude_each_other(tmp_path):
     assert "--config" in failure("router", "--ros2", "--config", str(file), code=2)
 
 
-def test_it_runs_what_it_prints(spawn: Spawn, free_port: int, tmp_path):
+def test_router_runs_its_printed_configuration(spawn: Spawn, free_port: int, tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     printed = zstate("router", "--listen", endpoint, "--print")
     file = tmp_path / "router.json5"
@@ -97,7 +97,7 @@ def test_it_runs_what_it_prints(spawn: Spawn, free_port: int, tmp_path):
         assert session.zenoh.info.routers_zid()
 
 
-def test_it_thins_streams_towards_its_neighbours(spawn: Spawn, free_port: int):
+def test_router_downsamples_streams_to_neighbours(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     options = ("--downsample", "joint_states=5", "--robot", "rrbot", "--wan", "lo")
     started(spawn, "router", "--listen", endpoint, *options).line()
@@ -165,9 +165,7 @@ def test_peers_are_not_introduced_past_its_access_control(spawn: Spawn, free_por
         assert list(victim.zenoh.info.peers_zid()) == []
 
 
-def test_the_password_is_in_the_file_it_writes_and_not_in_what_it_prints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_password_is_in_the_output_file_but_masked_in_print(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_PASSWORD", "open sesame")
     users, file = tmp_path / "users", tmp_path / "router.json5"
     users.touch(0o600)

@@ -30,7 +30,7 @@ STATIC = StaticTransformSnapshot("arm", "tool.1", "lower", "came ra", (0.1, 0.2,
     ],
 )
 @pytest.mark.parametrize(("text", "suffix"), [(Snapshot.as_toml, "toml"), (Snapshot.as_json, "json")])
-def test_what_is_written_is_read_again_as_it_was(tmp_path: Path, urdf: str, text, suffix: str):
+def test_snapshot_file_round_trips(tmp_path: Path, urdf: str, text, suffix: str):
     positions = {"shoulder pan": 0.1, "base": (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0), 'a"b': -1e-9}
     arm = RobotSnapshot(name="arm", urdf=urdf, writers=("tf: driver",), stamp=17, positions=positions)
     shots = (arm, RobotSnapshot(name="other", urdf=urdf))
@@ -41,7 +41,7 @@ def test_what_is_written_is_read_again_as_it_was(tmp_path: Path, urdf: str, text
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "error"),
     [
         ("", "missing required field `format`"),
         (
@@ -56,15 +56,15 @@ def test_what_is_written_is_read_again_as_it_was(tmp_path: Path, urdf: str, text
     ],
 )
 @pytest.mark.processes
-def test_a_file_that_is_no_snapshot_is_told_with_the_place_in_it(tmp_path: Path, text: str, told: str):
+def test_invalid_snapshot_error_names_the_place_in_the_file(tmp_path: Path, text: str, error: str):
     file = tmp_path / "cell.toml"
     file.write_text(text)
-    assert told in failure("snapshot", "load", str(file))
+    assert error in failure("snapshot", "load", str(file))
 
 
 @pytest.mark.processes
 @pytest.mark.parametrize("suffix", ["toml", "json"])
-def test_a_robot_stands_again_as_it_stood(spawn: Spawn, tmp_path: Path, suffix: str):
+def test_loaded_robot_has_the_saved_poses(spawn: Spawn, tmp_path: Path, suffix: str):
     file = tmp_path / f"cell.{suffix}"
     edge = Transform("lower", "camera", (0.0, 0.1, 0.2), (0.0, 0.0, 0.6, 0.8))
     with standing(), connect() as session, StaticPublisher(session, "rrbot", "calibration") as static:
@@ -106,7 +106,7 @@ def test_a_robot_stands_again_as_it_stood(spawn: Spawn, tmp_path: Path, suffix: 
         ),
     ],
 )
-def test_who_saved_it_can_be_followed_onto_the_network(saved, options: str, network: SessionOptions):
+def test_saved_session_options_can_be_used_again(saved, options: str, network: SessionOptions):
     assert saved.options() == options
     assert saved.is_default == (not options)
     assert saved.network(SessionOptions()) == network
@@ -115,9 +115,7 @@ def test_who_saved_it_can_be_followed_onto_the_network(saved, options: str, netw
 
 
 @pytest.mark.processes
-def test_a_snapshot_is_loaded_here_unless_it_is_asked_for_where_it_was_taken(
-    spawn: Spawn, tmp_path: Path, free_port: int
-):
+def test_snapshot_is_loaded_on_this_host_unless_as_saved(spawn: Spawn, tmp_path: Path, free_port: int):
     file, router = tmp_path / "cell.toml", f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", router).line()
     with standing(router=router):
@@ -143,7 +141,7 @@ def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
 
 
 @pytest.mark.processes
-def test_a_robot_without_joint_states_is_saved_with_a_word_about_it():
+def test_robot_without_joint_states_is_saved_without_positions():
     with standing(streams=("robot_description", "tf_static")):
         saved = zstate("snapshot", "save", "-")
     assert b"positions" not in saved.stdout
@@ -161,7 +159,7 @@ def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path):
 
 
 @pytest.mark.processes
-def test_where_nobody_is_announced_nothing_is_saved(tmp_path: Path):
+def test_empty_network_saves_no_file(tmp_path: Path):
     file = tmp_path / "cell.toml"
     failure("snapshot", "save", str(file))
     assert not file.exists()

@@ -85,7 +85,7 @@ def test_with_two_robots_it_asks_which_and_names_them():
     assert "--robot NAME (announced: 'left', 'right')" in message
 
 
-def test_what_is_no_pose_is_told():
+def test_invalid_pose_error_names_the_reason():
     xyz = ("--xyz", "0", "0", "0")
     assert "2 rotations" in failure("static", "r/a", "b", *POSE, "--rpy", "0", "0", "0")
     assert "length 2" in failure("static", "r/a", "b", *xyz, "--quat-xyzw", "0", "0", "0", "2")
@@ -106,7 +106,7 @@ def test_half_an_edge_is_wrong_usage():
     assert "TARGET" in failure("static", "--xyz", "0", "0", "0", code=2)
 
 
-def test_an_edge_of_a_file_is_said_on_each_of_its_wires(spawn: Spawn, ros_router: str, tmp_path: Path):
+def test_edge_of_a_file_is_published_on_each_of_its_wires(spawn: Spawn, ros_router: str, tmp_path: Path):
     file = tmp_path / "cell.toml"
     file.write_text(
         '[parameters]\nheight = 1.0\n[[static]]\nrobot = "arm"\ntarget = "tool"\nsource = "camera"\n'
@@ -151,7 +151,7 @@ def test_a_new_target_above_the_robot_leads_to_the_frame_that_robots_share(spawn
         ("fleet/map", "rrbot/world"),
     ],
 )
-def test_of_what_is_known_new_or_shared_nothing_is_said(spawn: Spawn, edge: tuple[str, ...]):
+def test_known_new_and_shared_targets_cause_no_warning(spawn: Spawn, edge: tuple[str, ...]):
     with standing(), connect() as session:
         publisher = StaticPublisher(session, "rrbot", "here")
         target, source, *new = edge

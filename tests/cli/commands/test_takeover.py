@@ -11,7 +11,7 @@ POSE = ("--xyz", "1", "0", "0")
 
 
 @pytest.mark.parametrize("command", [("joints", "rrbot"), ("publish", "rrbot", "--source", "sine")])
-def test_what_somebody_writes_already_is_written_with_takeover_only(spawn: Spawn, command):
+def test_stream_with_a_writer_needs_takeover(spawn: Spawn, command):
     with standing():
         message = failure(*command)
         assert f"pid {os.getpid()}'" in message
@@ -19,7 +19,7 @@ def test_what_somebody_writes_already_is_written_with_takeover_only(spawn: Spawn
         assert "rrbot" in started(spawn, *command, "--takeover").line()
 
 
-def test_an_edge_that_somebody_places_already_is_placed_with_takeover_only(spawn: Spawn):
+def test_static_edge_with_a_writer_needs_takeover(spawn: Spawn):
     started(spawn, "static", "r/base", "r/camera", *POSE, "--writer", "mount").line()
     assert "as 'mount' of 'r'" in failure("static", "r/base", "r/camera", *POSE)
     assert "r/camera" in started(spawn, "static", "r/base", "r/camera", *POSE, "--takeover").line()

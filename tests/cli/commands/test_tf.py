@@ -57,7 +57,7 @@ def test_the_twist_is_that_of_the_published_velocities():
     assert facts["angular"] == pytest.approx(angular, abs=1e-12)
 
 
-def test_a_twist_of_what_never_moves_is_zero():
+def test_twist_of_a_static_edge_is_zero():
     with standing():
         lines = zstate("tf", "world", "base", "--once", "--twist").stdout.decode().splitlines()
     assert lines[-2:] == [
@@ -96,7 +96,7 @@ def test_fixed_frames_answer_although_nothing_moves():
     assert lines[1:3] == ["At any time (static)", "- Translation: [0.000, 0.000, 0.800]"]
 
 
-def test_it_says_what_it_waits_for_and_that_the_wait_is_over(spawn: Spawn):
+def test_tf_prints_the_reason_while_it_waits_and_the_end_of_the_wait(spawn: Spawn):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     assert command.line() == "pose of lower in base"
     until(lambda: "waiting: no robot is announced" in command.stderr)
@@ -108,7 +108,7 @@ def test_it_says_what_it_waits_for_and_that_the_wait_is_over(spawn: Spawn):
     interrupted(command)
 
 
-def test_it_says_when_the_samples_stop(spawn: Spawn):
+def test_tf_reports_when_samples_stop(spawn: Spawn):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     with standing():
         command.line()
@@ -155,7 +155,7 @@ def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
 
 
 @pytest.mark.parametrize("stamp", ["noon", "1.0000000001", "nan", "1e40"])
-def test_what_is_no_stamp_is_wrong_usage(stamp: str):
+def test_invalid_stamp_is_wrong_usage(stamp: str):
     assert f"{stamp!r} is no stamp" in failure("tf", "a", "b", "--at", stamp, code=2)
 
 

@@ -37,7 +37,7 @@ def test_each_edge_has_its_kind_rate_age_and_writer():
     assert lines[0].split()[2] == "static"
 
 
-def test_guides_show_who_hangs_on_whom():
+def test_guides_show_parents_and_children():
     with standing():
         lines = drawn()
     assert lines[2].startswith("└── base ")
@@ -90,7 +90,7 @@ def test_a_robot_that_is_not_there_is_an_error_that_lists_the_others():
     assert "announced: 'rrbot'" in message
 
 
-def test_nobody_at_all_is_no_error_as_in_ls_and_it_is_said_how_to_begin():
+def test_empty_network_is_no_error_and_prints_how_to_start():
     ended = zstate("tree")
     assert (ended.returncode, ended.stdout) == (0, b"")
     assert b"zstate publish" in ended.stderr
@@ -98,7 +98,7 @@ def test_nobody_at_all_is_no_error_as_in_ls_and_it_is_said_how_to_begin():
     assert "robot 'rrbot' is not announced" in failure("tree", "rrbot")
 
 
-def test_joint_states_alone_have_no_tree_and_it_is_said_who_would_make_one():
+def test_joint_states_without_model_have_no_tree_and_print_how_to_publish_one():
     with standing(streams=("joint_states",)):
         ended = zstate("tree")
     assert ended.returncode == 0

@@ -39,9 +39,9 @@ def file_of(folder: Path, text: str) -> Path:
     return file
 
 
-def lines_until(child: Child, *wanted: str) -> list[str]:
+def lines_until(child: Child, *texts: str) -> list[str]:
     lines: list[str] = []
-    while not all(any(text in line for line in lines) for text in wanted):
+    while not all(any(text in line for line in lines) for text in texts):
         lines.append(child.line())
     return lines
 
@@ -54,7 +54,7 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-def pid_said(child: Child, name: str) -> int:
+def printed_pid(child: Child, name: str) -> int:
     (line,) = lines_until(child, name)[-1:]
     return int(line.split()[-1])
 
@@ -73,7 +73,7 @@ def test_a_program_of_plain_python_comes_to_the_router_of_the_file(up, free_port
         [
             "import zstate",
             "with zstate.connect() as session, zstate.TransformListener(session, 'left') as listener:",
-            "    print('heard', listener.buffer.wait('base', 'lower', timeout_s=10.0).source)",
+            "    print('received', listener.buffer.wait('base', 'lower', timeout_s=10.0).source)",
         ]
     )
     child = up(
@@ -81,7 +81,7 @@ def test_a_program_of_plain_python_comes_to_the_router_of_the_file(up, free_port
         + robot(name="left")
         + table("program", name="mine", run=["python", "-c", program], after=["left"])
     )
-    assert any(line.startswith("mine") for line in lines_until(child, "heard lower"))
+    assert any(line.startswith("mine") for line in lines_until(child, "received lower"))
     interrupted(child)
 
 
@@ -141,14 +141,14 @@ def test_a_part_that_may_starts_again_and_the_others_live_on(up):
     child = up(
         table("program", name="shell", run=["sh", "-c", "echo at $$; exec sleep 60"], restart="on-failure")
     )
-    first = pid_said(child, "at")
+    first = printed_pid(child, "at")
     os.kill(first, signal.SIGKILL)
-    assert pid_said(child, "at") != first
+    assert printed_pid(child, "at") != first
     interrupted(child)
     assert "'shell' ended with exit code -9: it said nothing; it starts again in 0.5 s" in child.stderr
 
 
-def test_the_last_error_of_a_part_is_the_cause_that_is_told(up, free_port: int):
+def test_last_error_of_a_process_is_reported_as_the_cause(up, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     with connect(listen=endpoint):
         child = up(f"[network]\nlisten = ['{endpoint}']\n" + robot())
@@ -156,9 +156,9 @@ def test_the_last_error_of_a_part_is_the_cause_that_is_told(up, free_port: int):
     assert f"'rrbot' ended with exit code 1: zstate: somebody listens at {endpoint!r}" in child.stderr
 
 
-def test_an_error_of_several_lines_is_told_whole(up):
-    says = "echo Trouble >&2; echo 'Bad: a file' >&2; echo '  line 3  it has no end' >&2; exit 3"
-    child = up(table("program", name="driver", run=["sh", "-c", says]))
+def test_error_of_several_lines_is_reported_in_full(up):
+    script = "echo Trouble >&2; echo 'Bad: a file' >&2; echo '  line 3  it has no end' >&2; exit 3"
+    child = up(table("program", name="driver", run=["sh", "-c", script]))
     assert child.wait() == 1
     assert "'driver' ended with exit code 3: Bad: a file line 3  it has no end\n" in child.stderr
 
@@ -185,7 +185,7 @@ def test_all_is_well_when_every_part_has_done_its_work(up):
     assert child.wait() == 0
 
 
-def test_who_others_need_ends_after_them(up):
+def test_processes_end_before_the_ones_they_need(up):
     waits = "trap 'echo {} ends; exit 0' INT; echo {} runs; while :; do sleep 0.05; done"
     child = up(
         table("program", name="base", run=["bash", "-c", waits.format("base", "base")], ready="runs")
@@ -200,7 +200,7 @@ def test_who_others_need_ends_after_them(up):
 
 def test_programs_end_with_it_however_it_ends(up):
     child = up(table("program", run=["sh", "-c", "echo at $$; exec sleep 60"]))
-    pid = pid_said(child, "at")
+    pid = printed_pid(child, "at")
     child.kill()
     until(lambda: not is_alive(pid))
 
@@ -209,7 +209,7 @@ def test_what_a_program_left_behind_and_what_ignores_signals_ends_when_it_is_kil
     """Else a second driver would come to the same arm when it is started again."""
     deaf = "trap '' INT TERM; sleep 60 & echo at $!; echo at $$; sleep 60"
     child = up(table("program", run=["sh", "-c", deaf]))
-    pids = [pid_said(child, "at"), pid_said(child, "at")]
+    pids = [printed_pid(child, "at"), printed_pid(child, "at")]
     child.kill()
     until(lambda: not any(map(is_alive, pids)))
 
@@ -224,7 +224,7 @@ def test_a_line_without_an_end_is_cut(up):
     interrupted(child)
 
 
-def test_models_and_included_files_are_found_beside_the_file(tmp_path: Path, up):
+def test_paths_are_relative_to_the_file(tmp_path: Path, up):
     (tmp_path / "arm.urdf").write_text(Path(RRBOT).read_text())
     (tmp_path / "robots.toml").write_text(robot(model="arm.urdf", name="${arm}"))
     lines_until(up("include = 'robots.toml'\n[parameters]\narm = 'left'\n"), "publishing 'left'")
@@ -239,7 +239,7 @@ def test_a_file_that_several_include_is_read_once(tmp_path: Path):
     assert [line.split()[0] for line in shown.stdout.decode().splitlines()] == ["rrbot"], shown.stderr
 
 
-def test_what_would_start_can_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_check_prints_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SPEED", "20")
     text = robot(rate="${SPEED}", wires=["native", "ros2"], metrics=9100, takeover=True, restart="always")
     shown = zstate("up", str(file_of(tmp_path, text)), "--check").stdout.decode().split()
@@ -249,7 +249,7 @@ def test_what_would_start_can_be_looked_at(tmp_path: Path, monkeypatch: pytest.M
     )
 
 
-def test_in_json_each_line_of_a_part_says_whose_it_is(up):
+def test_json_lines_name_their_process(up):
     child = up(robot(source="joints"), "--log-format", "json")
     child.line()
     until(lambda: '"part": "rrbot"' in child.stderr or child.process.poll() is not None)
@@ -272,7 +272,7 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "error"),
     [
         ("", "starts nothing"),
         ("[[robot]\n", "line 1"),
@@ -338,13 +338,13 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         ),
     ],
 )
-def test_a_file_that_cannot_be_used_is_told_with_the_place_in_it(tmp_path: Path, text: str, told: str):
+def test_invalid_file_error_names_the_place(tmp_path: Path, text: str, error: str):
     message = failure("up", str(file_of(tmp_path, text)))
-    assert told in message
+    assert error in message
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "error"),
     [
         ("sped=2", "has no parameter 'sped'; did you mean 'speed'?; its [parameters]: speed"),
         (
@@ -355,6 +355,6 @@ def test_a_file_that_cannot_be_used_is_told_with_the_place_in_it(tmp_path: Path,
         ("speed", "'speed' is not a parameter; write KEY=VALUE"),
     ],
 )
-def test_a_parameter_that_the_file_does_not_have_is_refused(tmp_path: Path, setting: str, told: str):
+def test_a_parameter_that_the_file_does_not_have_is_refused(tmp_path: Path, setting: str, error: str):
     file = file_of(tmp_path, "[parameters]\nspeed = 1.0\n" + robot())
-    assert told in failure("up", str(file), setting)
+    assert error in failure("up", str(file), setting)

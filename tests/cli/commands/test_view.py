@@ -24,7 +24,7 @@ def address(line: str) -> str:
     return found[1]
 
 
-def test_it_says_the_address_that_is_to_be_opened(spawn):
+def test_view_prints_the_address_to_open(spawn):
     child = started(spawn, "view", "--port", "0")
     url = address(child.line())
     assert url.startswith("http://127.0.0.1:")
@@ -37,28 +37,28 @@ def test_it_says_the_address_that_is_to_be_opened(spawn):
 def test_without_a_port_it_takes_the_first_free_one_and_a_taken_one_is_an_error(spawn):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        said = failure("view", "--port", str(port))
-    assert f"port {port} is taken at '127.0.0.1'" in said
+        text = failure("view", "--port", str(port))
+    assert f"port {port} is taken at '127.0.0.1'" in text
     first, second = started(spawn, "view"), started(spawn, "view")
     assert address(first.line()) != address(second.line())
 
 
-def test_beyond_loopback_the_address_holds_a_token_and_a_word_of_warning(spawn):
+def test_view_beyond_loopback_has_a_token_in_its_address_and_a_warning(spawn):
     child = started(spawn, "view", "--host", "0.0.0.0", "--port", "0")
     assert re.search(r":\d+/\?token=[\w-]{20,}$", address(child.line()))
     until(lambda: "unencrypted" in child.stderr)
     interrupted(child)
 
 
-def test_with_sliders_a_robot_is_there_for_everybody(spawn):
+def test_robot_moved_by_sliders_is_published(spawn):
     child = started(spawn, "view", RRBOT, "--sliders", "--port", "0")
     child.line()
-    said = zstate("tf", "base", "tool", "--once", "--json").stdout.decode()
-    assert '"target": "base"' in said
+    text = zstate("tf", "base", "tool", "--once", "--json").stdout.decode()
+    assert '"target": "base"' in text
     interrupted(child)
 
 
-def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
+def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it(spawn):
     with standing():
         child = started(spawn, "view", "rrbot", "--sliders", "--port", "0")
         child.line()
@@ -68,7 +68,7 @@ def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "text"),
     [
         (["--snapshot", "picture.jpg"], 2, "'picture.jpg' does not end with .png"),
         (["a.mcap", "b.mcap"], 2, "a recording must be the only argument; got a.mcap, b.mcap"),
@@ -83,11 +83,11 @@ def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
         (["--camera", "-1,2,3:-1,2,3"], 2, "a camera at -1,2,3 cannot look at the same point"),
     ],
 )
-def test_a_mistake_is_told_in_a_line(arguments: list[str], code: int, said: str):
-    assert said in failure("view", *arguments, code=code)
+def test_wrong_arguments_are_reported_on_one_line(arguments: list[str], code: int, text: str):
+    assert text in failure("view", *arguments, code=code)
 
 
-def test_without_viser_it_says_what_to_install(tmp_path: Path):
+def test_missing_viser_error_names_the_package_to_install(tmp_path: Path):
     (tmp_path / "viser.py").write_text("raise ImportError('no module of that name')")
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.argv[1:] = ['view']\n"
     code += "from zstate.cli.main import main; main()"
@@ -118,7 +118,7 @@ MINE = """<robot name="mine"><link name="base"><visual><geometry>
 
 
 @pytest.mark.browser
-def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_path: Path):
+def test_snapshot_names_visible_robots_hidden_robots_and_missing_meshes(tmp_path: Path):
     trimesh = pytest.importorskip("trimesh")
     urdf = tmp_path / "mine" / "urdf" / "mine.urdf"
     mesh = tmp_path / "mine" / "meshes" / "base.stl"
@@ -153,6 +153,6 @@ def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_pa
         assert own.stderr == ""
 
 
-def test_a_snapshot_of_a_robot_that_is_not_there_says_who_is(tmp_path: Path):
-    said = failure("view", "nobody", "--snapshot", str(tmp_path / "x.png"))
-    assert "waited 5 s for 'nobody'; robots that were received: none" in said
+def test_snapshot_of_an_absent_robot_names_the_received_ones(tmp_path: Path):
+    text = failure("view", "absent", "--snapshot", str(tmp_path / "x.png"))
+    assert "waited 5 s for 'absent'; robots that were received: none" in text

@@ -19,7 +19,7 @@ def waited(*arguments: str, code: int) -> dict[str, object]:
     return json.loads(ended.stdout)
 
 
-def await_words(child: Child, text: str) -> None:
+def await_text(child: Child, text: str) -> None:
     until(lambda: text in child.stderr)
 
 
@@ -32,9 +32,9 @@ def test_a_robot_that_is_there_is_not_waited_for():
 
 def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
     child = started(spawn, "wait", "robot", "rrbot")
-    await_words(child, "robot 'rrbot' is not announced")
+    await_text(child, "robot 'rrbot' is not announced")
     with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
-        await_words(child, "joint_states of 'rrbot' has no writer")
+        await_text(child, "joint_states of 'rrbot' has no writer")
         assert child.process.poll() is None
         with standing(streams=("joint_states",)):
             assert child.line() == "ready: 'rrbot' (7 frames)"
@@ -43,13 +43,13 @@ def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
 
 def test_every_robot_that_is_named_has_to_be_there():
     with standing("left"):
-        said = waited("robot", "left", "right", "--timeout", "1", code=1)
-    assert said["ready"] is False
-    assert "robot 'right' is not announced" in str(said["reason"])
-    assert float(str(said["waited_s"])) >= 1.0
+        outcome = waited("robot", "left", "right", "--timeout", "1", code=1)
+    assert outcome["ready"] is False
+    assert "robot 'right' is not announced" in str(outcome["reason"])
+    assert float(str(outcome["waited_s"])) >= 1.0
 
 
-def test_a_robot_that_says_transforms_needs_no_joint_states():
+def test_robot_that_publishes_transforms_is_ready_without_joint_states():
     with standing(streams=("tf", "robot_description")):
         assert waited("robot", "rrbot", code=0)["ready"] is True
 
@@ -70,7 +70,7 @@ def test_a_pose_is_waited_for_with_the_reason():
 def test_a_router_may_come_late(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "router", endpoint)
-    await_words(child, f"waiting: no answer yet at '{endpoint}'")
+    await_text(child, f"waiting: no answer yet at '{endpoint}'")
     started(spawn, "router", "--listen", endpoint)
     assert child.line() == f"ready: the router at '{endpoint}'"
     assert child.wait() == 0
@@ -86,18 +86,18 @@ def test_a_robot_behind_a_router_that_comes_late_is_waited_for_as_well(spawn: Sp
 
 def test_a_router_that_never_comes_ends_the_wait_in_time(free_port: int):
     began = time.monotonic()
-    said = waited("router", f"tcp/127.0.0.1:{free_port}", "--timeout", "1", code=1)
-    assert "nothing answers" in str(said["reason"])
+    outcome = waited("router", f"tcp/127.0.0.1:{free_port}", "--timeout", "1", code=1)
+    assert "nothing answers" in str(outcome["reason"])
     assert time.monotonic() - began < 10.0
 
 
 def test_ctrl_c_ends_a_wait(spawn: Spawn):
     child = started(spawn, "wait", "robot", "rrbot")
-    await_words(child, "waiting:")
+    await_text(child, "waiting:")
     interrupted(child)
 
 
-def test_what_is_waited_for_is_checked():
+def test_wait_arguments_are_checked():
     assert "name a robot" in failure("wait", "robot", code=2)
     assert "two frames" in failure("wait", "frame", "base", code=2)
     assert "'robto' is not one of" in failure("wait", "robto", code=2)

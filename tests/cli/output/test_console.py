@@ -27,7 +27,7 @@ EVIL = WriterId(f"driver{FAKE}", f"host{FAKE}", 1, 5, 77)
 
 @pytest.fixture
 def stranger() -> Iterator[None]:
-    """Everything that a program can name, with escapes and line ends in it, beside a robot that is sound."""
+    """Every name that a program can choose, with escapes and line ends, next to a healthy robot."""
     pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     status = Status(time.time_ns(), 77, "error", EVIL.program, EVIL.host, 1, 1.0, 1, 0, FAKE)
     with ExitStack() as opened:

@@ -26,7 +26,7 @@ def lines(width: int | None) -> list[str]:
     return tree_text(FRAMES, NOW, in_full=False, width=width).splitlines()
 
 
-def test_where_there_is_room_everything_stands_on_the_line_of_its_frame():
+def test_wide_layout_has_all_columns():
     assert (
         lines(None)
         == lines(120)
@@ -41,7 +41,7 @@ def test_where_there_is_room_everything_stands_on_the_line_of_its_frame():
     )
 
 
-def test_siblings_stand_in_one_order_whichever_came_first():
+def test_siblings_are_sorted():
     assert tree_text(FRAMES[::-1], NOW, in_full=False) == tree_text(FRAMES, NOW, in_full=False)
 
 
@@ -58,7 +58,7 @@ def test_a_narrow_terminal_has_letters_for_the_writers():
     ]
 
 
-def test_a_narrower_one_is_indented_only_where_the_tree_forks():
+def test_narrower_layout_indents_only_at_forks():
     assert lines(45)[1:6] == [
         "r1/base   root",
         "↓ upper   joint   100.0 Hz  2.0 ms  a",
@@ -68,5 +68,5 @@ def test_a_narrower_one_is_indented_only_where_the_tree_forks():
     ]
 
 
-def test_in_the_narrowest_the_kind_of_what_moves_is_left_out():
+def test_narrowest_layout_omits_the_kind_of_moving_edges():
     assert lines(33)[1] == "↓ upper   100.0 Hz 2.0 ms  a"

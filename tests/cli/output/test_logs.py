@@ -1,4 +1,4 @@
-"""Lines on standard error: for people, for programs, and beside a live table."""
+"""Lines on standard error: text, JSON, and during a live display."""
 
 from __future__ import annotations
 
@@ -54,22 +54,22 @@ def test_the_format_is_also_read_from_the_environment_and_the_option_goes_before
     assert failure("joints", "no_such_robot", "--log-format", "text").startswith("zstate: no robot")
 
 
-def test_a_format_that_is_none_is_refused():
+def test_unknown_format_is_refused():
     assert "'jason' is not one of 'text', 'json'" in failure("joints", RRBOT, "--log-format", "jason", code=2)
 
 
-def test_every_line_of_a_command_that_goes_on_is_json(spawn: Spawn):
+def test_every_line_of_a_running_command_is_json(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing() as publisher:
         command.line()
-        said = entries(command.stderr)
+        output = entries(command.stderr)
     interrupted(command)
-    assert {entry["level"] for entry in said} == {"info"}
-    assert {entry.get("robot") for entry in said if "following" in str(entry["text"])} == {publisher.robot}
+    assert {entry["level"] for entry in output} == {"info"}
+    assert {entry.get("robot") for entry in output if "following" in str(entry["text"])} == {publisher.robot}
 
 
-def test_what_a_service_announces_on_standard_output_is_json_too(spawn: Spawn, free_port: int):
+def test_standard_output_of_a_service_is_json_too(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = started(spawn, "router", "--listen", endpoint, "--log-format", "json")
     publisher = started(
@@ -81,7 +81,7 @@ def test_what_a_service_announces_on_standard_output_is_json_too(spawn: Spawn, f
         assert text in str(entry["text"])
 
 
-def test_a_warning_of_the_library_tells_its_event_and_reason(spawn: Spawn):
+def test_library_warning_has_its_event_and_reason(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
     with standing(), connect() as session, StreamPublisher(session, key, encoding) as noise:
@@ -94,7 +94,7 @@ def test_a_warning_of_the_library_tells_its_event_and_reason(spawn: Spawn):
     interrupted(command)
 
 
-def test_what_a_thread_ends_with_is_a_json_line_too(spawn: Spawn):
+def test_unhandled_exception_of_a_thread_is_a_json_line(spawn: Spawn):
     child = spawn(
         "import threading\n"
         "from zstate.cli.output.logs import use_format\n"
@@ -139,13 +139,13 @@ LIVE = """
 
 def shown(stream: int) -> list[str]:
     """The lines that a terminal of one live line is left with: what is erased is not there."""
-    heard = b""
+    received = b""
     try:
         while chunk := os.read(stream, 4096):
-            heard += chunk
+            received += chunk
     except OSError:  # the end of a terminal
         pass
-    text = heard.decode().replace("\r\n", "\n")
+    text = received.decode().replace("\r\n", "\n")
     lines = (re.split(r"\r\x1b\[2K", line)[-1] for line in text.split("\n"))
     return [re.sub(r"\x1b\[[?\d;]*\w", "", line) for line in lines]
 
@@ -159,12 +159,12 @@ def live_on_a_terminal(errors: int | None) -> tuple[list[str], str]:
     os.close(theirs)
     lines = shown(ours)
     os.close(ours)
-    said = process.stderr.read().decode() if process.stderr else ""
+    output = process.stderr.read().decode() if process.stderr else ""
     assert process.wait(DEADLINE_S) == 0
-    return lines, said
+    return lines, output
 
 
-def test_a_note_beside_a_live_table_has_a_line_of_its_own():
+def test_status_line_during_a_live_display_stays_above_it():
     lines, _ = live_on_a_terminal(None)
     assert "recording panda" in lines
     assert "zstate: a gap" in lines
@@ -172,7 +172,7 @@ def test_a_note_beside_a_live_table_has_a_line_of_its_own():
     assert not [line for line in lines if "12 messages" in line]
 
 
-def test_a_file_gets_its_lines_though_a_live_table_is_shown():
-    lines, said = live_on_a_terminal(subprocess.PIPE)
-    assert said == "recording panda\nzstate: a gap\n"
+def test_redirected_standard_error_gets_lines_during_a_live_display():
+    lines, output = live_on_a_terminal(subprocess.PIPE)
+    assert output == "recording panda\nzstate: a gap\n"
     assert not [line for line in lines if "panda" in line or "gap" in line]

@@ -1,4 +1,4 @@
-"""On sixty columns nothing is wider, but for a word, and nobody who wants no colours gets any."""
+"""Output fits a terminal of 60 columns, and has no colours with NO_COLOR."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ pytestmark = pytest.mark.processes
 WIDTH = 60
 
 
-def seen(*arguments: str, **environment: str) -> list[str]:
-    """The lines of a command on a terminal that is so narrow."""
+def run_in_terminal(*arguments: str, **environment: str) -> list[str]:
+    """The lines of a command on a terminal with WIDTH columns."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, WIDTH, 0, 0))
     plain = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "NO_COLOR")}
@@ -32,21 +32,21 @@ def seen(*arguments: str, **environment: str) -> list[str]:
         env={**plain, **environment},
     ):
         os.close(theirs)
-        said = b""
+        received = b""
         while part := _read(ours):
-            said += part
+            received += part
     os.close(ours)
-    return said.decode().replace("\r\n", "\n").split("\n")
+    return received.decode().replace("\r\n", "\n").split("\n")
 
 
 def _read(terminal: int) -> bytes:
     try:
         return os.read(terminal, 65536)
-    except OSError:  # so Linux says that nobody is at the other end any more
+    except OSError:  # Linux reports the closed terminal so
         return b""
 
 
-def test_what_runs_is_told_within_the_width():
+def test_commands_about_running_robots_fit_the_width():
     with standing("left"), standing("right"):
         for command in (
             ("ls",),
@@ -58,12 +58,12 @@ def test_what_runs_is_told_within_the_width():
             ("monitor", "left/base", "left/lower", "--once"),
             ("tf", "left/base", "nothing", "--once", "--timeout", "0.6"),
         ):
-            said = seen(*command, NO_COLOR="1")
-            assert max(map(len, said)) <= WIDTH + 2 * (command[0] == "tf"), (command, said)
-            assert "\x1b" not in "".join(said)
+            lines = run_in_terminal(*command, NO_COLOR="1")
+            assert max(map(len, lines)) <= WIDTH + 2 * (command[0] == "tf"), (command, lines)
+            assert "\x1b" not in "".join(lines)
 
 
-def test_settings_models_and_errors_are_told_within_the_width(tmp_path: Path):
+def test_settings_models_and_errors_fit_the_width(tmp_path: Path):
     bad = tmp_path / "bad.urdf"
     bad.write_text(Path(RRBOT).read_text().replace('<child link="upper"/>', '<child link="uper"/>'))
     for command in (
@@ -72,12 +72,12 @@ def test_settings_models_and_errors_are_told_within_the_width(tmp_path: Path):
         ("check", "rrbot"),
         ("ls", "--connect", "tcp/127.0.0.1:9"),
     ):
-        said = [line for line in seen(*command) if RRBOT not in line]
-        assert max(map(len, said)) <= WIDTH, (command, said)
+        lines = [line for line in run_in_terminal(*command) if RRBOT not in line]
+        assert max(map(len, lines)) <= WIDTH, (command, lines)
 
 
-def test_the_comment_of_a_long_example_stands_above_it():
-    lines = seen("tree", "--help")
+def test_comment_of_a_long_example_is_above_it():
+    lines = run_in_terminal("tree", "--help")
     place = lines.index("  zstate tree --wire ros2")
     assert lines[place - 1] == "  # reads /tf and /tf_static"
     in_a_pipe = zstate("tree", "--help").stdout.decode().splitlines()

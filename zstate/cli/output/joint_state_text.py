@@ -42,7 +42,7 @@ class JointStateFormatter:
     """Formats joint states as documents.
 
     A document has "stamp" [ns], "seq", and those of "positions", "velocities" and "efforts" that were
-    sent, by joint name; a joint with several numbers has a list. If the names are unknown each is a plain list.
+    sent, by joint name; a joint with several numbers has a list. Unknown names leave plain lists.
     """
 
     def __init__(self) -> None:
