@@ -156,7 +156,7 @@ def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
 
 @pytest.mark.parametrize("stamp", ["noon", "1.0000000001", "nan", "1e40"])
 def test_invalid_stamp_is_wrong_usage(stamp: str):
-    assert f"{stamp!r} is no stamp" in failure("tf", "a", "b", "--at", stamp, code=2)
+    assert f"{stamp!r} is not a stamp" in failure("tf", "a", "b", "--at", stamp, code=2)
 
 
 @pytest.mark.parametrize(("option", "value"), [("--rate", "0"), ("--rate", "nan"), ("--timeout", "-1")])

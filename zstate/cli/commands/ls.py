@@ -236,14 +236,14 @@ def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
         lines += [f"{count_text(len(graph.nodes), 'node')} in domain {wire.options.domain}"]
         lines += [f"  {node.full_name}" for node in graph.nodes]
     for topic in graph.topics:
-        type_of_topic = ros_type(topic.stream)
+        topic_type = ros_type(topic.stream)
         ends = [("  publisher", end) for end in topic.publishers]
         ends += [("  subscriber", end) for end in topic.subscribers]
         rows: list[tuple[str, ...]] = []
         for role, end in ends:
             qos = end.qos
             depth = f"keep last {qos.depth}" if qos.history == "keep_last" else "keep all"
-            is_usual = end.hash in ("", type_of_topic.hash)
+            is_usual = end.hash in ("", topic_type.hash)
             other = "" if is_usual else "another version of the type"
             rows.append(
                 (
@@ -253,7 +253,7 @@ def ros_graph_text(graph: RosGraph, wire: Ros2Wire) -> str:
                     "humble" if end.hash == HUMBLE_HASH else other,
                 )
             )
-        lines += [f"{topic.name}  {type_of_topic.name}", *in_columns(rows)]
+        lines += [f"{topic.name}  {topic_type.name}", *in_columns(rows)]
     return "\n".join(lines)
 
 
