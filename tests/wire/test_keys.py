@@ -44,7 +44,7 @@ PARSERS: tuple[Callable[[str], object], ...] = (
     keys.parse_edge_key,
     keys.robot_from_key,
     WriterId.parse,
-    NativeWire().statics_writer,
+    NativeWire().static_writer_name,
 )
 
 
@@ -58,7 +58,7 @@ def test_a_key_of_a_stranger_is_foreign_and_nothing_else(key: str):
         with suppress(InvalidInput):
             parse(key)
     for wire in (NativeWire(), Ros2Wire(), Ros2DdsWire()):
-        announced = wire.announced(key, "*")
+        announced = wire.parse_token(key, "*")
         if announced is not None:
             assert keys.check_robot(announced.robot) == announced.robot
             assert 0 <= announced.writer.since < 2**63
@@ -67,7 +67,7 @@ def test_a_key_of_a_stranger_is_foreign_and_nothing_else(key: str):
 
 @given(TOKEN)
 def test_an_announced_writer_is_one_that_can_be_asked_under_its_own_keys(key: str):
-    announced = NativeWire().announced(key, "*")
+    announced = NativeWire().parse_token(key, "*")
     if announced is not None:
         again = keys.writer_key(announced.robot, announced.stream, announced.identity)
         assert again == key

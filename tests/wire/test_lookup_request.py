@@ -39,7 +39,7 @@ def test_a_bad_parameter_is_named(parameters: dict[str, str], said: str):
 
 @pytest.mark.parametrize("frame", ["", "a;b"])
 def test_a_frame_that_no_selector_can_say_is_refused(frame: str):
-    with pytest.raises(InvalidInput, match="cannot be asked for"):
+    with pytest.raises(InvalidInput, match="cannot be looked up"):
         LookupRequest("a", frame).parameters()
 
 

@@ -262,5 +262,5 @@ def test_a_token_of_the_native_wire_says_who_writes_what():
     wire = NativeWire()
     encoder = encoder_of("tf")
     assert encoder.token is not None
-    assert wire.announced(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
-    assert wire.announced("zstate/r1/@writer/tf/nonsense", "r1") is None
+    assert wire.parse_token(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
+    assert wire.parse_token("zstate/r1/@writer/tf/nonsense", "r1") is None

@@ -26,7 +26,7 @@ from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
-USERS = (*FLEET.names, "stranger")
+USERS = (*FLEET.identities, "stranger")
 
 
 class Site:

@@ -20,7 +20,7 @@ from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"
 FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,))
-USERS = (*FLEET.names, "stranger")
+USERS = (*FLEET.identities, "stranger")
 JOINTS = "sensor_msgs::msg::dds_::JointState_/hash"
 ENDPOINT = "@ros2_lv/7/z/0/{number}/{kind}/%/%{robot}/node/%{topic}/type/hash/::,10:,:,:,,"
 

@@ -83,13 +83,13 @@ def test_the_robot_of_a_key_is_the_end_of_its_namespace(layout, namespace: str, 
 def test_what_is_everybodys_is_the_shared_robots():
     keys = RmwKeys(Ros2Options(namespace="*"))
     for stream in ("tf", "tf_static", "clock"):
-        assert keys.robot_of(keys.key("panda", stream)) == SHARED
+        assert keys.robot_from_key(keys.key("panda", stream)) == SHARED
 
 
 @pytest.mark.parametrize("stranger", ["", "0", "0/tf", "0/tf/tf2_msgs::msg::dds_::TFMessage_"])
 def test_a_key_of_another_layout_has_no_robot(stranger: str):
     with pytest.raises(InvalidInput, match="'<domain>/<topic>/<type>/<hash>'"):
-        RmwKeys(Ros2Options()).robot_of(stranger)
+        RmwKeys(Ros2Options()).robot_from_key(stranger)
 
 
 @pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])

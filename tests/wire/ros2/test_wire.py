@@ -88,7 +88,7 @@ def test_the_bridges_wire_has_plain_keys_its_own_tokens_and_nothing_beside():
 @pytest.mark.parametrize("written", ["", HUMBLE])
 def test_a_publisher_of_a_stream_is_announced_by_its_node_and_signed_as_its_messages(topic, written):
     token = endpoint(topic, "rsp", hash_=written)
-    said = wire().announced(token, "r1")
+    said = wire().parse_token(token, "r1")
     assert said is not None
     assert (said.robot, said.stream, str(said.writer)) == ("r1", topic[0], "/rsp")
     assert said.writer.session == int.from_bytes(gid_of(token)[:8], "little")
@@ -112,10 +112,10 @@ def test_a_publisher_of_a_stream_is_announced_by_its_node_and_signed_as_its_mess
 )
 def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespace, topic, robot, expected):
     one = wire(**options)
-    said = one.announced(endpoint(topic, "rsp", namespace=namespace), robot)
+    said = one.parse_token(endpoint(topic, "rsp", namespace=namespace), robot)
     assert (said and said.robot) == expected
     if expected and robot == "*":
-        assert one.robot_of(key_of(topic, namespace)) == expected
+        assert one.robot_from_key(key_of(topic, namespace)) == expected
 
 
 @pytest.mark.parametrize(
@@ -130,8 +130,8 @@ def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespa
     ],
 )
 def test_tokens_of_anything_else_announce_nothing(token: str):
-    assert wire().announced(token, "r1") is None
-    assert wire().announced(token, "*") is None
+    assert wire().parse_token(token, "r1") is None
+    assert wire().parse_token(token, "*") is None
 
 
 @pytest.mark.parametrize("stream", DDS_TOPICS)
@@ -139,12 +139,12 @@ def test_a_route_of_a_bridge_is_announced(stream):
     one = Ros2DdsWire()
     for tail in (":1:1:0,1", f":1:1:0,1:typehash={TF[2]};", ""):
         token = f"@/{ZID}/@ros2_lv/MP/{stream}/{DDS_TOPICS[stream]}/{tail or ':0:0:1,-1'}"
-        said = one.announced(token, "r1")
+        said = one.parse_token(token, "r1")
         assert said is not None
         assert (said.robot, said.stream, said.writer.session) == ("r1", stream, 0)
         assert str(said.writer) == f"ros2dds bridge {ZID[:8]}"
-        assert one.announced(token.replace("/MP/", "/MS/"), "r1") is None
-        assert one.announced(token.replace("§msg§", "§"), "r1") is None
+        assert one.parse_token(token.replace("/MP/", "/MS/"), "r1") is None
+        assert one.parse_token(token.replace("§msg§", "§"), "r1") is None
 
 
 def test_messages_are_told_apart_by_the_writer_and_the_number_beside_them():
@@ -175,7 +175,7 @@ def test_a_key_in_a_namespace_that_ros_does_not_have_is_foreign():
     one = wire(namespace="*")
     key = key_of(JOINT_STATES, "two words")
     with pytest.raises(MessageError, match="two words") as caught:
-        one.decode("joint_states", arrival(key=key), one.robot_of(key))
+        one.decode("joint_states", arrival(key=key), one.robot_from_key(key))
     assert caught.value.reason == "foreign"
 
 
@@ -209,7 +209,7 @@ def test_whatever_arrives_is_read_or_refused_with_a_reason(
     one = (Ros2DdsWire if behind_bridge else Ros2Wire)(Ros2Options(namespace=namespace))
     come = arrival(*given_)
     try:
-        said = one.decode(stream, come, one.robot_of(come.key))
+        said = one.decode(stream, come, one.robot_from_key(come.key))
     except MessageError as error:
         assert error.reason
     else:
@@ -226,5 +226,5 @@ def test_whatever_arrives_is_read_or_refused_with_a_reason(
 )
 def test_whatever_is_announced_is_understood_or_passed_over(token: str, namespace: str, robot: str):
     for one in (wire(namespace=namespace), Ros2DdsWire(Ros2Options(namespace=namespace))):
-        one.announced(token, robot)
-        one.announced(f"@/{ZID}/@ros2_lv/MP/{token}", robot)
+        one.parse_token(token, robot)
+        one.parse_token(f"@/{ZID}/@ros2_lv/MP/{token}", robot)

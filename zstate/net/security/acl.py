@@ -137,7 +137,7 @@ class Ros2AclRules:
         self._domain = str(options.domain)
         self._graph = f"@ros2_lv/{options.domain}"
         self._global = (*(("tf", "tf_static") if options.tf == "global" else ()), *_OF_EVERY_NODE)
-        _check_apart(fleet.robots, [options.namespace_of(robot) for robot in fleet.robots])
+        _check_apart(fleet.robots, [options.robot_namespace(robot) for robot in fleet.robots])
 
     def roles(self, name: str) -> Iterator[str]:
         """The rules that ``name`` has, by their names."""
@@ -180,7 +180,7 @@ class Ros2AclRules:
         return f"{text} in ROS domain {self._domain}"
 
     def _own(self, robot: str) -> tuple[str, ...]:
-        namespace = self._options.namespace_of(robot)
+        namespace = self._options.robot_namespace(robot)
         return self._topic(namespace) if namespace else (f"{self._domain}/**", f"{self._domain}/**/@adv/**")
 
     def _topic(self, name: str) -> tuple[str, str]:
@@ -188,7 +188,7 @@ class Ros2AclRules:
 
     def _tokens(self, robot: str) -> Iterator[str]:
         """Its nodes, what they read, and what they offer of its own and of everybody's."""
-        namespace = self._options.namespace_of(robot)
+        namespace = self._options.robot_namespace(robot)
         if not namespace:
             yield f"{self._graph}/**"
             return
@@ -250,14 +250,14 @@ class AclRoles:
     placers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in self.names:
+        for name in self.identities:
             _check_identity(name)
         check_namespace(self.namespace)
-        if not self.names:
+        if not self.identities:
             raise InvalidInput("nobody is named; access control without names would deny everything")
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def identities(self) -> tuple[str, ...]:
         """Everybody, each once."""
         names = (*self.robots, *self.viewers, *self.operators, *self.timekeepers, *self.placers)
         return tuple(dict.fromkeys(names))
@@ -301,13 +301,13 @@ def access_text(fleet: AclRoles) -> str:
 def access_control(fleet: AclRoles) -> dict[str, object]:
     """The section ``access_control`` of a Zenoh configuration."""
     wires = [_access(fleet, wire) for wire in dict.fromkeys(fleet.wires)]
-    roles = {name: [rule for wire in wires for rule in wire.roles(name)] for name in fleet.names}
+    roles = {name: [rule for wire in wires for rule in wire.roles(name)] for name in fleet.identities}
     used = {rule for rules in roles.values() for rule in rules}
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [rule for wire in wires for rule in wire.rules() if rule["id"] in used],
-        "subjects": [subject for name in fleet.names for subject in _subjects(name)],
+        "subjects": [subject for name in fleet.identities for subject in _subjects(name)],
         "policies": [
             {"id": name, "rules": rules, "subjects": [str(one["id"]) for one in _subjects(name)]}
             for name, rules in roles.items()

@@ -37,7 +37,7 @@ class FrameNames:
     def __init__(self, options: Ros2Options, robot: str) -> None:
         self._robot = robot
         # Beside robots in a namespace, SHARED stands for the tf that all of them speak on.
-        self._prefix = "" if robot == SHARED and options.namespace else options.prefix_of(robot)
+        self._prefix = "" if robot == SHARED and options.namespace else options.robot_frame_prefix(robot)
         self._edges_to_ros = lru_cache(_REMEMBERED)(partial(_renamed, self.to_ros))
         self._edges_to_zstate = lru_cache(_REMEMBERED)(partial(_renamed, self.to_zstate))
 

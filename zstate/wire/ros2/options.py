@@ -69,7 +69,7 @@ class Ros2Options:
             given[_check_key(key)] = value
         return cls(**_typed(given))
 
-    def namespace_of(self, robot: str) -> str:
+    def robot_namespace(self, robot: str) -> str:
         """The namespace of ``robot``'s topics, without outer slashes; "" is the root.
 
         Raises InvalidInput when it must be the robot's name and that is no ROS name.
@@ -80,7 +80,7 @@ class Ros2Options:
             return robot
         return self.namespace
 
-    def prefix_of(self, robot: str) -> str:
+    def robot_frame_prefix(self, robot: str) -> str:
         """What stands before the frames of ``robot`` on ROS's side; may be empty.
 
         Robots in namespaces of their own that share /tf are told apart there: unless given, by their names.

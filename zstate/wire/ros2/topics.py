@@ -61,7 +61,7 @@ class TopicKeys(Protocol):
         """
         ...
 
-    def robot_of(self, key: str) -> str:
+    def robot_from_key(self, key: str) -> str:
         """The robot whose key this is: the last token of its namespace, SHARED in the root.
 
         InvalidInput for a key that is not of this layout.
@@ -76,7 +76,7 @@ class RmwKeys:
         self._options = options
 
     def topic(self, robot: str, stream: Stream) -> str:
-        return f"/{self._path(self._options.namespace_of(robot), stream)}"
+        return f"/{self._path(self._options.robot_namespace(robot), stream)}"
 
     def key(self, robot: str, stream: Stream) -> str:
         kind = ros_type(stream)
@@ -87,7 +87,7 @@ class RmwKeys:
         path = self._path(_namespace_pattern(self._options, robot), stream)
         return f"{self._options.domain}/{path}/{ros_type(stream).dds}/*"
 
-    def robot_of(self, key: str) -> str:
+    def robot_from_key(self, key: str) -> str:
         _domain, *path = key.split("/")
         if len(path) < 3:
             raise InvalidInput(f"the key {key!r} is not of the form '<domain>/<topic>/<type>/<hash>'")
@@ -114,18 +114,18 @@ class DdsKeys:
 
     def key(self, robot: str, stream: Stream) -> str:
         ros_type(stream)
-        return _joined(self._options.namespace_of(robot), stream)
+        return _joined(self._options.robot_namespace(robot), stream)
 
     def expression(self, robot: str, stream: Stream) -> str:
         ros_type(stream)
         return _joined(_namespace_pattern(self._options, robot), stream)
 
-    def robot_of(self, key: str) -> str:
+    def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
 
 def _namespace_pattern(options: Ros2Options, robot: str) -> str:
-    return options.namespace if robot == ANY else options.namespace_of(robot)
+    return options.namespace if robot == ANY else options.robot_namespace(robot)
 
 
 def _joined(namespace: str, name: str) -> str:

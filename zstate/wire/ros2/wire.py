@@ -12,7 +12,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import ANY, Stream
-from zstate.wire.messages import Message
+from zstate.wire.messages import Message, check_edges, check_size
 from zstate.wire.protocol import EntityId, SerializedSample
 from zstate.wire.ros2.attachment import session_from_gid, unpack
 from zstate.wire.ros2.decoder import RosDecoder
@@ -31,7 +31,6 @@ from zstate.wire.ros2.graph import (
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
 from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_from_topic, ros_type
-from zstate.wire.sizes import check_edges, check_size
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 
@@ -75,7 +74,7 @@ class Ros2Wire:
         return RosStreamEncoder(stream, address, self._frame_names(robot), sample_names)
 
     def _node(self, robot: str, program: str, node: EntityId) -> NodeToken:
-        namespace = f"/{self.options.namespace_of(robot)}"
+        namespace = f"/{self.options.robot_namespace(robot)}"
         name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", program, flags=re.ASCII)
         return NodeToken(self.options.domain, node.zid, node.number, "/", namespace, name)
 
@@ -118,10 +117,10 @@ class Ros2Wire:
     def expression(self, robot: str, stream: Stream) -> str:
         return self._keys.expression(robot, stream)
 
-    def robot_of(self, key: str) -> str:
-        return self._keys.robot_of(key)
+    def robot_from_key(self, key: str) -> str:
+        return self._keys.robot_from_key(key)
 
-    def statics_writer(self, key: str) -> None:
+    def static_writer_name(self, key: str) -> None:
         """None: all static edges of ROS share one topic."""
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
@@ -146,7 +145,7 @@ class Ros2Wire:
     def writers_expression(self, robot: str) -> str:
         return graph_expression(self.options.domain)
 
-    def announced(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> Announcement | None:
         parsed = parse_token(token)
         if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
             return None
@@ -203,7 +202,7 @@ class Ros2DdsWire(Ros2Wire):
     def writers_expression(self, robot: str) -> str:
         return DDS_GRAPH_EXPRESSION
 
-    def announced(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> Announcement | None:
         parsed = parse_dds_token(token)
         if parsed is None or parsed.kind != "MP":
             return None

@@ -18,11 +18,10 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
+from zstate.wire.messages import MAX_BYTES, STATIC_EDGES, JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
-from zstate.wire.sizes import MOST_BYTES, STATIC_EDGES
 
 ORDER = order_digest(("a",))
 
@@ -35,7 +34,7 @@ def statics(count: int) -> StaticTransforms:
 @pytest.mark.parametrize("wire", ["native", "ros2"])
 @pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description"])
 def test_each_stream_has_a_largest_payload(wire, stream):
-    size = 4 * MOST_BYTES[stream] + 1
+    size = 4 * MAX_BYTES[stream] + 1
     for arrival in (
         SerializedSample("key", bytes(size), "any"),
         SerializedSample("key", b"\0", "any", None, size),
