@@ -118,7 +118,7 @@ def test_a_string_that_is_not_one_is_malformed(data: bytes):
 @pytest.mark.parametrize("take", [CdrReader.text, CdrReader.sequence])
 @pytest.mark.parametrize("count", [2, 2**31, 2**32 - 1])
 def test_a_count_beyond_the_end_is_truncated_before_anything_is_made_of_it(take, count: int):
-    with pytest.raises(MessageError, match="more were to come") as caught:
+    with pytest.raises(MessageError, match="more are expected") as caught:
         take(reader(LITTLE + struct.pack("<I", count)))
     assert caught.value.reason == "truncated"
 

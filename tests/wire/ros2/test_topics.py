@@ -77,7 +77,7 @@ def test_a_bridge_puts_its_namespace_before_everything_and_nothing_else():
 def test_the_robot_of_a_key_is_the_end_of_its_namespace(layout, namespace: str, robot: str):
     keys = layout(Ros2Options(namespace=namespace, tf="namespace"))
     for stream in STREAMS[:-1]:
-        assert keys.robot_of(keys.key("panda", stream)) == robot
+        assert keys.robot_from_key(keys.key("panda", stream)) == robot
 
 
 def test_what_is_everybodys_is_the_shared_robots():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.ros2.simple_messages import decode_clock, decode_string, encode_clock, encode_string
+from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
 
 STAMP = 1_700_000_000_123_456_789
 TEXTS = ["", "a", "abc", "<robot name='ü'/>", "日本", "x" * 3_000_000]
