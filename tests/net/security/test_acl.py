@@ -315,5 +315,5 @@ def test_a_namespace_that_cannot_stand_before_keys_is_refused(namespace: str):
 
 
 def test_a_fleet_of_nobody_is_refused():
-    with pytest.raises(InvalidInput, match="nobody is named"):
+    with pytest.raises(InvalidInput, match="no role has a name"):
         AclRoles()

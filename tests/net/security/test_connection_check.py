@@ -115,7 +115,7 @@ def test_no_user_where_one_is_asked_for(fleet: Fleet):
 def test_a_user_where_nobody_knows_any(fleet: Fleet):
     reason, text = denied(fleet.tcp("open"), Credentials(user="alice", password="wonder"))
     assert reason == "user or password"
-    assert "a router that has none refuses whoever names a user" in text
+    assert "a router without one refuses every session with a user" in text
 
 
 def test_a_router_at_a_host_that_is_not_in_its_certificate(fleet: Fleet, spawn, free_port: int):

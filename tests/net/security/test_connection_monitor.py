@@ -36,7 +36,7 @@ CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | N
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
     """It looks every tenth of a second."""
-    monkeypatch.setattr(connection_monitor, "FIRST_LOOK_S", 0.1)
+    monkeypatch.setattr(connection_monitor, "FIRST_PERIOD_S", 0.1)
     monkeypatch.setattr(connection_monitor, "PERIOD_S", 0.1)
 
 

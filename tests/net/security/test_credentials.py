@@ -54,7 +54,7 @@ def test_a_folder_without_the_identity_says_which_it_has(fleet: Path):
     assert Credentials.from_folder(fleet, "r1").certificate == fleet / "r1.pem"
     with pytest.raises(ConfigError, match=r"no identity 'r3'.*are 'r1', 'r2'; .*zstate certs"):
         Credentials.from_folder(fleet, "r3")
-    with pytest.raises(ConfigError, match="there are none"):
+    with pytest.raises(ConfigError, match="it has none"):
         Credentials.from_folder(fleet / "elsewhere", "r1")
 
 
@@ -138,8 +138,8 @@ def test_what_cannot_be_read_is_named(fleet: Path, tmp_path: Path):
         ("alice:wonder\n# nobody\n", "line 2: write user:password; comments"),
         ("alice:\n", "line 1: write user:password"),
         (":wonder\n", "line 1: write user:password"),
-        ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' stands in line 1"),
-        ("\n", "names no user"),
+        ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' is already in line 1"),
+        ("\n", "has no user"),
     ],
 )
 def test_a_file_of_users_that_zenoh_would_take_wrongly_is_refused_with_its_line(
