@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import NamedTuple
@@ -73,7 +74,7 @@ def check_endpoints(endpoints: Sequence[str], credentials: Credentials | None) -
     if len(endpoints) == 1:  # without a pool, which starts no thread while the interpreter exits
         return CheckResults({endpoints[0]: _check_endpoint(endpoints[0], credentials)})
     with ThreadPoolExecutor(len(endpoints) or 1) as pool:
-        refusals = pool.map(lambda endpoint: _check_endpoint(endpoint, credentials), endpoints)
+        refusals = pool.map(partial(_check_endpoint, credentials=credentials), endpoints)
         return CheckResults(dict(zip(endpoints, refusals, strict=True)))
 
 
@@ -126,8 +127,8 @@ def _accepts_tls(link: socket.socket) -> bool:
 
 def _handshake(link: socket.socket, host: str, credentials: Credentials | None) -> RefusalReason:
     link.settimeout(_REFUSAL_TIMEOUT_S)
-    has_ca = credentials is not None and credentials.ca is not None
-    context = client_context(credentials) if has_ca else ssl.create_default_context()
+    trusted = credentials if credentials and credentials.ca else None
+    context = client_context(trusted) if trusted else ssl.create_default_context()
     try:
         secured = context.wrap_socket(link, server_hostname=host)
     except ssl.SSLCertVerificationError as error:

@@ -1,6 +1,6 @@
 """Connection monitor: logs why endpoints refuse a session that keeps trying to connect.
 
-A probe session is a second session with the same credentials, which checks what the router forwards.
+A probe session is a second session with the same credentials, which checks that the router forwards a sample.
 """
 
 # pyright: reportUnknownMemberType=false

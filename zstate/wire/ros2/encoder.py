@@ -46,7 +46,7 @@ class RosStreamEncoder:
         self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleLayout
     ) -> None:
         self.key = address.key
-        self.token = address.token
+        self.token: str | None = address.token
         self._gid = address.gid
         self._seq = 0
         self._stream = stream

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal
 
 from xxhash import xxh3_128_digest
 
@@ -160,7 +160,7 @@ def parse_token(key: str) -> NodeToken | EndpointToken | None:
         zid=chunks[2],
         nid=int(chunks[3]),
         eid=int(chunks[4]),
-        kind=cast(Kind, chunks[5]),
+        kind=chunks[5],
         enclave=enclave,
         namespace=namespace,
         node=name,

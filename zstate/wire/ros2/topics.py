@@ -48,21 +48,25 @@ class TopicKeys(Protocol):
 
     def topic(self, robot: str, stream: Stream) -> str:
         """The full ROS name of the topic, with its leading slash."""
+        ...
 
     def key(self, robot: str, stream: Stream) -> str:
         """The Zenoh key of ``stream``. Raises InvalidInput for a name that ROS does not allow."""
+        ...
 
     def expression(self, robot: str, stream: Stream) -> str:
         """The key expression of ``stream``; robot ``"*"`` means all robots in the namespace.
 
         With ``namespace=*`` these are all robots in a namespace of one token.
         """
+        ...
 
     def robot_from_key(self, key: str) -> str:
         """The robot of ``key``: the last token of its namespace, SHARED in the root.
 
         Raises InvalidInput for a key that is not of this layout.
         """
+        ...
 
 
 class RmwKeys:
