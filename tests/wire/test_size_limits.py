@@ -1,4 +1,4 @@
-"""What is too large is refused by its stream before it is decoded, and what waits is bounded in bytes."""
+"""Size limits: a payload too large for its stream is refused before decoding; queues are bounded in bytes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_more_than_ten_thousand_static_edges_are_too_many():
         NativeWire().decode("tf_static", arrival(STATIC_EDGES + 1), "r1")
 
 
-def test_what_travels_on_no_stream_is_bounded_too():
+def test_messages_without_a_stream_have_a_limit_too():
     with pytest.raises(MessageError) as caught:
         decode(bytes(64_001), ENCODINGS[Status], Status)
     assert caught.value.reason == "too large"
@@ -69,7 +69,7 @@ def test_samples_that_wait_for_a_description_are_bounded_in_bytes():
     assert (count - given_up) * len(block) <= EARLY_BYTES
 
 
-def test_too_large_messages_are_counted_and_the_next_are_taken(sessions):
+def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
     writer, reader = sessions
     with (
         StreamPublisher(writer, "zstate/r2/joint_states", ENCODINGS[JointState]) as stranger,

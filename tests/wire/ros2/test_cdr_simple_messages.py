@@ -56,7 +56,7 @@ def test_a_message_cut_off_anywhere_is_truncated(decode, payload: bytes):
         assert caught.value.reason == "truncated"
 
 
-def test_what_ros_2_cannot_say_is_not_sent():
+def test_values_that_ros_2_cannot_represent_are_refused():
     with pytest.raises(InvalidInput):
         encode_string("a\0b")
     with pytest.raises(InvalidInput):

@@ -25,7 +25,7 @@ def test_every_option_can_be_written():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "problem"),
     [
         ("namepsace=r1", "has no option 'namepsace'; did you mean 'namespace'? known: domain, namespace,"),
         ("colour=red", "has no option 'colour'; known: domain, namespace, frame_prefix, tf, hash, node"),
@@ -43,14 +43,14 @@ def test_every_option_can_be_written():
         ("frame_prefix=r1//", "contains '//'"),
     ],
 )
-def test_what_cannot_be_used_is_named_with_what_can(text: str, says: str):
+def test_invalid_option_error_lists_allowed_values(text: str, problem: str):
     with pytest.raises(InvalidInput) as caught:
         Ros2Options.parse(text)
-    assert says in str(caught.value)
+    assert problem in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("namespace", "says", "instead"),
+    ("namespace", "problem", "instead"),
     [
         ("arm-2.left", "'arm-2.left' contains '-' and '.'", "'arm_2_left'"),
         ("fleet/2nd", "'2nd' in 'fleet/2nd' begins with a digit", "'_2nd'"),
@@ -59,12 +59,10 @@ def test_what_cannot_be_used_is_named_with_what_can(text: str, says: str):
         ("fleet/*", "'fleet/*' has a '*' within", "'*' alone"),
     ],
 )
-def test_a_namespace_that_ros_would_refuse_is_refused_with_one_that_it_takes(
-    namespace: str, says: str, instead: str
-):
+def test_invalid_namespace_error_suggests_a_valid_one(namespace: str, problem: str, instead: str):
     with pytest.raises(InvalidInput) as caught:
         Ros2Options(namespace=namespace)
-    assert says in str(caught.value)
+    assert problem in str(caught.value)
     assert instead in str(caught.value)
 
 
