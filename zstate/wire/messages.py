@@ -101,8 +101,8 @@ class JointState(Sample, frozen=True, array_like=True, gc=False):
 class TransformSample(Sample, frozen=True, array_like=True, gc=False):
     """Every moving edge of a robot at one instant.
 
-    ``poses`` is a block of ``parent_from_child``, seven numbers for each edge. The edges are those of
-    ``RobotDescription.moving_edges``, or ``edges`` if there is no description.
+    ``poses`` is a block of ``parent_from_child``, seven numbers for each edge. The edges are ``edges``, or
+    ``RobotDescription.moving_edges`` if None.
     """
 
     poses: bytes

@@ -216,17 +216,19 @@ def _server_certificate_reason(
 def _alert_reason(error: ssl.SSLError, credentials: Credentials | None) -> RefusalReason | None:
     """The reason in the TLS alert of a router that refuses our certificate (RFC 8446, section 6)."""
     alert = (error.reason or "").partition("ALERT_")[2]
-    ours = repr(str(credentials.certificate)) if credentials and credentials.certificate else "no certificate"
+    local = (
+        repr(str(credentials.certificate)) if credentials and credentials.certificate else "no certificate"
+    )
     if not alert or alert == "CERTIFICATE_REQUIRED":
         return _WANTS_CERTIFICATE if alert else None
     if alert == "CERTIFICATE_EXPIRED":
         return RefusalReason(
             "our certificate expired",
-            f"{ours} has expired, or is not valid yet by the router's clock; renew it, and check both clocks",
+            f"{local} has expired, or is not valid yet by the router's clock; renew it, and check both clocks",
         )
     return RefusalReason(
         "our certificate refused",
-        f"it refuses {ours} ({alert.lower().replace('_', ' ')}); make the identity in the folder of "
+        f"it refuses {local} ({alert.lower().replace('_', ' ')}); make the identity in the folder of "
         "the router's",
     )
 
