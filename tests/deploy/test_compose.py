@@ -49,7 +49,7 @@ def test_its_router_lets_nobody_else_write(deployment: Deployment, spawn: Any):
 def test_nobody_comes_in_without_a_certificate(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     ca = Credentials(ca=deployment.certs / "ca.pem")
-    with pytest.raises(AccessDenied, match="demands a certificate"):
+    with pytest.raises(AccessDenied, match="requires a certificate"):
         connect(mode="client", endpoints=f"tls/localhost:{deployment.port}", credentials=ca)
 
 

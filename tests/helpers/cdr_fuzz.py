@@ -21,8 +21,8 @@ from itertools import pairwise
 from helpers import manual_cdr as by_hand
 
 from zstate.errors import MessageError
+from zstate.wire.ros2.cdr import decode_clock, decode_string
 from zstate.wire.ros2.joint_state import JointStateDecoder
-from zstate.wire.ros2.simple_messages import decode_clock, decode_string
 from zstate.wire.ros2.tf_message import TfMessageDecoder
 
 REASONS = {"truncated", "malformed", "no positions"}

@@ -113,7 +113,7 @@ def test_who_a_program_is_comes_with_where_it_joins(
     monkeypatch.setenv("ZSTATE_PASSWORD_FILE", str(password))
     connect().close()
     password.write_text("\n")
-    with pytest.raises(ConfigError, match="nothing in its first line"):
+    with pytest.raises(ConfigError, match="the first line of the password file"):
         connect()
 
 

@@ -200,7 +200,7 @@ def test_machines_of_a_lan_with_certificates_of_one_authority_meet(machines, fol
     ("has_certificate", "told_us", "told_them"),
     [
         (True, "its certificate is not signed by", "its certificate is not signed by"),
-        (False, "it speaks no TLS", "and this session was given no other to trust"),
+        (False, "it does not use TLS", "and this session was given no other to trust"),
     ],
 )
 def test_strangers_in_a_lan_are_not_spoken_to_and_both_are_told_why(

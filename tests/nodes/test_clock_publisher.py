@@ -9,7 +9,7 @@ from zstate.errors import Closed, InvalidInput
 from zstate.nodes.clock import ClockPublisher
 from zstate.wire.messages import ClockMessage
 from zstate.wire.native import ENCODINGS, decode
-from zstate.wire.ros2.simple_messages import decode_clock
+from zstate.wire.ros2.cdr import decode_clock
 
 ROS = "ros2:domain=7,namespace=*,frame_prefix=*/"
 

@@ -10,17 +10,17 @@ from zstate.wire.messages import JointState, order_digest, to_block
 OURS = ("shoulder", "elbow", "wrist")
 
 
-def state(names: tuple[str, ...], *blocks: list[float] | None, said: bool = True) -> JointState:
+def state(names: tuple[str, ...], *blocks: list[float] | None, with_names: bool = True) -> JointState:
     numbers = [None if block is None else to_block(block) for block in blocks]
-    return JointState(0, 0, 0, order_digest(names), *numbers, names=names if said else None)
+    return JointState(0, 0, 0, order_digest(names), *numbers, names=names if with_names else None)
 
 
 def lists(numbers) -> list[list[float] | None]:
     return [None if block is None else block.tolist() for block in numbers]
 
 
-def test_numbers_in_our_order_are_read_as_they_are_without_a_copy():
-    message = state(OURS, [1, 2, 3], None, [4, 5, 6], said=False)
+def test_numbers_in_the_readers_order_are_not_copied():
+    message = state(OURS, [1, 2, 3], None, [4, 5, 6], with_names=False)
     numbers = JointOrder(OURS).read(message)
     assert lists(numbers) == [[1, 2, 3], None, [4, 5, 6]]
     assert np.shares_memory(numbers.positions, np.frombuffer(message.positions))
@@ -41,7 +41,7 @@ def test_a_missing_joint_is_named():
 
 def test_another_order_without_names_cannot_be_read():
     with pytest.raises(MessageError, match="the same URDF") as caught:
-        JointOrder(OURS).read(state(OURS[::-1], [1, 2, 3], said=False))
+        JointOrder(OURS).read(state(OURS[::-1], [1, 2, 3], with_names=False))
     assert caught.value.reason == "other joint order"
 
 
@@ -79,7 +79,7 @@ def test_a_joint_whose_parts_are_not_all_there_is_missing():
 
 
 @pytest.mark.parametrize("names", [OURS, OURS[::-1], ("lid", *OURS)])
-def test_velocities_and_efforts_that_are_not_known_of_one_of_our_joints_are_not_read(names):
+def test_velocities_and_efforts_with_nan_for_a_model_joint_are_none(names):
     nan = float("nan")
     unknown = [nan if name == "wrist" else 1.0 for name in names]
     numbers = JointOrder(OURS).read(state(names, [1.0] * len(names), unknown, [1.0] * len(names)))
@@ -88,16 +88,16 @@ def test_velocities_and_efforts_that_are_not_known_of_one_of_our_joints_are_not_
     assert lists(numbers) == [[1.0] * 3, [1.0] * 3, None]
 
 
-def test_velocities_that_are_not_known_of_others_joints_do_not_matter():
+def test_nan_of_other_joints_is_ignored():
     names = ("lid", *OURS)
     rates = [float("nan"), 1.0, 2.0, 3.0]
     assert lists(JointOrder(OURS).read(state(names, [0.0] * 4, rates)))[1] == [1.0, 2.0, 3.0]
 
 
-def test_positions_are_not_left_out_and_neither_is_nan_of_who_tells_no_names():
+def test_nan_in_positions_or_without_names_is_kept():
     nan = float("nan")
     named = JointOrder(OURS).read(state(OURS, [nan, 1.0, 2.0]))
     assert np.isnan(named.positions).tolist() == [True, False, False]
-    bare = JointOrder(OURS).read(state(OURS, [0.0, 1.0, 2.0], [nan, 1.0, 2.0], said=False))
+    bare = JointOrder(OURS).read(state(OURS, [0.0, 1.0, 2.0], [nan, 1.0, 2.0], with_names=False))
     assert bare.velocities is not None
     assert np.isnan(bare.velocities).tolist() == [True, False, False]

@@ -44,7 +44,7 @@ PARSERS: tuple[Callable[[str], object], ...] = (
     keys.parse_edge_key,
     keys.robot_from_key,
     WriterId.parse,
-    NativeWire().statics_writer,
+    NativeWire().static_writer_name,
 )
 
 
@@ -53,12 +53,12 @@ PARSERS: tuple[Callable[[str], object], ...] = (
 @example("zstate/evil/@writer/joint_states/p,h,1," + "1" * 30 + ",1")
 @example("zstate/e vil/@writer/joint_states/p,h,1,1,1")
 @example("zstate/*/joint_states")
-def test_a_key_of_a_stranger_is_foreign_and_nothing_else(key: str):
+def test_foreign_keys_raise_only_invalid_input(key: str):
     for parse in PARSERS:
         with suppress(InvalidInput):
             parse(key)
     for wire in (NativeWire(), Ros2Wire(), Ros2DdsWire()):
-        announced = wire.announced(key, "*")
+        announced = wire.parse_token(key, "*")
         if announced is not None:
             assert keys.check_robot(announced.robot) == announced.robot
             assert 0 <= announced.writer.since < 2**63
@@ -66,8 +66,8 @@ def test_a_key_of_a_stranger_is_foreign_and_nothing_else(key: str):
 
 
 @given(TOKEN)
-def test_an_announced_writer_is_one_that_can_be_asked_under_its_own_keys(key: str):
-    announced = NativeWire().announced(key, "*")
+def test_announced_writer_has_valid_keys_of_its_own(key: str):
+    announced = NativeWire().parse_token(key, "*")
     if announced is not None:
         again = keys.writer_key(announced.robot, announced.stream, announced.identity)
         assert again == key
@@ -83,13 +83,13 @@ def test_an_announced_writer_is_one_that_can_be_asked_under_its_own_keys(key: st
         *("zstate/", f"zstate/{'a' * 256}/tf", f"zstate/r1/{'a' * 20_000}"),
     ],
 )
-def test_a_key_with_a_wildcard_or_a_robot_that_cannot_be_one_is_of_no_robot(key: str):
+def test_key_with_a_wildcard_or_invalid_robot_has_no_robot(key: str):
     with pytest.raises(InvalidInput) as caught:
         keys.robot_from_key(key)
     assert len(str(caught.value)) < 1000
 
 
-def test_names_are_as_long_as_those_of_files():
+def test_name_lengths_are_limited_as_in_file_systems():
     assert keys.check_robot("a" * 255) == "a" * 255
     with pytest.raises(InvalidInput, match="256 characters, more than 255"):
         keys.check_robot("a" * 256)
@@ -108,7 +108,7 @@ def test_every_key_of_a_robot_lies_under_its_own_prefix():
     assert keys.CLOCK_KEY == "zstate/clock"
 
 
-def test_an_expression_hears_one_robot_or_all_and_every_static_writer():
+def test_expression_matches_one_robot_or_all_and_every_static_writer():
     assert keys.stream_expression("panda", "joint_states") == "zstate/panda/joint_states"
     assert keys.stream_expression("*", "joint_states") == "zstate/*/joint_states"
     assert keys.stream_expression("*", "tf_static") == "zstate/*/tf_static/*"
@@ -117,7 +117,7 @@ def test_an_expression_hears_one_robot_or_all_and_every_static_writer():
 
 
 @pytest.mark.parametrize("robot", ["panda", "*", "%2A", "a@b", "über"])
-def test_a_reader_stands_apart_from_robots_and_tells_whose_stream_it_reads(robot: str):
+def test_reader_key_is_outside_of_robots_and_names_robot_and_stream(robot: str):
     key = keys.reader_key(robot, "joint_states", "x")
     assert key.startswith("zstate/@reader/")
     assert "*" not in key
@@ -127,7 +127,7 @@ def test_a_reader_stands_apart_from_robots_and_tells_whose_stream_it_reads(robot
 @pytest.mark.parametrize(
     "key", ["zstate/panda/@writer/tf/x", "zstate/@reader/panda/songs/x", "zstate/@reader/panda/tf/x/y"]
 )
-def test_other_keys_are_no_readers(key: str):
+def test_other_keys_are_not_parsed_as_readers(key: str):
     with pytest.raises(InvalidInput, match="@reader"):
         keys.parse_reader_key(key)
 
@@ -141,7 +141,7 @@ def test_an_edge_that_is_being_placed_is_found_by_its_child(edge: tuple[str, str
 
 
 @pytest.mark.parametrize("key", ["zstate/r1/@edge/a/b", "zstate/r1/@writer/a/b/x", "r1/zstate/@edge/a/b/x"])
-def test_other_keys_are_no_edges(key: str):
+def test_other_keys_are_not_parsed_as_edges(key: str):
     with pytest.raises(InvalidInput, match="@edge"):
         keys.parse_edge_key(key)
 
@@ -182,11 +182,11 @@ def test_a_robot_or_writer_name_that_is_not_one_chunk_is_refused_by_name(name: s
 
 
 @pytest.mark.parametrize("name", ["panda", "r1", "arm-2.left", "über", "a@b", "clock"])
-def test_ordinary_names_are_taken_as_they_are(name: str):
+def test_ordinary_names_are_unchanged(name: str):
     assert keys.check_robot(name) == name
 
 
-def test_a_star_is_no_robot_to_write_for():
+def test_star_is_not_a_robot_for_writing():
     with pytest.raises(InvalidInput):
         keys.stream_key("*", "joint_states")
 

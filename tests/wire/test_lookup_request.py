@@ -12,14 +12,14 @@ from zstate.errors import Disconnected, InFuture, InvalidInput, NetworkError, Un
 from zstate.wire.lookup_request import LookupRequest, error_from_json, error_to_json
 
 
-def test_what_is_asked_is_read_back():
+def test_request_is_parsed_from_its_own_parameters():
     for asked in (LookupRequest("map", "r1/tool"), LookupRequest("a", "b", -5)):
         pairs = dict(part.split("=") for part in asked.parameters().split(";"))
         assert LookupRequest.parse(pairs) == asked
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("parameters", "text"),
     [
         ({}, "needs the parameter 'target'"),
         ({"target": "a"}, "needs the parameter 'source'"),
@@ -32,14 +32,14 @@ def test_what_is_asked_is_read_back():
         ({"target": "a", "source": "b", "at": "9" * 30}, "'at' is '999"),
     ],
 )
-def test_a_bad_parameter_is_named(parameters: dict[str, str], said: str):
-    with pytest.raises(InvalidInput, match=said):
+def test_a_bad_parameter_is_named(parameters: dict[str, str], text: str):
+    with pytest.raises(InvalidInput, match=text):
         LookupRequest.parse(parameters)
 
 
 @pytest.mark.parametrize("frame", ["", "a;b"])
-def test_a_frame_that_no_selector_can_say_is_refused(frame: str):
-    with pytest.raises(InvalidInput, match="cannot be asked for"):
+def test_frame_that_cannot_be_in_a_selector_is_refused(frame: str):
+    with pytest.raises(InvalidInput, match="cannot be looked up"):
         LookupRequest("a", frame).parameters()
 
 
@@ -55,7 +55,7 @@ GONE.edge, GONE.writer, GONE.gone_s = ("map", "base"), "odom", 40.9
         GONE,
         UnknownFrame("a", "hnad", name="hnad", near_misses=("hand",), frame_count=3),
         InvalidInput("too few"),
-        Unreachable("nobody", endpoints=("tcp/1.2.3.4:7447",)),
+        Unreachable("no answer", endpoints=("tcp/1.2.3.4:7447",)),
     ],
 )
 def test_an_error_keeps_its_class_its_text_and_its_facts(error):
@@ -65,7 +65,7 @@ def test_an_error_keeps_its_class_its_text_and_its_facts(error):
     assert vars(back) == vars(error)
 
 
-def test_what_an_older_version_does_not_tell_of_an_error_is_not_known():
+def test_missing_facts_of_an_older_version_give_a_network_error():
     facts = json.loads(error_to_json(GONE))
     del facts["gone_s"]
     back = error_from_json(json.dumps(facts).encode())
@@ -75,9 +75,9 @@ def test_what_an_older_version_does_not_tell_of_an_error_is_not_known():
 
 
 def test_an_error_in_json_names_its_class_its_text_and_its_facts():
-    said = json.loads(error_to_json(FUTURE))
-    assert (said["error"], said["message"]) == ("InFuture", str(FUTURE))
-    assert (said["edge"], said["requested"], said["newest"]) == (["a", "b"], 7, 3)
+    facts = json.loads(error_to_json(FUTURE))
+    assert (facts["error"], facts["message"]) == ("InFuture", str(FUTURE))
+    assert (facts["edge"], facts["requested"], facts["newest"]) == (["a", "b"], 7, 3)
 
 
 @pytest.mark.parametrize(

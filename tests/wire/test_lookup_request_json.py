@@ -45,11 +45,11 @@ def test_the_fields_have_the_names_of_the_constructor() -> None:
         (b"\xff", "JSON"),
     ],
 )
-def test_what_is_no_transform_is_refused_with_the_field(text: bytes, named: str) -> None:
+def test_malformed_transform_is_refused_with_the_field(text: bytes, named: str) -> None:
     with pytest.raises(MessageError, match=named):
         from_json(text)
 
 
-def test_numbers_that_are_no_pose_are_refused_as_by_the_constructor() -> None:
+def test_invalid_pose_is_refused_as_by_the_constructor() -> None:
     with pytest.raises(InvalidInput, match="length 2"):
         from_json('{"target": "a", "source": "b", "translation": [0, 0, 0], "rotation": [0, 0, 0, 2]}')

@@ -166,12 +166,12 @@ def test_a_message_under_another_encoding_is_foreign_and_the_encoding_is_named(e
     assert repr(encoding) in str(caught.value)
 
 
-def test_a_newer_version_is_told_from_a_stranger():
+def test_newer_version_has_its_own_reason():
     assert reason(b"whatever", "zstate/JointState;v=2") == "newer version"
     assert reason(b"whatever", "zstate/Clock;v=2") == "foreign"
 
 
-def test_fields_that_a_later_writer_appends_are_passed_over():
+def test_appended_fields_of_a_later_version_are_ignored():
     fields = msgspec.msgpack.decode(encode(MESSAGES[0]))
     assert decode(msgspec.msgpack.encode([*fields, "more"]), ENCODINGS[JointState], JointState) == MESSAGES[0]
 
@@ -215,7 +215,7 @@ def test_arrays_nested_without_end_are_malformed():
     assert reason(bomb, ENCODINGS[JointState]) == "malformed"
 
 
-def test_infinite_numbers_are_not_the_wires_business():
+def test_the_wire_does_not_check_for_infinite_numbers():
     state = JointState(0, 0, 1, ORDER, to_block([np.nan, np.inf]))
     assert decode(encode(state), ENCODINGS[JointState], JointState) == state
 
@@ -245,7 +245,7 @@ def encoder_of(stream: Stream, name: str = "") -> StreamEncoder:
     )
 
 
-def test_the_native_wire_says_every_stream_through_the_seam():
+def test_native_wire_implements_the_protocol_for_every_stream():
     wire: Wire = NativeWire()
     by_type = {type(message): message for message in MESSAGES}
     for stream, kind in STREAM_TYPES.items():
@@ -258,9 +258,9 @@ def test_the_native_wire_says_every_stream_through_the_seam():
         assert wire.decode(stream, arrival, "r1") == (message,)
 
 
-def test_a_token_of_the_native_wire_says_who_writes_what():
+def test_native_token_announces_writer_and_stream():
     wire = NativeWire()
     encoder = encoder_of("tf")
     assert encoder.token is not None
-    assert wire.announced(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
-    assert wire.announced("zstate/r1/@writer/tf/nonsense", "r1") is None
+    assert wire.parse_token(encoder.token, "r1") == Announcement("r1", "tf", WRITER)
+    assert wire.parse_token("zstate/r1/@writer/tf/nonsense", "r1") is None

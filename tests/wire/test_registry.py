@@ -23,14 +23,14 @@ def options(name: str) -> Ros2Options:
 @pytest.mark.parametrize(
     ("name", "kind"), [("native", NativeWire), ("ros2", Ros2Wire), ("ros2dds", Ros2DdsWire)]
 )
-def test_each_name_gives_its_wire_anew(name: str, kind: type):
+def test_get_wire_returns_a_new_instance_by_name(name: str, kind: type):
     one, other = get_wire(name), get_wire(name)
     assert type(one) is type(other) is kind
     assert one is not other
     assert one.name == name
 
 
-def test_options_stand_behind_a_colon():
+def test_options_follow_a_colon():
     expected = Ros2Options(domain=5, namespace="r1", frame_prefix="r1/")
     assert options("ros2:domain=5,namespace=r1,frame_prefix=r1/") == expected
     assert options("ros2dds:namespace=r1") == Ros2Options(namespace="r1")
@@ -57,14 +57,14 @@ def test_the_domain_is_that_of_the_environment_unless_given(monkeypatch, name, v
 
 
 @pytest.mark.parametrize("variable", ["many", "233", "-1", "1.5", "5,namespace=r1"])
-def test_a_domain_of_the_environment_that_cannot_be_names_the_variable(monkeypatch, variable: str):
+def test_invalid_domain_in_the_environment_names_the_variable(monkeypatch, variable: str):
     monkeypatch.setenv("ROS_DOMAIN_ID", variable)
     with pytest.raises(InvalidInput, match="ROS_DOMAIN_ID"):
         get_wire("ros2")
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "text"),
     [
         ("dds", "no wire 'dds'; known: 'native', 'ros2', 'ros2dds'"),
         ("", "no wire ''"),
@@ -76,6 +76,6 @@ def test_a_domain_of_the_environment_that_cannot_be_names_the_variable(monkeypat
         ("ros2:domain", "key=value"),
     ],
 )
-def test_what_is_no_wire_is_refused_with_those_there_are(name: str, said: str):
-    with pytest.raises(InvalidInput, match=said):
+def test_unknown_wire_error_lists_known_wires(name: str, text: str):
+    with pytest.raises(InvalidInput, match=text):
         get_wire(name)

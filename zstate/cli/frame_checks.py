@@ -94,7 +94,7 @@ class KnownFrames(Closeable):
                     self._described.set()
 
     def _on_statics(self, arrival: SerializedSample) -> None:
-        writer = self._wire.statics_writer(arrival.key) or ""
+        writer = self._wire.static_writer_name(arrival.key) or ""
         if writer in (MODEL_WRITER, self._writer):
             return
         with suppress(MessageError):

@@ -282,7 +282,7 @@ class _RobotCapture(Closeable):
 
     def _insert_statics(self, arrival: SerializedSample) -> None:
         try:
-            writer = self._wire.statics_writer(arrival.key) or arrival.key
+            writer = self._wire.static_writer_name(arrival.key) or arrival.key
             if not arrival.payload or writer == MODEL_WRITER:
                 self._statics.pop(writer, None)  # the model has the same edges
                 return

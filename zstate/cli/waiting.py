@@ -185,7 +185,7 @@ class RobotReadiness(Closeable):
         from zstate.wire.messages import RobotDescription
 
         with suppress(MessageError, InvalidInput):  # withdrawn; or broken, which the listener reports
-            robot = self._format.robot_of(arrival.key)
+            robot = self._format.robot_from_key(arrival.key)
             for message in self._format.decode("robot_description", arrival, robot):
                 if isinstance(message, RobotDescription) and not message.moving_edges:
                     self._rigid.add(robot)

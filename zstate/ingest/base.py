@@ -14,8 +14,7 @@ from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.sequence import MissingSamples
-from zstate.wire.messages import RobotDescription, Sample
-from zstate.wire.sizes import size_of
+from zstate.wire.messages import RobotDescription, Sample, message_size
 
 # Bounds on the samples that wait for the robot's description, which takes milliseconds.
 _EARLY = 1024
@@ -102,7 +101,7 @@ class StreamIngest(ABC):
                 is_in_order = sample.seq >= (self._next_seq or 0) - 1
                 self._count_gap(sample.seq, overflowed)
             if not self._insert_counted(sample, is_in_order=is_in_order):
-                for _ in range(self._early.append(sample, size_of(sample))):
+                for _ in range(self._early.append(sample, message_size(sample))):
                     self._refuse_undescribed()
 
     def insert_history(self, samples: Sequence[Sample]) -> bool:
@@ -134,7 +133,7 @@ class StreamIngest(ABC):
             return False
         if inserted is None:
             self._early_history.append(sample)
-            self._early_history_bytes += size_of(sample)
+            self._early_history_bytes += message_size(sample)
             is_full = self._early_history_bytes >= _EARLY_HISTORY_BYTES
             return not is_full and len(self._early_history) < _EARLY_HISTORY
         if inserted:

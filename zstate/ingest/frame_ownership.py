@@ -41,7 +41,7 @@ from zstate.ingest.edge_claims import (
 )
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
-from zstate.wire.keys import FOREIGN, EdgeNames, foreign_objection, robot_in
+from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, foreign_edge_problem, frame_owner
 
 _MODEL, _OWN, _OTHERS = range(3)
 
@@ -102,7 +102,7 @@ class FrameOwnership:
             return
         with self._lock:
             self._robots.add(robot)
-            if any(robot in map(robot_in, claim.names) for claim in self._outside):
+            if any(robot in map(frame_owner, claim.names) for claim in self._outside):
                 self.resolve()
 
     def add_writer(self, robot: str, session: int) -> None:
@@ -286,7 +286,7 @@ class FrameOwnership:
         if claim is None:
             claim = source.claims[names] = EdgeClaim(source, *names, next(self._counter))
             self._claims.setdefault(names[1], []).append(claim)
-            if robot_in(names[1]) != source.robot:
+            if frame_owner(names[1]) != source.robot:
                 self._outside[claim] = None
         return claim
 
@@ -330,7 +330,7 @@ class FrameOwnership:
             self.buffer.add_frames(claim.names)
 
     def _rank(self, claim: EdgeClaim) -> int:
-        robot, owner = claim.source.robot, robot_in(claim.child)
+        robot, owner = claim.source.robot, frame_owner(claim.child)
         if self._is_shared or owner == robot:
             return _MODEL if claim.source.is_model else _OWN
         return _OTHERS if owner in self._robots else _OWN
@@ -409,9 +409,9 @@ class FrameOwnership:
         parent, child = names = claim.names
         by, rank = claim.source.name, self._rank(claim)
         if rank == _OTHERS:
-            rule = foreign_objection(claim.source.robot, names, self._robots, self._placers)
+            rule = foreign_edge_problem(claim.source.robot, names, self._robots, self._placers)
             if rule:
-                return InsertRefused(rule, reason=FOREIGN, edge=names)
+                return InsertRefused(rule, reason=FOREIGN_FRAME, edge=names)
         there = accepted.get(child)
         if there is None:
             return _loop(names, by, accepted)
@@ -420,11 +420,11 @@ class FrameOwnership:
             return None
         if rank == _OTHERS and self._rank_of(there) < _OTHERS:
             text = (
-                f"{child!r} is placed on {there.parent!r} by robot {robot_in(child)!r} itself "
+                f"{child!r} is placed on {there.parent!r} by robot {frame_owner(child)!r} itself "
                 f"({there.writer}), whose edge counts; that of robot {claim.source.robot!r}, on {parent!r}, "
                 "does not"
             )
-            return InsertRefused(text, reason=FOREIGN, edge=names)
+            return InsertRefused(text, reason=FOREIGN_FRAME, edge=names)
         if is_same_edge:
             text = f"{parent!r} -> {child!r} is written by {there.writer} already; refused: {by}"
             return InsertRefused(f"{text}; one edge has one writer", reason="second writer", edge=names)
@@ -468,7 +468,7 @@ class FrameOwnership:
 
     def _report(self, source: EdgeSource, error: InsertRefused) -> None:
         self.counters.count_refusal(error.reason, f"static edge of {source.name!r}: {error}")
-        if error.reason in (*CONTESTED, FOREIGN) and self._on_conflict is not None:
+        if error.reason in (*CONTESTED, FOREIGN_FRAME) and self._on_conflict is not None:
             self._on_conflict(source.robot, source.name, error.edge[1], str(error))
 
 

@@ -27,15 +27,15 @@ from zstate.net.streams import Ring, to_serialized
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import (
     ANY,
-    FOREIGN,
+    FOREIGN_FRAME,
     MODEL_WRITER,
     Stream,
     edge_expression,
     edge_key,
-    foreign_objection,
+    foreign_edge_problem,
+    frame_owner,
     full_name,
     parse_edge_key,
-    robot_in,
     stream_key,
 )
 from zstate.wire.messages import Edges, RobotDescription, Sample, StaticTransforms
@@ -208,7 +208,7 @@ class WriterClaim(Closeable):
         return self._rivals_of(tokens_there(self._session, self._expression))
 
     def _rivals_of(self, tokens: Iterable[str]) -> list[Announcement]:
-        said = (_WIRE.announced(token, ANY) for token in tokens)
+        said = (_WIRE.parse_token(token, ANY) for token in tokens)
         return self._excluded_by(one for one in said if one is not None)
 
     def _excluded_by(self, others: Iterable[Announcement]) -> list[Announcement]:
@@ -337,22 +337,22 @@ def check_edges(
 
 def _is_own_frame(robot: str, child: str, writer: Announcement) -> bool:
     """Whether ``child`` is a frame of the writer's robot, which counts more than what others say of it."""
-    return robot_in(child) == writer.robot != robot
+    return frame_owner(child) == writer.robot != robot
 
 
 def check_readers(session: Session, writer: Announcement, edges: Sequence[Edge]) -> None:
     """Raise InsertRefused for an edge that readers refuse, as far as what is announced now tells.
 
-    That is an edge that places another robot's frames, see ``foreign_objection``, or that excludes an edge
+    That is an edge that places another robot's frames, see ``foreign_edge_problem``, or that excludes an edge
     of a robot's model. Takes as long as the network: some round trips.
     """
     wait_for_discovery(session)
     for edge in edges:
-        named = {robot_in(frame) for frame in edge} - {writer.robot}
+        named = {frame_owner(frame) for frame in edge} - {writer.robot}
         robots = {robot for robot in named if _is_announced(session, robot)}
-        objection = foreign_objection(writer.robot, edge, robots)
+        objection = foreign_edge_problem(writer.robot, edge, robots)
         if objection:
-            raise InsertRefused(objection, reason=FOREIGN, edge=edge)
+            raise InsertRefused(objection, reason=FOREIGN_FRAME, edge=edge)
     known = _Models(session, writer.robot)
     for edge in edges:
         known.check(edge)
@@ -417,7 +417,7 @@ class _Models:
             )
 
     def _what_places(self, frame: str) -> _Above | None:
-        robot = robot_in(frame)
+        robot = frame_owner(frame)
         if robot not in self._fetched:
             self._fetched.add(robot)
             for description in _descriptions_now(self._session, robot):
@@ -443,7 +443,7 @@ def _statics_now(session: Session) -> Iterator[tuple[str, str, StaticTransforms]
     """What static writers keep for late joiners, whose key tells robot and name."""
     for arrival in _kept_now(session, _WIRE.expression(ANY, "tf_static")):
         with suppress(MessageError, InvalidInput):  # withdrawn, or not ours
-            robot, name = _WIRE.robot_of(arrival.key), _WIRE.statics_writer(arrival.key)
+            robot, name = _WIRE.robot_from_key(arrival.key), _WIRE.static_writer_name(arrival.key)
             if arrival.key == stream_key(robot, "tf_static", name):
                 (said,) = _WIRE.decode("tf_static", arrival, robot)
                 assert isinstance(said, StaticTransforms)
@@ -472,7 +472,7 @@ def _unknown(name: str, said: StaticTransforms) -> WriterId:
 def _with_identity(session: Session, placed: Announcement) -> Announcement:
     """The same with who it is, if that is announced."""
     for token in tokens_there(session, _WIRE.writers_expression(placed.robot)):
-        said = _WIRE.announced(token, placed.robot)
+        said = _WIRE.parse_token(token, placed.robot)
         if said is not None and said.stream == "tf_static" and said.writer.session == placed.writer.session:
             return Announcement(placed.robot, "tf_static", said.writer, placed.name)
     return placed

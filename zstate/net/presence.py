@@ -31,7 +31,7 @@ from zstate.net.queryable import MOST_REPLIES, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, Ring, call_for_each
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MOST_CHARACTERS, READERS, Stream, parse_reader_key, shortened
+from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, Stream, parse_reader_key, shortened
 from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
 
@@ -94,9 +94,9 @@ def local_writer(session: int, program: str = "") -> WriterId:
 
     Raises InvalidInput for a name of more than 255 characters, which readers would not accept.
     """
-    if len(program) > MOST_CHARACTERS:
+    if len(program) > MAX_NAME_LENGTH:
         text = f"the program name {shortened(program)!r} has {len(program)} characters"
-        raise InvalidInput(f"{text}, more than {MOST_CHARACTERS}")
+        raise InvalidInput(f"{text}, more than {MAX_NAME_LENGTH}")
     script = Path(sys.argv[0]).stem if sys.argv and sys.argv[0] not in ("", "-c") else "python"
     return WriterId(program or script, socket.gethostname(), os.getpid(), time.time_ns(), session)
 
@@ -157,7 +157,7 @@ def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") 
     """
     spoken = get_wire(wire)
     tokens = discover_tokens(session, spoken.writers_expression(ANY), timeout_s)
-    announced = (spoken.announced(token, ANY) for token in tokens)
+    announced = (spoken.parse_token(token, ANY) for token in tokens)
     return by_robot({one for one in announced if one is not None})
 
 
@@ -286,7 +286,7 @@ class WriterWatch(Closeable):
         if alive and len(self._known) >= MOST_REPLIES:
             self.ignored += 1
             return
-        announced = self._wire.announced(token, self._robot) if alive else self._known.pop(token)
+        announced = self._wire.parse_token(token, self._robot) if alive else self._known.pop(token)
         if alive:
             self._known[token] = announced
             self.foreign += announced is None

@@ -20,8 +20,8 @@ from zstate._util.closeable import Closeable
 from zstate.errors import Closed
 from zstate.net.at_exit import join_at_exit
 from zstate.net.session import Session, Undeclarable
+from zstate.wire.messages import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
 from zstate.wire.protocol import SerializedSample
-from zstate.wire.sizes import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
 
 JOIN_WITHIN_S = 0.8
 

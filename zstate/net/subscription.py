@@ -50,7 +50,7 @@ def subscribe(
                     on_withdrawn(arrival.key)
                 continue
             try:
-                name = wire.robot_of(arrival.key) if robot == ANY else robot
+                name = wire.robot_from_key(arrival.key) if robot == ANY else robot
                 for message in wire.decode(stream, arrival, name):
                     yield Received(name, arrival.key, message)
             except (MessageError, InvalidInput) as error:

@@ -222,7 +222,7 @@ class TopicStatistics(Closeable):
             with self._arrived:
                 for arrival in arrivals:
                     with suppress(InvalidInput, MessageError):
-                        named = self._wire.robot_of(arrival.key) if robot == ANY else robot
+                        named = self._wire.robot_from_key(arrival.key) if robot == ANY else robot
                         for sample in self._wire.decode(stream, arrival, named):
                             if isinstance(sample, Sample):
                                 self.add(named, stream, sample, at, now)

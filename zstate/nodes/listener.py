@@ -85,7 +85,9 @@ class TransformListener(Closeable):
         if clock is not None:
             self.buffer.use_clock(clock)
         self._wire = get_wire(wire)
-        self._robot_from_key: Callable[[str], str] = self._wire.robot_of if robot == ANY else lambda _: robot
+        self._robot_from_key: Callable[[str], str] = (
+            self._wire.robot_from_key if robot == ANY else lambda _: robot
+        )
         self._follow: Follow = follow
         self._is_shared = follow in self._wire.shared
         self._counters = Counters()
@@ -259,7 +261,7 @@ class TransformListener(Closeable):
 
     def _on_statics(self, arrival: SerializedSample) -> None:
         try:
-            robot, writer = self._robot_from_key(arrival.key), self._wire.statics_writer(arrival.key)
+            robot, writer = self._robot_from_key(arrival.key), self._wire.static_writer_name(arrival.key)
         except InvalidInput as error:
             self._count_foreign(arrival.key, error)
             return

@@ -18,7 +18,7 @@ from zstate.recording.decode import LATCHED, RecordedWriter
 from zstate.recording.reader import RecordingReader
 from zstate.recording.storage import ROBOT, Channel
 from zstate.wire.keys import Stream
-from zstate.wire.ros2.simple_messages import decode_string
+from zstate.wire.ros2.cdr import decode_string
 
 
 @dataclass(frozen=True)

@@ -325,7 +325,7 @@ class Recorder(Closeable):
     def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
         assert encoder is not None
-        static_writer = self._wire.statics_writer(arrival.key) if stream == "tf_static" else None
+        static_writer = self._wire.static_writer_name(arrival.key) if stream == "tf_static" else None
         if not arrival.payload and stream in _LATCHED:
             if static_writer is not None:
                 encoder.withdraw(robot, static_writer, stamp)
@@ -343,8 +343,8 @@ class Recorder(Closeable):
     def _robot(self, batch: Batch, arrival: SerializedSample) -> str | None:
         try:
             if batch.stream == "tf_static":
-                self._wire.statics_writer(arrival.key)  # raises for a key without one
-            return self._wire.robot_of(arrival.key) if batch.robot is None else batch.robot
+                self._wire.static_writer_name(arrival.key)  # raises for a key without one
+            return self._wire.robot_from_key(arrival.key) if batch.robot is None else batch.robot
         except InvalidInput as error:
             self._counters.count_refusal("foreign", str(error))
             return None

@@ -1,1 +1,1 @@
-"""How it is said: messages, their bytes and the keys they travel under. Pure: no I/O."""
+"""Wire formats: messages, their encodings and their keys. Pure: no I/O."""

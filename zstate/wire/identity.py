@@ -1,4 +1,4 @@
-"""Writer identity, and what a writer's liveliness token announces."""
+"""Writer identity, and the content of a writer's liveliness token."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.wire.keys import MOST_CHARACTERS, Stream, check_writer, shortened
+from zstate.wire.keys import MAX_NAME_LENGTH, Stream, check_writer, shortened
 
-_MOST_DIGITS = 20
-_MOST_OF_AN_IDENTITY = 4 * 12 * MOST_CHARACTERS
+_MAX_DIGITS = 20
+_MAX_IDENTITY_LENGTH = 4 * 12 * MAX_NAME_LENGTH
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -39,18 +39,20 @@ class WriterId:
     @classmethod
     def parse(cls, identity: str) -> WriterId:
         """The writer with this ``identity``. Raises InvalidInput if it is not one."""
-        fields = identity.split(",") if len(identity) <= _MOST_OF_AN_IDENTITY else []
-        if len(fields) == 5 and all(map(_is_number, fields[2:])):
+        fields = identity.split(",") if len(identity) <= _MAX_IDENTITY_LENGTH else []
+        if len(fields) == 5 and all(
+            text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS for text in fields[2:]
+        ):
             program, host = unquote(fields[0]), unquote(fields[1])
             pid, since, session = map(int, fields[2:])
             found = cls(program, host, pid, since, session)
             in_range = max(pid, since) < 2**63 and session < 2**64
             # One canonical form: two tokens of one writer would count as two writers.
-            if in_range and max(len(program), len(host)) <= MOST_CHARACTERS and found.identity == identity:
+            if in_range and max(len(program), len(host)) <= MAX_NAME_LENGTH and found.identity == identity:
                 return found
         raise InvalidInput(
             f"{shortened(identity)!r} is not 'program,host,pid,since,session', names of at most "
-            f"{MOST_CHARACTERS} characters and 64-bit numbers"
+            f"{MAX_NAME_LENGTH} characters and 64-bit numbers"
         )
 
 
@@ -58,7 +60,7 @@ class WriterId:
 class Announcement:
     """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
-    ``name`` is the one under which it writes static edges; empty for other streams, and on wires without
+    ``name`` is the name under which it writes static edges; empty for other streams, and on wires without
     such names.
     """
 
@@ -70,8 +72,7 @@ class Announcement:
     @property
     def identity(self) -> str:
         """Writer and name in one chunk of a key."""
-        named = f",{_quoted(self.name)}" if self.name else ""
-        return self.writer.identity + named
+        return self.writer.identity + (f",{_quoted(self.name)}" if self.name else "")
 
     @classmethod
     def parse(cls, robot: str, stream: Stream, identity: str) -> Announcement:
@@ -90,14 +91,10 @@ class Announcement:
         Writers of static edges conflict if their names are equal; without a name they never do.
         """
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
-        is_one = self.stream != "tf_static" or bool(self.name)
-        return same and is_one and self.writer.session != other.writer.session
+        is_exclusive = self.stream != "tf_static" or bool(self.name)
+        return same and is_exclusive and self.writer.session != other.writer.session
 
 
 def _quoted(text: str) -> str:
     # A script name may have bytes that are not text.
     return quote(text, safe="", errors="replace")
-
-
-def _is_number(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) <= _MOST_DIGITS

@@ -1,7 +1,4 @@
-"""JointOrder: reading JointState messages into the order of a model.
-
-SampleNames: what the numbers in the samples of one robot are called.
-"""
+"""Joint order: reading JointState messages into a model's order, and the names behind their numbers."""
 
 from __future__ import annotations
 
@@ -19,21 +16,27 @@ Floats = NDArray[np.float64]
 
 
 class JointNumbers(NamedTuple):
-    """The numbers of one message, in the reader's joint order; None for what was not sent."""
+    """The numbers of one message, in the reader's joint order; None if not sent."""
 
     positions: Floats
     velocities: Floats | None
     efforts: Floats | None
 
 
-class JointOrder:
-    """The joints a reader expects, by name, and how to find them in what writers send.
+class _Permutation(NamedTuple):
+    """The index in a writer's order of each number in the reader's."""
 
-    A writer with the same order of joint ``names`` is read as it is. One that names its numbers in full
-    may have any order and others besides; each of our ``coordinates`` must be among them, which are the
-    names unless given. ``velocity_slots`` says which coordinate each velocity stands under. NaN among the
-    velocities or efforts of such a writer is how ROS says of a joint that they are not known: then they
-    are not taken for any.
+    positions: NDArray[np.intp]
+    velocities: NDArray[np.intp]
+
+
+class JointOrder:
+    """The joints that a reader expects, by name, and their place in the samples of writers.
+
+    A writer with the same order of joint ``names`` is read as it is. A writer that sends all names may use
+    any order and send further joints; each of the reader's ``coordinates`` (default: ``names``) must be among
+    them. ``velocity_slots`` is the coordinate of each velocity. In ROS, NaN marks velocities or efforts of
+    such a writer as unknown; a block with a NaN is read as None.
     """
 
     def __init__(
@@ -42,30 +45,34 @@ class JointOrder:
         self.digest = order_digest(tuple(names))
         self._coordinates = tuple(coordinates or names)
         self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
-        self._picks: dict[tuple[str, ...], _Permutation] = {}
+        self._permutations: dict[tuple[str, ...], _Permutation] = {}
 
     def is_plain(self, state: JointState) -> bool:
-        """Whether ``state`` is a block of positions in our order and nothing else, as nearly always."""
+        """Whether ``state`` has only positions, in the reader's order: the usual case."""
         return state.order == self.digest and state.names is state.velocities is state.efforts is None
 
     def read(self, state: JointState) -> JointNumbers:
-        """The numbers of ``state`` in our order. Raises MessageError when they are not all there."""
-        pick = None if state.order == self.digest else self._pick(state.names)
-        numbers = JointNumbers(
-            from_block(state.positions), _numbers(state.velocities), _numbers(state.efforts)
-        )
-        if pick is not None:
-            numbers = pick.apply(numbers)
-        return numbers if state.names is None else _known(numbers)
+        """The numbers of ``state`` in the reader's order. Raises MessageError if any is missing."""
+        positions = from_block(state.positions)
+        velocities = None if state.velocities is None else from_block(state.velocities)
+        efforts = None if state.efforts is None else from_block(state.efforts)
+        if state.order != self.digest:
+            order = self._permutation(state.names)
+            positions = positions[order.positions]
+            velocities = None if velocities is None else velocities[order.velocities]
+            efforts = None if efforts is None else efforts[order.velocities]
+        if state.names is not None:
+            velocities, efforts = _none_if_nan(velocities), _none_if_nan(efforts)
+        return JointNumbers(positions, velocities, efforts)
 
-    def _pick(self, names: tuple[str, ...] | None) -> _Permutation:
+    def _permutation(self, names: tuple[str, ...] | None) -> _Permutation:
         if names is None:
             raise MessageError(
                 "a joint state in an order of another model; do both sides use the same URDF?",
                 reason="other joint order",
             )
-        pick = self._picks.get(names)
-        if pick is None:
+        found = self._permutations.get(names)
+        if found is None:
             missing = [name for name in self._coordinates if name not in names]
             if missing:
                 raise MessageError(
@@ -73,45 +80,21 @@ class JointOrder:
                 )
             # One order per writer is usual; a writer that shuffles must not fill the memory.
             positions = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
-            pick = _Permutation(positions, positions[self._slots])
-            self._picks = {names: pick}
-        return pick
+            found = _Permutation(positions, positions[self._slots])
+            self._permutations = {names: found}
+        return found
 
 
-class _Permutation(NamedTuple):
-    """Where our numbers stand in what a writer sends."""
-
-    positions: NDArray[np.intp]
-    velocities: NDArray[np.intp]
-
-    def apply(self, numbers: JointNumbers) -> JointNumbers:
-        positions, velocities, efforts = numbers
-        return JointNumbers(
-            positions[self.positions],
-            None if velocities is None else velocities[self.velocities],
-            None if efforts is None else efforts[self.velocities],
-        )
-
-
-def _known(numbers: JointNumbers) -> JointNumbers:
-    positions, velocities, efforts = numbers
-    return JointNumbers(positions, _without_nan(velocities), _without_nan(efforts))
-
-
-def _without_nan(numbers: Floats | None) -> Floats | None:
+def _none_if_nan(numbers: Floats | None) -> Floats | None:
     return None if numbers is None or np.isnan(numbers).any() else numbers
-
-
-def _numbers(block: bytes | None) -> Floats | None:
-    return None if block is None else from_block(block)
 
 
 @dataclass(frozen=True, slots=True)
 class SampleLayout:
     """The names behind the numbers of a writer's samples, for wires that name each of them.
 
-    ``coordinates`` names each number of a position vector; ``velocity_slots`` says under which of them
-    each number of a velocity or effort vector stands; ``moving_edges`` is the order of poses.
+    ``coordinates`` names each number of a position vector; ``velocity_slots`` is the coordinate of each
+    number of a velocity or effort vector; ``moving_edges`` is the order of poses.
     """
 
     coordinates: tuple[str, ...] = ()

@@ -1,7 +1,7 @@
 """The native key space: one prefix for each robot, one chunk for its name.
 
 ==============================================  ==========================================
-``zstate/<robot>/joint_states``                 JointState, each sample; a query gets a Past, the last ones
+``zstate/<robot>/joint_states``                 JointState, each sample; a query returns a HistoryPage
 ``zstate/<robot>/tf``                           TransformSample, each sample; likewise
 ``zstate/<robot>/tf_static/<writer>``           StaticTransforms, latched
 ``zstate/<robot>/robot_description``            RobotDescription, latched
@@ -9,11 +9,15 @@
 ``zstate/<robot>/lookup``                       a queryable
 ``zstate/<robot>/status/<id>``                  Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<stream>/<id>``        liveliness token of one writer
-``zstate/<robot>/@clock/<id>``                  a queryable: what time it is by that writer's clock
-``zstate/<robot>/@edge/<child>/<parent>/<id>``  liveliness token of one who is about to place a static edge
+``zstate/<robot>/@clock/<id>``                  a queryable: the time by that writer's clock
+``zstate/<robot>/@edge/<child>/<parent>/<id>``  liveliness token of a writer about to place a static edge
 ``zstate/@reader/<robot>/<stream>/<id>``        liveliness token of one reader
-``zstate/clock``                                Clock
+``zstate/clock``                                ClockMessage
 ==============================================  ==========================================
+
+``<id>`` is the identity of a writer or reader, already one chunk. Functions that build a key raise
+InvalidInput for names that are not one chunk of a key, and functions that parse one for any other key.
+An expression for the robot ``"*"`` matches all robots.
 """
 
 from __future__ import annotations
@@ -36,18 +40,19 @@ READERS = "zstate/@reader/*/*/*"
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
 
-MOST_CHARACTERS = 255
+MAX_NAME_LENGTH = 255
 """The longest name of a robot, a writer, a program or a host, as in file systems."""
 
-MOST_OF_A_FRAME = 1024
-_MOST_OF_A_KEY = 16_384
-"""A name of ``MOST_CHARACTERS`` is up to 12 times as long when it is quoted."""
+MAX_FRAME_NAME_LENGTH = 1024
+_MAX_KEY_LENGTH = 16_384
+"""A name of ``MAX_NAME_LENGTH`` is up to 12 times as long when it is quoted."""
 
+_STREAMS: dict[str, Stream] = {stream: stream for stream in get_args(Stream)}
 _RESERVED = frozenset("/*$?#")
 
 
 def check_robot(name: str) -> str:
-    """``name`` if it can be one chunk of a key; InvalidInput saying what is wrong otherwise."""
+    """``name`` if it can be one chunk of a key. Raises InvalidInput with the reason otherwise."""
     return _check_chunk("robot", name)
 
 
@@ -71,17 +76,21 @@ def _chunk_problem(name: str) -> str:
         return "is empty"
     if name.startswith("@"):
         return "begins with '@'"
-    if len(name) > MOST_CHARACTERS:
-        return f"has {len(name)} characters, more than {MOST_CHARACTERS}"
+    if len(name) > MAX_NAME_LENGTH:
+        return f"has {len(name)} characters, more than {MAX_NAME_LENGTH}"
     for character in name:
         if character in _RESERVED or character.isspace() or not character.isprintable():
             return f"contains {character!r}"
     return ""
 
 
+def _check_robot_or_any(robot: str) -> str:
+    return robot if robot == ANY else check_robot(robot)
+
+
 def shortened(text: str) -> str:
-    """``text`` for an error message, which nobody should be able to fill."""
-    return text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}..."
+    """``text`` for an error message, cut off after 255 characters."""
+    return text if len(text) <= MAX_NAME_LENGTH else f"{text[:MAX_NAME_LENGTH]}..."
 
 
 def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
@@ -93,54 +102,48 @@ def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
 
 
 def stream_expression(robot: str, stream: Stream) -> str:
-    """The key expression that hears every writer of ``stream``; robot ``"*"`` means all robots."""
+    """The key expression of every writer of ``stream``."""
     if stream == "clock":
         return CLOCK_KEY
-    key = f"zstate/{robot if robot == ANY else check_robot(robot)}/{stream}"
+    key = f"zstate/{_check_robot_or_any(robot)}/{stream}"
     return f"{key}/*" if stream == "tf_static" else key
 
 
 def lookup_key(robot: str) -> str:
-    """The key that answers lookups for devices without a buffer."""
+    """The key of the queryable that serves lookups to devices without a buffer."""
     return f"zstate/{check_robot(robot)}/lookup"
 
 
 def status_key(robot: str, identity: str) -> str:
-    """The key on which one writer says how it does; ``identity`` is already one chunk."""
+    """The key on which one writer publishes its Status."""
     return f"zstate/{check_robot(robot)}/status/{identity}"
 
 
 def status_expression(robot: str) -> str:
-    """The key expression of every status of ``robot``, or of every robot for ``"*"``."""
-    return f"zstate/{robot if robot == ANY else check_robot(robot)}/status/*"
+    """The key expression of every status of ``robot``."""
+    return f"zstate/{_check_robot_or_any(robot)}/status/*"
 
 
 def parse_status_key(key: str) -> tuple[str, str]:
-    """Robot and identity in a ``status_key``. Raises InvalidInput for any other key."""
-    chunks = _chunks(key)
-    if len(chunks) == 4 and chunks[0] == "zstate" and chunks[2] == "status":
-        return check_robot(chunks[1]), chunks[3]
-    raise _other_form(key, "zstate/<robot>/status/<identity>")
+    """Robot and identity in a ``status_key``."""
+    robot, identity = _parse(key, "zstate/<robot>/status/<identity>")
+    return check_robot(robot), identity
 
 
 def writer_key(robot: str, stream: Stream, identity: str) -> str:
-    """The liveliness token of one writer; ``identity`` is already one chunk."""
+    """The liveliness token of one writer."""
     return f"zstate/{check_robot(robot)}/@writer/{stream}/{identity}"
 
 
 def writer_expression(robot: str) -> str:
-    """The key expression of all tokens of ``robot``, or of every robot for ``"*"``."""
-    return f"zstate/{robot if robot == ANY else check_robot(robot)}/@writer/*/*"
+    """The key expression of all writer tokens of ``robot``."""
+    return f"zstate/{_check_robot_or_any(robot)}/@writer/*/*"
 
 
 def parse_writer_key(key: str) -> tuple[str, Stream, str]:
-    """Robot, stream and identity in a ``writer_key``. Raises InvalidInput for any other key."""
-    chunks = _chunks(key)
-    if len(chunks) == 5 and chunks[0] == "zstate" and chunks[2] == "@writer":
-        for stream in get_args(Stream):
-            if chunks[3] == stream:
-                return check_robot(chunks[1]), stream, chunks[4]
-    raise _other_form(key, "zstate/<robot>/@writer/<stream>/<identity>")
+    """Robot, stream and identity in a ``writer_key``."""
+    robot, stream, identity = _parse(key, "zstate/<robot>/@writer/<stream>/<identity>")
+    return check_robot(robot), _STREAMS[stream], identity
 
 
 def reader_key(robot: str, stream: Stream, identity: str) -> str:
@@ -149,87 +152,86 @@ def reader_key(robot: str, stream: Stream, identity: str) -> str:
 
 
 def parse_reader_key(key: str) -> tuple[str, Stream, str]:
-    """Robot, stream and identity in a ``reader_key``. Raises InvalidInput for any other key."""
-    chunks = _chunks(key)
-    if len(chunks) == 5 and chunks[:2] == ["zstate", "@reader"]:
-        for stream in get_args(Stream):
-            if chunks[3] == stream:
-                robot = unquote(chunks[2])
-                return robot if robot == ANY else check_robot(robot), stream, chunks[4]
-    raise _other_form(key, "zstate/@reader/<robot>/<stream>/<identity>")
+    """Robot, stream and identity in a ``reader_key``."""
+    robot, stream, identity = _parse(key, "zstate/@reader/<robot>/<stream>/<identity>")
+    return _check_robot_or_any(unquote(robot)), _STREAMS[stream], identity
 
 
 def clock_key(robot: str, identity: str) -> str:
-    """The key on which one writer tells what time it is; ``identity`` is already one chunk."""
+    """The key of the queryable that replies with the time of one writer's clock."""
     return f"zstate/{check_robot(robot)}/@clock/{identity}"
 
 
 def clock_expression(robot: str) -> str:
-    """The key expression of the clocks of all writers of ``robot``, or of every robot for ``"*"``."""
-    return f"zstate/{robot if robot == ANY else check_robot(robot)}/@clock/*"
+    """The key expression of the clocks of all writers of ``robot``."""
+    return f"zstate/{_check_robot_or_any(robot)}/@clock/*"
 
 
 def parse_clock_key(key: str) -> tuple[str, str]:
-    """Robot and identity in a ``clock_key``. Raises InvalidInput for any other key."""
-    chunks = _chunks(key)
-    if len(chunks) == 4 and chunks[0] == "zstate" and chunks[2] == "@clock":
-        return check_robot(chunks[1]), chunks[3]
-    raise _other_form(key, "zstate/<robot>/@clock/<identity>")
+    """Robot and identity in a ``clock_key``."""
+    robot, identity = _parse(key, "zstate/<robot>/@clock/<identity>")
+    return check_robot(robot), identity
 
 
 def edge_key(robot: str, edge: tuple[str, str], identity: str) -> str:
-    """The token of one who is about to place ``edge``: parent and child, named in full."""
+    """The token of a writer that is about to place ``edge``: full names of parent and child."""
     parent, child = (quote(frame, safe="") for frame in edge)
     return f"zstate/{check_robot(robot)}/@edge/{child}/{parent}/{identity}"
 
 
 def edge_expression(child: str) -> str:
-    """The key expression of all who are about to place ``child``, for whichever robot."""
+    """The key expression of the tokens of all writers about to place ``child``, of any robot."""
     return f"zstate/*/@edge/{quote(child, safe='')}/*/*"
 
 
 def parse_edge_key(key: str) -> tuple[str, tuple[str, str], str]:
-    """Robot, edge and identity in an ``edge_key``. Raises InvalidInput for any other key."""
-    chunks = _chunks(key)
-    if len(chunks) == 6 and chunks[0] == "zstate" and chunks[2] == "@edge":
-        robot = check_robot(chunks[1])
-        parent, child = unquote(chunks[4]), unquote(chunks[3])
-        for frame in (parent, child):
-            full_name(robot, frame)
-        return robot, (parent, child), chunks[5]
-    raise _other_form(key, "zstate/<robot>/@edge/<child>/<parent>/<identity>")
+    """Robot, edge and identity in an ``edge_key``."""
+    robot, child, parent, identity = _parse(key, "zstate/<robot>/@edge/<child>/<parent>/<identity>")
+    check_robot(robot)
+    edge = unquote(parent), unquote(child)
+    for frame in edge:
+        full_name(robot, frame)
+    return robot, edge, identity
 
 
-@lru_cache(4096)  # of each sample that comes
+@lru_cache(4096)  # called for each received sample
 def robot_from_key(key: str) -> str:
-    """The robot whose key this is.
-
-    InvalidInput for a key that is not under ``zstate/<robot>/``, or has a wildcard: then it is several keys.
-    """
+    """The robot of a key under ``zstate/<robot>/``; a wildcard is refused, as it makes it several keys."""
     chunks = _chunks(key)
     if len(chunks) < 3 or chunks[0] != "zstate" or not chunks[1] or "*" in key:
-        raise _other_form(key, "zstate/<robot>/...")
+        raise _form_error(key, "zstate/<robot>/...")
     return check_robot(chunks[1])
 
 
+def _parse(key: str, form: str) -> list[str]:
+    """The chunks of ``key`` at the placeholders of ``form``."""
+    names, chunks = form.split("/"), _chunks(key)
+    if len(chunks) != len(names):
+        raise _form_error(key, form)
+    for name, chunk in zip(names, chunks, strict=True):
+        if chunk not in _STREAMS if name == "<stream>" else name[0] != "<" and name != chunk:
+            raise _form_error(key, form)
+    return [chunk for name, chunk in zip(names, chunks, strict=True) if name[0] == "<"]
+
+
 def _chunks(key: str) -> list[str]:
-    return key.split("/") if len(key) <= _MOST_OF_A_KEY else []
+    return key.split("/") if len(key) <= _MAX_KEY_LENGTH else []
 
 
-def _other_form(key: str, form: str) -> InvalidInput:
+def _form_error(key: str, form: str) -> InvalidInput:
     return InvalidInput(f"the key {shortened(key)!r} is not of the form {form!r}")
 
 
 def full_name(robot: str, frame: str) -> str:
-    """How a frame of ``robot`` is called among several robots: ``robot/frame``.
+    """The name of a frame of ``robot`` among several robots: ``robot/frame``; a name with a slash is one.
 
-    A name that has a slash is a full name already. An empty one, one that begins or ends with a slash, one
-    with control characters, and one of more than 1024 characters are InvalidInput.
+    Raises InvalidInput for a name that is empty, begins or ends with a slash, has control characters, or
+    is longer than 1024 characters.
     """
-    if len(frame) > MOST_OF_A_FRAME:
+    if len(frame) > MAX_FRAME_NAME_LENGTH:
         raise InvalidInput(
             f"the frame name {shortened(frame)!r} of robot {robot!r} has {len(frame)} characters, "
-            f"more than {MOST_OF_A_FRAME}"
+            f"more than {MAX_FRAME_NAME_LENGTH}"
         )
     if not frame or frame.startswith("/") or frame.endswith("/"):
         raise InvalidInput(
@@ -242,32 +244,32 @@ def full_name(robot: str, frame: str) -> str:
 
 
 def wire_name(robot: str, link: str) -> str:
-    """How a link of ``robot`` is named in its own messages: bare, unless a slash in it would mislead."""
+    """The name of a link of ``robot`` in its own messages: bare, or the full name if it has a slash."""
     return f"{robot}/{link}" if "/" in link else link
 
 
 EdgeNames = tuple[str, str]
-"""Parent and child, named in full."""
+"""Full names of parent and child."""
 
-FOREIGN = "foreign frame"
-"""The reason of refusals of edges that place another robot's frames."""
+FOREIGN_FRAME = "foreign frame"
+"""The reason of an InsertRefused for an edge that places another robot's frame."""
 
 
-def robot_in(frame: str) -> str:
-    """The first part of a full name: the robot whose frame that is, if there is such a robot."""
+def frame_owner(frame: str) -> str:
+    """The first part of a full name: the robot that owns the frame, if there is such a robot."""
     return frame.partition("/")[0]
 
 
-def foreign_objection(
+def foreign_edge_problem(
     robot: str, edge: EdgeNames, robots: Collection[str], placers: Collection[str] | None = None
 ) -> str:
-    """Why a writer of ``robot`` may not publish ``edge`` at all; empty where it may.
+    """Why a writer of ``robot`` may not publish ``edge`` at all; empty if it may.
 
-    ``robots`` are those on the network. Of those that place other robots' roots only ``placers`` count,
-    unless that is None.
+    ``robots`` are the robots on the network. Only ``placers`` may place the root of another robot; None
+    permits all.
     """
     parent, child = edge
-    owner, other = robot_in(child), robot_in(parent)
+    owner, other = frame_owner(child), frame_owner(parent)
     if owner == robot or owner not in robots:
         return ""
     whose = f"{child!r} is a frame of robot {owner!r}, and the edge from {parent!r} came from robot {robot!r}"

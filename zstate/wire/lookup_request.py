@@ -1,7 +1,4 @@
-"""Lookups asked for by name: the question in a selector's parameters, a refusal in JSON.
-
-Transforms as JSON, for whatever is not Python.
-"""
+"""Lookup requests over the network: selector parameters, and transforms and errors as JSON."""
 
 from __future__ import annotations
 
@@ -15,15 +12,15 @@ import zstate.errors
 from zstate.clock import check_stamp
 from zstate.errors import InvalidInput, LookupFailed, MessageError, NetworkError, ZStateError
 from zstate.transform import Transform
-from zstate.wire.keys import MOST_OF_A_FRAME, shortened
+from zstate.wire.keys import MAX_FRAME_NAME_LENGTH, shortened
 
 _NAMES = ("target", "source", "at")
-_FORM = "ask target=FRAME;source=FRAME, and at=NANOSECONDS for another instant than the newest"
+_FORM = "write target=FRAME;source=FRAME, and at=NANOSECONDS for an instant other than the newest"
 
 
 @dataclass(frozen=True, slots=True)
 class LookupRequest:
-    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns]; None is the newest there is."""
+    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns]; None is the newest."""
 
     target: str
     source: str
@@ -31,34 +28,32 @@ class LookupRequest:
 
     @classmethod
     def parse(cls, parameters: Mapping[str, str]) -> LookupRequest:
-        """What the parameters of a selector ask. Raises InvalidInput naming what is wrong with them."""
+        """The request in the parameters of a selector. Raises InvalidInput with the parameter at fault."""
         for name in parameters:
             if name not in _NAMES:
                 raise InvalidInput(f"a lookup has no parameter {shortened(name)!r}; {_FORM}")
         for name in ("target", "source"):
             if not parameters.get(name):
                 raise InvalidInput(f"a lookup needs the parameter {name!r}; {_FORM}")
-            if len(parameters[name]) > MOST_OF_A_FRAME:
+            if len(parameters[name]) > MAX_FRAME_NAME_LENGTH:
                 raise InvalidInput(f"the frame {shortened(parameters[name])!r} is too long; {_FORM}")
         at = parameters.get("at")
-        return cls(parameters["target"], parameters["source"], None if at is None else _stamp(at))
+        if at is None:
+            return cls(parameters["target"], parameters["source"])
+        digits = at.removeprefix("-")
+        if not (digits.isascii() and digits.isdecimal() and len(digits) <= 19):
+            raise InvalidInput(
+                f"the parameter 'at' is {shortened(at)!r}, not a stamp: whole nanoseconds since 1970"
+            )
+        return cls(parameters["target"], parameters["source"], check_stamp(int(at)))
 
     def parameters(self) -> str:
-        """The same as the parameters of a selector. Raises InvalidInput for what cannot stand there."""
+        """The request as parameters of a selector. Raises InvalidInput for frames that cannot be in one."""
         for frame in (self.target, self.source):
             if not frame or ";" in frame:
-                raise InvalidInput(f"the frame name {frame!r} is empty or has a ';', and cannot be asked for")
-        asked = f"target={self.target};source={self.source}"
-        return asked if self.at is None else f"{asked};at={check_stamp(self.at)}"
-
-
-def _stamp(text: str) -> int:
-    digits = text.removeprefix("-")
-    if not (digits.isascii() and digits.isdecimal() and len(digits) <= 19):
-        raise InvalidInput(
-            f"the parameter 'at' is {shortened(text)!r}, not a stamp: whole nanoseconds since 1970"
-        )
-    return check_stamp(int(text))
+                raise InvalidInput(f"the frame name {frame!r} is empty or has a ';', and cannot be looked up")
+        text = f"target={self.target};source={self.source}"
+        return text if self.at is None else f"{text};at={check_stamp(self.at)}"
 
 
 def error_to_json(error: ZStateError) -> bytes:
@@ -68,7 +63,7 @@ def error_to_json(error: ZStateError) -> bytes:
 
 
 def error_from_json(text: bytes) -> ZStateError:
-    """The error that ``error_to_json`` wrote; a NetworkError with what was said for any other text."""
+    """The error that ``error_to_json`` wrote; a NetworkError that quotes any other text."""
     try:
         facts = msgspec.json.decode(text, type=dict[str, object])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -79,26 +74,16 @@ def error_from_json(text: bytes) -> ZStateError:
         # Not by the constructor, which differs from error to error.
         error = kind.__new__(kind)
         error.args = (message,)
-        error.__dict__.update({name: _frozen(value) for name, value in facts.items()})
-        if not issubclass(kind, LookupFailed) or _can_explain(error):
+        for name, value in facts.items():
+            error.__dict__[name] = tuple(cast("list[object]", value)) if isinstance(value, list) else value
+        if not issubclass(kind, LookupFailed):
             return error
+        try:  # the text is made of the facts, which another program may have left out
+            if str(error):
+                return error
+        except Exception:  # any error that foreign facts lead to
+            pass
     return NetworkError(f"refused: {message}")
-
-
-def _frozen(value: object) -> object:
-    return tuple(cast("list[object]", value)) if isinstance(value, list) else value
-
-
-def _can_explain(error: ZStateError) -> bool:
-    # Their text is made of their facts, which a stranger may have left out.
-    try:
-        return bool(str(error))
-    except Exception:  # whatever a stranger's facts lead to
-        return False
-
-
-Triple = tuple[float, float, float]
-Quadruple = tuple[float, float, float, float]
 
 
 class TransformJson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -106,8 +91,8 @@ class TransformJson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     target: str
     source: str
-    translation: Triple
-    rotation: Quadruple
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
     stamp: int | None = None
     kind: Literal["static", "exact", "interpolated", "predicted"] | None = None
 
@@ -121,7 +106,7 @@ def to_json(transform: Transform) -> bytes:
 
 
 def from_json(text: bytes | str) -> Transform:
-    """The transform that ``to_json`` wrote. Raises MessageError naming the field at fault, InvalidInput."""
+    """The transform that ``to_json`` wrote. Raises MessageError with the field at fault, InvalidInput."""
     try:
         fields = _DECODER.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

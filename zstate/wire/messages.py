@@ -1,13 +1,14 @@
-"""What is said: the messages of the native wire, as frozen values.
+"""Message types of the native wire format (frozen msgspec structs), and their size limits.
 
-Numbers stand in blocks: little-endian float64, one after the other, as bytes. ``to_block`` makes
-one of an array, ``from_block`` reads it without a copy. Fields travel by position, so a later
-version may append some and today's readers pass over them; anything else needs a new version.
+A block is the bytes of consecutive little-endian float64: ``to_block`` makes one of an array, ``from_block``
+reads it without a copy. Fields are encoded by position, so a later version may append fields, which
+today's readers skip; any other change needs a new version. The limits bound the memory that a writer
+can make a reader use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from hashlib import blake2b
 from typing import Annotated, Literal
@@ -17,7 +18,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import ArrayLike, NDArray
 
-from zstate.errors import InvalidInput
+from zstate.errors import InvalidInput, MessageError
+from zstate.wire.keys import Stream
 
 Edges = tuple[tuple[str, str], ...]
 Stamp = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
@@ -30,7 +32,7 @@ _FLOAT64 = np.dtype("<f8")
 
 
 def to_block(values: ArrayLike) -> bytes:
-    """Numbers of any shape as a block, row by row."""
+    """The block of an array of any shape, row by row."""
     return np.asarray(values, dtype=_FLOAT64).tobytes()
 
 
@@ -45,28 +47,27 @@ def poses_from_block(block: bytes) -> NDArray[np.float64]:
 
 
 def order_digest(order: Sequence[str] | Sequence[tuple[str, str]]) -> bytes:
-    """8 bytes that tell one joint order (names) or edge order ((parent, child) pairs) from another.
+    """The 8-byte digest of a joint order (names) or edge order ((parent, child) pairs).
 
     BLAKE2b of the order as a MessagePack array.
     """
     return _order_digest(tuple(order))
 
 
-# A writer that names its numbers in full does so in each sample.
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=256)  # a writer that sends names does so in each sample
 def _order_digest(order: tuple[object, ...]) -> bytes:
     return blake2b(msgspec.msgpack.encode(order), digest_size=8).digest()
 
 
 class Message(Struct, frozen=True, array_like=True, gc=False):
-    """What every message of the native wire is."""
+    """Base of the messages of the native wire format."""
 
 
 class Sample(Message, frozen=True, array_like=True, gc=False):
-    """One instant of a robot.
+    """One instant ``stamp`` [ns] of a robot.
 
-    ``stamp`` [ns] says when; ``seq`` grows by one with each sample of a ``session``, which is drawn
-    at random when a writer starts; ``order`` is the digest of the order of the numbers.
+    ``seq`` grows by one with each sample of a ``session``, a random number drawn when a writer starts;
+    ``order`` is the digest of the order of the numbers.
     """
 
     stamp: Stamp
@@ -78,8 +79,8 @@ class Sample(Message, frozen=True, array_like=True, gc=False):
 class JointState(Sample, frozen=True, array_like=True, gc=False):
     """The joint positions of a whole robot at one instant, with velocities and efforts if known.
 
-    Blocks in the order whose digest is ``order``. A writer that has no model tells the ``names`` of
-    that order in full, one number for each.
+    Blocks in the order with the digest ``order``. A writer without a model sends the ``names`` of
+    that order, one number for each.
     """
 
     positions: bytes
@@ -91,14 +92,17 @@ class JointState(Sample, frozen=True, array_like=True, gc=False):
         if len(self.positions) % 8 or self.velocities is not None or self.efforts is not None:
             _check_numbers(self.positions, self.velocities, self.efforts)
         if self.names is not None:
-            _check_names(self)
+            for block in (self.positions, self.velocities, self.efforts):
+                if block is not None and len(block) != 8 * len(self.names):
+                    raise InvalidInput(f"{len(self.names)} names need as many numbers, not {len(block) // 8}")
+            _check_order(self.order, self.names)
 
 
 class TransformSample(Sample, frozen=True, array_like=True, gc=False):
     """Every moving edge of a robot at one instant.
 
-    ``poses`` is a block of ``parent_from_child``, seven numbers for each edge. The edges stand in
-    ``RobotDescription.moving_edges``, or here when there is no description.
+    ``poses`` is a block of ``parent_from_child``, seven numbers for each edge. The edges are ``edges``, or
+    ``RobotDescription.moving_edges`` if None.
     """
 
     poses: bytes
@@ -111,7 +115,7 @@ class TransformSample(Sample, frozen=True, array_like=True, gc=False):
 
 
 class JointCommand(Sample, frozen=True, array_like=True, gc=False):
-    """What a driver is asked to do; blocks that are not commanded are None."""
+    """Setpoints for a driver; a block that is not commanded is None."""
 
     positions: bytes | None = None
     velocities: bytes | None = None
@@ -133,11 +137,11 @@ class StaticTransforms(Message, frozen=True, array_like=True, gc=False):
 
 
 class RobotDescription(Message, frozen=True, array_like=True, gc=False):
-    """What the robot is: its URDF, and what a reader without a URDF parser needs of it.
+    """The URDF of a robot, and the facts that a reader without a URDF parser needs.
 
     ``joint_names`` is the order of joint samples, ``moving_edges`` that of transform samples;
-    ``clock`` is the domain of all stamps: "system", the name of a simulated one, or empty where the wire
-    does not tell.
+    ``clock`` is the domain of all stamps: "system", the name of a simulated clock, or empty if the wire
+    format does not carry it.
     """
 
     session: Count
@@ -149,7 +153,7 @@ class RobotDescription(Message, frozen=True, array_like=True, gc=False):
 
 
 class ClockMessage(Message, frozen=True, array_like=True, gc=False):
-    """What time it is: simulated, or by the clock of a writer that was asked."""
+    """The simulated time, or the reply of one writer's clock."""
 
     stamp: Stamp
     seq: Count
@@ -157,13 +161,13 @@ class ClockMessage(Message, frozen=True, array_like=True, gc=False):
 
 
 class Status(Message, frozen=True, array_like=True, gc=False):
-    """How a writer does.
+    """The state of a writer.
 
-    ``level`` is "ok"; "warn" when it is late or some of what it was given cannot be said; "error" when
-    none of it can; "stale" when it was given nothing new. ``text`` says why. ``rate_hz`` counts the
-    samples of the last second, ``sent`` all of them, ``late`` the ticks that began more than a period
-    after they were due; ``values`` is what else there is to know. ``stamp`` [ns] is by the system's
-    clock of ``host``, also where samples carry simulated time.
+    ``level`` is "ok"; "warn" if it is late or cannot publish some of its input; "error" if it cannot publish
+    any; "stale" without new input. ``text`` is the reason. ``rate_hz`` counts the samples of the last
+    second, ``sent`` all samples, ``late`` the ticks that began more than a period after they were due;
+    ``values`` has further facts. ``stamp`` [ns] is of the system clock of ``host``, also if samples carry
+    simulated time.
     """
 
     stamp: Stamp
@@ -180,9 +184,9 @@ class Status(Message, frozen=True, array_like=True, gc=False):
 
 
 class HistoryPage(Message, frozen=True, array_like=True, gc=False):
-    """Samples that were sent before, oldest first, each as it was sent under ``encoding``.
+    """Cached samples, oldest first, each as published under ``encoding``.
 
-    ``before`` is the ``seq`` of the first of them: what to ask for next; None when nothing older is kept.
+    ``before`` is the ``seq`` of the first, for the request of the next page; None if no older one is kept.
     """
 
     encoding: str
@@ -204,14 +208,50 @@ def _check_poses(block: bytes, edges: Edges | None) -> None:
         raise InvalidInput(f"{len(edges)} edges need as many poses, not {count}")
 
 
-def _check_names(state: JointState) -> None:
-    names = state.names or ()
-    for block in (state.positions, state.velocities, state.efforts):
-        if block is not None and len(block) != 8 * len(names):
-            raise InvalidInput(f"{len(names)} names need as many numbers, not {len(block) // 8}")
-    _check_order(state.order, names)
-
-
 def _check_order(order: bytes, items: Sequence[str] | Sequence[tuple[str, str]]) -> None:
     if order != order_digest(items):
         raise InvalidInput(f"the digest {order.hex()} is not that of the order sent with it")
+
+
+SAMPLE_BYTES = 256_000
+"""The transforms of 2000 links, names included, take less; in CDR they take up to four times as many."""
+
+LATCHED_BYTES = 16 * 2**20
+ATTACHMENT_BYTES = 1_024
+STATIC_EDGES = 10_000
+
+MAX_BYTES: Mapping[Stream, int] = {
+    "joint_states": SAMPLE_BYTES,
+    "tf": SAMPLE_BYTES,
+    "joint_commands": SAMPLE_BYTES,
+    "tf_static": 1_000_000,
+    "robot_description": LATCHED_BYTES,
+    "clock": 1_000,
+}
+
+_OVERHEAD = 200
+"""The least size of a decoded message without its numbers and names [bytes]."""
+
+
+def check_size(stream: Stream, size: int, factor: int = 1) -> None:
+    """Raise MessageError for a payload of ``size`` bytes that is too large for ``stream``."""
+    limit = MAX_BYTES[stream] * factor
+    if size > limit:
+        raise MessageError(f"{size} bytes on {stream}, where {limit} are allowed", reason="too large")
+
+
+def check_edges(message: Message) -> None:
+    """Raise MessageError for more than 10,000 static edges in one message."""
+    if isinstance(message, StaticTransforms) and len(message.edges) > STATIC_EDGES:
+        text = f"{len(message.edges)} static edges of one writer, where {STATIC_EDGES} are allowed"
+        raise MessageError(text, reason="too large")
+
+
+def message_size(message: Message) -> int:
+    """The approximate memory of a decoded sample [bytes]."""
+    if isinstance(message, JointState):
+        blocks = len(message.positions) + len(message.velocities or b"") + len(message.efforts or b"")
+        return _OVERHEAD + blocks + 60 * len(message.names or ())
+    if isinstance(message, TransformSample):
+        return _OVERHEAD + len(message.poses) + 200 * len(message.edges or ())
+    return _OVERHEAD

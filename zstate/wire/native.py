@@ -24,6 +24,8 @@ from zstate.wire.keys import (
     writer_key,
 )
 from zstate.wire.messages import (
+    LATCHED_BYTES,
+    SAMPLE_BYTES,
     ClockMessage,
     HistoryPage,
     JointCommand,
@@ -33,9 +35,10 @@ from zstate.wire.messages import (
     StaticTransforms,
     Status,
     TransformSample,
+    check_edges,
+    check_size,
 )
 from zstate.wire.protocol import EntityId, SerializedSample
-from zstate.wire.sizes import LATCHED_BYTES, SAMPLE_BYTES, check_edges, check_size
 
 VERSION = 1
 
@@ -61,11 +64,11 @@ STREAM_TYPES: dict[Stream, type[Message]] = {
     "clock": ClockMessage,
 }
 
-# No limit is smaller, so that most payloads pass with one comparison.
-_LEAST_BYTES = 1_000
+# The smallest limit: most payloads pass with one comparison.
+_MIN_LIMIT_BYTES = 1_000
 
-# Messages that have no stream.
-_MOST_BYTES: dict[type[Message], int] = {Status: 64_000, HistoryPage: 4 * SAMPLE_BYTES}
+# Of messages without a stream.
+_MAX_BYTES: dict[type[Message], int] = {Status: 64_000, HistoryPage: 4 * SAMPLE_BYTES}
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in ENCODINGS}
@@ -73,7 +76,7 @@ _ENCODING = re.compile(r"zstate/(\w+);v=([1-9]\d{0,8})")
 
 
 def encode(message: Message) -> bytes:
-    """The payload of ``message``, to be sent under the encoding ``ENCODINGS[type(message)]``."""
+    """The payload of ``message``; its Zenoh encoding is ``ENCODINGS[type(message)]``."""
     return _ENCODER.encode(message)
 
 
@@ -85,12 +88,16 @@ def decode(payload: bytes, encoding: str, kind: type[M]) -> M:
     """
     if encoding != ENCODINGS[kind]:
         raise _foreign_error(encoding, kind)
-    if len(payload) > _LEAST_BYTES and len(payload) > _MOST_BYTES.get(kind, LATCHED_BYTES):
+    if len(payload) > _MIN_LIMIT_BYTES and len(payload) > _MAX_BYTES.get(kind, LATCHED_BYTES):
         raise MessageError(f"a {_type_name(kind)} of {len(payload)} bytes", reason="too large")
     try:
         return _DECODERS[kind].decode(payload)  # type: ignore[return-value]  # one decoder per type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise _malformed_error(payload, kind, error) from None
+        # msgspec raises one exception for both; only the texts differ
+        if type(error) is msgspec.DecodeError and "truncated" in str(error):
+            text = f"a {_type_name(kind)} cut off after {len(payload)} bytes"
+            raise MessageError(text, reason="truncated") from None
+        raise MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed") from None
 
 
 class NativeStreamEncoder:
@@ -101,8 +108,8 @@ class NativeStreamEncoder:
     def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
         self.key = stream_key(robot, stream, name)
         self.encoding = ENCODINGS[STREAM_TYPES[stream]]
-        announced = Announcement(robot, stream, writer, name if stream == "tf_static" else "")
-        self.token = None if stream == "clock" else writer_key(robot, stream, announced.identity)
+        identity = Announcement(robot, stream, writer, name if stream == "tf_static" else "").identity
+        self.token = None if stream == "clock" else writer_key(robot, stream, identity)
 
     def encode(self, message: Message) -> bytes:
         return _ENCODER.encode(message)
@@ -142,24 +149,24 @@ class NativeWire:
     def expression(self, robot: str, stream: Stream) -> str:
         return stream_expression(robot, stream)
 
-    robot_of = staticmethod(robot_from_key)
+    robot_from_key = staticmethod(robot_from_key)
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
-        if arrival.size or len(arrival.payload) > _LEAST_BYTES:
+        if arrival.size or len(arrival.payload) > _MIN_LIMIT_BYTES:
             check_size(stream, arrival.size or len(arrival.payload))
         message = decode(arrival.payload, arrival.encoding, STREAM_TYPES[stream])
         if stream == "tf_static":
             check_edges(message)
         return (message,)
 
-    def statics_writer(self, key: str) -> str:
+    def static_writer_name(self, key: str) -> str:
         robot_from_key(key)
         return check_writer(key.rpartition("/")[2])
 
     def writers_expression(self, robot: str) -> str:
         return writer_expression(robot)
 
-    def announced(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> Announcement | None:
         try:
             return Announcement.parse(*parse_writer_key(token))
         except InvalidInput:
@@ -182,10 +189,3 @@ def _foreign_error(encoding: str, kind: type[Message]) -> MessageError:
         "another program writes on this key",
         reason="foreign",
     )
-
-
-def _malformed_error(payload: bytes, kind: type[Message], error: Exception) -> MessageError:
-    # msgspec raises one exception for both, which differ in the text only
-    if type(error) is msgspec.DecodeError and "truncated" in str(error):
-        return MessageError(f"a {_type_name(kind)} cut off after {len(payload)} bytes", reason="truncated")
-    return MessageError(f"a malformed {_type_name(kind)}: {error}", reason="malformed")

@@ -37,25 +37,17 @@ class EntityId(NamedTuple):
 class StreamEncoder(Protocol):
     """Encodes one stream of one writer: key, Zenoh encoding, liveliness token, payloads, attachments."""
 
-    @property
-    def key(self) -> str:
-        """The key of the stream."""
-        ...
+    key: str
+    """The key of the stream."""
 
-    @property
-    def encoding(self) -> str:
-        """The Zenoh encoding of the payloads; empty for none."""
-        ...
+    encoding: str
+    """The Zenoh encoding of the payloads; empty for none."""
 
-    @property
-    def token(self) -> str | None:
-        """The liveliness token of this writer of this stream, if the wire format has one."""
-        ...
+    token: str | None
+    """The liveliness token of this writer of this stream, if the wire format has one."""
 
-    @property
-    def can_withdraw(self) -> bool:
-        """Whether readers of this wire format accept that a latched value is withdrawn."""
-        ...
+    can_withdraw: bool
+    """Whether readers of this wire format accept that a latched value is withdrawn."""
 
     def encode(self, message: Message) -> bytes:
         """The payload of ``message``. Raises InvalidInput if the wire format cannot represent it."""
@@ -74,15 +66,11 @@ class Wire(Protocol):
     Decoding may keep state, so each reader has an instance of its own.
     """
 
-    @property
-    def name(self) -> str:
-        """Its name for users: "native", ..."""
-        ...
+    name: str
+    """Its name for users: "native", ..."""
 
-    @property
-    def shared(self) -> frozenset[Stream]:
-        """The streams of a robot that several writers publish, each a part."""
-        ...
+    shared: frozenset[Stream]
+    """The streams of a robot that several writers publish, each a part."""
 
     def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
         """The liveliness token of ``writer`` as a node of the ROS graph; None if there is no such graph."""
@@ -119,7 +107,7 @@ class Wire(Protocol):
         """The key expression of ``stream`` from all writers of ``robot``, or of all robots for ``"*"``."""
         ...
 
-    def robot_of(self, key: str) -> str:
+    def robot_from_key(self, key: str) -> str:
         """The robot that a key belongs to. Raises InvalidInput if it belongs to none."""
         ...
 
@@ -127,7 +115,7 @@ class Wire(Protocol):
         """The messages of a sample received on ``stream`` of ``robot``. Raises MessageError."""
         ...
 
-    def statics_writer(self, key: str) -> str | None:
+    def static_writer_name(self, key: str) -> str | None:
         """The name under which the static edges on ``key`` are written, if the key has it.
 
         Raises InvalidInput if the key belongs to no robot.
@@ -138,6 +126,6 @@ class Wire(Protocol):
         """The key expression of the tokens of all writers of ``robot``, or of all robots for ``"*"``."""
         ...
 
-    def announced(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> Announcement | None:
         """The writer and stream of a token under that expression; None for any other token."""
         ...

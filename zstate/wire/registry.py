@@ -1,4 +1,4 @@
-"""The wires there are, by name."""
+"""Wire formats by name."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ NAMES = ("native", "ros2", "ros2dds")
 
 
 def as_wire_names(wires: str | Sequence[str]) -> tuple[str, ...]:
-    """The names of one wire or several."""
+    """The names of one wire format or several."""
     return (wires,) if isinstance(wires, str) else tuple(wires)
 
 
 def get_wire(name: str) -> Wire:
-    """The wire a user calls ``name``: "native", "ros2" or "ros2dds".
+    """The wire format ``name``: "native", "ros2" or "ros2dds".
 
-    What follows a colon are options of a ROS wire, as ``Ros2Options.parse`` reads them: for instance
-    "ros2:domain=5,namespace=r1". The domain is ROS_DOMAIN_ID unless given. Raises InvalidInput.
+    A ROS wire takes options after a colon, as ``Ros2Options.parse`` reads them, for instance
+    "ros2:domain=5,namespace=r1". The domain defaults to ROS_DOMAIN_ID. Raises InvalidInput.
     """
     kind, colon, options = name.partition(":")
     if kind not in NAMES:
@@ -38,14 +38,14 @@ def get_wire(name: str) -> Wire:
         if colon:
             raise InvalidInput(f"the native wire has no options; {name!r} gives some")
         return NativeWire()
-    # Loaded for those who speak to ROS, with its hash library.
+    # Loaded only for a ROS wire, because of its hash library.
     from zstate.wire.ros2.wire import Ros2DdsWire, Ros2Wire  # noqa: PLC0415
 
     return Ros2Wire(ros_options(options)) if kind == "ros2" else Ros2DdsWire(ros_options(options))
 
 
 def ros_options(text: str) -> Ros2Options:
-    """What follows "ros2:" in the name of a wire, with the domain of ROS_DOMAIN_ID. Raises InvalidInput."""
+    """The options after "ros2:"; the domain defaults to ROS_DOMAIN_ID. Raises InvalidInput."""
     from zstate.wire.ros2.options import Ros2Options  # noqa: PLC0415 - as above
 
     domain = os.environ.get(DOMAIN_VARIABLE, "")

@@ -73,7 +73,7 @@ def test_a_file_without_access_control_is_not_taken_for_one(tmp_path: Path):
 def test_access_control_without_authentication_is_refused(tmp_path: Path):
     file = tmp_path / "acl.json5"
     file.write_bytes(zstate("acl", "--robot", "r1").stdout)
-    assert "nobody is asked for a name" in failure("router", "--acl", str(file))
+    assert "access control without certificates or users" in failure("router", "--acl", str(file))
 
 
 def test_ros_robots_are_separated_by_namespaces():

@@ -1,4 +1,4 @@
-"""The access control of a fleet, as a router enforces it: r1 and r2 are robots, the others look."""
+"""Access control on the native wire, enforced by a router with the robots r1 and r2."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from zstate.wire.messages import TransformSample, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
 FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), placers=("site",))
-USERS = (*FLEET.names, "stranger")
+USERS = (*FLEET.identities, "stranger")
 
 
 class Site:
-    """A router with users, and sessions that come to it."""
+    """A router with users, and sessions of its clients."""
 
     def __init__(self, folder: Any, fleet: AclRoles) -> None:
         self.endpoint = f"tcp/127.0.0.1:{a_free_port()}"
@@ -48,7 +48,7 @@ class Site:
         self.opened.enter_context(connect(self.settings))
 
     def join(self, user: str, **more: object) -> Session:
-        """A client who is ``user``."""
+        """A client with the identity ``user``."""
         settings = {
             "mode": "client",
             "connect": {"endpoints": [self.endpoint], "timeout_ms": 5000},
@@ -94,24 +94,24 @@ WRITES = [
 ]
 
 
-def test_each_writes_what_is_theirs_and_nothing_else(site: Site):
+def test_each_role_can_write_only_its_own_keys(site: Site):
     tap = Tap(site.join("desk"), "zstate/**")
     writers = {user: site.join(user) for user in USERS}
     allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
 
-    def heard() -> set[tuple[bytes, str]]:
+    def received() -> set[tuple[bytes, str]]:
         return {(arrival.payload, arrival.key) for arrival in tap.arrivals}
 
-    def all_is_heard_ten_times() -> bool:
+    def publish_until_received() -> bool:
         for user, key, _ in WRITES:
             writers[user].zenoh.put(key, user.encode())
-        return heard() >= allowed and len(tap.arrivals) >= 10 * len(allowed)
+        return received() >= allowed and len(tap.arrivals) >= 10 * len(allowed)
 
-    until(all_is_heard_ten_times)
-    assert heard() == allowed
+    until(publish_until_received)
+    assert received() == allowed
 
 
-def test_a_viewer_who_comes_late_is_told_everything(site: Site):
+def test_late_viewer_receives_all_streams(site: Site):
     robot = site.join("r1")
     with (
         StatePublisher(robot, RRBOT, "r1") as publisher,
@@ -133,21 +133,21 @@ def publish_and_look(publisher: StatePublisher, listener: TransformListener) -> 
     return listener.buffer.can_lookup("base", "lower")
 
 
-def test_a_robot_hears_no_samples_of_others_but_the_clock(site: Site):
+def test_robot_receives_only_the_clock_of_others(site: Site):
     taps = {user: Tap(site.join(user), "zstate/r1/joint_commands") for user in ("r1", "r2", "stranger")}
     clock = Tap(site.join("r2"), "zstate/clock")
     hand, simulator = site.join("hand"), site.join("simulator")
 
-    def all_is_heard_ten_times() -> bool:
+    def publish_until_received() -> bool:
         hand.zenoh.put("zstate/r1/joint_commands", b"go")
         simulator.zenoh.put("zstate/clock", b"tick")
         return min(len(taps["r1"].arrivals), len(clock.arrivals)) >= 10
 
-    until(all_is_heard_ten_times)
+    until(publish_until_received)
     assert (taps["r2"].arrivals, taps["stranger"].arrivals) == ([], [])
 
 
-def test_a_robot_sees_who_the_others_are_and_their_static_edges(site: Site):
+def test_robot_discovers_others_and_their_static_edges(site: Site):
     with (
         StatePublisher(site.join("r1"), RRBOT, "r1"),
         TransformListener(site.join("r2"), "r1", follow="tf") as listener,
@@ -156,7 +156,7 @@ def test_a_robot_sees_who_the_others_are_and_their_static_edges(site: Site):
         assert listener.buffer.wait("world", "base", timeout_s=5.0).kind == "static"
 
 
-def test_a_placer_places_the_roots_of_robots_and_robots_none_but_their_own_where_it_is_named(site: Site):
+def test_named_placer_places_robot_roots_and_robots_only_their_own(site: Site):
     robot, thief, placer = site.join("r1"), site.join("r2"), site.join("site")
     with (
         StatePublisher(robot, RRBOT, "r1") as publisher,
@@ -179,7 +179,7 @@ def test_a_placer_places_the_roots_of_robots_and_robots_none_but_their_own_where
                 assert "not among the placers ('site')" in reader.refusals["foreign frame"]
 
 
-def test_a_robot_that_announces_itself_as_another_takes_nothing_over(site: Site):
+def test_robot_announced_as_another_takes_over_no_edges(site: Site):
     robot, thief = site.join("r1"), site.join("r2")
     edges = (("r1/upper", "r1/lower"),)
     with (
@@ -211,7 +211,7 @@ def test_a_robot_that_announces_itself_as_another_takes_nothing_over(site: Site)
         assert listener.buffer.lookup("upper", "lower").translation[0] != 9.0
 
 
-def test_whoever_reads_is_known_to_viewers(site: Site):
+def test_viewers_discover_all_readers(site: Site):
     with (
         StatePublisher(site.join("r1"), RRBOT, "r1"),
         TransformListener(site.join("r2"), "r1", follow="tf"),
@@ -236,7 +236,7 @@ def test_a_robot_that_is_a_viewer_too_sees_the_others_move(tmp_path):
         until(lambda: publish_and_look(publisher, listener))
 
 
-def test_what_answers_lookups_is_asked_by_viewers_and_stands_under_its_own_robot(site: Site):
+def test_viewers_query_lookup_services_under_their_own_robot(site: Site):
     robot, other, viewer = site.join("r1"), site.join("r2"), site.join("desk")
 
     def answer(query: zenoh.Query) -> None:
@@ -253,17 +253,17 @@ def test_what_answers_lookups_is_asked_by_viewers_and_stands_under_its_own_robot
     assert answers() == ["here"]
 
 
-def test_a_namespace_stands_before_every_key(tmp_path):
+def test_namespace_prefixes_every_key(tmp_path):
     with (
         a_site(tmp_path, AclRoles(("r1",), ("desk",), namespace="hall/east")) as site,
         StatePublisher(site.join("r1", namespace="hall/east"), RRBOT, "r1") as publisher,
         TransformListener(site.join("desk", namespace="hall/east"), "r1") as listener,
     ):
         until(lambda: publish_and_look(publisher, listener))
-        assert discover(site.join("desk"), 0.2) == ()  # looks where nobody is
+        assert discover(site.join("desk"), 0.2) == ()  # without any robot
 
 
-def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
+def test_router_without_users_denies_everything(tmp_path):
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
     settings = {
         "mode": "router",
@@ -279,7 +279,7 @@ def test_a_router_that_asks_for_no_names_knows_nobody(tmp_path):
         assert discover(other, 0.3) == ()
 
 
-def test_every_chunk_that_wildcards_go_past_is_named():
+def test_rules_name_every_chunk_that_wildcards_skip():
     chunks = set(re.findall(r"/(@\w+)/", keys.__doc__ or "")) | {"@adv"}
     assert len(chunks) >= 2
     for rule in access_control(AclRoles(("r1",), ("desk",)))["rules"]:
@@ -288,16 +288,16 @@ def test_every_chunk_that_wildcards_go_past_is_named():
             assert {f"{root}/**/{chunk}/**" for chunk in chunks} <= set(rule["key_exprs"])
 
 
-def test_the_text_says_the_same_to_zenoh():
+def test_zenoh_parses_the_text_to_the_same_rules():
     parsed = json.loads(str(zenoh.Config.from_json5(access_text(FLEET))))["access_control"]
-    said = access_control(FLEET)
+    rules_by_section = access_control(FLEET)
     for section in ("rules", "subjects", "policies"):
         named = [{k: v for k, v in one.items() if v is not None} for one in parsed[section]]
-        assert named == said[section]
+        assert named == rules_by_section[section]
     assert (parsed["enabled"], parsed["default_permission"]) == (True, "deny")
 
 
-def test_only_the_rules_that_somebody_has_are_there():
+def test_rules_without_a_role_are_left_out():
     rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
     assert rules == ["viewers read", "viewers are given", "readers are known"]
 
@@ -309,11 +309,11 @@ def test_a_name_that_cannot_be_one_is_refused(name: str):
 
 
 @pytest.mark.parametrize("namespace", ["/hall", "hall/", "a//b", "h*", "@x"])
-def test_a_namespace_that_cannot_stand_before_keys_is_refused(namespace: str):
+def test_namespace_that_is_no_key_prefix_is_refused(namespace: str):
     with pytest.raises(InvalidInput, match="is not made of chunks"):
         AclRoles(("r1",), namespace=namespace)
 
 
-def test_a_fleet_of_nobody_is_refused():
-    with pytest.raises(InvalidInput, match="nobody is named"):
+def test_roles_without_names_are_refused():
+    with pytest.raises(InvalidInput, match="no role has a name"):
         AclRoles()

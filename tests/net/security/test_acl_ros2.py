@@ -1,4 +1,4 @@
-"""The access control of a fleet on ROS 2's wire, as a router in a process of its own enforces it."""
+"""Access control on the ROS 2 wire, enforced by a router in a process of its own."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"
 FLEET = AclRoles(("r1", "r2"), ("desk",), ("hand",), ("simulator",), wires=(WIRE,))
-USERS = (*FLEET.names, "stranger")
+USERS = (*FLEET.identities, "stranger")
 JOINTS = "sensor_msgs::msg::dds_::JointState_/hash"
 ENDPOINT = "@ros2_lv/7/z/0/{number}/{kind}/%/%{robot}/node/%{topic}/type/hash/::,10:,:,:,,"
 
@@ -29,7 +29,7 @@ Join = Callable[[str], Session]
 
 @pytest.fixture
 def join(tmp_path: Path, spawn: Callable[..., Child], free_port: int) -> Iterator[Join]:
-    """``join(user)``: a client of the router who is that user."""
+    """``join(user)``: a client of the router with that identity."""
     users, acl = tmp_path / "users.txt", tmp_path / "acl.json5"
     users.touch(0o600)
     users.write_text("".join(f"{name}:secret\n" for name in USERS))
@@ -40,8 +40,8 @@ def join(tmp_path: Path, spawn: Callable[..., Child], free_port: int) -> Iterato
     with ExitStack() as opened:
 
         def enter(user: str) -> Session:
-            who = Credentials(user=user, password="secret")
-            return opened.enter_context(connect(mode="client", endpoints=endpoint, credentials=who))
+            credentials = Credentials(user=user, password="secret")
+            return opened.enter_context(connect(mode="client", endpoints=endpoint, credentials=credentials))
 
         yield enter
 
@@ -68,22 +68,22 @@ WRITES = [
 ]
 
 
-def test_each_writes_the_topics_that_are_theirs_and_nothing_else(join: Join):
+def test_each_role_can_write_only_its_own_topics(join: Join):
     viewer = join("desk")
     taps = [Tap(viewer, key) for key in ("7/**", "5/**", "zstate/**")]
     writers = {user: join(user) for user in USERS}
     allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
 
-    def heard() -> list[tuple[bytes, str]]:
+    def received() -> list[tuple[bytes, str]]:
         return [(arrival.payload, arrival.key) for tap in taps for arrival in tap.arrivals]
 
-    def all_is_heard_ten_times() -> bool:
+    def publish_until_received() -> bool:
         for user, key, _ in WRITES:
             writers[user].zenoh.put(key, user.encode())
-        return set(heard()) >= allowed and len(heard()) >= 10 * len(allowed)
+        return set(received()) >= allowed and len(received()) >= 10 * len(allowed)
 
-    until(all_is_heard_ten_times)
-    assert set(heard()) == allowed
+    until(publish_until_received)
+    assert set(received()) == allowed
 
 
 TOKENS = [
@@ -104,7 +104,7 @@ TOKENS = [
 ]
 
 
-def test_each_stands_in_the_graph_with_what_is_theirs(join: Join):
+def test_each_role_can_announce_only_its_own_endpoints(join: Join):
     sessions = {user: join(user) for user in USERS}
     tokens = [sessions[user].zenoh.liveliness().declare_token(key) for user, key, _ in TOKENS]
     allowed = {key for _, key, is_allowed in TOKENS if is_allowed}
@@ -118,7 +118,7 @@ def test_each_stands_in_the_graph_with_what_is_theirs(join: Join):
     del tokens
 
 
-def test_a_viewer_who_comes_late_is_told_everything_of_a_robot(join: Join):
+def test_late_viewer_receives_all_streams_of_a_robot(join: Join):
     robot = join("r1")
     with (
         StatePublisher(robot, RRBOT, "r1", WIRE) as publisher,
@@ -138,12 +138,12 @@ def test_a_viewer_who_comes_late_is_told_everything_of_a_robot(join: Join):
 
 
 @pytest.mark.parametrize("user", ["r2", "desk", "hand"])
-def test_who_writes_as_another_robot_is_told_so(join: Join, user: str):
+def test_writing_as_another_robot_is_denied(join: Join, user: str):
     with pytest.raises(AccessDenied, match="write as robot 'r1'"):
         StatePublisher(join(user), RRBOT, "r1", WIRE)
 
 
-def test_services_are_called_by_operators_and_answered_by_their_robot(join: Join):
+def test_only_operators_call_services_and_only_their_robot_replies(join: Join):
     robot, other = join("r1"), join("r2")
     service = "7/r1/stop/std_srvs::srv::dds_::Trigger_/hash"
 
@@ -163,7 +163,7 @@ def test_services_are_called_by_operators_and_answered_by_their_robot(join: Join
     assert answers(join("desk")) == []
 
 
-def test_several_wires_stand_side_by_side():
+def test_rules_of_several_wires_are_combined():
     def rules(*wires: str) -> list[object]:
         listed = access_control(AclRoles(("r1",), ("desk",), wires=wires))["rules"]
         return [rule["id"] for rule in listed]  # type: ignore[index, union-attr]
@@ -173,7 +173,7 @@ def test_several_wires_stand_side_by_side():
     assert len(set(rules("native", WIRE, other))) == len(rules("native", WIRE, other))
 
 
-def test_a_robot_alone_in_the_root_namespace_has_its_domain():
+def test_single_robot_in_the_root_namespace_has_the_whole_domain():
     (written, *_) = access_control(AclRoles(("r1",), wires=("ros2:domain=5",)))["rules"]  # type: ignore[misc]
     assert written["key_exprs"] == ["5/**", "5/**/@adv/**", "@ros2_lv/5/**"]
 
@@ -189,6 +189,6 @@ def test_a_robot_alone_in_the_root_namespace_has_its_domain():
         (AclRoles(("r1",), wires=("pigeon",)), "there is for 'native' and 'ros2'"),
     ],
 )
-def test_what_cannot_be_told_apart_or_is_no_wire_is_refused(fleet: AclRoles, text: str):
+def test_robots_in_one_namespace_and_unknown_wires_are_refused(fleet: AclRoles, text: str):
     with pytest.raises(InvalidInput, match=text.replace("*", r"\*")):
         access_control(fleet)

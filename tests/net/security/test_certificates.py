@@ -53,7 +53,7 @@ def test_an_identity_is_good_for_the_hosts_that_were_given_and_for_no_other(tmp_
             handshake(tmp_path, "router", "r1", host)
 
 
-def test_a_second_call_adds_to_the_authority_that_is_there(tmp_path: Path):
+def test_second_call_uses_the_existing_authority(tmp_path: Path):
     issue_identities(tmp_path, ["router"])
     authority = (tmp_path / "ca.pem").read_bytes()
     issue_identities(tmp_path, ["r1"])
@@ -61,7 +61,7 @@ def test_a_second_call_adds_to_the_authority_that_is_there(tmp_path: Path):
     assert handshake(tmp_path, "router", "r1", "localhost") == "r1"
 
 
-def test_keys_are_their_owners_only(tmp_path: Path):
+def test_keys_are_readable_by_their_owner_only(tmp_path: Path):
     was = os.umask(0)
     try:
         files = issue_identities(tmp_path / "fleet", ["r1"])["r1"]
@@ -72,7 +72,7 @@ def test_keys_are_their_owners_only(tmp_path: Path):
     assert stat.S_IMODE((tmp_path / "fleet").stat().st_mode) == 0o700
 
 
-def test_nothing_is_overwritten_and_nothing_is_made_beside_what_is_refused(tmp_path: Path):
+def test_refused_call_overwrites_and_creates_no_file(tmp_path: Path):
     issue_identities(tmp_path, ["r1"])
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(InvalidInput, match=r"identity 'r1' already.*nothing is overwritten"):
@@ -96,7 +96,7 @@ def test_a_certificate_begins_an_hour_ago_for_machines_whose_clocks_are_behind(t
     assert certificate.not_valid_after_utc - certificate.not_valid_before_utc == timedelta(days=1, hours=1)
 
 
-def test_none_outlives_its_authority(tmp_path: Path):
+def test_certificate_cannot_outlive_its_authority(tmp_path: Path):
     with pytest.raises(InvalidInput, match="the authority is valid until"):
         issue_identities(tmp_path, ["r1"], days=10_000)
 
@@ -113,18 +113,18 @@ def test_none_outlives_its_authority(tmp_path: Path):
         ({"names": ["r1"], "days": 0}, "days is 0"),
     ],
 )
-def test_arguments_that_cannot_be_used_leave_no_trace(tmp_path: Path, arguments, text: str):
+def test_invalid_arguments_create_no_file(tmp_path: Path, arguments, text: str):
     with pytest.raises(InvalidInput) as caught:
         issue_identities(tmp_path / "fleet", **arguments)
     assert text in str(caught.value)
     assert not (tmp_path / "fleet").exists()
 
 
-def test_an_authority_in_part_or_of_another_kind_is_named(tmp_path: Path):
+def test_incomplete_or_foreign_authority_is_named(tmp_path: Path):
     issue_identities(tmp_path, ["r1"])
     key = (tmp_path / "ca.key").read_bytes()
     (tmp_path / "ca.key").unlink()
-    with pytest.raises(ConfigError, match=r"ca\.key' is missing beside .*ca\.pem"):
+    with pytest.raises(ConfigError, match=r"ca\.key' is missing next to .*ca\.pem"):
         issue_identities(tmp_path, ["r2"])
     (tmp_path / "ca.key").write_bytes((tmp_path / "r1.key").read_bytes())
     with pytest.raises(ConfigError, match="is not the key"):
@@ -134,12 +134,11 @@ def test_an_authority_in_part_or_of_another_kind_is_named(tmp_path: Path):
         issue_identities(tmp_path, ["r2"])
 
 
-def test_without_the_library_the_text_says_what_to_install():
+def test_missing_library_error_has_the_install_command():
     code = (
         "import sys; sys.modules['cryptography'] = None\n"
         "from zstate.errors import LibraryMissing\n"
-        "from zstate.net.security.certificates import issue_identities\n"
-        "try: issue_identities('nowhere', ['r1'])\n"
+        "try: import zstate.net.security.certificates\n"
         "except LibraryMissing as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""What somebody is told whom a router does not let in, by real routers that run in a process of their own."""
+"""Reasons of refused connections, with real routers in a process of their own."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ def denied(endpoint: str, credentials: Credentials | None) -> tuple[str, str]:
     return caught.value.reason, str(caught.value)
 
 
-def lets_in(endpoint: str, credentials: Credentials | None) -> bool:
+def accepts(endpoint: str, credentials: Credentials | None) -> bool:
     with connect(mode="client", endpoints=endpoint, credentials=credentials) as session:
         return bool(list(session.zenoh.info.routers_zid()))
 
 
-def test_the_right_ones_are_let_in(fleet: Fleet):
-    assert lets_in(fleet.tls("mtls"), fleet.identity("r1"))
-    assert lets_in(fleet.tls("mtls", "localhost"), fleet.identity("r1"))
-    assert lets_in(fleet.tcp("users"), Credentials(user="alice", password="wonder"))
-    assert lets_in(fleet.tcp("users"), Credentials(user="bob", password="build:it"))
-    assert lets_in(fleet.tls("mtls and users"), fleet.identity("r1", "alice", "wonder"))
+def test_valid_credentials_are_accepted(fleet: Fleet):
+    assert accepts(fleet.tls("mtls"), fleet.identity("r1"))
+    assert accepts(fleet.tls("mtls", "localhost"), fleet.identity("r1"))
+    assert accepts(fleet.tcp("users"), Credentials(user="alice", password="wonder"))
+    assert accepts(fleet.tcp("users"), Credentials(user="bob", password="build:it"))
+    assert accepts(fleet.tls("mtls and users"), fleet.identity("r1", "alice", "wonder"))
 
 
 def test_plain_tcp_towards_tls(fleet: Fleet):
@@ -53,7 +53,7 @@ def test_a_router_of_another_authority(fleet: Fleet):
     assert f"not signed by '{fleet.strangers / 'ca.pem'}'" in text
 
 
-def test_tls_without_an_authority_of_ones_own(fleet: Fleet):
+def test_tls_without_a_configured_authority(fleet: Fleet):
     reason, text = denied(fleet.tls("mtls"), None)
     assert reason == "wrong CA"
     assert "--certs DIR" in text
@@ -75,7 +75,7 @@ def test_no_certificate(fleet: Fleet):
 
 
 @pytest.mark.parametrize("name", ["expired", "early"])
-def test_a_certificate_out_of_its_time(fleet: Fleet, name: str):
+def test_certificate_outside_its_validity(fleet: Fleet, name: str):
     reason, text = denied(fleet.tls("mtls"), fleet.identity(name))
     assert reason == "our certificate expired"
     assert f"'{fleet.folder / name}.pem' has expired, or is not valid yet" in text
@@ -89,7 +89,7 @@ def test_a_certificate_out_of_its_time(fleet: Fleet, name: str):
         ("early", "their certificate not yet valid", "clock behind"),
     ],
 )
-def test_a_router_whose_certificate_is_out_of_its_time(fleet: Fleet, kind: str, expected: str, hint: str):
+def test_router_certificate_outside_its_validity(fleet: Fleet, kind: str, expected: str, hint: str):
     reason, text = denied(fleet.tls(kind), fleet.identity("r1"))
     assert reason == expected
     assert hint in text
@@ -106,16 +106,16 @@ def test_a_wrong_user_or_password(fleet: Fleet, kind: str, user: str, password: 
     assert password not in text
 
 
-def test_no_user_where_one_is_asked_for(fleet: Fleet):
+def test_no_user_at_a_router_that_requires_one(fleet: Fleet):
     reason, text = denied(fleet.tcp("users"), None)
     assert reason == "user demanded"
     assert "ZSTATE_PASSWORD" in text
 
 
-def test_a_user_where_nobody_knows_any(fleet: Fleet):
+def test_user_at_a_router_without_users(fleet: Fleet):
     reason, text = denied(fleet.tcp("open"), Credentials(user="alice", password="wonder"))
     assert reason == "user or password"
-    assert "a router that has none refuses whoever names a user" in text
+    assert "a router without one refuses every session with a user" in text
 
 
 def test_a_router_at_a_host_that_is_not_in_its_certificate(fleet: Fleet, spawn, free_port: int):
@@ -126,7 +126,7 @@ def test_a_router_at_a_host_that_is_not_in_its_certificate(fleet: Fleet, spawn, 
     assert "--host 127.0.0.2" in text
 
 
-def test_a_configuration_of_zenoh_that_shows_the_wrong_certificate_is_told_the_same(fleet: Fleet):
+def test_zenoh_configuration_with_the_wrong_authority_has_the_same_error(fleet: Fleet):
     config = {
         "mode": "client",
         "connect": {"endpoints": [fleet.tls("mtls")], "timeout_ms": 200, "exit_on_failure": True},
@@ -138,21 +138,19 @@ def test_a_configuration_of_zenoh_that_shows_the_wrong_certificate_is_told_the_s
     assert caught.value.reason == "wrong CA"
 
 
-def test_where_nobody_listens_there_is_no_refusal_and_of_two_the_one_that_refuses_is_told(
-    fleet: Fleet, free_port: int
-):
-    nobody = f"tls/127.0.0.1:{free_port}"
+def test_free_port_is_unreachable_and_the_refusing_endpoint_of_two_is_reported(fleet: Fleet, free_port: int):
+    unused = f"tls/127.0.0.1:{free_port}"
     with pytest.raises(Unreachable, match="nothing answers"):
-        connect(mode="client", endpoints=nobody, credentials=fleet.identity("r1"), timeout_s=0.2)
+        connect(mode="client", endpoints=unused, credentials=fleet.identity("r1"), timeout_s=0.2)
     with pytest.raises(AccessDenied) as caught:
-        both = [nobody, fleet.tls("mtls")]
+        both = [unused, fleet.tls("mtls")]
         connect(mode="client", endpoints=both, credentials=fleet.identity("expired"), timeout_s=0.2)
     assert caught.value.endpoint == fleet.tls("mtls")
-    assert f"nothing answers at '{nobody}'" in str(caught.value)
+    assert f"nothing answers at '{unused}'" in str(caught.value)
 
 
-def test_a_listener_that_accepts_and_never_answers_is_not_taken_for_one_without_tls(fleet: Fleet):
-    """As the kernel accepts for a router process that is stopped."""
+def test_listener_without_replies_is_not_reported_as_one_without_tls(fleet: Fleet):
+    """Like the kernel, which accepts connections for a stopped router process."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         for endpoint, credentials in (
@@ -164,9 +162,7 @@ def test_a_listener_that_accepts_and_never_answers_is_not_taken_for_one_without_
             assert caught.value.endpoints == (endpoint,)
 
 
-def test_a_router_that_is_busy_with_failed_handshakes_is_told_from_one_that_refuses(
-    fleet: Fleet, spawn, free_port: int
-):
+def test_router_busy_with_failed_handshakes_is_no_refusal(fleet: Fleet, spawn, free_port: int):
     """Zenoh pauses its accepting for 0.1 s after each handshake that failed."""
     endpoint = f"tls/127.0.0.1:{free_port}"
     assert spawn(ROUTERS, str(fleet.folder), endpoint).line() == "ready"
@@ -178,10 +174,8 @@ def test_a_router_that_is_busy_with_failed_handshakes_is_told_from_one_that_refu
         assert list(session.zenoh.info.routers_zid())
 
 
-def test_idle_connections_do_not_keep_a_client_out_of_a_router_that_asks_for_users(
-    fleet: Fleet, spawn, free_port: int
-):
-    """By Zenoh's own settings the first hundred do, for ten seconds."""
+def test_idle_connections_do_not_block_a_client_of_a_router_with_users(fleet: Fleet, spawn, free_port: int):
+    """With Zenoh's default settings a hundred idle connections block it for ten seconds."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     code = """
         import sys
@@ -195,7 +189,7 @@ def test_idle_connections_do_not_keep_a_client_out_of_a_router_that_asks_for_use
     assert spawn(code, endpoint, str(fleet.folder / "users")).line() == "ready"
     idle = [socket.create_connection(("127.0.0.1", free_port)) for _ in range(300)]
     try:
-        assert lets_in(endpoint, Credentials(user="alice", password="wonder"))
+        assert accepts(endpoint, Credentials(user="alice", password="wonder"))
     finally:
         for connection in idle:
             connection.close()

@@ -1,4 +1,4 @@
-"""What sessions are told that go on trying: peers and routers, which need no link."""
+"""Connection monitor: refusals that are logged while sessions keep trying."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | N
     "their certificate expired": (lambda fleet: fleet.tls("expired"), lambda fleet: fleet.identity("r1")),
     "user or password": (
         lambda fleet: fleet.tls("mtls and users"),
-        # Routers name users only where they know some.
+        # A router sends a user only if it has a users file.
         lambda fleet: replace(fleet.identity("r1", "alice", "wander"), users=fleet.folder / "users"),
     ),
     "user demanded": (lambda fleet: fleet.tcp("users"), lambda _: None),
@@ -35,59 +35,59 @@ CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | N
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It looks every tenth of a second."""
-    monkeypatch.setattr(connection_monitor, "FIRST_LOOK_S", 0.1)
+    """The monitor checks every tenth of a second."""
+    monkeypatch.setattr(connection_monitor, "FIRST_PERIOD_S", 0.1)
     monkeypatch.setattr(connection_monitor, "PERIOD_S", 0.1)
 
 
 def refusals(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
     """The reasons and texts that were logged."""
-    said = [record for record in caplog.records if record.name == "zstate"]
-    assert {record.levelno for record in said} <= {logging.WARNING}
-    refused = [record for record in said if record.__dict__["event"] == "refused"]
+    records = [record for record in caplog.records if record.name == "zstate"]
+    assert {record.levelno for record in records} <= {logging.WARNING}
+    refused = [record for record in records if record.__dict__["event"] == "refused"]
     return [(record.__dict__["reason"], record.getMessage()) for record in refused]
 
 
-def own_listener(credentials: Credentials | None) -> str:
+def free_endpoint(credentials: Credentials | None) -> str:
     is_encrypted = credentials is not None and credentials.ca is not None
     return f"{'tls' if is_encrypted else 'tcp'}/127.0.0.1:{a_free_port()}"
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
 @pytest.mark.parametrize("reason", CASES)
-def test_whoever_is_refused_and_goes_on_is_told_what_to_check(
+def test_refused_session_that_keeps_trying_logs_the_reason(
     fleet: Fleet, caplog: pytest.LogCaptureFixture, mode: str, reason: str
 ):
-    endpoint, credentials = (of(fleet) for of in CASES[reason])
-    where = own_listener(credentials)
+    endpoint, credentials = (choose(fleet) for choose in CASES[reason])
+    where = free_endpoint(credentials)
     with connect(mode=mode, endpoints=endpoint, listen=where, credentials=credentials):
         until(lambda: refusals(caplog))
-    ((told, text),) = refusals(caplog)
-    assert told == reason
+    ((logged, text),) = refusals(caplog)
+    assert logged == reason
     assert text.startswith(f"{endpoint!r} answers and does not let this session in: ")
     assert text.endswith("; still trying")
 
 
-def test_a_configuration_of_zenoh_is_told_the_same(fleet: Fleet, caplog: pytest.LogCaptureFixture):
+def test_session_of_a_zenoh_configuration_logs_the_reason(fleet: Fleet, caplog: pytest.LogCaptureFixture):
     config = {
         "mode": "router",
         "connect": {"endpoints": [fleet.tcp("users")]},
-        "listen": {"endpoints": [own_listener(None)]},
+        "listen": {"endpoints": [free_endpoint(None)]},
     }
     with connect(config):
         until(lambda: refusals(caplog))
     assert refusals(caplog)[0][0] == "user demanded"
 
 
-def test_only_of_those_who_refuse_something_is_said_and_once(fleet: Fleet, caplog: pytest.LogCaptureFixture):
+def test_only_refusing_endpoints_are_logged_and_once(fleet: Fleet, caplog: pytest.LogCaptureFixture):
     first, second = (f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2))
-    nobody, refusing = f"tcp/127.0.0.1:{a_free_port()}", fleet.tcp("users")
-    # Each calls the other, of which one link remains.
-    ours = {"endpoints": [nobody, second, fleet.tcp("open"), refusing], "listen": first}
-    with connect(endpoints=first, listen=second), connect(**ours) as session:
+    unused, refusing = f"tcp/127.0.0.1:{a_free_port()}", fleet.tcp("users")
+    # Each connects to the other, and one link remains.
+    settings = {"endpoints": [unused, second, fleet.tcp("open"), refusing], "listen": first}
+    with connect(endpoints=first, listen=second), connect(**settings) as session:
         until(lambda: len(session.zenoh.info.transports()) >= 2)
         until(lambda: refusals(caplog))
-        with connect(endpoints=fleet.tcp("users"), listen=own_listener(None)):
+        with connect(endpoints=fleet.tcp("users"), listen=free_endpoint(None)):
             until(lambda: len(refusals(caplog)) == 2)
     assert {text.partition(" ")[0] for _, text in refusals(caplog)} == {repr(refusing)}
 
@@ -120,7 +120,7 @@ def routers(spawn: Callable[..., Child], tmp_path: Path) -> Callable[[str, str],
 ALICE = Credentials(user="alice", password="wonder")
 
 
-def test_a_client_that_finds_another_router_in_the_place_of_its_own_is_told(
+def test_client_logs_a_refusing_router_that_replaced_its_own(
     routers: Callable[[str, str], Child], caplog: pytest.LogCaptureFixture, free_port: int
 ):
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -132,18 +132,18 @@ def test_a_client_that_finds_another_router_in_the_place_of_its_own_is_told(
     assert [reason for reason, _ in refusals(caplog)] == ["user or password"]
 
 
-def test_after_there_was_a_link_it_is_told_again(
+def test_refusal_is_logged_again_after_a_link(
     routers: Callable[[str, str], Child], caplog: pytest.LogCaptureFixture, free_port: int
 ):
     endpoint, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{a_free_port()}"
     stranger = routers(endpoint, "eve")
-    with connect(endpoints=[endpoint, other], listen=own_listener(None), credentials=ALICE) as session:
+    with connect(endpoints=[endpoint, other], listen=free_endpoint(None), credentials=ALICE) as session:
         until(lambda: len(refusals(caplog)) == 1)
         stranger.kill()
         own = routers(endpoint, "alice")
         until(session.zenoh.info.routers_zid)
         routers(other, "eve")
-        until(lambda: len(refusals(caplog)) == 2)  # it has looked while there was a link
+        until(lambda: len(refusals(caplog)) == 2)  # it has checked while there was a link
         own.kill()
         routers(endpoint, "eve")
         until(lambda: len(refusals(caplog)) == 3)
@@ -158,7 +158,7 @@ def test_a_peer_with_credentials_is_warned_at_a_router_and_a_client_is_not(
     endpoint, identity = fleet.tls("mtls"), fleet.identity("r1")
     with (
         connect(mode="client", endpoints=endpoint, credentials=identity),
-        connect(endpoints=endpoint, listen=own_listener(identity), credentials=identity),
+        connect(endpoints=endpoint, listen=free_endpoint(identity), credentials=identity),
     ):
         until(lambda: warnings(caplog))
     ((event, text),) = warnings(caplog)
@@ -168,5 +168,5 @@ def test_a_peer_with_credentials_is_warned_at_a_router_and_a_client_is_not(
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
-    said = [record for record in caplog.records if record.name == "zstate"]
-    return [(record.__dict__["event"], record.getMessage()) for record in said]
+    records = [record for record in caplog.records if record.name == "zstate"]
+    return [(record.__dict__["event"], record.getMessage()) for record in records]

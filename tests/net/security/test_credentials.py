@@ -40,25 +40,25 @@ def refusal(credentials: Credentials, **arguments: object) -> str:
         ({"certificate": "r1.pem", "key": "r1.key"}, "a certificate and no ca"),
     ],
 )
-def test_credentials_that_lack_a_part_say_which(arguments: dict[str, str], text: str):
+def test_incomplete_credentials_name_the_missing_part(arguments: dict[str, str], text: str):
     with pytest.raises(ConfigError) as caught:
         Credentials(**arguments)
     assert text in str(caught.value)
 
 
-def test_a_password_is_not_shown_where_credentials_are():
+def test_repr_of_credentials_has_no_password():
     assert "wonder" not in repr(Credentials(user="alice", password="wonder"))
 
 
-def test_a_folder_without_the_identity_says_which_it_has(fleet: Path):
+def test_missing_identity_error_lists_existing_ones(fleet: Path):
     assert Credentials.from_folder(fleet, "r1").certificate == fleet / "r1.pem"
     with pytest.raises(ConfigError, match=r"no identity 'r3'.*are 'r1', 'r2'; .*zstate certs"):
         Credentials.from_folder(fleet, "r3")
-    with pytest.raises(ConfigError, match="there are none"):
+    with pytest.raises(ConfigError, match="it has none"):
         Credentials.from_folder(fleet / "elsewhere", "r1")
 
 
-def test_an_endpoint_that_shows_no_certificate_is_refused(fleet: Path):
+def test_unencrypted_endpoint_is_refused_with_certificates(fleet: Path):
     text = refusal(Credentials.from_folder(fleet, "r1"), endpoints="tcp/10.0.0.1:7447")
     assert "'tcp/10.0.0.1:7447' is not encrypted" in text
     assert "write 'tls/10.0.0.1:7447'" in text
@@ -71,12 +71,12 @@ def test_listening_with_encryption_needs_a_certificate(fleet: Path):
         connect(mode="router", listen=HERE)
 
 
-def test_a_router_with_a_name_and_no_users_would_let_nobody_in():
+def test_router_with_a_user_and_no_users_file_is_refused():
     text = refusal(Credentials(user="alice", password="x"), mode="router", endpoints=())
     assert "let nobody in" in text
 
 
-def test_programs_of_one_host_meet_without_credentials():
+def test_rendezvous_of_one_host_needs_no_credentials():
     for mode in ("peer", "loopback"):
         assert "endpoints=" in refusal(Credentials(user="a", password="b"), mode=mode, endpoints=())
 
@@ -88,7 +88,7 @@ def test_files_that_are_missing_are_named(fleet: Path):
         assert "nothing' cannot be read: No such file" in text
 
 
-def test_files_that_are_something_else_are_named(fleet: Path, tmp_path: Path):
+def test_malformed_files_are_named(fleet: Path, tmp_path: Path):
     other = tmp_path / "other"
     other.write_text("hello")
     other.chmod(0o600)
@@ -100,7 +100,7 @@ def test_files_that_are_something_else_are_named(fleet: Path, tmp_path: Path):
     assert "do not belong together" in text
 
 
-def test_a_key_with_a_password_is_refused_and_nobody_is_asked_for_it(fleet: Path, tmp_path: Path):
+def test_encrypted_key_is_refused_without_a_prompt(fleet: Path, tmp_path: Path):
     serialization = pytest.importorskip("cryptography.hazmat.primitives.serialization")
     key = serialization.load_pem_private_key((fleet / "r1.key").read_bytes(), None)
     locked = tmp_path / "locked.key"
@@ -113,7 +113,7 @@ def test_a_key_with_a_password_is_refused_and_nobody_is_asked_for_it(fleet: Path
     assert "unencrypted key" in text
 
 
-def test_secrets_that_everybody_can_read_are_refused(fleet: Path, tmp_path: Path):
+def test_world_readable_secrets_are_refused(fleet: Path, tmp_path: Path):
     key, users = tmp_path / "r1.key", tmp_path / "users"
     key.write_bytes((fleet / "r1.key").read_bytes())
     users.write_text("alice:wonder\n")
@@ -125,7 +125,7 @@ def test_secrets_that_everybody_can_read_are_refused(fleet: Path, tmp_path: Path
     assert f"chmod 600 {users}" in refusal(Credentials(users=users), endpoints="tcp/127.0.0.1:1")
 
 
-def test_what_cannot_be_read_is_named(fleet: Path, tmp_path: Path):
+def test_unreadable_file_is_named(fleet: Path, tmp_path: Path):
     hidden = tmp_path / "ca.pem"
     hidden.mkdir()  # root reads every file
     assert str(hidden) in refusal(Credentials(ca=hidden))
@@ -138,13 +138,11 @@ def test_what_cannot_be_read_is_named(fleet: Path, tmp_path: Path):
         ("alice:wonder\n# nobody\n", "line 2: write user:password; comments"),
         ("alice:\n", "line 1: write user:password"),
         (":wonder\n", "line 1: write user:password"),
-        ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' stands in line 1"),
-        ("\n", "names no user"),
+        ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' is already in line 1"),
+        ("\n", "has no user"),
     ],
 )
-def test_a_file_of_users_that_zenoh_would_take_wrongly_is_refused_with_its_line(
-    tmp_path: Path, lines: str, text: str
-):
+def test_users_file_that_zenoh_would_misread_is_refused_with_its_line(tmp_path: Path, lines: str, text: str):
     users = tmp_path / "users"
     users.write_text(lines)
     users.chmod(0o600)

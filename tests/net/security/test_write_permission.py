@@ -18,7 +18,7 @@ USERS = ("r1", "r2", "desk", "stranger")
 
 @pytest.fixture
 def endpoint(tmp_path) -> Iterator[str]:
-    """Where a router listens that knows the robots r1 and r2, and the viewer desk."""
+    """The endpoint of a router with the robots r1 and r2, and the viewer desk."""
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
     users = tmp_path / "users.txt"
     users.write_text("".join(f"{name}:secret\n" for name in USERS))
@@ -47,7 +47,7 @@ def test_a_robot_may_write_itself(endpoint: str):
 
 
 @pytest.mark.parametrize("user", ["r2", "desk", "stranger"])
-def test_who_may_not_is_told_who_they_are_and_which_rule_is_missing(endpoint: str, user: str):
+def test_denial_names_the_identity_and_the_missing_rule(endpoint: str, user: str):
     with join(endpoint, user) as session:
         with pytest.raises(AccessDenied) as refused:
             StatePublisher(session, RRBOT, "r1")
@@ -59,11 +59,11 @@ def test_who_may_not_is_told_who_they_are_and_which_rule_is_missing(endpoint: st
         assert str(pickle.loads(pickle.dumps(refused.value))) == text
         with pytest.raises(AccessDenied):
             StaticPublisher(session, "r1", "mount")
-        # Nothing stays behind of what could not be opened.
+        # A publisher that failed to open leaves no token.
         assert discover(session, 0.2) == ()
 
 
-def test_who_shows_nothing_cannot_be_told_apart_and_is_not_asked():
+def test_session_without_credentials_has_no_probe():
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
     with (
         connect(mode="router", listen=endpoint),
@@ -73,7 +73,7 @@ def test_who_shows_nothing_cannot_be_told_apart_and_is_not_asked():
         assert session.probe is None
 
 
-def test_where_the_router_is_gone_nothing_is_held_against_the_writer(tmp_path):
+def test_writer_is_not_refused_after_its_router_closed(tmp_path):
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
     users = tmp_path / "users.txt"
     users.write_text("r1:secret\n")

@@ -20,11 +20,11 @@ def test_an_attachment_is_33_bytes_sequence_time_length_and_gid():
 
 
 @given(seq=SEQ, source_time=INT64, gid=st.binary(min_size=16, max_size=16))
-def test_what_is_packed_is_unpacked(seq: int, source_time: int, gid: bytes):
+def test_attachment_is_unpacked_as_packed(seq: int, source_time: int, gid: bytes):
     assert unpack(pack(seq, source_time, gid)) == Attachment(seq, source_time, gid)
 
 
-def test_a_message_without_one_is_refused_as_such():
+def test_missing_attachment_has_its_own_reason():
     with pytest.raises(MessageError, match="another program writes on this key") as caught:
         unpack(None)
     assert caught.value.reason == "no attachment"

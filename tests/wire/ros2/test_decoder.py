@@ -26,7 +26,7 @@ PLAIN = FrameNames(Ros2Options(), "r1")
 PREFIXED = FrameNames(Ros2Options(frame_prefix="r1/"), "r1")
 
 
-def heard(stream, payload: bytes, names: FrameNames = PLAIN):
+def decoded(stream, payload: bytes, names: FrameNames = PLAIN):
     return RosDecoder().messages(stream, payload, 77, 5, names)
 
 
@@ -34,16 +34,16 @@ def test_a_joint_state_keeps_its_stamp_names_and_numbers_and_is_signed_by_its_wr
     payload = rosbags_joint_state(STAMP, "base", ("a", "b"), [1.0, 2.0], [3.0, 4.0], [])
     numbers = to_block([1.0, 2.0]), to_block([3.0, 4.0])
     order = order_digest(("a", "b"))
-    assert heard("joint_states", payload) == (JointState(STAMP, 5, 77, order, *numbers, None, ("a", "b")),)
+    assert decoded("joint_states", payload) == (JointState(STAMP, 5, 77, order, *numbers, None, ("a", "b")),)
 
 
 def test_transforms_of_one_instant_are_one_sample_that_names_its_edges():
-    (sample,) = heard("tf", rosbags_tf_message([STAMP] * 3, EDGES, POSES))
+    (sample,) = decoded("tf", rosbags_tf_message([STAMP] * 3, EDGES, POSES))
     assert sample == TransformSample(STAMP, 5, 77, order_digest(EDGES), to_block(POSES), EDGES)
 
 
 def test_transforms_of_several_instants_are_several_samples_the_oldest_first():
-    samples = heard("tf", rosbags_tf_message([STAMP + 9, STAMP, STAMP + 9], EDGES, POSES))
+    samples = decoded("tf", rosbags_tf_message([STAMP + 9, STAMP, STAMP + 9], EDGES, POSES))
     assert [(sample.stamp, sample.edges) for sample in samples] == [
         (STAMP, EDGES[1:2]),
         (STAMP + 9, (EDGES[0], EDGES[2])),
@@ -54,25 +54,25 @@ def test_transforms_of_several_instants_are_several_samples_the_oldest_first():
 
 
 def test_no_transforms_are_no_sample():
-    assert heard("tf", rosbags_tf_message([], [], [])) == ()
+    assert decoded("tf", rosbags_tf_message([], [], [])) == ()
 
 
 @pytest.mark.parametrize("stamps", [[0] * 3, [STAMP, 0, STAMP]])
 def test_a_moving_transform_without_a_stamp_is_refused(stamps):
     with pytest.raises(MessageError, match=r"stamp is zero.*header\.stamp") as caught:
-        heard("tf", rosbags_tf_message(stamps, EDGES, POSES))
+        decoded("tf", rosbags_tf_message(stamps, EDGES, POSES))
     assert caught.value.reason == "no stamp"
 
 
 def test_a_joint_state_without_a_stamp_is_refused():
     with pytest.raises(MessageError) as caught:
-        heard("joint_states", rosbags_joint_state(0, "", ("a",), [1.0], [], []))
+        decoded("joint_states", rosbags_joint_state(0, "", ("a",), [1.0], [], []))
     assert caught.value.reason == "no stamp"
 
 
 @pytest.mark.parametrize("stamps", [[0, 0, 0], [STAMP, 0, STAMP + 1]])
-def test_static_transforms_hold_at_every_time_whatever_their_stamps(stamps):
-    (statics,) = heard("tf_static", rosbags_tf_message(stamps, EDGES, POSES))
+def test_static_transforms_ignore_stamps(stamps):
+    (statics,) = decoded("tf_static", rosbags_tf_message(stamps, EDGES, POSES))
     assert statics == StaticTransforms(77, EDGES, to_block(POSES))
 
 
@@ -80,24 +80,24 @@ def test_frames_are_called_as_in_zstate():
     edges = (("map", "r1/odom"), ("r1/odom", "r1/base"))
     expected = (("ros/map", "odom"), ("odom", "base"))
     for stream in ("tf", "tf_static"):
-        (message,) = heard(stream, rosbags_tf_message([STAMP] * 2, edges, POSES[:2]), PREFIXED)
+        (message,) = decoded(stream, rosbags_tf_message([STAMP] * 2, edges, POSES[:2]), PREFIXED)
         assert message.edges == expected
 
 
 def test_a_description_is_known_by_its_text():
-    one, same, other = (heard("robot_description", rosbags_cdr("std_msgs/msg/String", t))[0] for t in "xxy")
+    one, same, other = (decoded("robot_description", rosbags_cdr("std_msgs/msg/String", t))[0] for t in "xxy")
     assert one == same == RobotDescription(77, "x", one.digest, (), (), clock="")
     assert other.digest != one.digest
 
 
 def test_a_clock_may_stand_at_zero():
-    assert heard("clock", rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(0))) == (
+    assert decoded("clock", rosbags_cdr("rosgraph_msgs/msg/Clock", rosbags_time(0))) == (
         ClockMessage(0, 5, 77),
     )
 
 
 @pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description", "clock"])
-def test_what_is_cut_off_is_refused(stream):
+def test_truncated_payload_is_refused(stream):
     with pytest.raises(MessageError) as caught:
-        heard(stream, b"\x00\x01\x00\x00\x01")
+        decoded(stream, b"\x00\x01\x00\x00\x01")
     assert caught.value.reason == "truncated"

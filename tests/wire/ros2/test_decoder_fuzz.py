@@ -1,4 +1,4 @@
-"""Made-up messages on every topic that a listener hears on the ros2 wire."""
+"""Random messages on every topic that a listener subscribes to on the ros2 wire."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
-# What a listener may hear: whole messages, and messages with some bytes cut off, changed or made up.
+# Payloads on the network: whole messages, and messages with bytes cut off, changed or random.
 NUMBERS = st.floats(width=64)
 WHOLE = {
     JOINT_STATES: st.builds(
@@ -72,21 +72,21 @@ def broken(whole: st.SearchStrategy[bytes]) -> st.SearchStrategy[bytes]:
 
 
 class Fuzz:
-    """Puts what it is told to, and knows what a listener must have counted in the end."""
+    """Puts payloads, and counts the outcomes that a listener must report."""
 
     def __init__(self, session: Session, topic) -> None:
         self.samples = self.refusals = 0
         self._session, self._topic, self._wire = session, topic, Ros2Wire()
 
-    def put(self, payload: bytes, beside: bytes | None) -> None:
+    def put(self, payload: bytes, attached: bytes | None) -> None:
         key = key_of(self._topic)
-        self._session.zenoh.put(key, payload, attachment=beside)
+        self._session.zenoh.put(key, payload, attachment=attached)
         try:
-            said = self._wire.decode(self._topic[0], SerializedSample(key, payload, "", beside), "r1")
+            decoded = self._wire.decode(self._topic[0], SerializedSample(key, payload, "", attached), "r1")
         except MessageError:
             self.refusals += 1
         else:
-            self.samples += len(said)
+            self.samples += len(decoded)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ class Fuzz:
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],
 )
-def test_nothing_that_arrives_stops_a_listener_and_all_of_it_is_counted(sessions, monkeypatch, topic, follow):
+def test_no_payload_stops_a_listener_and_all_are_counted(sessions, monkeypatch, topic, follow):
     writer, reader = sessions
     raised: list[object] = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
@@ -110,8 +110,8 @@ def test_nothing_that_arrives_stops_a_listener_and_all_of_it_is_counted(sessions
 
         @settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck), database=None)
         @given(broken(WHOLE[topic]), BESIDE)
-        def put(payload: bytes, beside: bytes | None) -> None:
-            fuzz.put(payload, beside)
+        def put(payload: bytes, attached: bytes | None) -> None:
+            fuzz.put(payload, attached)
 
         put()
         assert min(fuzz.samples, fuzz.refusals) > 0

@@ -46,7 +46,7 @@ def test_without_a_prefix_a_bare_name_is_the_robots_own():
 
 
 @pytest.mark.parametrize("prefix", ["", "r1/", "left_"])
-def test_the_slash_that_old_programs_put_before_a_frame_is_dropped_once_as_tf2_does(prefix: str):
+def test_leading_slash_of_a_frame_is_dropped_once_as_in_tf2(prefix: str):
     for ros in ("hand", "r1/hand", "left_hand", "fleet/map"):
         assert names(prefix).to_zstate(f"/{ros}") == names(prefix).to_zstate(ros)
     for no_name in ("/", "//hand"):
@@ -54,7 +54,7 @@ def test_the_slash_that_old_programs_put_before_a_frame_is_dropped_once_as_tf2_d
             full_name(ROBOT, names(prefix).to_zstate(no_name))
 
 
-def test_the_robot_of_the_root_namespace_keeps_its_own_frames_apart_from_nobodys():
+def test_root_namespace_robot_keeps_its_frames_separate_from_unowned_ones():
     shared = names("x_", robot="ros")
     assert shared.to_ros("hand") == "x_hand"
     assert shared.to_ros("ros/map") == "map"
@@ -85,7 +85,7 @@ def test_a_name_that_is_only_the_prefix_names_no_frame_of_the_robot():
 
 
 @given(prefix=PREFIXES, name=BARE | FULL)
-def test_what_is_written_is_read_as_the_same_frame(prefix: str, name: str):
+def test_written_name_is_read_as_the_same_frame(prefix: str, name: str):
     both = names(prefix)
     own_prefix = prefix.replace("*", ROBOT)
     owner, slash, rest = name.partition("/")
@@ -98,7 +98,7 @@ def test_what_is_written_is_read_as_the_same_frame(prefix: str, name: str):
 
 
 @given(prefix=PREFIXES, name=BARE | FULL)
-def test_what_is_read_is_written_as_the_same_name(prefix: str, name: str):
+def test_read_name_is_written_as_the_same_name(prefix: str, name: str):
     both = names(prefix)
     own_prefix = prefix.replace("*", ROBOT)
     is_prefixed = bool(own_prefix) and name.startswith(own_prefix)
@@ -106,7 +106,7 @@ def test_what_is_read_is_written_as_the_same_name(prefix: str, name: str):
     assert both.to_ros(both.to_zstate(name)) == name
 
 
-def test_whole_edges_are_renamed_at_both_ends_and_remembered():
+def test_edges_are_renamed_at_both_ends_and_cached():
     both = names("r1/")
     own = (("base", "arm"), ("fleet/map", "base"))
     written = (("r1/base", "r1/arm"), ("fleet/map", "r1/base"))
@@ -116,7 +116,7 @@ def test_whole_edges_are_renamed_at_both_ends_and_remembered():
     assert both.edges_to_ros(again) is both.edges_to_ros(own)
 
 
-def test_only_so_many_orders_of_edges_are_remembered():
+def test_cache_of_edge_orders_is_limited():
     both = names("r1/")
     first = both.edges_to_ros((("base", "0"),))
     for number in range(1000):

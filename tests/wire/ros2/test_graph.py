@@ -59,21 +59,21 @@ ENDPOINTS = st.builds(
 )
 
 
-def test_a_node_in_the_root_is_told_with_percent_signs_for_slashes():
+def test_node_token_has_percent_signs_for_slashes():
     assert NODE.key == f"@ros2_lv/0/{ZID}/0/0/NN/%/%/zstate"
 
 
-def test_an_endpoint_is_told_in_thirteen_chunks():
+def test_endpoint_token_has_thirteen_chunks():
     assert PUBLISHER.key == PUBLISHER_KEY
     assert PUBLISHER.key.count("/") == 12
 
 
 @given(token=NODES | ENDPOINTS)
-def test_what_is_told_is_understood(token: NodeToken | EndpointToken):
+def test_tokens_are_parsed_from_their_own_keys(token: NodeToken | EndpointToken):
     assert parse_token(token.key) == token
 
 
-def test_what_a_later_version_appends_is_passed_over():
+def test_appended_chunks_of_a_later_version_are_ignored():
     assert parse_token(f"{PUBLISHER_KEY}/backends:cpu") == PUBLISHER
 
 
@@ -94,7 +94,7 @@ def test_what_a_later_version_appends_is_passed_over():
         f"@/{ZID}/@ros2_lv/MP/joint_states/sensor_msgs§msg§JointState/:1:0:0,10",
     ],
 )
-def test_strangers_tell_nothing(stranger: str):
+def test_foreign_keys_are_not_parsed(stranger: str):
     assert parse_token(stranger) is None
 
 
@@ -114,12 +114,12 @@ def test_a_gid_is_the_hash_of_the_token_low_half_first():
     assert gid(PUBLISHER_KEY) != gid(NODE.key)
 
 
-def test_one_expression_hears_the_graph_of_a_domain():
+def test_one_expression_matches_the_graph_of_a_domain():
     assert graph_expression(5) == "@ros2_lv/5/**"
     assert DDS_GRAPH_EXPRESSION == "@/*/@ros2_lv/**"
 
 
-def test_a_bridge_tells_a_topic_with_its_type_and_qos():
+def test_bridge_token_has_topic_type_and_qos():
     token = DdsToken(
         ZID, "MP", "r1/tf_static", "tf2_msgs/msg/TFMessage", STREAM_QOS["tf_static"], "RIHS01_e3"
     )
@@ -136,7 +136,7 @@ def test_a_bridge_tells_a_topic_with_its_type_and_qos():
         DdsToken, WORDS, st.sampled_from(["MP", "MS"]), WORDS, WORDS, QOS, st.sampled_from(["", "RIHS01_00"])
     )
 )
-def test_what_a_bridge_tells_is_understood(token: DdsToken):
+def test_bridge_tokens_are_parsed_from_their_own_keys(token: DdsToken):
     assert parse_dds_token(token.key) == token
 
 
@@ -150,5 +150,5 @@ def test_what_a_bridge_tells_is_understood(token: DdsToken):
         f"@/{ZID}/@ros2_lv/MP/tf/tf2_msgs§msg§TFMessage/x",
     ],
 )
-def test_strangers_are_no_tokens_of_a_bridge(stranger: str):
+def test_foreign_keys_are_no_bridge_tokens(stranger: str):
     assert parse_dds_token(stranger) is None

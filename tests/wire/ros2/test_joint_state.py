@@ -120,7 +120,7 @@ def test_big_endian_messages_are_read_alike(has_velocities: bool, has_efforts: b
         assert decoder.decode(theirs) == (-1, "base", names_of(7), *blocks(*rows))
 
 
-def test_what_stands_in_gaps_and_behind_the_message_changes_neither_the_answer_nor_the_way_to_it():
+def test_padding_and_trailing_bytes_change_neither_result_nor_template():
     dice = random.Random(1)
     decoder = JointStateDecoder()
     names = names_of(9)
@@ -150,7 +150,7 @@ def test_numbers_that_are_not_finite_pass_bit_by_bit():
     assert [JointStateDecoder().decode(payload).positions for _ in range(2)] == [row, row]
 
 
-def test_many_writers_that_take_turns_are_all_remembered():
+def test_templates_of_many_alternating_writers_are_cached():
     decoder = JointStateDecoder()
     prefixes = [f"robot{number}/" for number in range(60)]
     encoders = [JointStateEncoder([prefix + name for name in names_of(7)]) for prefix in prefixes]
@@ -160,7 +160,7 @@ def test_many_writers_that_take_turns_are_all_remembered():
     assert all(now is before for one in rounds[1:] for now, before in zip(one, rounds[0], strict=True))
 
 
-def test_names_of_other_lengths_in_a_message_of_the_same_length_are_told_apart():
+def test_payloads_of_equal_length_with_other_name_lengths_differ():
     decoder = JointStateDecoder()
     for _ in range(3):
         for lengths in itertools.permutations((1, 5, 9, 13)):
@@ -169,7 +169,7 @@ def test_names_of_other_lengths_in_a_message_of_the_same_length_are_told_apart()
             assert decoder.decode(payload) == (5, "", names, to_block([1, 2, 3, 4]), None, None)
 
 
-def test_names_that_change_all_the_time_do_not_fill_the_memory():
+def test_changing_names_do_not_fill_the_memory():
     decoder = JointStateDecoder()
     tracemalloc.start()
     try:
@@ -182,7 +182,7 @@ def test_names_that_change_all_the_time_do_not_fill_the_memory():
     assert held < 8 * 2**20
 
 
-def test_positions_only_of_what_has_no_joints_is_an_empty_state():
+def test_state_without_joints_is_empty():
     payload = JointStateEncoder([]).encode(3, b"", b"", b"")
     assert JointStateDecoder().decode(payload) == (3, "", (), b"", None, None)
 
@@ -190,7 +190,7 @@ def test_positions_only_of_what_has_no_joints_is_an_empty_state():
 @pytest.mark.parametrize(
     "counts", [(3, 2, 0, 0), (2, 3, 0, 0), (2, 2, 1, 0), (2, 2, 2, 3), (0, 1, 0, 0), (0, 0, 1, 0)]
 )
-def test_counts_that_do_not_agree_are_malformed_and_said(counts: tuple[int, int, int, int]):
+def test_different_counts_are_malformed_and_in_the_error(counts: tuple[int, int, int, int]):
     names, *rest = counts
     payload = cdr(joint_state(0, "", names_of(names), *[numbers(count, 0.0) for count in rest]))
     expected = "{} names, {} positions, {} velocities, {} efforts".format(*counts)
@@ -206,7 +206,7 @@ def test_joints_without_positions_have_a_reason_of_their_own():
         JointStateDecoder().decode(payload)
 
 
-def test_a_joint_that_comes_twice_is_malformed_and_named():
+def test_duplicate_joint_is_malformed_and_named():
     with pytest.raises(MessageError, match="'a' comes 2 times among 3 names") as caught:
         JointStateDecoder().decode(cdr(joint_state(0, "", ["a", "b", "a"], numbers(3, 0.0), [], [])))
     assert caught.value.reason == "malformed"
@@ -214,7 +214,7 @@ def test_a_joint_that_comes_twice_is_malformed_and_named():
 
 
 @pytest.mark.parametrize("change", ["count", "nanoseconds", "name"])
-def test_a_message_like_one_seen_before_is_still_refused_for_what_is_wrong_in_it(change: str):
+def test_message_of_a_cached_template_is_still_checked(change: str):
     decoder = JointStateDecoder()
     decoder.decode(GOLDEN)
     broken = bytearray(GOLDEN)
@@ -238,14 +238,14 @@ def test_a_message_cut_off_anywhere_is_truncated(fresh: bool):
 
 @pytest.mark.parametrize("place", range(3))
 @pytest.mark.parametrize("size", [0, 8, 15, 24])
-def test_a_block_that_has_not_one_number_for_each_name_is_not_sent(place: int, size: int):
+def test_block_without_one_number_per_name_is_refused(place: int, size: int):
     given = [bytes(16)] * 3
     given[place] = bytes(size)
     with pytest.raises(InvalidInput, match=f"2 names need blocks of 16 bytes.*{size} bytes"):
         JointStateEncoder(["a", "b"]).encode(0, *given)
 
 
-def test_names_and_stamps_that_ros_2_cannot_say_are_not_sent():
+def test_names_and_stamps_that_ros_2_cannot_represent_are_refused():
     with pytest.raises(InvalidInput, match="'a' comes 2 times"):
         JointStateEncoder(["a", "b", "a"])
     with pytest.raises(InvalidInput, match="NUL"):

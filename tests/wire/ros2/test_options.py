@@ -25,7 +25,7 @@ def test_every_option_can_be_written():
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "problem"),
     [
         ("namepsace=r1", "has no option 'namepsace'; did you mean 'namespace'? known: domain, namespace,"),
         ("colour=red", "has no option 'colour'; known: domain, namespace, frame_prefix, tf, hash, node"),
@@ -43,14 +43,14 @@ def test_every_option_can_be_written():
         ("frame_prefix=r1//", "contains '//'"),
     ],
 )
-def test_what_cannot_be_used_is_named_with_what_can(text: str, says: str):
+def test_invalid_option_error_lists_allowed_values(text: str, problem: str):
     with pytest.raises(InvalidInput) as caught:
         Ros2Options.parse(text)
-    assert says in str(caught.value)
+    assert problem in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("namespace", "says", "instead"),
+    ("namespace", "problem", "instead"),
     [
         ("arm-2.left", "'arm-2.left' contains '-' and '.'", "'arm_2_left'"),
         ("fleet/2nd", "'2nd' in 'fleet/2nd' begins with a digit", "'_2nd'"),
@@ -59,18 +59,16 @@ def test_what_cannot_be_used_is_named_with_what_can(text: str, says: str):
         ("fleet/*", "'fleet/*' has a '*' within", "'*' alone"),
     ],
 )
-def test_a_namespace_that_ros_would_refuse_is_refused_with_one_that_it_takes(
-    namespace: str, says: str, instead: str
-):
+def test_invalid_namespace_error_suggests_a_valid_one(namespace: str, problem: str, instead: str):
     with pytest.raises(InvalidInput) as caught:
         Ros2Options(namespace=namespace)
-    assert says in str(caught.value)
+    assert problem in str(caught.value)
     assert instead in str(caught.value)
 
 
 @pytest.mark.parametrize("written", ["fleet/r1", "/fleet/r1", "/fleet/r1/"])
 def test_a_namespace_is_one_with_and_without_outer_slashes(written: str):
-    assert Ros2Options(namespace=written).namespace_of("panda") == "fleet/r1"
+    assert Ros2Options(namespace=written).robot_namespace("panda") == "fleet/r1"
 
 
 def test_the_root_namespace_can_be_written_as_ros_does():
@@ -79,24 +77,24 @@ def test_the_root_namespace_can_be_written_as_ros_does():
 
 def test_a_star_is_a_namespace_of_the_robots_own_name():
     options = Ros2Options(namespace="*")
-    assert options.namespace_of("panda") == "panda"
+    assert options.robot_namespace("panda") == "panda"
     with pytest.raises(InvalidInput) as caught:
-        options.namespace_of("arm-2")
+        options.robot_namespace("arm-2")
     assert "the robot 'arm-2'" in str(caught.value)
     assert "contains '-'" in str(caught.value)
     assert "'arm_2'" in str(caught.value)
 
 
 def test_a_star_in_the_frame_prefix_is_the_robots_name():
-    assert Ros2Options(frame_prefix="*/").prefix_of("arm-2") == "arm-2/"
-    assert Ros2Options(frame_prefix="left_").prefix_of("arm-2") == "left_"
-    assert Ros2Options().prefix_of("arm-2") == ""
+    assert Ros2Options(frame_prefix="*/").robot_frame_prefix("arm-2") == "arm-2/"
+    assert Ros2Options(frame_prefix="left_").robot_frame_prefix("arm-2") == "left_"
+    assert Ros2Options().robot_frame_prefix("arm-2") == ""
 
 
 def test_a_name_that_no_robot_can_have_has_no_namespace_and_no_prefix():
     for options in (Ros2Options(), Ros2Options(namespace="*", frame_prefix="*/")):
         for name in ("*", "a/b", ""):
             with pytest.raises(InvalidInput, match="robot name"):
-                options.namespace_of(name)
+                options.robot_namespace(name)
             with pytest.raises(InvalidInput, match="robot name"):
-                options.prefix_of(name)
+                options.robot_frame_prefix(name)

@@ -42,24 +42,24 @@ def test_a_qos_is_written_as_each_side_writes_it(qos: Qos, rmw: str, dds: str):
 
 
 @given(qos=QOS)
-def test_what_is_written_is_read(qos: Qos):
+def test_written_qos_is_parsed_back(qos: Qos):
     assert Qos.parse_rmw(qos.encode_rmw()) == qos
     assert Qos.parse_dds(qos.encode_dds()) == qos
 
 
-def test_a_deadline_a_lifespan_and_a_lease_are_passed_over():
+def test_deadline_lifespan_and_lease_are_ignored():
     assert Qos.parse_rmw("2:1:,7:1,0:2,500:3,4,5") == Qos("best_effort", "transient_local", depth=7)
 
 
-def test_a_type_hash_behind_a_bridges_qos_is_passed_over():
+def test_type_hash_after_the_qos_of_a_bridge_is_ignored():
     assert Qos.parse_dds(":1:0:0,10:typehash=RIHS01_00;") == Qos(depth=10)
-    assert Qos.parse_dds("K:::") == Qos(depth=1)  # what DDS has where nothing is told
+    assert Qos.parse_dds("K:::") == Qos(depth=1)  # the defaults of DDS
 
 
 @pytest.mark.parametrize(
     "text", ["", ":", "::", "::10:,:,:,,", "::,x:,:,:,,", "3::,1:", ":0:,1", "::,-1", "::,0", "::1,2,3"]
 )
-def test_what_is_no_qos_is_refused(text: str):
+def test_malformed_qos_is_refused(text: str):
     with pytest.raises(MessageError, match="'::,10:,:,:,,'") as caught:
         Qos.parse_rmw(text)
     assert caught.value.reason == "malformed"
@@ -98,7 +98,7 @@ def test_a_recording_names_the_same_qos_to_rosbags(qos: Qos):
     assert parse_qos(dump_qos_v8([theirs])) == [theirs]
 
 
-def test_what_late_joiners_must_have_is_transient_local_and_the_rest_is_not():
+def test_only_latched_streams_are_transient_local():
     latched = {stream for stream, qos in STREAM_QOS.items() if qos.durability == "transient_local"}
     assert latched == {"tf_static", "robot_description"}
     assert {qos.reliability for qos in STREAM_QOS.values()} == {"reliable"}

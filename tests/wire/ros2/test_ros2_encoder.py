@@ -1,4 +1,4 @@
-"""What zstate's writers say in ROS 2, read by rosbags."""
+"""Payloads of RosStreamEncoder, decoded by rosbags."""
 
 import math
 import struct
@@ -46,9 +46,9 @@ def encoder(sample_names: SampleLayout = ARM, gid: bytes | None = GID, prefix: s
 
 
 def state(*blocks, names=None, stamp: int = STAMP) -> JointState:
-    said = [None if block is None else to_block(block) for block in blocks]
+    decoded = [None if block is None else to_block(block) for block in blocks]
     order = DIGEST if names is None else order_digest(names)
-    return JointState(stamp, 0, 1, order, *said, **({} if names is None else {"names": names}))
+    return JointState(stamp, 0, 1, order, *decoded, **({} if names is None else {"names": names}))
 
 
 @pytest.mark.parametrize("blocks", [([1.0, 2.0],), ([1.0, 2.0], [3.0, 4.0]), ([1.0, 2.0], None, [5.0, 6.0])])
@@ -57,7 +57,7 @@ def test_joint_states_are_named_by_the_layout(blocks):
     assert encoder().encode(state(*blocks)) == rosbags_joint_state(STAMP, "", ("a", "b"), *filled)
 
 
-def test_joint_states_that_bring_their_names_keep_them():
+def test_joint_states_with_names_keep_them():
     one = encoder()
     for names in (("x",), ("y", "z", "w"), ("x",)):
         numbers = [float(n) for n in range(len(names))]
@@ -68,11 +68,11 @@ def test_joint_states_that_bring_their_names_keep_them():
 def test_a_robot_that_floats_has_no_velocity_for_the_last_number_of_its_quaternion():
     positions, rates = [0.0, 1.0, 2.0, 0.0, 0.0, 0.0, 1.0, 0.5], [10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0]
     payload = encoder(DRONE).encode(state(positions, rates, rates))
-    said = STORE.deserialize_cdr(payload, "sensor_msgs/msg/JointState")
-    assert tuple(said.name) == DRONE.coordinates
-    assert said.position.tolist() == positions
-    for block in (said.velocity, said.effort):
-        by_name = dict(zip(said.name, block.tolist(), strict=True))
+    decoded = STORE.deserialize_cdr(payload, "sensor_msgs/msg/JointState")
+    assert tuple(decoded.name) == DRONE.coordinates
+    assert decoded.position.tolist() == positions
+    for block in (decoded.velocity, decoded.effort):
+        by_name = dict(zip(decoded.name, block.tolist(), strict=True))
         assert math.isnan(by_name.pop("body.qw"))
         assert list(by_name.values()) == rates
 
@@ -87,7 +87,7 @@ def test_moving_edges_are_those_of_the_layout_or_of_the_message():
     assert one.encode(sample) == rosbags_tf_message([STAMP] * 2, expected, POSES)
 
 
-def test_static_edges_have_the_stamp_by_which_ros_means_always():
+def test_static_edges_have_the_stamp_zero():
     for count in (2, 0):
         statics = StaticTransforms(1, EDGES[:count], to_block(POSES[:count]))
         expected = rosbags_tf_message([0] * count, EDGES[:count], POSES[:count])
@@ -103,7 +103,7 @@ def test_a_description_is_its_text_and_a_clock_its_time():
 
 
 @pytest.mark.parametrize("stamp", [0, 2**31 * 10**9, -(2**31) * 10**9 - 1])
-def test_a_moment_that_ros_cannot_say_is_refused(stamp: int):
+def test_stamp_out_of_the_range_of_ros_is_refused(stamp: int):
     for message in (
         state([1.0, 2.0], stamp=stamp),
         TransformSample(stamp, 0, 1, DIGEST, to_block(POSES)),
@@ -112,7 +112,7 @@ def test_a_moment_that_ros_cannot_say_is_refused(stamp: int):
             encoder().encode(message)
 
 
-def test_what_has_no_topic_and_numbers_that_have_no_names_are_refused():
+def test_messages_without_a_topic_and_numbers_without_names_are_refused():
     with pytest.raises(InvalidInput, match="no topic for a JointCommand"):
         encoder().encode(JointCommand(STAMP, 0, 1, DIGEST))
     with pytest.raises(InvalidInput, match="2 names need"):
@@ -132,6 +132,6 @@ def test_attachments_are_numbered_from_one_on_and_a_refused_message_takes_no_num
     assert encoder(gid=None).attachment(5) is None
 
 
-def test_nothing_is_withdrawn_and_no_encoding_told():
+def test_latched_values_are_not_withdrawn_and_encoding_is_empty():
     assert (encoder().can_withdraw, encoder().encoding) == (False, "")
     assert (encoder().key, encoder().token) == ("key", "token")

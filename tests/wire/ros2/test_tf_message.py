@@ -94,7 +94,7 @@ def test_big_endian_messages_are_read_alike():
         assert decoder.decode(theirs) == (-1, (-1,) * 7, edges, to_block(poses))
 
 
-def test_what_stands_in_gaps_and_behind_the_message_changes_neither_the_answer_nor_the_way_to_it():
+def test_padding_and_trailing_bytes_change_neither_result_nor_template():
     dice = random.Random(1)
     decoder = TfMessageDecoder()
     first = None
@@ -107,7 +107,7 @@ def test_what_stands_in_gaps_and_behind_the_message_changes_neither_the_answer_n
         assert found.edges is first.edges
 
 
-def test_many_writers_that_take_turns_are_all_remembered():
+def test_templates_of_many_alternating_writers_are_cached():
     decoder = TfMessageDecoder()
     fleet: list[Edges] = [(("map", f"robot{number:02}/base"),) for number in range(60)]
     encoders = [TfMessageEncoder(tuple(edges)) for edges in fleet]
@@ -118,7 +118,7 @@ def test_many_writers_that_take_turns_are_all_remembered():
     assert all(now is before for one in rounds[1:] for now, before in zip(one, rounds[0], strict=True))
 
 
-def test_frames_of_other_lengths_in_a_message_of_the_same_length_are_told_apart():
+def test_payloads_of_equal_length_with_other_frame_lengths_differ():
     decoder = TfMessageDecoder()
     for _ in range(3):
         for parent in range(1, 60):
@@ -127,7 +127,7 @@ def test_frames_of_other_lengths_in_a_message_of_the_same_length_are_told_apart(
             assert decoder.decode(payload) == (5, (5,), edges, to_block(POSE))
 
 
-def test_frames_that_change_all_the_time_do_not_fill_the_memory():
+def test_changing_frames_do_not_fill_the_memory():
     decoder = TfMessageDecoder()
     tracemalloc.start()
     try:
@@ -140,7 +140,7 @@ def test_frames_that_change_all_the_time_do_not_fill_the_memory():
     assert held < 8 * 2**20
 
 
-def test_a_message_longer_than_what_is_remembered_is_read_every_time():
+def test_message_larger_than_the_cache_is_decoded_every_time():
     edges = tuple((f"frame{number}", "c" * 400) for number in range(2500))
     poses = to_block(np.ones((2500, 7)))
     payload = TfMessageEncoder(edges).encode(1, poses)
@@ -152,7 +152,7 @@ def test_a_message_longer_than_what_is_remembered_is_read_every_time():
 
 
 @pytest.mark.parametrize("change", ["nanoseconds", "NUL"])
-def test_a_message_like_one_seen_before_is_still_refused_for_what_is_wrong_in_it(change: str):
+def test_message_of_a_cached_template_is_still_checked(change: str):
     decoder = TfMessageDecoder()
     decoder.decode(GOLDEN)
     broken = bytearray(GOLDEN)
@@ -184,12 +184,12 @@ def test_more_transforms_than_there_are_bytes_is_truncated(count: int):
 
 
 @pytest.mark.parametrize("size", [0, 55, 57, 112])
-def test_a_block_that_has_not_one_pose_for_each_edge_is_not_sent(size: int):
+def test_block_without_one_pose_per_edge_is_refused(size: int):
     with pytest.raises(InvalidInput, match=f"1 edges need a block of 56 bytes.*not {size}"):
         TfMessageEncoder((("a", "b"),)).encode(0, bytes(size))
 
 
-def test_names_and_stamps_that_ros_2_cannot_say_are_not_sent():
+def test_names_and_stamps_that_ros_2_cannot_represent_are_refused():
     with pytest.raises(InvalidInput, match="NUL"):
         TfMessageEncoder((("a", "b\0"),))
     with pytest.raises(InvalidInput, match=f"{2**62}"):

@@ -30,7 +30,7 @@ def test_in_the_root_namespace_the_topics_are_those_of_a_robot_state_publisher()
     }
 
 
-def test_a_namespace_stands_before_what_is_the_robots_and_not_before_tf_and_clock():
+def test_namespace_prefixes_robot_topics_but_not_tf_and_clock():
     keys = RmwKeys(Ros2Options(domain=5, namespace="/fleet/r1"))
     assert keys.key("panda", "joint_states") == f"5/fleet/r1/joint_states/{JOINT_STATE}"
     assert keys.key("panda", "robot_description") == f"5/fleet/r1/robot_description/{STRING}"
@@ -38,21 +38,21 @@ def test_a_namespace_stands_before_what_is_the_robots_and_not_before_tf_and_cloc
     assert keys.key("panda", "clock") == f"5/clock/{CLOCK}"
 
 
-def test_tf_can_be_put_into_the_namespace_but_the_clock_stays_everybodys():
+def test_tf_can_be_in_the_namespace_but_the_clock_is_global():
     keys = RmwKeys(Ros2Options(namespace="*", tf="namespace"))
     assert keys.topic("r1", "tf") == "/r1/tf"
     assert keys.topic("r1", "tf_static") == "/r1/tf_static"
     assert keys.topic("r1", "clock") == "/clock"
 
 
-def test_humble_writes_that_it_has_no_hashes_and_readers_hear_either():
+def test_humble_keys_have_no_hash_and_readers_match_both():
     iron, humble = (RmwKeys(Ros2Options(hash=style)) for style in ("iron", "humble"))
     assert humble.key("r1", "tf") == "0/tf/tf2_msgs::msg::dds_::TFMessage_/TypeHashNotSupported"
     assert iron.expression("r1", "tf") == humble.expression("r1", "tf")
     assert humble.expression("r1", "tf") == "0/tf/tf2_msgs::msg::dds_::TFMessage_/*"
 
 
-def test_listening_to_all_robots_means_whoever_is_in_the_namespace():
+def test_expression_of_all_robots_matches_the_namespace():
     end = "joint_states/sensor_msgs::msg::dds_::JointState_/*"
     assert RmwKeys(Ros2Options(namespace="*")).expression("*", "joint_states") == f"0/*/{end}"
     assert RmwKeys(Ros2Options(namespace="*")).expression("r1", "joint_states") == f"0/r1/{end}"
@@ -60,7 +60,7 @@ def test_listening_to_all_robots_means_whoever_is_in_the_namespace():
     assert RmwKeys(Ros2Options()).expression("*", "joint_states") == f"0/{end}"
 
 
-def test_a_bridge_puts_its_namespace_before_everything_and_nothing_else():
+def test_bridge_keys_are_namespace_and_topic_only():
     keys = DdsKeys(Ros2Options(domain=5, namespace="fleet/r1", hash="humble"))
     for stream in STREAMS:
         assert keys.key("panda", stream) == f"fleet/r1/{stream}"
@@ -77,19 +77,19 @@ def test_a_bridge_puts_its_namespace_before_everything_and_nothing_else():
 def test_the_robot_of_a_key_is_the_end_of_its_namespace(layout, namespace: str, robot: str):
     keys = layout(Ros2Options(namespace=namespace, tf="namespace"))
     for stream in STREAMS[:-1]:
-        assert keys.robot_of(keys.key("panda", stream)) == robot
+        assert keys.robot_from_key(keys.key("panda", stream)) == robot
 
 
-def test_what_is_everybodys_is_the_shared_robots():
+def test_global_topics_belong_to_the_shared_robot():
     keys = RmwKeys(Ros2Options(namespace="*"))
     for stream in ("tf", "tf_static", "clock"):
-        assert keys.robot_of(keys.key("panda", stream)) == SHARED
+        assert keys.robot_from_key(keys.key("panda", stream)) == SHARED
 
 
 @pytest.mark.parametrize("stranger", ["", "0", "0/tf", "0/tf/tf2_msgs::msg::dds_::TFMessage_"])
 def test_a_key_of_another_layout_has_no_robot(stranger: str):
     with pytest.raises(InvalidInput, match="'<domain>/<topic>/<type>/<hash>'"):
-        RmwKeys(Ros2Options()).robot_of(stranger)
+        RmwKeys(Ros2Options()).robot_from_key(stranger)
 
 
 @pytest.mark.parametrize("layout", [RmwKeys, DdsKeys])

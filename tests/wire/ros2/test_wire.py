@@ -1,4 +1,4 @@
-"""The ROS wires: what is announced, heard and said, without a network."""
+"""ROS 2 wire formats without a network: tokens, keys, decoded samples."""
 
 import struct
 
@@ -50,9 +50,9 @@ def endpoint(topic, name: str, *, kind: str = "MP", namespace: str = "", hash_: 
 
 
 def arrival(
-    payload: bytes = GOOD, beside: bytes | None = attachment(7, GID), key: str = ""
+    payload: bytes = GOOD, attached: bytes | None = attachment(7, GID), key: str = ""
 ) -> SerializedSample:
-    return SerializedSample(key or key_of(JOINT_STATES), payload, "zenoh/bytes", beside)
+    return SerializedSample(key or key_of(JOINT_STATES), payload, "zenoh/bytes", attached)
 
 
 def encoder_of(wire: Ros2Wire, stream: Stream, number: int) -> StreamEncoder:
@@ -75,7 +75,7 @@ def test_a_writer_is_a_node_with_an_endpoint_for_each_stream():
     assert tf.token.split("/")[9:] == ["%tf", *TF[1:]]
 
 
-def test_the_bridges_wire_has_plain_keys_its_own_tokens_and_nothing_beside():
+def test_bridge_wire_has_plain_keys_own_tokens_and_no_attachment():
     bridged = Ros2DdsWire(Ros2Options(namespace="r1"))
     assert bridged.node_token("r1", WRITER, EntityId(ZID, 3)) is None
     encoder = encoder_of(bridged, "tf_static", 9)
@@ -88,10 +88,10 @@ def test_the_bridges_wire_has_plain_keys_its_own_tokens_and_nothing_beside():
 @pytest.mark.parametrize("written", ["", HUMBLE])
 def test_a_publisher_of_a_stream_is_announced_by_its_node_and_signed_as_its_messages(topic, written):
     token = endpoint(topic, "rsp", hash_=written)
-    said = wire().announced(token, "r1")
-    assert said is not None
-    assert (said.robot, said.stream, str(said.writer)) == ("r1", topic[0], "/rsp")
-    assert said.writer.session == int.from_bytes(gid_of(token)[:8], "little")
+    decoded = wire().parse_token(token, "r1")
+    assert decoded is not None
+    assert (decoded.robot, decoded.stream, str(decoded.writer)) == ("r1", topic[0], "/rsp")
+    assert decoded.writer.session == int.from_bytes(gid_of(token)[:8], "little")
 
 
 @pytest.mark.parametrize(
@@ -112,10 +112,10 @@ def test_a_publisher_of_a_stream_is_announced_by_its_node_and_signed_as_its_mess
 )
 def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespace, topic, robot, expected):
     one = wire(**options)
-    said = one.announced(endpoint(topic, "rsp", namespace=namespace), robot)
-    assert (said and said.robot) == expected
+    decoded = one.parse_token(endpoint(topic, "rsp", namespace=namespace), robot)
+    assert (decoded and decoded.robot) == expected
     if expected and robot == "*":
-        assert one.robot_of(key_of(topic, namespace)) == expected
+        assert one.robot_from_key(key_of(topic, namespace)) == expected
 
 
 @pytest.mark.parametrize(
@@ -130,8 +130,8 @@ def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespa
     ],
 )
 def test_tokens_of_anything_else_announce_nothing(token: str):
-    assert wire().announced(token, "r1") is None
-    assert wire().announced(token, "*") is None
+    assert wire().parse_token(token, "r1") is None
+    assert wire().parse_token(token, "*") is None
 
 
 @pytest.mark.parametrize("stream", DDS_TOPICS)
@@ -139,24 +139,24 @@ def test_a_route_of_a_bridge_is_announced(stream):
     one = Ros2DdsWire()
     for tail in (":1:1:0,1", f":1:1:0,1:typehash={TF[2]};", ""):
         token = f"@/{ZID}/@ros2_lv/MP/{stream}/{DDS_TOPICS[stream]}/{tail or ':0:0:1,-1'}"
-        said = one.announced(token, "r1")
-        assert said is not None
-        assert (said.robot, said.stream, said.writer.session) == ("r1", stream, 0)
-        assert str(said.writer) == f"ros2dds bridge {ZID[:8]}"
-        assert one.announced(token.replace("/MP/", "/MS/"), "r1") is None
-        assert one.announced(token.replace("§msg§", "§"), "r1") is None
+        decoded = one.parse_token(token, "r1")
+        assert decoded is not None
+        assert (decoded.robot, decoded.stream, decoded.writer.session) == ("r1", stream, 0)
+        assert str(decoded.writer) == f"ros2dds bridge {ZID[:8]}"
+        assert one.parse_token(token.replace("/MP/", "/MS/"), "r1") is None
+        assert one.parse_token(token.replace("§msg§", "§"), "r1") is None
 
 
-def test_messages_are_told_apart_by_the_writer_and_the_number_beside_them():
+def test_session_and_sequence_number_come_from_the_attachment():
     (state,) = wire().decode("joint_states", arrival(), "r1")
     assert (state.session, state.seq) == (int.from_bytes(GID[:8], "little"), 7)
     one = Ros2DdsWire()
-    said = [one.decode("joint_states", arrival(beside=None), "r1")[0] for _ in range(3)]
-    assert [(state.session, state.seq) for state in said] == [(0, 1), (0, 2), (0, 3)]
+    decoded = [one.decode("joint_states", arrival(attached=None), "r1")[0] for _ in range(3)]
+    assert [(state.session, state.seq) for state in decoded] == [(0, 1), (0, 2), (0, 3)]
 
 
 @pytest.mark.parametrize(
-    ("beside", "reason"),
+    ("attached", "reason"),
     [
         (None, "no attachment"),
         (b"", "foreign"),
@@ -165,17 +165,17 @@ def test_messages_are_told_apart_by_the_writer_and_the_number_beside_them():
         (b"\x0fsequence_number" + bytes(40), "foreign"),
     ],
 )
-def test_a_message_whose_writer_is_not_told_is_refused(beside, reason: str):
+def test_message_without_a_valid_attachment_is_refused(attached, reason: str):
     with pytest.raises(MessageError) as caught:
-        wire().decode("joint_states", arrival(beside=beside), "r1")
+        wire().decode("joint_states", arrival(attached=attached), "r1")
     assert caught.value.reason == reason
 
 
-def test_a_key_in_a_namespace_that_ros_does_not_have_is_foreign():
+def test_key_in_a_namespace_that_ros_does_not_allow_is_foreign():
     one = wire(namespace="*")
     key = key_of(JOINT_STATES, "two words")
     with pytest.raises(MessageError, match="two words") as caught:
-        one.decode("joint_states", arrival(key=key), one.robot_of(key))
+        one.decode("joint_states", arrival(key=key), one.robot_from_key(key))
     assert caught.value.reason == "foreign"
 
 
@@ -203,17 +203,15 @@ KEYS = st.text(st.characters(exclude_characters="*$?#/"), min_size=1).map(lambda
 
 @settings(max_examples=400, deadline=None)
 @given(STREAMS, st.tuples(PAYLOADS, BESIDE, KEYS), st.sampled_from(["", "*"]), st.booleans())
-def test_whatever_arrives_is_read_or_refused_with_a_reason(
-    stream, given_, namespace: str, behind_bridge: bool
-):
+def test_any_payload_is_decoded_or_refused_with_a_reason(stream, given_, namespace: str, behind_bridge: bool):
     one = (Ros2DdsWire if behind_bridge else Ros2Wire)(Ros2Options(namespace=namespace))
     come = arrival(*given_)
     try:
-        said = one.decode(stream, come, one.robot_of(come.key))
+        decoded = one.decode(stream, come, one.robot_from_key(come.key))
     except MessageError as error:
         assert error.reason
     else:
-        assert isinstance(said, tuple)
+        assert isinstance(decoded, tuple)
 
 
 @settings(max_examples=400, deadline=None)
@@ -224,7 +222,7 @@ def test_whatever_arrives_is_read_or_refused_with_a_reason(
     st.sampled_from(["", "r1", "*"]),
     st.sampled_from(["r1", "*"]),
 )
-def test_whatever_is_announced_is_understood_or_passed_over(token: str, namespace: str, robot: str):
+def test_any_token_is_parsed_or_ignored(token: str, namespace: str, robot: str):
     for one in (wire(namespace=namespace), Ros2DdsWire(Ros2Options(namespace=namespace))):
-        one.announced(token, robot)
-        one.announced(f"@/{ZID}/@ros2_lv/MP/{token}", robot)
+        one.parse_token(token, robot)
+        one.parse_token(f"@/{ZID}/@ros2_lv/MP/{token}", robot)

@@ -1,4 +1,4 @@
-"""The ros2 wires beside the native one: the same answers, and the same numbers."""
+"""Lookups and samples of the ROS 2 wires equal those of the native wire."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def data_key(wire: str, robot: str, stream: str) -> str:
 
 @pytest.mark.parametrize("model", [EVERY, load_model("rrbot")], ids=["every joint", "rrbot"])
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_the_answers_are_those_of_the_native_wire_bit_for_bit(sessions, model, follow: str):
+def test_lookups_equal_those_of_the_native_wire_bit_for_bit(sessions, model, follow: str):
     writer, reader = sessions
     random = np.random.default_rng(7)
     listeners = [TransformListener(reader, "r1", wire=wire, follow=follow) for wire in WIRES]
@@ -113,7 +113,7 @@ def test_joint_states_are_read_back_as_they_were_published(sessions, wire: str):
     assert (bare.velocities, bare.efforts) == (None, None)
 
 
-def test_a_source_takes_what_a_ros_driver_says_and_counts_the_rest(sessions):
+def test_source_reads_a_ros_driver_and_counts_other_messages(sessions):
     writer, reader = sessions
     names, nan = RRBOT.joint_names, float("nan")
     with SubscribedSource(reader, RRBOT, "r1", wire="ros2") as source:
@@ -138,16 +138,16 @@ def test_a_source_takes_what_a_ros_driver_says_and_counts_the_rest(sessions):
     assert source.refused == dict.fromkeys([*reasons, "no attachment"], 1)
 
 
-def test_both_wires_say_the_same_numbers_at_the_same_instants(sessions):
+def test_both_wires_carry_the_same_numbers_at_the_same_instants(sessions):
     writer, reader = sessions
     keys = {wire: data_key(wire, "r1", "joint_states") for wire in ("native", "ros2")}
-    said: dict[str, list[SerializedSample]] = {wire: [] for wire in keys}
+    received: dict[str, list[SerializedSample]] = {wire: [] for wire in keys}
 
     def note(wire: str) -> Callable:
         def take(sample) -> None:
-            beside = sample.attachment.to_bytes() if sample.attachment else None
+            attached = sample.attachment.to_bytes() if sample.attachment else None
             key, payload = str(sample.key_expr), sample.payload.to_bytes()
-            said[wire].append(SerializedSample(key, payload, str(sample.encoding), beside))
+            received[wire].append(SerializedSample(key, payload, str(sample.encoding), attached))
 
         return take
 
@@ -157,9 +157,9 @@ def test_both_wires_say_the_same_numbers_at_the_same_instants(sessions):
             await_reader(writer, key)
         for number in range(5):
             publisher.publish([0.1 * number, 0.2], [1.0, 2.0])
-        until(lambda: all(len(arrivals) == 5 for arrivals in said.values()))
-    native = [NativeWire().decode("joint_states", one, "r1")[0] for one in said["native"]]
-    ros = [Ros2Wire().decode("joint_states", one, "r1")[0] for one in said["ros2"]]
+        until(lambda: all(len(arrivals) == 5 for arrivals in received.values()))
+    native = [NativeWire().decode("joint_states", one, "r1")[0] for one in received["native"]]
+    ros = [Ros2Wire().decode("joint_states", one, "r1")[0] for one in received["ros2"]]
     for one, other in zip(native, ros, strict=True):
         assert (one.stamp, one.positions, one.velocities) == (other.stamp, other.positions, other.velocities)
         assert (one.seq + 1, one.order) == (other.seq, other.order)
@@ -202,7 +202,7 @@ def test_plain_puts_of_a_bridge_need_no_token_and_jumps_of_stamps_are_new_epochs
 
 
 @pytest.mark.parametrize("stamp", [0, 2**31 * 10**9])
-def test_a_stamp_that_ros_has_no_place_for_is_refused_with_nothing_sent_on_either_wire(sessions, stamp: int):
+def test_stamp_out_of_the_range_of_ros_is_sent_on_neither_wire(sessions, stamp: int):
     writer, reader = sessions
     native, ros = "zstate/r1/joint_states", key_of(JOINT_STATES)
     ears = Ear(reader, native), Ear(reader, ros), Ear(reader, key_of(TF))
@@ -218,7 +218,7 @@ def test_a_stamp_that_ros_has_no_place_for_is_refused_with_nothing_sent_on_eithe
         assert [len(ear.heard(2)) for ear in ears] == [2, 2, 2]
 
 
-def test_a_wire_that_cannot_be_opened_leaves_nothing_of_the_others(sessions):
+def test_wire_that_fails_to_open_closes_the_others(sessions):
     writer, reader = sessions
     errors = []  # kept, with all that is reached from where they were raised
     for bad in ("dds", "ros2:namespace=*", "ros2:domain=300"):

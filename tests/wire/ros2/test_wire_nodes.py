@@ -60,7 +60,7 @@ def moving_poses(model: RobotModel, positions) -> dict[tuple[str, str], list[flo
     return {edge: pose for edge, pose in poses if edge in moving}
 
 
-def said_poses(message) -> dict[tuple[str, str], list[float]]:
+def decoded_poses(message) -> dict[tuple[str, str], list[float]]:
     return {
         (one.header.frame_id, one.child_frame_id): [
             *(getattr(one.transform.translation, axis) for axis in "xyz"),
@@ -70,7 +70,7 @@ def said_poses(message) -> dict[tuple[str, str], list[float]]:
     }
 
 
-def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ros(sessions):
+def test_ros_node_decodes_joint_states_and_transforms(sessions):
     writer, reader = sessions
     joints, transforms = Ear(reader, key_of(JOINT_STATES)), Ear(reader, key_of(TF))
     rates, forces = POSITIONS * 2, POSITIONS * 3
@@ -80,7 +80,7 @@ def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ro
         publisher.publish(POSITIONS, rates, forces, stamp=STAMP)
         publisher.publish(POSITIONS, stamp=STAMP + 1)
         full, bare = joints.messages(2, JOINT_STATE_MSG)
-        (said, _) = transforms.messages(2, TF_MSG)
+        (decoded, _) = transforms.messages(2, TF_MSG)
     assert (full.header.stamp.sec, full.header.stamp.nanosec) == (SEC, NANOSEC)
     assert tuple(full.name) == RRBOT.joint_names
     assert [block.tolist() for block in (full.position, full.velocity, full.effort)] == [
@@ -89,18 +89,20 @@ def test_a_ros_node_reads_the_joint_states_and_transforms_it_would_be_told_by_ro
         forces.tolist(),
     ]
     assert (bare.header.stamp.nanosec, len(bare.velocity), len(bare.effort)) == (NANOSEC + 1, 0, 0)
-    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in said.transforms} == {(SEC, NANOSEC)}
-    assert said_poses(said) == moving_poses(RRBOT, POSITIONS)
+    assert {(one.header.stamp.sec, one.header.stamp.nanosec) for one in decoded.transforms} == {
+        (SEC, NANOSEC)
+    }
+    assert decoded_poses(decoded) == moving_poses(RRBOT, POSITIONS)
 
 
-def test_who_joins_late_is_given_the_description_and_the_fixed_edges(sessions):
+def test_late_joiner_receives_the_description_and_the_fixed_edges(sessions):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, wires=("ros2",)):
         (text,) = Ear(reader, key_of(DESCRIPTION), latched=True).messages(1, STRING_MSG)
         (statics,) = Ear(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
     assert text.data == RRBOT.urdf
     fixed = {(j.parent, j.child): list(j.origin) for j in RRBOT.joints if j.type == "fixed"}
-    assert said_poses(statics) == fixed
+    assert decoded_poses(statics) == fixed
 
 
 def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(sessions):
@@ -115,10 +117,10 @@ def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(
             publisher.publish(POSITIONS, stamp=STAMP + number)
         alive = endpoints(reader, 4)
         for topic, numbers in ((JOINT_STATES, 3), (TF, 3), (TF_STATIC, 1), (DESCRIPTION, 1)):
-            said = ears[topic[0]].attachments(numbers)
-            assert [seq for seq, _, _ in said] == list(range(1, numbers + 1))
-            assert all(before <= at <= time.time_ns() for _, at, _ in said)
-            assert {gid for _, _, gid in said} == {gid_of("/".join(alive[f"%{topic[0]}"]))}
+            decoded = ears[topic[0]].attachments(numbers)
+            assert [seq for seq, _, _ in decoded] == list(range(1, numbers + 1))
+            assert all(before <= at <= time.time_ns() for _, at, _ in decoded)
+            assert {gid for _, _, gid in decoded} == {gid_of("/".join(alive[f"%{topic[0]}"]))}
             # A ROS node does not look at the encoding; none is what ROS itself gives.
             assert {str(sample.encoding) for sample in ears[topic[0]].samples} == {"zenoh/bytes"}
 
@@ -177,7 +179,7 @@ def test_humble_has_no_hashes(sessions):
         assert late.data == RRBOT.urdf
 
 
-def test_iron_and_humble_are_said_side_by_side(sessions):
+def test_iron_and_humble_can_be_published_together(sessions):
     writer, reader = sessions
     keys = [key_of(JOINT_STATES), key_of(JOINT_STATES, written=HUMBLE)]
     ears = [Ear(reader, key) for key in keys]
@@ -212,7 +214,7 @@ def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.
         ("namespace=*", "rrbot", ""),
     ],
 )
-def test_a_namespace_stands_before_the_topics_and_around_the_node(sessions, options, namespace, tf_in):
+def test_namespace_prefixes_topics_and_node(sessions, options, namespace, tf_in):
     writer, reader = sessions
     ears = {topic[0]: Ear(reader, key_of(topic, namespace), latched=topic == DESCRIPTION) for topic in TOPICS}
     shared = [Ear(reader, key_of(topic, tf_in), latched=topic == TF_STATIC) for topic in (TF, TF_STATIC)]
@@ -231,7 +233,7 @@ def test_a_namespace_stands_before_the_topics_and_around_the_node(sessions, opti
     }
 
 
-def test_a_frame_prefix_stands_before_every_frame_of_the_robot(sessions):
+def test_frame_prefix_applies_to_every_frame_of_the_robot(sessions):
     writer, reader = sessions
     transforms = Ear(reader, key_of(TF))
     with StatePublisher(writer, RRBOT, "r1", wires=("ros2:frame_prefix=*/",)) as publisher:
@@ -240,10 +242,10 @@ def test_a_frame_prefix_stands_before_every_frame_of_the_robot(sessions):
         publisher.publish([0.1, 0.2], stamp=STAMP)
         (moving,) = transforms.messages(1, TF_MSG)
     edges = {(f"r1/{joint.parent}", f"r1/{joint.child}") for joint in RRBOT.joints}
-    assert said_poses(statics).keys() | said_poses(moving).keys() == edges
+    assert decoded_poses(statics).keys() | decoded_poses(moving).keys() == edges
 
 
-def test_two_robots_of_one_session_stand_in_two_namespaces(sessions):
+def test_two_robots_of_one_session_have_two_namespaces(sessions):
     writer, reader = sessions
     wires = ("ros2:namespace=*,frame_prefix=*/",)
     ears = {robot: Ear(reader, key_of(JOINT_STATES, robot)) for robot in ("r1", "r2")}
@@ -258,10 +260,10 @@ def test_two_robots_of_one_session_stand_in_two_namespaces(sessions):
         two.publish([2.0, 2.0], stamp=STAMP)
         assert ears["r1"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [1.0, 1.0]
         assert ears["r2"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [2.0, 2.0]
-        said = transforms.messages(2, TF_MSG)
+        decoded = transforms.messages(2, TF_MSG)
         alive = tokens(reader)
         robots = {robot.name for robot in discover(reader, wire=wires[0])}
-    assert {edge[1] for message in said for edge in said_poses(message)} == {
+    assert {edge[1] for message in decoded for edge in decoded_poses(message)} == {
         f"{robot}/{link}" for robot in ("r1", "r2") for link in ("upper", "lower")
     }
     assert robots == {"r1", "r2", "ros"}
@@ -283,7 +285,7 @@ def test_two_robots_of_one_session_stand_in_two_namespaces(sessions):
         ("/", "_"),
     ],
 )
-def test_the_node_is_called_as_the_program_by_a_name_that_ros_allows(sessions, monkeypatch, script, node):
+def test_node_name_is_the_program_made_valid_for_ros(sessions, monkeypatch, script, node):
     monkeypatch.setattr(sys, "argv", [script])
     with StatePublisher(sessions[0], RRBOT, wires=("ros2",)):
         until(lambda: len(tokens(sessions[1])) == 5)

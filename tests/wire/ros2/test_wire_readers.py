@@ -20,7 +20,7 @@ def program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
-def test_a_listener_stands_in_the_graph_as_a_node_with_its_subscriptions(sessions):
+def test_listener_is_a_node_with_subscriptions_in_the_graph(sessions):
     writer, reader = sessions
     with TransformListener(reader, "panda", wire="ros2:namespace=r1", follow="joint_states"):
         until(lambda: len(tokens(writer)) == 4)
@@ -37,7 +37,7 @@ def test_a_listener_stands_in_the_graph_as_a_node_with_its_subscriptions(session
     until(lambda: not tokens(writer))
 
 
-def test_a_listener_to_the_native_wire_leaves_the_graph_alone(sessions):
+def test_native_listener_declares_no_graph_tokens(sessions):
     writer, reader = sessions
     with TransformListener(reader, "panda"), SubscribedSource(reader, load_model("rrbot"), "r1", wire="ros2"):
         until(lambda: len(tokens(writer)) == 2)

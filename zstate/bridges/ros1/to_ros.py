@@ -75,7 +75,7 @@ class RobotSubscriber(Closeable):
                 if isinstance(message, JointState):
                     self._hearer.move(message)
                 elif isinstance(message, StaticTransforms):
-                    self._hearer.place(self._wire.statics_writer(key), message)
+                    self._hearer.place(self._wire.static_writer_name(key), message)
                 elif isinstance(message, RobotDescription):
                     self._hearer.describe(message)
             except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other messages may be good
@@ -84,7 +84,7 @@ class RobotSubscriber(Closeable):
 
     def _on_withdrawn(self, key: str) -> None:
         with suppress(InvalidInput):  # a key without a writer's name
-            self._hearer.place(self._wire.statics_writer(key), None)
+            self._hearer.place(self._wire.static_writer_name(key), None)
 
     def close(self) -> None:
         """Stop. A second call does nothing."""

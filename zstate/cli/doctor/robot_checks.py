@@ -20,7 +20,7 @@ from zstate.model.urdf_joint import JointLimits
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
-from zstate.wire.keys import MODEL_WRITER, foreign_objection
+from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem
 from zstate.wire.messages import Status
 
 _FEWER = 0.8
@@ -276,7 +276,7 @@ def _foreign_static(ear: Ear, owned: Iterable[FrameInfo]) -> str | None:
     """Which static edge of this robot is refused by readers of all robots."""
     robots = {info.name for info in ear.neighbours}
     for frame in owned:
-        text = foreign_objection(ear.info.name, (frame.parent or "", frame.name), robots)
+        text = foreign_edge_problem(ear.info.name, (frame.parent or "", frame.name), robots)
         if text and not ear.nodes:  # in ROS all writers share all frames
             return f"{_OF_STATICS} {frame.writer!r}: {text}"
     return None

@@ -1,22 +1,15 @@
-"""Who may do what behind a router: its access control, from the key space.
+"""Access control of a Zenoh router, generated from roles: robots, viewers, operators, timekeepers, placers.
 
-What nobody is allowed is denied. Zenoh allows a message when a rule's key expression includes that of
-the message, so that a robot cannot write to others by a wildcard either.
+Messages that no rule allows are denied. Zenoh allows a message if a rule's key expression includes that of
+the message, so a robot cannot write to other robots by a wildcard either.
 
-A rule of Zenoh's access control: who has it may send, or is given, some messages on some keys.
+Native wire: ``**`` does not match chunks that begin with ``@``, so each needs a key expression: history
+queries of late joiners (``@adv``), liveliness tokens (``@writer``, ``@reader``), static edges (``@edge``)
+and clocks (``@clock``).
 
-Access control from a file: what ``zstate acl`` printed, or somebody wrote.
-
-NativeAccess: who may do what in a fleet that speaks zstate's own wire.
-
-``**`` goes past chunks that begin with ``@``, which are named apart: late joiners ask under ``@adv``,
-presence stands under ``@writer``, static edges are announced under ``@edge``, and clocks are compared
-under ``@clock``. Whoever reads may say so, under ``@reader``.
-
-RosAccess: who may do what in a fleet that speaks ROS 2 as rmw_zenoh_cpp does.
-
-Topics and services stand under ``<domain>/``, late joiners ask under ``@adv`` below them, and the ROS
-graph is made of tokens under ``@ros2_lv/<domain>/``, which tell node and topic with ``%`` for ``/``.
+ROS 2 (rmw_zenoh_cpp): topics and services are below ``<domain>/``, history queries under ``@adv`` below
+them, and the tokens of the ROS graph under ``@ros2_lv/<domain>/``, with node and topic names in which ``%``
+replaces ``/``.
 """
 
 from __future__ import annotations
@@ -40,14 +33,79 @@ Rule = dict[str, object]
 PUBLISH = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
 SUBSCRIBE = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 
+_AT_CHUNKS = ("@adv", "@writer", "@clock", "@edge", "@reader")
+_NODE_TOPICS = ("rosout", "parameter_events")  # outside of all namespaces; each ROS node writes them
+_SECTIONS = ("rules", "subjects", "policies")
+_IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+_HEAD = """\
+Access control for a Zenoh router: what no rule allows is denied.
+
+{roles}
+A name is the common name of a certificate (mTLS: enable_mtls in transport/link/tls) or a user
+(transport/auth/usrpwd). A router that requires neither identifies no session, and denies everything.
+It is read when the router starts."""
+
+
+@dataclass(frozen=True, slots=True)
+class AclRoles:
+    """Roles of identities behind a router, by name: the common name of a certificate, or a user.
+
+    A robot writes and reads its own keys; of other robots it reads their names, their static edges,
+    which it must not contradict, and the simulated time. A viewer reads everything and writes nothing; an
+    operator also commands joints; a timekeeper also writes the simulated time. A placer writes only static
+    edges under its own name, and reads those of the robots: it places their roots, as in
+    ``fleet/map -> r1/odom``; readers with ``placers=`` accept such edges from these only. A name may have
+    several roles. ``namespace`` is that of the sessions behind the router, if they have one. ``wires``:
+    "native", and "ros2" with its options, see Ros2AclRules.
+    Raises InvalidInput for names that cannot be names of identities.
+    """
+
+    robots: tuple[str, ...] = ()
+    viewers: tuple[str, ...] = ()
+    operators: tuple[str, ...] = ()
+    timekeepers: tuple[str, ...] = ()
+    namespace: str = ""
+    wires: tuple[str, ...] = ("native",)
+    placers: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in self.identities:
+            if not _IDENTITY.fullmatch(name):
+                raise InvalidInput(
+                    f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, "
+                    "beginning with a letter or digit"
+                )
+        check_namespace(self.namespace)
+        if not self.identities:
+            raise InvalidInput("no role has a name; access control without names would deny everything")
+
+    @property
+    def identities(self) -> tuple[str, ...]:
+        """All names, each once."""
+        names = (*self.robots, *self.viewers, *self.operators, *self.timekeepers, *self.placers)
+        return tuple(dict.fromkeys(names))
+
+
+def check_namespace(namespace: str) -> str:
+    """``namespace`` if it is empty or a valid prefix of keys. Raises InvalidInput otherwise."""
+    try:
+        for chunk in namespace.split("/") if namespace else ():
+            check_robot(chunk)
+    except InvalidInput:
+        raise InvalidInput(
+            f"the namespace {namespace!r} is not made of chunks of a Zenoh key; write for instance 'site_1'"
+        ) from None
+    return namespace
+
 
 def ingress(name: str, messages: Sequence[str], keys: Iterable[str]) -> Rule:
-    """What somebody sends to the router."""
+    """A rule for messages to the router."""
     return _rule(name, "ingress", messages, keys)
 
 
 def egress(name: str, messages: Sequence[str], keys: Iterable[str]) -> Rule:
-    """What the router passes on to somebody."""
+    """A rule for messages that the router forwards."""
     return _rule(name, "egress", messages, keys)
 
 
@@ -61,52 +119,48 @@ def _rule(name: str, flow: str, messages: Sequence[str], keys: Iterable[str]) ->
     }
 
 
-_APART = ("@adv", "@writer", "@clock", "@edge", "@reader")
-
-
 class NativeAclRules:
-    """The rules for ``fleet``."""
+    """The rules for ``roles`` on the native wire."""
 
-    def __init__(self, fleet: AclRoles) -> None:
-        self._fleet = fleet
+    def __init__(self, roles: AclRoles) -> None:
+        self._roles = roles
 
-    def roles(self, name: str) -> Iterator[str]:
-        """The rules that ``name`` has, by their names."""
-        fleet = self._fleet
-        if name in fleet.robots:
+    def rule_ids(self, name: str) -> Iterator[str]:
+        """The ids of the rules of ``name``."""
+        roles = self._roles
+        if name in roles.robots:
             yield from (f"{name} writes", f"{name} reads", f"{name} is given")
             yield from ("robots read", "robots are given", "robots are asked")
-        elif name in fleet.placers:
+        elif name in roles.placers:
             yield from (f"{name} places", "robots read", "robots are given", "robots are asked")
         yield "readers are known"
-        if name in (*fleet.viewers, *fleet.operators, *fleet.timekeepers):
+        if name in (*roles.viewers, *roles.operators, *roles.timekeepers):
             yield from ("viewers read", "viewers are given")
-        if name in fleet.operators:
+        if name in roles.operators:
             yield "operators command"
-        if name in fleet.timekeepers:
+        if name in roles.timekeepers:
             yield "timekeepers write"
 
     def rules(self) -> Iterator[Rule]:
-        """All of them."""
-        fleet = self._fleet
-        root = f"{fleet.namespace}/zstate" if fleet.namespace else "zstate"
-        everything, clock = _under(root), root.removesuffix("zstate") + CLOCK_KEY
+        """The rules of all names."""
+        namespace = self._roles.namespace
+        root = f"{namespace}/zstate" if namespace else "zstate"
+        everything, clock = _below(root), root.removesuffix("zstate") + CLOCK_KEY
         statics = f"{root}/*/tf_static/*"
         shared = (statics, f"{statics}/@adv/**", f"{root}/*/@edge/**", f"{root}/*/@writer/**", clock)
-        for robot in dict.fromkeys(fleet.robots):
-            own = _under(f"{root}/{check_robot(robot)}")
-            yield ingress(f"{robot} writes", PUBLISH, own)
-            yield ingress(f"{robot} reads", SUBSCRIBE, own)
-            yield egress(f"{robot} is given", PUBLISH, own)
-        for placer in dict.fromkeys(fleet.placers):
-            own = f"{root}/{check_robot(placer)}"
-            edges = (f"{own}/tf_static/*", f"{own}/tf_static/*/@adv/**")
-            yield ingress(
-                f"{placer} places", PUBLISH, (*edges, f"{own}/@writer/tf_static/*", f"{own}/@edge/**")
-            )
+        for robot in dict.fromkeys(self._roles.robots):
+            keys = _below(f"{root}/{check_robot(robot)}")
+            yield ingress(f"{robot} writes", PUBLISH, keys)
+            yield ingress(f"{robot} reads", SUBSCRIBE, keys)
+            yield egress(f"{robot} is given", PUBLISH, keys)
+        for placer in dict.fromkeys(self._roles.placers):
+            prefix = f"{root}/{check_robot(placer)}"
+            edges = (f"{prefix}/tf_static/*", f"{prefix}/tf_static/*/@adv/**")
+            tokens = (f"{prefix}/@writer/tf_static/*", f"{prefix}/@edge/**")
+            yield ingress(f"{placer} places", PUBLISH, (*edges, *tokens))
         yield ingress("robots read", SUBSCRIBE, shared)
         yield egress("robots are given", PUBLISH, shared)
-        # What is asked of all robots at once is asked of each; only its own is in what it answers.
+        # A query for all robots goes to each of them; a reply has the robot's own data only.
         yield egress("robots are asked", SUBSCRIBE, everything)
         yield ingress("viewers read", SUBSCRIBE, everything)
         yield egress("viewers are given", PUBLISH, everything)
@@ -115,80 +169,80 @@ class NativeAclRules:
         yield ingress("timekeepers write", ("put",), (clock,))
 
 
-def _under(key: str) -> tuple[str, ...]:
-    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _APART))
-
-
-_OF_EVERY_NODE = ("rosout", "parameter_events")
-"""Topics outside of all namespaces that each ROS node writes."""
+def _below(key: str) -> tuple[str, ...]:
+    return (f"{key}/**", *(f"{key}/**/{chunk}/**" for chunk in _AT_CHUNKS))
 
 
 class Ros2AclRules:
-    """The rules for ``fleet`` in one domain. Robots are told apart by their namespaces.
+    """The rules for ``roles`` in one ROS domain, where each robot has a namespace.
 
-    A robot writes the topics of its namespace and answers its services, and stands in the graph with
-    nothing else; /tf and /tf_static, where they are global, belong to all robots. A viewer hears all
-    topics and calls no service, which an operator does. Raises InvalidInput for robots in one namespace.
+    A robot writes the topics of its namespace, serves its services, and announces only these in the graph;
+    global /tf and /tf_static belong to all robots. A viewer subscribes to all topics and calls no service;
+    an operator does. Raises InvalidInput for robots in one namespace.
     """
 
-    def __init__(self, fleet: AclRoles, options: Ros2Options) -> None:
-        self._fleet = fleet
+    def __init__(self, roles: AclRoles, options: Ros2Options) -> None:
+        self._roles = roles
         self._options = options
         self._domain = str(options.domain)
         self._graph = f"@ros2_lv/{options.domain}"
-        self._global = (*(("tf", "tf_static") if options.tf == "global" else ()), *_OF_EVERY_NODE)
-        _check_apart(fleet.robots, [options.namespace_of(robot) for robot in fleet.robots])
+        self._global = (*(("tf", "tf_static") if options.tf == "global" else ()), *_NODE_TOPICS)
+        namespaces = {options.robot_namespace(robot) for robot in roles.robots}
+        if len(namespaces) < len(set(roles.robots)):
+            raise InvalidInput(
+                f"the robots {', '.join(map(repr, roles.robots))} would write the same topics, which access "
+                "control cannot separate; give each a namespace of its name: 'ros2:namespace=*'"
+            )
 
-    def roles(self, name: str) -> Iterator[str]:
-        """The rules that ``name`` has, by their names."""
-        fleet = self._fleet
-        if name in fleet.robots:
+    def rule_ids(self, name: str) -> Iterator[str]:
+        """The ids of the rules of ``name``."""
+        roles = self._roles
+        if name in roles.robots:
             yield from map(self._id, (f"{name} writes", f"{name} reads", f"{name} is given"))
             yield from map(self._id, ("robots write", "robots read", "robots are given", "robots are asked"))
-        if name in (*fleet.viewers, *fleet.operators, *fleet.timekeepers):
-            yield from map(
-                self._id, ("viewers are known", "viewers hear", "viewers ask", "viewers are given")
-            )
-        if name in fleet.operators:
+        if name in (*roles.viewers, *roles.operators, *roles.timekeepers):
+            viewing = ("viewers are known", "viewers subscribe", "viewers ask", "viewers are given")
+            yield from map(self._id, viewing)
+        if name in roles.operators:
             yield self._id("operators call")
-        if name in fleet.timekeepers:
+        if name in roles.timekeepers:
             yield self._id("timekeepers write")
 
     def rules(self) -> Iterator[Rule]:
-        """All of them."""
-        whole = (f"{self._domain}/**", f"{self._domain}/**/@adv/**", f"{self._graph}/**")
+        """The rules of all names."""
+        topics, history = f"{self._domain}/**", f"{self._domain}/**/@adv/**"
+        graph = f"{self._graph}/**"
+        everything = (topics, history, graph)
         clock = self._topic("clock")
         shared = tuple(key for name in self._global for key in self._topic(name))
-        for robot in dict.fromkeys(self._fleet.robots):
-            own = self._own(robot)
-            yield ingress(self._id(f"{robot} writes"), PUBLISH, (*own, *self._tokens(robot)))
-            yield ingress(self._id(f"{robot} reads"), SUBSCRIBE, own)
-            yield egress(self._id(f"{robot} is given"), PUBLISH, own)
+        for robot in dict.fromkeys(self._roles.robots):
+            namespace = self._options.robot_namespace(robot)
+            keys = self._topic(namespace) if namespace else (topics, history)
+            yield ingress(self._id(f"{robot} writes"), PUBLISH, (*keys, *self._robot_tokens(namespace)))
+            yield ingress(self._id(f"{robot} reads"), SUBSCRIBE, keys)
+            yield egress(self._id(f"{robot} is given"), PUBLISH, keys)
         yield ingress(self._id("robots write"), PUBLISH, shared)
-        yield ingress(self._id("robots read"), SUBSCRIBE, (*shared, *clock, whole[2]))
-        yield egress(self._id("robots are given"), PUBLISH, (*shared, *clock, whole[2]))
-        # What is asked of all at once is asked of each; only its own is in what it answers.
-        yield egress(self._id("robots are asked"), SUBSCRIBE, whole)
-        yield ingress(self._id("viewers are known"), ("liveliness_token",), self._reader_tokens())
-        yield ingress(self._id("viewers hear"), ("declare_subscriber",), whole[:1])
-        yield ingress(self._id("viewers ask"), SUBSCRIBE, whole[1:])
-        yield egress(self._id("viewers are given"), PUBLISH, whole)
-        yield ingress(self._id("operators call"), ("query",), whole[:1])
+        yield ingress(self._id("robots read"), SUBSCRIBE, (*shared, *clock, graph))
+        yield egress(self._id("robots are given"), PUBLISH, (*shared, *clock, graph))
+        # A query for all robots goes to each of them; a reply has the robot's own data only.
+        yield egress(self._id("robots are asked"), SUBSCRIBE, everything)
+        tokens = (f"{self._graph}/*/*/*/{kind}/**" for kind in ("NN", "MS", "SC"))
+        viewers = (*tokens, f"{self._domain}/**/@adv/sub/**")
+        yield ingress(self._id("viewers are known"), ("liveliness_token",), viewers)
+        yield ingress(self._id("viewers subscribe"), ("declare_subscriber",), (topics,))
+        yield ingress(self._id("viewers ask"), SUBSCRIBE, (history, graph))
+        yield egress(self._id("viewers are given"), PUBLISH, everything)
+        yield ingress(self._id("operators call"), ("query",), (topics,))
         yield ingress(self._id("timekeepers write"), PUBLISH, (*clock, self._token("MP", "*", "%clock")))
 
     def _id(self, text: str) -> str:
         return f"{text} in ROS domain {self._domain}"
 
-    def _own(self, robot: str) -> tuple[str, ...]:
-        namespace = self._options.namespace_of(robot)
-        return self._topic(namespace) if namespace else (f"{self._domain}/**", f"{self._domain}/**/@adv/**")
-
     def _topic(self, name: str) -> tuple[str, str]:
         return f"{self._domain}/{name}/**", f"{self._domain}/{name}/**/@adv/**"
 
-    def _tokens(self, robot: str) -> Iterator[str]:
-        """Its nodes, what they read, and what they offer of its own and of everybody's."""
-        namespace = self._options.namespace_of(robot)
+    def _robot_tokens(self, namespace: str) -> Iterator[str]:
+        """A robot's nodes, their readers, and their writers of its own and of the shared topics."""
         if not namespace:
             yield f"{self._graph}/**"
             return
@@ -203,157 +257,75 @@ class Ros2AclRules:
     def _token(self, kind: str, place: str, topic: str) -> str:
         return f"{self._graph}/*/*/*/{kind}/*/{place}/*/{topic}/**"
 
-    def _reader_tokens(self) -> tuple[str, ...]:
-        nodes = (f"{self._graph}/*/*/*/{kind}/**" for kind in ("NN", "MS", "SC"))
-        return (*nodes, f"{self._domain}/**/@adv/sub/**")
 
-
-def _check_apart(robots: Sequence[str], namespaces: Sequence[str]) -> None:
-    if len(set(robots)) > 1 and len(set(namespaces)) < len(set(robots)):
-        raise InvalidInput(
-            f"the robots {', '.join(map(repr, robots))} would write the same topics, so that access control "
-            "could not tell them apart; give each a namespace of its name: 'ros2:namespace=*'"
-        )
-
-
-_IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-
-_HEAD = """\
-Access control for a Zenoh router: what no rule allows is denied.
-
-{roles}
-A name is the common name of a certificate (mTLS: enable_mtls in transport/link/tls) or a user
-(transport/auth/usrpwd). A router that asks for neither knows nobody, and denies everything.
-It is read when the router starts."""
-
-
-@dataclass(frozen=True, slots=True)
-class AclRoles:
-    """Who is who behind a router, by name: the common name of a certificate, or a user.
-
-    A robot writes its own keys and reads these; of others it reads who they are, their static edges,
-    which it must not contradict, and the simulated time. A viewer reads everything and writes nothing; an
-    operator, moreover, commands joints. A timekeeper, moreover, writes the simulated time. A placer writes
-    static edges under its own name and nothing else, and reads those of the robots: it places their roots,
-    as in ``fleet/map -> r1/odom``; readers that are given ``placers=`` take such edges from these alone.
-    Somebody may be several of these. ``namespace`` is that of the sessions behind the router, if they
-    have one. ``wires`` are what they speak: "native", and "ros2" with its options, for which see RosAccess.
-    Raises InvalidInput for names that cannot be names of identities.
-    """
-
-    robots: tuple[str, ...] = ()
-    viewers: tuple[str, ...] = ()
-    operators: tuple[str, ...] = ()
-    timekeepers: tuple[str, ...] = ()
-    namespace: str = ""
-    wires: tuple[str, ...] = ("native",)
-    placers: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in self.names:
-            _check_identity(name)
-        check_namespace(self.namespace)
-        if not self.names:
-            raise InvalidInput("nobody is named; access control without names would deny everything")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Everybody, each once."""
-        names = (*self.robots, *self.viewers, *self.operators, *self.timekeepers, *self.placers)
-        return tuple(dict.fromkeys(names))
-
-
-def _check_identity(name: str) -> None:
-    if not _IDENTITY.fullmatch(name):
-        raise InvalidInput(
-            f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, beginning "
-            "with a letter or digit"
-        )
-
-
-def check_namespace(namespace: str) -> str:
-    """``namespace`` if it is empty or can stand before keys. Raises InvalidInput."""
-    try:
-        for chunk in namespace.split("/") if namespace else ():
-            check_robot(chunk)
-    except InvalidInput:
-        raise InvalidInput(
-            f"the namespace {namespace!r} is not made of chunks of a Zenoh key; write for instance 'site_1'"
-        ) from None
-    return namespace
-
-
-def access_text(fleet: AclRoles) -> str:
-    """The access control of ``fleet`` as JSON5, which a router takes as its configuration or a part of it."""
-    roles = {
-        "robots": fleet.robots,
-        "viewers": fleet.viewers,
-        "operators": fleet.operators,
-        "timekeepers": fleet.timekeepers,
-        "placers": fleet.placers,
+def access_text(roles: AclRoles) -> str:
+    """The access control of ``roles`` as JSON5: the configuration of a router, or a part of it."""
+    names = {
+        "robots": roles.robots,
+        "viewers": roles.viewers,
+        "operators": roles.operators,
+        "timekeepers": roles.timekeepers,
+        "placers": roles.placers,
     }
-    if fleet.wires != ("native",):
-        roles["wires"] = fleet.wires
-    lines = [f"{role + ':':<13}{', '.join(names)}\n" for role, names in roles.items() if names]
-    return json5_text({"access_control": access_control(fleet)}, head=_HEAD.format(roles="".join(lines)))
+    if roles.wires != ("native",):
+        names["wires"] = roles.wires
+    lines = [f"{role + ':':<13}{', '.join(listed)}\n" for role, listed in names.items() if listed]
+    return json5_text({"access_control": access_control(roles)}, head=_HEAD.format(roles="".join(lines)))
 
 
-def access_control(fleet: AclRoles) -> dict[str, object]:
+def access_control(roles: AclRoles) -> dict[str, object]:
     """The section ``access_control`` of a Zenoh configuration."""
-    wires = [_access(fleet, wire) for wire in dict.fromkeys(fleet.wires)]
-    roles = {name: [rule for wire in wires for rule in wire.roles(name)] for name in fleet.names}
-    used = {rule for rules in roles.values() for rule in rules}
+    wires = [_wire_rules(roles, wire) for wire in dict.fromkeys(roles.wires)]
+    ids = {name: [rule for wire in wires for rule in wire.rule_ids(name)] for name in roles.identities}
+    used = {rule for rules in ids.values() for rule in rules}
+    # Two subjects for a name, as one subject with both properties would match only sessions with both.
+    subjects = {
+        name: (
+            {"id": f"certificate {name}", "cert_common_names": [name]},
+            {"id": f"user {name}", "usernames": [name]},
+        )
+        for name in roles.identities
+    }
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [rule for wire in wires for rule in wire.rules() if rule["id"] in used],
-        "subjects": [subject for name in fleet.names for subject in _subjects(name)],
+        "subjects": [subject for pair in subjects.values() for subject in pair],
         "policies": [
-            {"id": name, "rules": rules, "subjects": [str(one["id"]) for one in _subjects(name)]}
-            for name, rules in roles.items()
+            {"id": name, "rules": rules, "subjects": [subject["id"] for subject in subjects[name]]}
+            for name, rules in ids.items()
         ],
     }
 
 
-def _access(fleet: AclRoles, wire: str) -> NativeAclRules | Ros2AclRules:
+def _wire_rules(roles: AclRoles, wire: str) -> NativeAclRules | Ros2AclRules:
     kind, _, options = wire.partition(":")
     if wire == "native":
-        return NativeAclRules(fleet)
+        return NativeAclRules(roles)
     if kind != "ros2":
         raise InvalidInput(
             f"there is no access control for the wire {wire!r}; there is for 'native' and 'ros2'"
         )
-    if fleet.namespace:
+    if roles.namespace:
         raise InvalidInput(
-            f"ROS nodes have no Zenoh namespace, such as {fleet.namespace!r}; write 'ros2:namespace=NAME' "
+            f"ROS nodes have no Zenoh namespace, such as {roles.namespace!r}; write 'ros2:namespace=NAME' "
             "for that of their topics"
         )
-    return Ros2AclRules(fleet, ros_options(options))
-
-
-def _subjects(name: str) -> tuple[Rule, Rule]:
-    # Apart, as one subject with both would be somebody who has both.
-    return (
-        {"id": f"certificate {name}", "cert_common_names": [name]},
-        {"id": f"user {name}", "usernames": [name]},
-    )
-
-
-_SECTIONS = ("rules", "subjects", "policies")
+    return Ros2AclRules(roles, ros_options(options))
 
 
 def read_access_control(path: str | os.PathLike[str]) -> dict[str, object]:
-    """That section of the Zenoh configuration in a file. Raises ConfigError where there is none."""
-    given = json.loads(str(user_config(path, "peer", (), ())))["access_control"]
-    if not given["enabled"]:
+    """The section ``access_control`` of a Zenoh configuration file. Raises ConfigError if there is none."""
+    section = json.loads(str(user_config(path, "peer", (), ())))["access_control"]
+    if not section["enabled"]:
         raise ConfigError(
             f"{str(path)!r} has no access_control that is enabled; `zstate acl` prints one", path=str(path)
         )
-    lists = {section: [_as_written(one) for one in given[section] or ()] for section in _SECTIONS}
-    return {"enabled": True, "default_permission": given["default_permission"], **lists}
+    lists = {name: [_without_defaults(entry) for entry in section[name] or ()] for name in _SECTIONS}
+    return {"enabled": True, "default_permission": section["default_permission"], **lists}
 
 
-def _as_written(entry: Mapping[str, Any]) -> dict[str, Any]:
-    # Zenoh sorts the names, and adds those that were not there.
+def _without_defaults(entry: Mapping[str, Any]) -> dict[str, Any]:
+    # Zenoh sorts the names, and adds absent ones as null.
     names = sorted(entry, key=lambda name: (name != "id", isinstance(entry[name], list), name))
     return {name: entry[name] for name in names if entry[name] is not None}

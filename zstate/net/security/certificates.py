@@ -1,7 +1,4 @@
-"""Identities for tests: a certificate and a key for each, as files of one folder.
-
-The certificate authority behind `zstate certs`: a key that signs, kept as files.
-"""
+"""Certificate authority for tests (`zstate certs`): issues certificates and keys as files of one folder."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from zstate.net.security.credentials import AUTHORITY, CertificateFiles
 
 THIS_HOST = ("localhost", "127.0.0.1", "::1")
 
-_CLOCKS_DIFFER_BY = timedelta(hours=1)  # a machine whose clock is behind takes a new certificate, too
+_CLOCK_DIFFERENCE = timedelta(hours=1)  # a machine whose clock is behind accepts a new certificate, too
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")  # a common name has 64 characters at most
 _HOST_NAME = re.compile(r"(\*\.)?[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?")
 
@@ -32,24 +29,27 @@ def issue_identities(
     days: int = 365,
     valid_from: datetime | None = None,
 ) -> dict[str, CertificateFiles]:
-    """Certificates for ``names``, by the authority in ``folder``, which is made if there is none.
+    """Issues certificates for ``names``, by the authority in ``folder``, which is created if missing.
 
-    The common name of each is its name, which is how access control knows it. Those of ``servers``
-    (all unless given) serve to listen, too, at this host's loopback addresses and at ``hosts`` (names
-    or IP addresses); the others serve to connect and cannot pose as a router. All are valid for
-    ``days`` from ``valid_from`` (an aware time; now unless given). Keys are readable by their owner
-    only. No file is ever overwritten.
+    The name is the common name, the identity for access control. Certificates of ``servers`` (default: all)
+    are valid for listening, too, at this host's loopback addresses and at ``hosts`` (names or IP addresses);
+    the others are for clients and cannot pose as a router. All are valid for ``days`` from ``valid_from``
+    (an aware time; default: now). Keys are readable by their owner only. No file is ever overwritten.
 
-    Raises InvalidInput before anything is written, ConfigError for an authority that cannot be used
-    and files that cannot be written, LibraryMissing without ``cryptography``.
+    Raises InvalidInput before any file is written, ConfigError for an unusable authority and files that
+    cannot be written. Importing this module raises LibraryMissing without ``cryptography``.
     """
     _check(names, hosts, days)
     issued = {name: CertificateFiles.for_name(folder, name) for name in names}
     for name, files in issued.items():
-        _refuse_existing(name, files)
-
+        if files.existing:
+            existing = " and ".join(repr(str(path)) for path in files.existing)
+            raise InvalidInput(
+                f"there is an identity {name!r} already: {existing}; nothing is overwritten: choose another "
+                "name, or remove these files to replace it"
+            )
     start = valid_from or datetime.now(timezone.utc)
-    first, last = start - (timedelta() if valid_from else _CLOCKS_DIFFER_BY), start + timedelta(days=days)
+    first, last = start - (timedelta() if valid_from else _CLOCK_DIFFERENCE), start + timedelta(days=days)
     authority = CertificateAuthority.in_folder(Path(folder))
     authority.check_outlives(last)
     for name, files in issued.items():
@@ -84,15 +84,6 @@ def _is_address(host: str) -> bool:
     return True
 
 
-def _refuse_existing(name: str, files: CertificateFiles) -> None:
-    if files.existing:
-        there = " and ".join(repr(str(path)) for path in files.existing)
-        raise InvalidInput(
-            f"there is an identity {name!r} already: {there}; nothing is overwritten: choose another name, "
-            "or remove what is there to replace it"
-        )
-
-
 try:
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes
@@ -115,33 +106,33 @@ Validity = tuple[datetime, datetime]
 
 @dataclass(frozen=True, slots=True)
 class CertificateAuthority:
-    """Who vouches for identities: whoever trusts ``certificate`` trusts what ``key`` has signed."""
+    """Signs identities with ``key``; sessions that trust ``certificate`` trust these."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
     @classmethod
     def in_folder(cls, folder: Path) -> CertificateAuthority:
-        """The one that the folder holds, or a new one. Raises ConfigError if it is there in part."""
+        """The authority in ``folder``, or a new one. Raises ConfigError if one of its files is missing."""
         files = CertificateFiles.for_name(folder, AUTHORITY)
         if not files.existing:
-            return cls._made(folder, files)
+            return cls._create(folder, files)
         if len(files.existing) == 1:
             missing = files.key if files.certificate.exists() else files.certificate
             raise ConfigError(
-                f"{str(missing)!r} is missing beside {str(files.existing[0])!r}; identities are added where "
-                "the authority is whole: work in the folder in which it was made, or begin a new one",
+                f"{str(missing)!r} is missing next to {str(files.existing[0])!r}; an authority needs both "
+                "files: use the folder in which it was made, or a new one",
                 path=str(missing),
             )
         return cls._read(files)
 
     @classmethod
-    def _made(cls, folder: Path, files: CertificateFiles) -> CertificateAuthority:
-        # A name of its own: two authorities of one name look as one with a bad signature.
+    def _create(cls, folder: Path, files: CertificateFiles) -> CertificateAuthority:
+        # A unique name: two authorities of one name look like one with a bad signature.
         name = f"zstate test authority {os.urandom(4).hex()}"
         key = _new_key()
         now = datetime.now(timezone.utc)
-        # From long ago, so that certificates of the past can be made for tests.
+        # From long ago: tests need certificates of the past.
         valid = (now - timedelta(days=AUTHORITY_DAYS), now + timedelta(days=AUTHORITY_DAYS))
         builder = (
             _builder(name, key, valid)
@@ -176,14 +167,17 @@ class CertificateAuthority:
         if last > until:
             raise InvalidInput(
                 f"the authority is valid until {until:%Y-%m-%d}, which is before {last:%Y-%m-%d}; ask for "
-                "fewer days, or begin a new folder"
+                "fewer days, or use a new folder"
             )
 
     def issue(self, name: str, files: CertificateFiles, hosts: Iterable[str], valid: Validity) -> None:
-        """Write a key and a certificate for ``name``: to connect, and to listen at ``hosts``, if any."""
+        """Write a key and a certificate for ``name``: for clients, and for listening at ``hosts``, if any."""
         key = _new_key()
         issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
-        names = _alternatives(hosts)
+        names = [
+            x509.IPAddress(ipaddress.ip_address(host)) if _is_address(host) else x509.DNSName(host)
+            for host in dict.fromkeys(hosts)
+        ]
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
         if names:
             purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
@@ -232,17 +226,6 @@ def _usage(*, signs_certificates: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
-
-
-def _alternatives(hosts: Iterable[str]) -> list[x509.GeneralName]:
-    return [_alternative(host) for host in dict.fromkeys(hosts)]
-
-
-def _alternative(host: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(host))
-    except ValueError:
-        return x509.DNSName(host)
 
 
 def _write(files: CertificateFiles, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:

@@ -1,6 +1,6 @@
-"""RefusalWatch: tells a session that goes on trying who does not let it in, and why.
+"""Connection monitor: logs why endpoints refuse a session that keeps trying to connect.
 
-Twin: one more session like a given one, to see through other eyes what became of its words.
+A probe session is a second session with the same credentials, which checks that the router forwards a sample.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -13,7 +13,7 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -29,26 +29,26 @@ from zstate.net.security.credentials import Credentials
 
 _LOG = logging.getLogger("zstate")
 
-FIRST_LOOK_S = 1.0
+FIRST_PERIOD_S = 1.0
 PERIOD_S = 5.0
 
-_FOUND_WITHIN_S = 0.5
+_SCOUT_S = 0.5
 _BYPASS = (
-    "%s: this session is a peer of a router, with credentials. Access control applies to what passes through "
-    "the router; peers send over direct links, and get nothing from each other without. Connect as "
+    "%s: this session is a peer of a router, with credentials. Access control applies to messages through "
+    "the router only; peers use direct links, and receive nothing from each other without them. Connect as "
     "a client: mode='client' (--mode client)"
 )
 
 
 class ConnectionMonitor(Closeable):
-    """Looks every few seconds whether ``session`` lacks a link to one of ``endpoints``, and asks there why.
+    """Checks every few seconds for ``endpoints`` without a link from ``session``, and logs their refusals.
 
-    With multicast, and nobody met, also at those who are found by it. A refusal is logged once, until
-    there was a link. A client needs one link only. Nothing is said of endpoints where nobody is: in no
-    order need programs start.
+    With multicast and without any link, it also checks the endpoints found by scouting. A refusal is logged
+    once until there is a link. A client needs only one link. Endpoints without a listener are not logged,
+    as programs may start in any order.
 
-    A peer with credentials that is linked to a router is warned once: access control applies to what
-    passes through a router, and peers exchange data over direct links.
+    A peer with credentials and a link to a router is warned once: access control applies to messages through
+    a router, and peers exchange data over direct links.
     """
 
     def __init__(
@@ -65,22 +65,22 @@ class ConnectionMonitor(Closeable):
         mode = json.loads(config.get_json("mode"))
         self._needs_all = mode != "client"
         self._may_bypass = mode == "peer" and credentials is not None
-        self._seeks = json.loads(config.get_json("scouting/multicast/enabled")) is True
-        self._settled: set[str] = set()
+        self._scouts = json.loads(config.get_json("scouting/multicast/enabled")) is True
+        self._checked: set[str] = set()
         self._stop = threading.Event()
         thread = threading.Thread(target=self._run, name="zstate refusals", daemon=True)
         self._thread = join_at_exit(thread)
-        if endpoints or self._seeks:
+        if endpoints or self._scouts:
             self._thread.start()
 
     def close(self) -> None:
-        """Look no more. A second call does nothing."""
+        """Stop checking. A second call does nothing."""
         self._stop.set()
         if self._thread.ident not in (None, threading.get_ident()):
             self._thread.join(JOIN_WITHIN_S)
 
     def _run(self) -> None:
-        period_s = FIRST_LOOK_S
+        period_s = FIRST_PERIOD_S
         with suppress(zenoh.ZError, Closed):  # the session was closed, or the process ends
             while not self._stop.wait(period_s):
                 self._check()
@@ -93,52 +93,50 @@ class ConnectionMonitor(Closeable):
         links = {_addresses(str(link.dst)) for link in self._session.info.links()}
         linked = frozenset[Endpoint]().union(*links)
         if linked and not self._needs_all:
-            self._settled.clear()
+            self._checked.clear()
             return
-        for endpoint in [*self._endpoints, *self._found(alone=not linked)]:
+        scouted = self._scout() if self._scouts and not linked else []
+        for endpoint in [*self._endpoints, *scouted]:
             if _addresses(endpoint) & linked:
-                self._settled.discard(endpoint)
-            elif endpoint not in self._settled and not self._stop.is_set():
-                self._ask(endpoint)
+                self._checked.discard(endpoint)
+            elif endpoint not in self._checked and not self._stop.is_set():
+                self._check_endpoint(endpoint)
 
-    def _found(self, *, alone: bool) -> Iterator[str]:
-        """Where those listen who answer by multicast."""
-        if not (alone and self._seeks):
-            return
+    def _scout(self) -> list[str]:
+        """The endpoints of sessions that reply by multicast."""
         ring: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(64)
         scout = zenoh.scout(ring, what="peer|router", config=self._config)
-        self._stop.wait(_FOUND_WITHIN_S)
+        self._stop.wait(_SCOUT_S)
         hellos: dict[str, list[str]] = {}
         while (hello := scout.try_recv()) is not None:
             hellos[str(hello.zid)] = hello.locators
         scout.stop()
-        for zid, locators in hellos.items():
-            if zid != str(self._session.zid()):
-                yield from locators
+        hellos.pop(str(self._session.zid()), None)
+        return [locator for locators in hellos.values() for locator in locators]
 
-    def _ask(self, endpoint: str) -> None:
+    def _check_endpoint(self, endpoint: str) -> None:
         from zstate.net.security.connection_check import check_endpoints  # noqa: PLC0415  # loads ssl, which few need
 
-        answers = check_endpoints([endpoint], self._credentials)
-        if not answers.are_refusals:
+        results = check_endpoints([endpoint], self._credentials)
+        if not results.are_refusals:
             return
-        self._settled.add(endpoint)
-        if not self._lets_in(endpoint):
-            error = answers.error
+        self._checked.add(endpoint)
+        if not self._accepts(endpoint):
+            error = results.error
             facts = {"event": "refused", "reason": getattr(error, "reason", None)}
             _LOG.warning("%s; still trying", error, extra=facts)
 
-    def _lets_in(self, endpoint: str) -> bool:
-        """Whether a client like this session is let in: then there is a link of theirs, or one soon."""
+    def _accepts(self, endpoint: str) -> bool:
+        """Whether a client with this configuration is accepted: then the session has a link, or one soon."""
         config = zenoh.Config.from_json5(str(self._config))
-        told: dict[str, object] = {
+        settings: dict[str, object] = {
             "id": f"1{secrets.token_hex(15)}",
             "mode": "client",
             "connect": {"endpoints": [endpoint], "timeout_ms": 0, "exit_on_failure": True},
             "listen/endpoints": [],
             "scouting/multicast/enabled": False,
         }
-        for path, value in told.items():
+        for path, value in settings.items():
             config.insert_json5(path, json.dumps(value))
         try:
             open_zenoh(config).close()
@@ -148,7 +146,7 @@ class ConnectionMonitor(Closeable):
 
 
 def _addresses(endpoint: str) -> frozenset[Endpoint]:
-    """All that the host of ``endpoint`` stands for; none where that is not known, or not by TCP."""
+    """All addresses of ``endpoint``; none if its host is unknown, or its protocol not TCP or TLS."""
     parsed = parse_endpoint(endpoint)
     if parsed is None or parsed.protocol not in ("tcp", "tls"):
         return frozenset()
@@ -162,19 +160,19 @@ def _addresses(endpoint: str) -> frozenset[Endpoint]:
 
 @dataclass(frozen=True, slots=True)
 class ProbeSession:
-    """How to open one more client like this one, whom routers take for ``identity``."""
+    """Configuration of a second client with the same ``identity`` to routers."""
 
     config: zenoh.Config
     identity: str
 
     @classmethod
     def for_config(cls, config: zenoh.Config, credentials: Credentials | None) -> ProbeSession | None:
-        """That of the session that ``config`` has opened; None unless it is a client that shows who it is."""
+        """For the session that ``config`` opened; None unless it is a client with an identity."""
         if credentials is None or not credentials.identity or json.loads(config.get_json("mode")) != "client":
             return None
         config.insert_json5("connect/timeout_ms", "0")  # each endpoint once
         return cls(config, credentials.identity)
 
     def open(self) -> zenoh.Session:
-        """It. Raises zenoh.ZError where nobody answers."""
+        """Open it. Raises zenoh.ZError if no router answers."""
         return open_zenoh(self.config)

@@ -1,4 +1,4 @@
-"""The files that credentials name, looked into before Zenoh is given them; of these it says little."""
+"""Checks of credential files before Zenoh opens them: its own errors do not name the cause."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _OTHERS = 0o007
 
 
 def check_files(credentials: Credentials) -> None:
-    """Raise ConfigError for a file that is missing, open to everybody, or not what it should be."""
+    """Raise ConfigError for a file that is missing, open to all users of this machine, or malformed."""
     for file in (credentials.ca, credentials.certificate, credentials.key, credentials.users):
         if file is not None:
             _check_readable(file)
@@ -26,7 +26,7 @@ def check_files(credentials: Credentials) -> None:
 
 
 def client_context(credentials: Credentials) -> ssl.SSLContext:
-    """What a TLS client with these credentials, which have a ca, trusts and shows. Raises ConfigError."""
+    """TLS context of a client with these credentials, which have a ca. Raises ConfigError."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     assert credentials.ca is not None
     try:
@@ -35,8 +35,17 @@ def client_context(credentials: Credentials) -> ssl.SSLContext:
         raise ConfigError(
             f"{_name(credentials.ca)} holds no certificate in PEM", path=str(credentials.ca)
         ) from None
-    if credentials.certificate is not None:
-        _load_pair(context, credentials.certificate, credentials.key)
+    if credentials.certificate is None:
+        return context
+    try:
+        # Without a password, OpenSSL asks for one on the terminal.
+        context.load_cert_chain(credentials.certificate, credentials.key, password="")
+    except OSError as error:
+        both = f"{_name(credentials.certificate)} and {_name(credentials.key or '')}"
+        text = f"{both} are not a certificate and its unencrypted key in PEM"
+        if isinstance(error, ssl.SSLError) and error.reason == "KEY_VALUES_MISMATCH":
+            text = f"{both} do not belong together: the certificate is of another key"
+        raise ConfigError(text, path=str(credentials.key)) from None
     return context
 
 
@@ -62,20 +71,8 @@ def password_in(file: File) -> str:
             f"the password file {str(file)!r} cannot be read: {error}", path=str(file)
         ) from None
     if not lines or not lines[0]:
-        raise ConfigError(f"the password file {str(file)!r} has nothing in its first line", path=str(file))
+        raise ConfigError(f"the first line of the password file {str(file)!r} is empty", path=str(file))
     return lines[0]
-
-
-def _load_pair(context: ssl.SSLContext, certificate: File, key: File | None) -> None:
-    try:
-        # A password is asked for on the terminal unless one is given.
-        context.load_cert_chain(certificate, key, password="")
-    except OSError as error:
-        both = f"{_name(certificate)} and {_name(key or '')}"
-        told = f"{both} are not a certificate and its unencrypted key in PEM"
-        if isinstance(error, ssl.SSLError) and error.reason == "KEY_VALUES_MISMATCH":
-            told = f"{both} do not belong together: the certificate is of another key"
-        raise ConfigError(told, path=str(key)) from None
 
 
 def _check_readable(file: File) -> None:
@@ -88,8 +85,8 @@ def _check_readable(file: File) -> None:
 
 
 def _check_users(file: File) -> None:
-    """Zenoh takes user:password lines, no comments, and the last of several lines of one user."""
-    known: dict[str, int] = {}
+    """Zenoh accepts user:password lines, no comments, and uses the last of several lines of one user."""
+    line_numbers: dict[str, int] = {}
     try:
         lines = Path(file).read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
@@ -100,14 +97,12 @@ def _check_users(file: File) -> None:
             raise ConfigError(
                 f"{file}, line {number}: write user:password; comments are not allowed", path=str(file)
             )
-        if line.strip() and user in known:
-            raise ConfigError(
-                f"{file}, line {number}: the user {user!r} stands in line {known[user]} already",
-                path=str(file),
-            )
-        known[user] = number
-    if not set(known) - {""}:
-        raise ConfigError(f"{_name(file)} names no user, so that nobody could connect", path=str(file))
+        if line.strip() and user in line_numbers:
+            text = f"{file}, line {number}: the user {user!r} is already in line {line_numbers[user]}"
+            raise ConfigError(text, path=str(file))
+        line_numbers[user] = number
+    if not set(line_numbers) - {""}:
+        raise ConfigError(f"{_name(file)} has no user; no client could connect", path=str(file))
 
 
 def _name(file: File) -> str:

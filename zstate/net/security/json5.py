@@ -1,4 +1,4 @@
-"""Settings as JSON5 that people read and change, and that zenohd takes."""
+"""JSON5 text of nested settings, with comments, that zenohd reads."""
 
 from __future__ import annotations
 
@@ -10,18 +10,16 @@ WIDTH = 100
 
 Settings = Mapping[str, object]
 
-_STEP = "  "
-_BARE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_INDENT = "  "
+_BARE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def json5_text(settings: Settings, comments: Mapping[str, str] | None = None, head: str = "") -> str:
-    """``settings`` as a document, beginning with the comment ``head``.
+    """``settings`` as a document that begins with the comment ``head``.
 
-    ``comments`` are keyed by the path of what they stand above, such as "connect/endpoints".
+    ``comments`` are keyed by the path of the setting below them, such as "connect/endpoints".
     """
-    lines = _comment(head)
-    lines += _value(settings, "", "", comments or {}).splitlines()
-    return "\n".join(lines) + "\n"
+    return "\n".join([*_comment(head), *_value(settings, "", "", comments or {}).splitlines()]) + "\n"
 
 
 def _comment(text: str, indent: str = "") -> list[str]:
@@ -29,32 +27,23 @@ def _comment(text: str, indent: str = "") -> list[str]:
 
 
 def _value(value: object, indent: str, path: str, comments: Mapping[str, str]) -> str:
-    # A comment below, or too little room, and it takes a line for each of its parts.
-    if not any(_is_below(path, commented) for commented in comments):
+    below = f"{path}/" if path else ""
+    # One line per member if a comment is below, or if one line for all is too long.
+    if not any(commented.startswith(below) and commented != path for commented in comments):
         short = _short(value)
         if len(indent) + len(short) < WIDTH:
             return short
+    inner = indent + _INDENT
     if isinstance(value, Mapping):
-        return _object(value, indent, path, comments)  # pyright: ignore[reportUnknownArgumentType]
+        lines = ["{"]
+        for key, member in value.items():  # pyright: ignore
+            lines += _comment(comments.get(below + key, ""), inner)  # pyright: ignore
+            lines.append(f"{inner}{_name(key)}: {_value(member, inner, below + key, comments)},")  # pyright: ignore
+        return "\n".join([*lines, f"{indent}}}"])
     if isinstance(value, Sequence) and not isinstance(value, str):
-        inner = indent + _STEP
         elements = [f"{inner}{_value(element, inner, path, {})}," for element in value]  # pyright: ignore
         return "\n".join(["[", *elements, f"{indent}]"])
     return _short(value)
-
-
-def _is_below(path: str, commented: str) -> bool:
-    return commented.startswith(f"{path}/" if path else "") and commented != path
-
-
-def _object(value: Settings, indent: str, path: str, comments: Mapping[str, str]) -> str:
-    inner = indent + _STEP
-    lines = ["{"]
-    for key, member in value.items():
-        below = f"{path}/{key}" if path else key
-        lines += _comment(comments.get(below, ""), inner)
-        lines.append(f"{inner}{_name(key)}: {_value(member, inner, below, comments)},")
-    return "\n".join([*lines, f"{indent}}}"])
 
 
 def _short(value: object) -> str:
@@ -67,4 +56,4 @@ def _short(value: object) -> str:
 
 
 def _name(key: str) -> str:
-    return key if _BARE.fullmatch(key) else json.dumps(key)
+    return key if _BARE_NAME.fullmatch(key) else json.dumps(key)

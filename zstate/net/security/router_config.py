@@ -1,12 +1,12 @@
-"""The configuration of a router: JSON5 that zenohd takes unchanged, and that ``zstate router`` runs.
+"""Router configuration: JSON5 that zenohd reads unchanged, and that ``zstate router`` runs.
 
-Thinning: streams that a router passes on more slowly than they come, for links that are narrow.
+Downsampling limits the rate at which a router forwards streams, for slow links.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,17 +17,17 @@ from zstate.net.security.credentials import Credentials
 from zstate.net.security.json5 import json5_text
 from zstate.wire.keys import Stream, stream_key
 
-THINNED: tuple[Stream, ...] = ("joint_states", "tf")
-"""The streams whose samples may be left out: each is followed by a newer one."""
+DOWNSAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
+"""Streams that may lose samples: each is replaced by a newer one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Downsampling:
-    """Streams of which a router passes on at most so many samples a second, to each neighbour.
+    """Limits on the samples per second that a router forwards to each neighbour.
 
-    ``rates_hz`` says how many, of each of ``robots``; ``interfaces`` names the network interfaces to
-    whose neighbours that applies, all unless given. Latched values are never left out. Readers count
-    the samples left out as missed. Raises InvalidInput.
+    ``rates_hz`` is the limit by stream, for each of ``robots``; ``interfaces`` are the network interfaces
+    that it applies to (default: all). Latched values are never dropped. Readers count dropped samples
+    as missed. Raises InvalidInput.
     """
 
     rates_hz: Mapping[str, float]
@@ -38,84 +38,84 @@ class Downsampling:
     def __post_init__(self) -> None:
         check_namespace(self.namespace)
         for stream, rate_hz in self.rates_hz.items():
-            if stream not in THINNED:
-                raise InvalidInput(f"{stream!r} cannot be downsampled; {' and '.join(THINNED)} can")
+            if stream not in DOWNSAMPLED:
+                raise InvalidInput(f"{stream!r} cannot be downsampled; {' and '.join(DOWNSAMPLED)} can")
             if not (math.isfinite(rate_hz) and rate_hz > 0.0):
                 raise InvalidInput(f"{stream!r} at {rate_hz} Hz; give a positive number of samples a second")
         if not self.rates_hz or not self.robots:
-            # One rule for all robots would let through so many of them together, and starve some.
+            # One rule for all robots would limit their sum, and starve some.
             raise InvalidInput(
-                "downsampling needs streams and the names of the robots: each is counted apart"
+                "downsampling needs streams and the names of the robots: each has a limit of its own"
             )
 
     def settings(self) -> list[dict[str, object]]:
         """The section ``downsampling`` of a Zenoh configuration."""
-        among = {"interfaces": list(self.interfaces)} if self.interfaces else {}
-        rules = list(self._rules())
-        return [{"id": "streams", **among, "flows": ["egress"], "messages": ["put"], "rules": rules}]
-
-    def _rules(self) -> Iterator[dict[str, object]]:
+        interfaces = {"interfaces": list(self.interfaces)} if self.interfaces else {}
         prefix = f"{self.namespace}/" if self.namespace else ""
-        for robot in dict.fromkeys(self.robots):
-            for stream in THINNED:
-                if stream in self.rates_hz:
-                    yield {"key_expr": prefix + stream_key(robot, stream), "freq": self.rates_hz[stream]}
+        rules = [
+            {"key_expr": prefix + stream_key(robot, stream), "freq": self.rates_hz[stream]}
+            for robot in dict.fromkeys(self.robots)
+            for stream in DOWNSAMPLED
+            if stream in self.rates_hz
+        ]
+        return [{"id": "streams", **interfaces, "flows": ["egress"], "messages": ["put"], "rules": rules}]
 
 
 _PRIVATE = ("tcp/127.", "tcp/localhost:", "tcp/[::1]:", "unixsock-stream/")
 _HEAD = "The configuration of a Zenoh router: `zenohd -c FILE.json5`, or `zstate router --config FILE.json5`."
 
-# How long peers are waited for at the start is not a router's; how it seeks other routers stands below.
-_OURS = {path: value for path, value in SETTINGS.items() if path not in ("scouting/delay", "connect/retry")}
-_SEEKING: dict[str, object] = {
+# A router does not wait for peers at its start; its retries are in _CONNECT_SETTINGS.
+_NATIVE_SETTINGS = {
+    path: value for path, value in SETTINGS.items() if path not in ("scouting/delay", "connect/retry")
+}
+_CONNECT_SETTINGS: dict[str, object] = {
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
     "connect/retry": SETTINGS["connect/retry"],
 }
 
 _COMMENTS = {
-    "listen": "Where robots, readers and other routers come to.",
-    "connect": "The routers that it joins. One that is not there yet, or no more, is sought for ever.",
-    "scouting": "Nobody is sought by multicast.",
-    "timestamping": "Samples carry their own stamps, and a router would replace those ahead of its clock.",
-    "transport/link/tx": "Whoever is silent for so long [ms] is gone, and its liveliness tokens with it.",
-    "transport/unicast": "How long opening and accepting a connection may take [ms]; how many may pend.",
-    "transport/link/tls": "Encryption; with enable_mtls everybody shows a certificate of this authority.",
-    "transport/auth": "Who may connect by name and password.",
+    "listen": "Endpoints for robots, readers and other routers.",
+    "connect": "The routers that it joins. Unreachable ones are retried without limit.",
+    "scouting": "No discovery by multicast.",
+    "timestamping": "Samples carry their own stamps; a router would replace stamps ahead of its clock.",
+    "transport/link/tx": "A link without messages for so long [ms] is closed, and its liveliness tokens go.",
+    "transport/unicast": "Limits on opening and accepting connections: time [ms], number of pending ones.",
+    "transport/link/tls": "Encryption; with enable_mtls each side needs a certificate of this authority.",
+    "transport/auth": "Users that may connect, with passwords.",
     "transport/shared_memory": "No gain for messages this small.",
-    "downsampling": "At most so many samples a second [Hz] to each neighbour, by rule, not by key.",
-    "access_control": "Who may do what; what no rule allows is denied.",
+    "downsampling": "Limit of samples per second [Hz] to each neighbour, by rule, not by key.",
+    "access_control": "Allowed messages by identity; all others are denied.",
 }
 _ROS_COMMENTS = {
-    "scouting": "As rmw_zenohd has it, from here on: ROS nodes are peers, which find each other through it.",
-    "timestamping": "Late joiners are given the past values of topics in order.",
-    "queries_default_timeout": "Many nodes start at once, and are busy with that for a while.",
+    "scouting": "From here on as in rmw_zenohd: ROS nodes are peers, which find each other through it.",
+    "timestamping": "Late joiners receive the history of topics in order.",
+    "queries_default_timeout": "Long, as many nodes that start at once reply late.",
     "transport/link/tx": "",
     "transport/unicast": "",
 }
 _ACCESS_COMMENTS = {
-    "scouting/gossip": "Peers that it introduces link directly, which access control does not see.\n"
-    'Without, they get nothing from each other: connect with mode "client", ROS nodes too.',
+    "scouting/gossip": "Gossip lets peers link directly, past access control.\n"
+    'Without it peers receive nothing from each other: connect with mode "client", ROS nodes too.',
 }
 
 
 @dataclass(frozen=True, slots=True)
 class RouterConfig:
-    """A router: where it listens, which routers it joins, whom it lets in, what it passes on.
+    """A router: endpoints, credentials, downsampling and access control.
 
-    It listens at ``tcp/127.0.0.1:7447`` unless told otherwise. ``access_control`` is that section of a
-    Zenoh configuration, for which somebody has to be asked for names; with it peers are not introduced
-    to each other by gossip, as the router does not see what goes over their direct links. With ``ros2``
-    the rest is as rmw_zenohd has it. With certificates everything is encrypted, but for what stays on
-    this host.
+    It listens at ``tcp/127.0.0.1:7447`` by default. ``access_control`` is that section of a Zenoh
+    configuration, and needs credentials that identify clients; it turns gossip off, because peers that
+    gossip link directly, past the router. With ``ros2`` the other settings are those of rmw_zenohd. With
+    certificates all links are encrypted, except those within this host.
 
-    Raises InvalidInput and ConfigError for what cannot be used.
+    Raises InvalidInput and ConfigError for settings that cannot be used.
     """
 
     listen: tuple[str, ...] = (ROUTER_ENDPOINT,)
     connect: tuple[str, ...] = ()
     credentials: Credentials | None = None
-    thinning: Downsampling | None = None
+    downsampling: Downsampling | None = None
     access_control: Mapping[str, object] = field(default_factory=dict[str, object])
     ros2: bool = False
 
@@ -125,35 +125,32 @@ class RouterConfig:
         if self.credentials is not None:
             exposed = [endpoint for endpoint in self.listen if not endpoint.startswith(_PRIVATE)]
             self.credentials.check_endpoints(self.connect, exposed)
-        if self.access_control and not self._asks_for_names:
+        identifies = self.credentials and (self.credentials.certificate or self.credentials.users)
+        if self.access_control and not identifies:
             raise ConfigError(
-                "there is access control, and nobody is asked for a name: everybody would be denied; give "
-                "the router certificates (--certs DIR --identity NAME), users (--users FILE), or both",
+                "access control without certificates or users denies every client; give the router "
+                "certificates (--certs DIR --identity NAME), users (--users FILE), or both",
                 path="access_control",
             )
 
-    @property
-    def _asks_for_names(self) -> bool:
-        return self.credentials is not None and bool(self.credentials.certificate or self.credentials.users)
-
     def settings(self) -> dict[str, object]:
-        """As a Zenoh configuration."""
-        told: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
+        """The Zenoh configuration."""
+        settings: dict[str, object] = {"mode": "router", "listen/endpoints": list(self.listen)}
         if self.connect:
-            told |= {"connect/endpoints": list(self.connect), **_SEEKING}
-        told |= ROS_ROUTER if self.ros2 else _OURS
+            settings |= {"connect/endpoints": list(self.connect), **_CONNECT_SETTINGS}
+        settings |= ROS_ROUTER if self.ros2 else _NATIVE_SETTINGS
         if self.credentials is not None:
-            told |= self.credentials.settings()
-        if self.thinning is not None:
-            told["downsampling"] = self.thinning.settings()
+            settings |= self.credentials.settings()
+        if self.downsampling is not None:
+            settings["downsampling"] = self.downsampling.settings()
         if self.access_control:
-            told |= {"scouting/gossip/enabled": False, "access_control": self.access_control}
-        whole: dict[str, Any] = {}
-        _merge(whole, told)
-        return whole
+            settings |= {"scouting/gossip/enabled": False, "access_control": self.access_control}
+        nested: dict[str, Any] = {}
+        _merge(nested, settings)
+        return nested
 
     def text(self, *, masked: bool = False) -> str:
-        """As commented JSON5; ``masked``, with asterisks for the password."""
+        """The configuration as commented JSON5; if ``masked``, with asterisks for the password."""
         comments = _COMMENTS | (_ROS_COMMENTS if self.ros2 else {})
         if self.access_control:
             comments |= _ACCESS_COMMENTS
@@ -163,11 +160,11 @@ class RouterConfig:
         return json5_text(settings, comments, _HEAD)
 
 
-def _merge(whole: dict[str, Any], told: Mapping[str, Any]) -> None:
-    """Put what is ``told`` by path, which may be objects, where it belongs in ``whole``."""
-    for path, value in told.items():
+def _merge(nested: dict[str, Any], settings: Mapping[str, Any]) -> None:
+    """Add ``settings``, by path, to the objects of ``nested``; values may be objects."""
+    for path, value in settings.items():
         *parents, last = path.split("/")
-        place = whole
+        place = nested
         for parent in parents:
             place = place.setdefault(parent, {})
         if isinstance(value, Mapping):

@@ -1,1 +1,1 @@
-"""The ros2 wire: what ROS 2 nodes with rmw_zenoh_cpp say and hear, byte for byte, without ROS. Pure."""
+"""ROS 2 wire formats: messages and graph of rmw_zenoh_cpp nodes, byte for byte, without ROS. Pure."""

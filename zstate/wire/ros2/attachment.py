@@ -1,4 +1,4 @@
-"""The 33 bytes that rmw_zenoh_cpp puts beside every message; a ROS node drops one that has none."""
+"""The 33-byte attachment that rmw_zenoh_cpp sends with each message; a ROS node drops one without it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from zstate.errors import MessageError
 
 GID_BYTES = 16
 
-_LAYOUT = Struct("<qqB16s")  # the third is the length of what follows, as Zenoh serialises a slice
+_LAYOUT = Struct("<qqB16s")  # the third is the length of the gid, as Zenoh serialises a slice
 _LABEL = b"sequence_number"
 
 
 class Attachment(NamedTuple):
-    """Which message of which writer this is.
+    """Sequence number, time and writer of a message.
 
-    ``seq`` begins at 1 and grows by one; ``source_time`` [ns since the Unix epoch] is the clock of
-    the writer when it wrote; ``gid`` tells the writer, see ``zstate.wire.ros2.graph.gid``.
+    ``seq`` begins at 1 and grows by one; ``source_time`` [ns since the Unix epoch] is the time of sending
+    by the writer's clock; ``gid`` identifies the writer, see ``zstate.wire.ros2.graph.gid``.
     """
 
     seq: int
@@ -26,15 +26,15 @@ class Attachment(NamedTuple):
 
 
 def pack(seq: int, source_time_ns: int, gid: bytes) -> bytes:
-    """The attachment of one message. A ROS node that reads another length ends in an exception."""
+    """The attachment of one message. A ROS node that reads another length exits with an exception."""
     return _LAYOUT.pack(seq, source_time_ns, GID_BYTES, gid)
 
 
 def unpack(data: bytes | None) -> Attachment:
-    """What stood beside a message.
+    """The fields of an attachment.
 
-    Raises MessageError with the reason "no attachment" when nothing did, or "foreign" when it was
-    not rmw_zenoh_cpp's.
+    Raises MessageError with the reason "no attachment" for None, and "foreign" if it is not of
+    rmw_zenoh_cpp.
     """
     if data is None:
         raise MessageError(
@@ -42,28 +42,23 @@ def unpack(data: bytes | None) -> Attachment:
             "or a bridge that drops it",
             reason="no attachment",
         )
-    if len(data) != _LAYOUT.size or data[16] != GID_BYTES:
-        raise _foreign(data)
-    seq, source_time, _length, gid = _LAYOUT.unpack(data)
-    if seq < 0:
-        raise _foreign(data)
-    return Attachment(seq, source_time, gid)
-
-
-def session_from_gid(gid: bytes) -> int:
-    """The number that tells this start of a writer from others, made of its ``gid``."""
-    return int.from_bytes(gid[:8], "little")
-
-
-def _foreign(data: bytes) -> MessageError:
+    if len(data) == _LAYOUT.size and data[16] == GID_BYTES:
+        seq, source_time, _length, gid = _LAYOUT.unpack(data)
+        if seq >= 0:
+            return Attachment(seq, source_time, gid)
     if _LABEL in data[: len(_LABEL) + 1]:
-        return MessageError(
+        raise MessageError(
             f"an attachment of {len(data)} bytes with labels, as rmw_zenoh_cpp wrote before mid 2025: "
             "upgrade it to humble 0.1.2, jazzy 0.2.4, kilted 0.6.0 or later",
             reason="foreign",
         )
-    return MessageError(
+    raise MessageError(
         f"an attachment of {len(data)} bytes that is not rmw_zenoh_cpp's, which has {_LAYOUT.size} bytes, "
         f"a sequence number from 0 on, and a {GID_BYTES} before the gid; another program writes on this key",
         reason="foreign",
     )
+
+
+def session_from_gid(gid: bytes) -> int:
+    """The session number of a writer, from its ``gid``; a restarted writer has another one."""
+    return int.from_bytes(gid[:8], "little")

@@ -1,8 +1,8 @@
-"""Hearing: ROS messages as the messages that listeners know."""
+"""Decoder of ROS 2 topics into zstate's messages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from hashlib import blake2b
 
 import numpy as np
@@ -11,7 +11,6 @@ from zstate.errors import MessageError
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
-    Edges,
     JointState,
     Message,
     RobotDescription,
@@ -21,14 +20,14 @@ from zstate.wire.messages import (
     poses_from_block,
     to_block,
 )
+from zstate.wire.ros2.cdr import decode_clock, decode_string
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.joint_state import JointStateDecoder
-from zstate.wire.ros2.simple_messages import decode_clock, decode_string
-from zstate.wire.ros2.tf_message import RosTransforms, TfMessageDecoder
+from zstate.wire.ros2.tf_message import TfMessageDecoder
 
 
 class RosDecoder:
-    """Reads what ROS nodes write. Remembers the shapes of their messages, so that the next is quick."""
+    """Decodes the messages of ROS nodes. Caches their templates, for speed."""
 
     def __init__(self) -> None:
         self._joints = JointStateDecoder()
@@ -37,54 +36,50 @@ class RosDecoder:
     def messages(
         self, stream: Stream, payload: bytes, session: int, seq: int, names: FrameNames
     ) -> Sequence[Message]:
-        """What ``payload`` says on ``stream``. Raises MessageError.
+        """The messages of ``payload`` on ``stream``. Raises MessageError.
 
-        A message of transforms with several stamps is several samples.
+        A TFMessage with several stamps is one TransformSample for each, oldest first.
         """
         if stream == "joint_states":
-            return (self._joint_state(payload, session, seq),)
+            state = self._joints.decode(payload)
+            stamp, order = _checked_stamp(state.stamp), order_digest(state.names)
+            blocks = state.positions, state.velocities, state.efforts
+            return (JointState(stamp, seq, session, order, *blocks, state.names),)
         if stream == "tf":
-            return tuple(self._samples(payload, session, seq, names))
+            return self._transform_samples(payload, session, seq, names)
         if stream == "tf_static":
-            said = self._edges.decode(payload)
-            return (StaticTransforms(session, names.edges_to_zstate(said.edges), said.poses),)
+            transforms = self._edges.decode(payload)
+            return (StaticTransforms(session, names.edges_to_zstate(transforms.edges), transforms.poses),)
         if stream == "robot_description":
-            return (_description(decode_string(payload), session),)
+            urdf = decode_string(payload)
+            digest = blake2b(urdf.encode(), digest_size=8).hexdigest()
+            return (RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock=""),)
         return (ClockMessage(decode_clock(payload), seq, session),)
 
-    def _joint_state(self, payload: bytes, session: int, seq: int) -> JointState:
-        said = self._joints.decode(payload)
-        stamp, order = _dated(said.stamp), order_digest(said.names)
-        return JointState(
-            stamp, seq, session, order, said.positions, said.velocities, said.efforts, said.names
-        )
-
-    def _samples(self, payload: bytes, session: int, seq: int, names: FrameNames) -> Iterator[Message]:
-        said = self._edges.decode(payload)
-        edges = names.edges_to_zstate(said.edges)
-        for stamp, part, poses in _by_stamp(said, edges):
-            yield TransformSample(_dated(stamp), seq, session, order_digest(part), poses, part)
-
-
-def _by_stamp(said: RosTransforms, edges: Edges) -> Iterator[tuple[int, Edges, bytes]]:
-    if said.stamp is not None:
-        yield said.stamp, edges, said.poses
-        return
-    stamps, poses = np.array(said.stamps, dtype=np.int64), poses_from_block(said.poses)
-    for stamp in sorted(set(said.stamps)):
-        rows = np.flatnonzero(stamps == stamp)
-        yield stamp, tuple(edges[row] for row in rows), to_block(poses[rows])
+    def _transform_samples(
+        self, payload: bytes, session: int, seq: int, names: FrameNames
+    ) -> tuple[TransformSample, ...]:
+        transforms = self._edges.decode(payload)
+        edges = names.edges_to_zstate(transforms.edges)
+        if transforms.stamp is not None:
+            stamp, order = _checked_stamp(transforms.stamp), order_digest(edges)
+            return (TransformSample(stamp, seq, session, order, transforms.poses, edges),)
+        samples: list[TransformSample] = []
+        stamps, poses = np.array(transforms.stamps, dtype=np.int64), poses_from_block(transforms.poses)
+        for stamp in sorted(set(transforms.stamps)):
+            rows = np.flatnonzero(stamps == stamp)
+            part = tuple(edges[row] for row in rows)
+            block = to_block(poses[rows])
+            samples.append(
+                TransformSample(_checked_stamp(stamp), seq, session, order_digest(part), block, part)
+            )
+        return tuple(samples)
 
 
-def _description(urdf: str, session: int) -> RobotDescription:
-    digest = blake2b(urdf.encode(), digest_size=8).hexdigest()
-    return RobotDescription(session, urdf, digest, joint_names=(), moving_edges=(), clock="")
-
-
-def _dated(stamp: int) -> int:
+def _checked_stamp(stamp: int) -> int:
     if not stamp:
         raise MessageError(
-            "its stamp is zero, by which ROS means that there is none; let the writer fill header.stamp",
+            "its stamp is zero, which means no stamp in ROS; let the writer fill header.stamp",
             reason="no stamp",
         )
     return stamp

@@ -21,9 +21,9 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.ros2.attachment import pack
+from zstate.wire.ros2.cdr import encode_clock, encode_string
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.joint_state import JointStateEncoder
-from zstate.wire.ros2.simple_messages import encode_clock, encode_string
 from zstate.wire.ros2.tf_message import TfMessageEncoder
 
 
@@ -46,7 +46,7 @@ class RosStreamEncoder:
         self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleLayout
     ) -> None:
         self.key = address.key
-        self.token = address.token
+        self.token: str | None = address.token
         self._gid = address.gid
         self._seq = 0
         self._stream = stream
@@ -68,7 +68,14 @@ class RosStreamEncoder:
         Raises InvalidInput for a stamp that ROS cannot represent, and for numbers without names.
         """
         if isinstance(message, JointState):
-            return self._encode_joints(message)
+            names = self._sample_names.coordinates if message.names is None else message.names
+            if self._joints is None or self._joints[0] is not names:
+                self._joints = names, JointStateEncoder(names)
+            velocities, efforts = message.velocities, message.efforts
+            if len(self._sample_names.velocity_slots) != len(names):
+                velocities, efforts = self._spread(velocities, len(names)), self._spread(efforts, len(names))
+            stamp = _checked_stamp(message.stamp)
+            return self._joints[1].encode(stamp, message.positions, velocities, efforts)
         if isinstance(message, TransformSample):
             edges = self._sample_names.moving_edges if message.edges is None else message.edges
             return self._encode_edges(edges, _checked_stamp(message.stamp), message.poses)
@@ -79,15 +86,6 @@ class RosStreamEncoder:
         if isinstance(message, ClockMessage):
             return encode_clock(message.stamp)
         raise InvalidInput(f"ROS 2 has no topic for a {type(message).__name__}")
-
-    def _encode_joints(self, state: JointState) -> bytes:
-        names = self._sample_names.coordinates if state.names is None else state.names
-        if self._joints is None or self._joints[0] is not names:
-            self._joints = names, JointStateEncoder(names)
-        rates, forces = state.velocities, state.efforts
-        if len(self._sample_names.velocity_slots) != len(names):
-            rates, forces = self._spread(rates, len(names)), self._spread(forces, len(names))
-        return self._joints[1].encode(_checked_stamp(state.stamp), state.positions, rates, forces)
 
     def _spread(self, block: bytes | None, count: int) -> bytes | None:
         """Each number at the index of its coordinate: in ROS there are as many velocities as positions."""
@@ -106,7 +104,5 @@ class RosStreamEncoder:
 
 def _checked_stamp(stamp: int) -> int:
     if not stamp:
-        raise InvalidInput(
-            "the stamp is 0, by which ROS means that there is none; give the time of the sample"
-        )
+        raise InvalidInput("the stamp is 0, which means no stamp in ROS; give the time of the sample")
     return stamp

@@ -1,14 +1,14 @@
-"""The ROS graph: liveliness tokens that tell who publishes and subscribes what, and with which QoS.
+"""Liveliness tokens of the ROS graph: nodes and their publishers, subscriptions, services and clients.
 
-A token is a key; its being alive is the statement. A token that was heard is known by its own key:
-``parse_token(key).key`` can differ where the other side wrote more than is kept here.
+A token is a key. The key of a received token must be kept: ``parse_token(key).key`` differs if the other side
+wrote more than is parsed here.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal
 
 from xxhash import xxh3_128_digest
 
@@ -19,12 +19,12 @@ Kind = Literal["MP", "MS", "SS", "SC"]
 """Message publisher, message subscription, service server, service client."""
 
 DDS_GRAPH_EXPRESSION = "@/*/@ros2_lv/**"
-"""Hears every token of the bridges of zenoh-plugin-ros2dds."""
+"""The key expression of the tokens of all zenoh-plugin-ros2dds bridges."""
 
 _ADMIN = "@ros2_lv"
 _NODE = "NN"
 _KINDS = ("MP", "MS", "SS", "SC")
-_MOST_CHARACTERS = 8192
+_MAX_KEY_LENGTH = 8192
 _NUMBER = re.compile(r"\d{1,18}", re.ASCII)
 _DDS_SLASH = "§"
 _TYPE_HASH = re.compile(r"typehash=([^;]+);")
@@ -84,7 +84,7 @@ class EndpointToken:
 
     @property
     def key(self) -> str:
-        """The liveliness key, of which ``gid`` is made."""
+        """The liveliness key, the input of ``gid``."""
         names = (_mangled(part) for part in (self.enclave, self.namespace, self.node, self.topic))
         numbers = (str(self.nid), str(self.eid))
         what = (self.dds_type, self.hash, self.qos.encode_rmw())
@@ -93,10 +93,10 @@ class EndpointToken:
 
 @dataclass(frozen=True)
 class DdsToken:
-    """A topic routed by a bridge of zenoh-plugin-ros2dds, which tells no nodes.
+    """A topic routed by a bridge of zenoh-plugin-ros2dds, which announces no nodes.
 
     ``topic`` is the Zenoh key of its messages, ``type_name`` for instance "std_msgs/msg/String";
-    ``hash`` is empty where the bridge tells none.
+    ``hash`` is empty if the bridge announces none.
     """
 
     zid: str
@@ -113,7 +113,7 @@ class DdsToken:
 
     @property
     def dds_type(self) -> str:
-        """The type as ``EndpointToken`` has it; of no message type if ``type_name`` has not three parts."""
+        """The type in the form of ``EndpointToken``; no message type if ``type_name`` has not three parts."""
         package, _, name = self.type_name.split("/") if self.type_name.count("/") == 2 else ("", "", "")
         return f"{package}::msg::dds_::{name}_"
 
@@ -126,34 +126,54 @@ class DdsToken:
 
 
 def graph_expression(domain: int) -> str:
-    """The key expression that hears every token of rmw_zenoh_cpp in ``domain``."""
+    """The key expression of all tokens of rmw_zenoh_cpp in ``domain``."""
     return f"{_ADMIN}/{domain}/**"
 
 
 def gid(token_key: str) -> bytes:
-    """The 16 bytes that ROS knows an endpoint by: a hash of its token's key, exactly as declared."""
+    """The 16-byte identifier of an endpoint in ROS: a hash of its token's key, exactly as declared."""
     digest = xxh3_128_digest(token_key.encode())  # big-endian: high half, low half
-    return digest[:7:-1] + digest[7::-1]  # rmw_zenoh_cpp: low, high, as a little-endian memory has them
+    return digest[:7:-1] + digest[7::-1]  # rmw_zenoh_cpp: low, high, in little-endian memory order
 
 
 def parse_token(key: str) -> NodeToken | EndpointToken | None:
-    """The node or endpoint that the token ``key`` of rmw_zenoh_cpp tells; None if it is no such key.
+    """The node or endpoint of the token ``key`` of rmw_zenoh_cpp; None if it is no such key.
 
-    What a later version appends to an endpoint is passed over.
+    Chunks that a later version appends to an endpoint are ignored.
     """
-    chunks = key.split("/") if len(key) <= _MOST_CHARACTERS else []
+    chunks = key.split("/") if len(key) <= _MAX_KEY_LENGTH else []
     if len(chunks) < 9 or not all(chunks) or chunks[0] != _ADMIN:
         return None
     if not all(_NUMBER.fullmatch(chunks[place]) for place in (1, 3, 4)):
         return None
+    enclave, namespace, name, *_ = names = [chunk.replace("%", "/") for chunk in chunks[6:10]]
     if chunks[5] == _NODE:
-        return _node(chunks)
-    return _endpoint(chunks) if chunks[5] in _KINDS and len(chunks) >= 13 else None
+        return NodeToken(int(chunks[1]), chunks[2], int(chunks[3]), enclave, namespace, name)
+    if chunks[5] not in _KINDS or len(chunks) < 13:
+        return None
+    try:
+        qos = Qos.parse_rmw(chunks[12])
+    except MessageError:
+        return None
+    return EndpointToken(
+        domain=int(chunks[1]),
+        zid=chunks[2],
+        nid=int(chunks[3]),
+        eid=int(chunks[4]),
+        kind=chunks[5],
+        enclave=enclave,
+        namespace=namespace,
+        node=name,
+        topic=names[3],
+        dds_type=chunks[10],
+        hash=chunks[11],
+        qos=qos,
+    )
 
 
 def parse_dds_token(key: str) -> DdsToken | None:
-    """The publisher or subscription that the token ``key`` of a bridge tells; None for other keys."""
-    chunks = key.split("/") if len(key) <= _MOST_CHARACTERS else []
+    """The publisher or subscription of a bridge's token ``key``; None for other keys."""
+    chunks = key.split("/") if len(key) <= _MAX_KEY_LENGTH else []
     if len(chunks) != 7 or chunks[0] != "@" or chunks[2] != _ADMIN or chunks[3] not in ("MP", "MS"):
         return None
     topic, type_name = (chunk.replace(_DDS_SLASH, "/") for chunk in chunks[4:6])
@@ -165,36 +185,5 @@ def parse_dds_token(key: str) -> DdsToken | None:
     return DdsToken(chunks[1], chunks[3], topic, type_name, qos, user_data[1] if user_data else "")
 
 
-def _node(chunks: list[str]) -> NodeToken:
-    enclave, namespace, name = map(_plain, chunks[6:9])
-    return NodeToken(int(chunks[1]), chunks[2], int(chunks[3]), enclave, namespace, name)
-
-
-def _endpoint(chunks: list[str]) -> EndpointToken | None:
-    enclave, namespace, node, topic = map(_plain, chunks[6:10])
-    try:
-        qos = Qos.parse_rmw(chunks[12])
-    except MessageError:
-        return None
-    return EndpointToken(
-        domain=int(chunks[1]),
-        zid=chunks[2],
-        nid=int(chunks[3]),
-        eid=int(chunks[4]),
-        kind=cast(Kind, chunks[5]),
-        enclave=enclave,
-        namespace=namespace,
-        node=node,
-        topic=topic,
-        dds_type=chunks[10],
-        hash=chunks[11],
-        qos=qos,
-    )
-
-
 def _mangled(name: str) -> str:
     return name.replace("/", "%")
-
-
-def _plain(chunk: str) -> str:
-    return chunk.replace("%", "/")

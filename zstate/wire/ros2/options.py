@@ -1,9 +1,8 @@
-"""What a user may choose about the ros2 wire: the domain, the namespace, how frames are named."""
+"""Options of the ROS 2 wire formats: domain, namespace, frame names."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -20,16 +19,15 @@ _FOREIGN = re.compile(r"[^A-Za-z0-9_]")
 
 @dataclass(frozen=True)
 class Ros2Options:
-    """Where in the ROS graph the robots stand. InvalidInput for values that ROS would not take.
+    """The place of robots in the ROS graph. Raises InvalidInput for values that ROS does not allow.
 
     ``domain`` is the ROS_DOMAIN_ID. ``namespace`` is kept without outer slashes: "" is the root,
-    "*" puts every robot into a namespace of its own name. ``frame_prefix`` stands before a robot's
-    own frames, as robot_state_publisher's parameter of that name; a "*" in it is the robot's name,
-    and "*/" is what is taken where all robots have namespaces and share /tf.
-    ``tf`` says whether /tf and /tf_static are "global", as tf2 has them, or in the "namespace".
-    ``hash`` is "iron" for ROS 2 from Iron on, or "humble", where types have none: it decides what is
-    written, readers hear both. ``node`` is the name under which a writer stands in the ROS graph; that of
-    its program unless given.
+    "*" puts each robot into a namespace of its own name. ``frame_prefix`` is put before a robot's
+    own frames, like robot_state_publisher's parameter of that name; a "*" in it is the robot's name.
+    The default is "*/" if robots with namespaces share /tf.
+    ``tf`` is "global" for /tf and /tf_static, as in tf2, or "namespace" for topics in the namespace.
+    ``hash`` is "iron" for ROS 2 since Iron, or "humble", whose types have no hash; it applies to writers,
+    readers accept both. ``node`` is a writer's name in the ROS graph; default: its program.
     """
 
     domain: int = 0
@@ -41,15 +39,21 @@ class Ros2Options:
 
     def __post_init__(self) -> None:
         if self.domain not in range(LAST_DOMAIN + 1):
-            raise _not_allowed("domain", self.domain, f"whole numbers from 0 to {LAST_DOMAIN}")
+            raise _value_error("domain", self.domain, f"whole numbers from 0 to {LAST_DOMAIN}")
         object.__setattr__(self, "namespace", self.namespace.strip("/"))
         if self.namespace not in ("", ANY):
-            _check_namespace(self.namespace)
+            if ANY in self.namespace:
+                raise InvalidInput(
+                    f"the namespace {self.namespace!r} has a '*' within; write '*' alone, "
+                    "which puts every robot into a namespace of its own name"
+                )
+            for token in self.namespace.split("/"):
+                _check_token("namespace", token, f" in {self.namespace!r}" if token != self.namespace else "")
         _check_prefix(self.frame_prefix)
         if self.tf not in ("global", "namespace"):
-            raise _not_allowed("tf", self.tf, "'global' and 'namespace'")
+            raise _value_error("tf", self.tf, "'global' and 'namespace'")
         if self.hash not in ("iron", "humble"):
-            raise _not_allowed("hash", self.hash, "'iron' and 'humble'")
+            raise _value_error("hash", self.hash, "'iron' and 'humble'")
         if self.node:
             _check_token("node", self.node)
 
@@ -57,22 +61,29 @@ class Ros2Options:
     def parse(cls, text: str) -> Ros2Options:
         """The options written as ``domain=5,namespace=r1``; an empty text gives the defaults.
 
-        Raises InvalidInput for an unknown key, listing those there are, and for a value that is not
-        allowed, saying which are.
+        Raises InvalidInput for an unknown key, with the known ones, and for a value that is not allowed,
+        with the allowed ones.
         """
-        given: dict[str, str] = {}
+        names = [field.name for field in fields(Ros2Options)]
+        known = f"known: {', '.join(names)}, for instance 'domain=5,namespace=r1'"
+        values: dict[str, Any] = {}
         for part in text.split(",") if text.strip() else ():
             key, equals, value = (piece.strip() for piece in part.partition("="))
-            if not equals or key in given:
+            if not equals or key in values:
                 problem = "is given twice" if equals else "is not written as key=value"
-                raise InvalidInput(f"the ros2 option {key!r} {problem}; {_known()}")
-            given[_check_key(key)] = value
-        return cls(**_typed(given))
+                raise InvalidInput(f"the ros2 option {key!r} {problem}; {known}")
+            if key not in names:
+                hint = did_you_mean(key, names) or ";"
+                raise InvalidInput(f"the ros2 wire has no option {key!r}{hint} {known}")
+            # other text stays: the constructor refuses it with the values it allows
+            is_number = key == "domain" and value.isascii() and value.isdecimal()
+            values[key] = int(value) if is_number else value
+        return cls(**values)
 
-    def namespace_of(self, robot: str) -> str:
+    def robot_namespace(self, robot: str) -> str:
         """The namespace of ``robot``'s topics, without outer slashes; "" is the root.
 
-        Raises InvalidInput when it must be the robot's name and that is no ROS name.
+        Raises InvalidInput if it must be the robot's name and this is no ROS name.
         """
         check_robot(robot)
         if self.namespace == ANY:
@@ -80,66 +91,27 @@ class Ros2Options:
             return robot
         return self.namespace
 
-    def prefix_of(self, robot: str) -> str:
-        """What stands before the frames of ``robot`` on ROS's side; may be empty.
+    def robot_frame_prefix(self, robot: str) -> str:
+        """The prefix of ``robot``'s frames in ROS; may be empty.
 
-        Robots in namespaces of their own that share /tf are told apart there: unless given, by their names.
+        Robots in namespaces of their own that share /tf have their names as prefixes by default.
         """
         shares_tf = self.namespace == ANY and self.tf == "global"
         prefix = self.frame_prefix or (f"{ANY}/" if shares_tf else "")
         return prefix.replace(ANY, check_robot(robot))
 
 
-def _check_key(key: str) -> str:
-    names = _names()
-    if key not in names:
-        hint = did_you_mean(key, names) or ";"
-        raise InvalidInput(f"the ros2 wire has no option {key!r}{hint} {_known()}")
-    return key
-
-
-def _typed(given: dict[str, str]) -> dict[str, Any]:
-    domain = given.get("domain", "0")
-    # what is no number stays a text, which the constructor refuses with the values it allows
-    return {**given, "domain": int(domain) if domain.isascii() and domain.isdecimal() else domain}
-
-
-def _names() -> Sequence[str]:
-    return [field.name for field in fields(Ros2Options)]
-
-
-def _known() -> str:
-    return f"known: {', '.join(_names())}, for instance 'domain=5,namespace=r1'"
-
-
-def _check_namespace(namespace: str) -> None:
-    if ANY in namespace:
-        raise InvalidInput(
-            f"the namespace {namespace!r} has a '*' within; write '*' alone, "
-            "which puts every robot into a namespace of its own name"
-        )
-    for token in namespace.split("/"):
-        _check_token("namespace", token, f" in {namespace!r}" if token != namespace else "")
-
-
 def _check_token(what: str, token: str, where: str = "") -> None:
-    if not _TOKEN.fullmatch(token):
-        raise InvalidInput(
-            f"the {what} {token!r}{where} {_token_problem(token)}; ROS names are made of letters, "
-            f"digits and '_' and begin with no digit, for instance {_legal(token)!r}"
-        )
-
-
-def _token_problem(token: str) -> str:
+    if _TOKEN.fullmatch(token):
+        return
     foreign = dict.fromkeys(_FOREIGN.findall(token))
-    if foreign:
-        return f"contains {' and '.join(map(repr, foreign))}"
-    return "begins with a digit" if token else "is empty"
-
-
-def _legal(token: str) -> str:
+    problem = f"contains {' and '.join(map(repr, foreign))}" if foreign else "begins with a digit"
     legal = _FOREIGN.sub("_", token) or "r1"
-    return legal if _TOKEN.fullmatch(legal) else f"_{legal}"
+    raise InvalidInput(
+        f"the {what} {token!r}{where} {problem if token else 'is empty'}; ROS names are made of letters, "
+        f"digits and '_' and begin with no digit, for instance "
+        f"{legal if _TOKEN.fullmatch(legal) else f'_{legal}'!r}"
+    )
 
 
 def _check_prefix(prefix: str) -> None:
@@ -153,5 +125,5 @@ def _check_prefix(prefix: str) -> None:
         )
 
 
-def _not_allowed(name: str, value: object, allowed: str) -> InvalidInput:
+def _value_error(name: str, value: object, allowed: str) -> InvalidInput:
     return InvalidInput(f"the ros2 option {name} is {value!r}; allowed are {allowed}")

@@ -1,8 +1,8 @@
-"""What a ROS 2 endpoint offers or asks of the network, in the three ways in which it is written.
+"""QoS profile of a ROS 2 endpoint and its three encodings: rmw_zenoh_cpp, zenoh-plugin-ros2dds, rosbag2.
 
-The numbers are those of ``rmw/types.h``, but for DDS's own in zenoh-plugin-ros2dds. Deadline,
-lifespan and liveliness are always written as their defaults and passed over when read: Zenoh has
-nothing that would keep them.
+The numbers are those of ``rmw/types.h``, except in zenoh-plugin-ros2dds, which uses those of DDS. Deadline,
+lifespan and liveliness are always written as their defaults and ignored when read: Zenoh does not
+enforce them.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Durability = Literal["volatile", "transient_local"]
 History = Literal["keep_last", "keep_all"]
 
 RMW_DEPTH = 42
-"""The depth that rmw_zenoh_cpp takes where none is written."""
+"""Default depth of rmw_zenoh_cpp."""
 
-Word = TypeVar("Word", bound=str)
+Policy = TypeVar("Policy", bound=str)
 
 _RELIABILITY: dict[Reliability, int] = {"reliable": 1, "best_effort": 2}
 _DURABILITY: dict[Durability, int] = {"transient_local": 1, "volatile": 2}
@@ -37,7 +37,7 @@ _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807"  # RMW_DURATION_INFINITE
 
 @dataclass(frozen=True)
 class Qos:
-    """Quality of service. ``depth`` counts the kept messages; 0 stands for all with "keep_all"."""
+    """Quality of service. ``depth`` is the number of kept messages; 0 with "keep_all"."""
 
     reliability: Reliability = "reliable"
     durability: Durability = "volatile"
@@ -52,7 +52,7 @@ class Qos:
             )
 
     def encode_rmw(self) -> str:
-        """The last chunk of an endpoint's token in rmw_zenoh_cpp: empty where it is the default.
+        """The last chunk of an endpoint's token in rmw_zenoh_cpp: defaults are empty.
 
         ``rel:dur:hist,depth:deadline:lifespan:liveliness``; ``::,10:,:,:,,`` is a plain publisher.
         """
@@ -64,17 +64,17 @@ class Qos:
 
     @classmethod
     def parse_rmw(cls, text: str) -> Qos:
-        """What ``encode_rmw`` wrote, or a ROS node. Raises MessageError ("malformed")."""
+        """The QoS that ``encode_rmw`` or a ROS node wrote. Raises MessageError ("malformed")."""
         parts = text.split(":")
         try:
             history, depth = parts[2].split(",")
             return cls(
-                _word(_RELIABILITY, parts[0], "reliable"),
-                _word(_DURABILITY, parts[1], "volatile"),
-                *_kept(_word(_HISTORY, history, "keep_last"), depth, RMW_DEPTH),
+                _parse_policy(_RELIABILITY, parts[0], "reliable"),
+                _parse_policy(_DURABILITY, parts[1], "volatile"),
+                *_parse_history(_parse_policy(_HISTORY, history, "keep_last"), depth, RMW_DEPTH),
             )
         except (LookupError, ValueError):
-            raise _unreadable(text, "'::,10:,:,:,,'") from None
+            raise _malformed_error(text, "'::,10:,:,:,,'") from None
 
     def encode_dds(self) -> str:
         """The same in zenoh-plugin-ros2dds, without a type hash: ``:rel:dur:hist,depth``."""
@@ -86,22 +86,22 @@ class Qos:
 
     @classmethod
     def parse_dds(cls, text: str) -> Qos:
-        """What ``encode_dds`` wrote, or a bridge, whatever follows. Raises MessageError ("malformed")."""
+        """The QoS of ``encode_dds`` or a bridge, before any suffix. Raises MessageError ("malformed")."""
         parts = text.split(":")
         try:
             history, depth = parts[3].split(",") if parts[3] else ("", "")
             return cls(
-                _word(_DDS_RELIABILITY, parts[1], "reliable"),
-                _word(_DDS_DURABILITY, parts[2], "volatile"),
-                *_kept(_word(_DDS_HISTORY, history, "keep_last"), depth, 1),
+                _parse_policy(_DDS_RELIABILITY, parts[1], "reliable"),
+                _parse_policy(_DDS_DURABILITY, parts[2], "volatile"),
+                *_parse_history(_parse_policy(_DDS_HISTORY, history, "keep_last"), depth, 1),
             )
         except (LookupError, ValueError):
-            raise _unreadable(text, "':1:0:0,10'") from None
+            raise _malformed_error(text, "':1:0:0,10'") from None
 
     def to_rosbag_yaml(self) -> str:
         """The ``offered_qos_profiles`` of a recording: a YAML list of this one.
 
-        With numbers for the policies, which every version of rosbag2 reads; names are for Jazzy on.
+        Policies are numbers, which every version of rosbag2 reads; names are read since Jazzy.
         """
         return (
             f"- history: {_HISTORY[self.history]}\n"
@@ -121,24 +121,24 @@ STREAM_QOS: dict[Stream, Qos] = {
     "tf": Qos(depth=100),
     "tf_static": Qos(durability="transient_local", depth=1),
     "robot_description": Qos(durability="transient_local", depth=1),
-    # Readers ask best effort (rclcpp's ClockQoS) or reliable (a plain subscription). DDS joins a
-    # reliable writer to both, a best-effort writer to the former only. An old time is of no use.
+    # Readers request best effort (rclcpp's ClockQoS) or reliable (a plain subscription). DDS matches a
+    # reliable writer with both, a best-effort writer with the former only. An old time is useless.
     "clock": Qos(depth=1),
 }
-"""What the writer of each stream offers: as robot_state_publisher and tf2 do."""
+"""The QoS that the writer of each stream offers, like robot_state_publisher and tf2."""
 
 
-def _word(numbers: dict[Word, int], text: str, default: Word) -> Word:
-    if not text:
-        return default
-    return {str(number): word for word, number in numbers.items()}[text]
+def _parse_policy(numbers: dict[Policy, int], text: str, default: Policy) -> Policy:
+    return {str(number): policy for policy, number in numbers.items()}[text] if text else default
 
 
-def _kept(history: History, depth: str, default: int) -> tuple[History, int]:
+def _parse_history(history: History, depth: str, default: int) -> tuple[History, int]:
     if not _DEPTH.fullmatch(depth):
         raise ValueError(depth)
     return history, 0 if history == "keep_all" else int(depth or default)
 
 
-def _unreadable(text: str, example: str) -> MessageError:
-    return MessageError(f"a malformed QoS {shortened(text)!r}; written as {example}", reason="malformed")
+def _malformed_error(text: str, example: str) -> MessageError:
+    return MessageError(
+        f"a malformed QoS {shortened(text)!r}; expected a form like {example}", reason="malformed"
+    )

@@ -1,4 +1,4 @@
-"""Which topic carries which stream, and under which Zenoh key the two ROS 2 worlds put a topic.
+"""ROS 2 topics of the streams, and their Zenoh keys in rmw_zenoh_cpp and zenoh-plugin-ros2dds.
 
 ===================  ======================  ===========================================
 stream               type                    topic of robot r1 with ``namespace=r1``
@@ -20,10 +20,10 @@ from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.types import CLOCK, JOINT_STATE, STRING, TF_MESSAGE, RosType
 
 SHARED = "ros"
-"""The robot to whom belongs what is in the root namespace, and the frames of nobody in particular."""
+"""The robot of topics in the root namespace, and of frames that belong to no robot."""
 
 HUMBLE_HASH = "TypeHashNotSupported"
-"""What ROS 2 Humble, whose types have no hash, writes in its place."""
+"""Type hash in the keys of ROS 2 Humble, whose types have none."""
 
 _TYPES: dict[Stream, RosType] = {
     "joint_states": JOINT_STATE,
@@ -35,7 +35,7 @@ _TYPES: dict[Stream, RosType] = {
 
 
 def ros_type(stream: Stream) -> RosType:
-    """The ROS type that carries ``stream``. InvalidInput for one that ROS has no topic for."""
+    """The ROS type that carries ``stream``. Raises InvalidInput for a stream without a ROS topic."""
     if stream not in _TYPES:
         raise InvalidInput(
             f"the stream {stream!r} is not carried by ROS 2; carried are {', '.join(map(repr, _TYPES))}"
@@ -44,27 +44,27 @@ def ros_type(stream: Stream) -> RosType:
 
 
 class TopicKeys(Protocol):
-    """The seam between what a stream is and where ROS 2 looks for it."""
+    """Maps the streams of robots to topics and Zenoh keys."""
 
     def topic(self, robot: str, stream: Stream) -> str:
         """The full ROS name of the topic, with its leading slash."""
         ...
 
     def key(self, robot: str, stream: Stream) -> str:
-        """The Zenoh key to put ``stream`` on. InvalidInput for a name that ROS would not take."""
+        """The Zenoh key of ``stream``. Raises InvalidInput for a name that ROS does not allow."""
         ...
 
     def expression(self, robot: str, stream: Stream) -> str:
-        """The key expression that hears ``stream``; robot ``"*"`` means whoever is in the namespace.
+        """The key expression of ``stream``; robot ``"*"`` means all robots in the namespace.
 
-        With ``namespace=*`` those are all robots in a namespace of one token.
+        With ``namespace=*`` these are all robots in a namespace of one token.
         """
         ...
 
-    def robot_of(self, key: str) -> str:
-        """The robot whose key this is: the last token of its namespace, SHARED in the root.
+    def robot_from_key(self, key: str) -> str:
+        """The robot of ``key``: the last token of its namespace, SHARED in the root.
 
-        InvalidInput for a key that is not of this layout.
+        Raises InvalidInput for a key that is not of this layout.
         """
         ...
 
@@ -76,18 +76,18 @@ class RmwKeys:
         self._options = options
 
     def topic(self, robot: str, stream: Stream) -> str:
-        return f"/{self._path(self._options.namespace_of(robot), stream)}"
+        return f"/{self._path(self._options.robot_namespace(robot), stream)}"
 
     def key(self, robot: str, stream: Stream) -> str:
         kind = ros_type(stream)
-        written = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
-        return f"{self._options.domain}{self.topic(robot, stream)}/{kind.dds}/{written}"
+        type_hash = kind.hash if self._options.hash == "iron" else HUMBLE_HASH
+        return f"{self._options.domain}{self.topic(robot, stream)}/{kind.dds}/{type_hash}"
 
     def expression(self, robot: str, stream: Stream) -> str:
         path = self._path(_namespace_pattern(self._options, robot), stream)
         return f"{self._options.domain}/{path}/{ros_type(stream).dds}/*"
 
-    def robot_of(self, key: str) -> str:
+    def robot_from_key(self, key: str) -> str:
         _domain, *path = key.split("/")
         if len(path) < 3:
             raise InvalidInput(f"the key {key!r} is not of the form '<domain>/<topic>/<type>/<hash>'")
@@ -102,8 +102,8 @@ class RmwKeys:
 class DdsKeys:
     """The keys of zenoh-plugin-ros2dds: the name of the topic, without its leading slash.
 
-    A bridge puts its namespace before everything that passes, before /tf and /clock too. Domains
-    and type hashes are the bridge's business and do not stand in its keys.
+    A bridge puts its namespace before every topic, before /tf and /clock too. Its keys have no
+    domain and no type hash.
     """
 
     def __init__(self, options: Ros2Options) -> None:
@@ -114,18 +114,18 @@ class DdsKeys:
 
     def key(self, robot: str, stream: Stream) -> str:
         ros_type(stream)
-        return _joined(self._options.namespace_of(robot), stream)
+        return _joined(self._options.robot_namespace(robot), stream)
 
     def expression(self, robot: str, stream: Stream) -> str:
         ros_type(stream)
         return _joined(_namespace_pattern(self._options, robot), stream)
 
-    def robot_of(self, key: str) -> str:
+    def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
 
 def _namespace_pattern(options: Ros2Options, robot: str) -> str:
-    return options.namespace if robot == ANY else options.namespace_of(robot)
+    return options.namespace if robot == ANY else options.robot_namespace(robot)
 
 
 def _joined(namespace: str, name: str) -> str:
@@ -133,6 +133,6 @@ def _joined(namespace: str, name: str) -> str:
 
 
 def robot_from_topic(topic: str) -> str:
-    """The robot that a topic speaks of: the last token of its namespace, SHARED in the root."""
+    """The robot of ``topic``: the last token of its namespace, SHARED in the root."""
     tokens = topic.strip("/").split("/")
     return tokens[-2] if len(tokens) > 1 else SHARED

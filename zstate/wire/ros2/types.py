@@ -1,4 +1,4 @@
-"""The ROS 2 message types of a robot's state: their names, their fields, and the hash of these."""
+"""ROS 2 message types of the streams: names, fields, and type hashes (REP-2016)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from hashlib import sha256
 from typing import Any, NamedTuple
 
-# Package/Type to its fields, as (type, name) in the notation of .msg files.
+# The fields of each package/type, as (type, name) in the notation of .msg files.
 _FIELDS: dict[str, tuple[tuple[str, str], ...]] = {
     "builtin_interfaces/Time": (("int32", "sec"), ("uint32", "nanosec")),
     "std_msgs/Header": (("builtin_interfaces/Time", "stamp"), ("string", "frame_id")),
@@ -41,11 +41,10 @@ _SEPARATOR = "=" * 80
 
 
 class RosType(NamedTuple):
-    """A message type by all the names it goes by.
+    """A message type.
 
-    ``name`` is the one people use, ``dds`` the one in key expressions, ``hash`` tells one version of
-    its fields from another (RIHS01), ``definition`` says the fields themselves, as .msg files joined
-    in the way of the schema encoding "ros2msg".
+    ``name`` is for instance "std_msgs/msg/String", ``dds`` its form in key expressions, ``hash`` the hash of
+    its fields (RIHS01), ``definition`` its .msg files, joined for the schema encoding "ros2msg".
     """
 
     name: str
@@ -53,10 +52,21 @@ class RosType(NamedTuple):
     hash: str
     definition: str
 
-
-def _ros_type(short: str) -> RosType:
-    package, kind = short.split("/")
-    return RosType(_full(short), f"{package}::msg::dds_::{kind}_", _hash(short), _definition(short))
+    @classmethod
+    def from_fields(cls, short: str) -> RosType:
+        """The type ``short`` (package/type), from its fields and those of the types within."""
+        package, kind = short.split("/")
+        names = tuple(dict.fromkeys(_with_parts(short)))
+        # The SHA-256 of the fields in the one form of JSON that REP-2016 prescribes.
+        described = {
+            "type_description": _description(short),
+            "referenced_type_descriptions": [_description(part) for part in sorted(names[1:])],
+        }
+        type_hash = f"RIHS01_{sha256(json.dumps(described).encode()).hexdigest()}"
+        fields = ["".join(f"{kind} {name}\n" for kind, name in _FIELDS[part]) for part in names]
+        parts = [f"MSG: {part}\n{text}" for part, text in zip(names[1:], fields[1:], strict=True)]
+        definition = f"{_SEPARATOR}\n".join([fields[0], *parts])
+        return cls(_full(short), f"{package}::msg::dds_::{kind}_", type_hash, definition)
 
 
 def _full(short: str) -> str:
@@ -64,48 +74,28 @@ def _full(short: str) -> str:
 
 
 def _with_parts(short: str) -> Iterator[str]:
-    """A type and, each after the one that needs it, the types of its fields; some more than once."""
+    """A type, then recursively the types of its fields; some more than once."""
     yield short
     for kind, _ in _FIELDS[short]:
         if (part := kind.removesuffix("[]")) in _FIELDS:
             yield from _with_parts(part)
 
 
-def _hash(short: str) -> str:
-    """The SHA-256 of the fields in the one spelling of JSON that REP-2016 prescribes."""
-    parts = sorted(set(_with_parts(short)) - {short})
-    described = {
-        "type_description": _description(short),
-        "referenced_type_descriptions": [_description(part) for part in parts],
-    }
-    return f"RIHS01_{sha256(json.dumps(described).encode()).hexdigest()}"
-
-
 def _description(short: str) -> dict[str, Any]:
-    fields = [{"name": name, "type": _field_type(kind)} for kind, name in _FIELDS[short]]
+    fields: list[dict[str, Any]] = []
+    for kind, name in _FIELDS[short]:
+        item = kind.removesuffix("[]")
+        field_type = {
+            "type_id": _PRIMITIVES.get(item, _NESTED) + (_UNBOUNDED_SEQUENCE if item != kind else 0),
+            "capacity": 0,
+            "string_capacity": 0,
+            "nested_type_name": _full(item) if item in _FIELDS else "",
+        }
+        fields.append({"name": name, "type": field_type})
     return {"type_name": _full(short), "fields": fields}
 
 
-def _field_type(kind: str) -> dict[str, Any]:
-    item = kind.removesuffix("[]")
-    return {
-        "type_id": _PRIMITIVES.get(item, _NESTED) + (_UNBOUNDED_SEQUENCE if item != kind else 0),
-        "capacity": 0,
-        "string_capacity": 0,
-        "nested_type_name": _full(item) if item in _FIELDS else "",
-    }
-
-
-def _definition(short: str) -> str:
-    first, *parts = (
-        f"MSG: {part}\n" + "".join(f"{kind} {name}\n" for kind, name in _FIELDS[part])
-        for part in dict.fromkeys(_with_parts(short))
-    )
-    _, _, fields = first.partition("\n")
-    return f"{_SEPARATOR}\n".join([fields, *parts])
-
-
-JOINT_STATE = _ros_type("sensor_msgs/JointState")
-TF_MESSAGE = _ros_type("tf2_msgs/TFMessage")
-STRING = _ros_type("std_msgs/String")
-CLOCK = _ros_type("rosgraph_msgs/Clock")
+JOINT_STATE = RosType.from_fields("sensor_msgs/JointState")
+TF_MESSAGE = RosType.from_fields("tf2_msgs/TFMessage")
+STRING = RosType.from_fields("std_msgs/String")
+CLOCK = RosType.from_fields("rosgraph_msgs/Clock")

@@ -1,10 +1,11 @@
-"""ROS 2 wire formats: the messages and the graph of ROS nodes over Zenoh, without ROS."""
+"""ROS 2 wire formats: messages and graph of ROS nodes over Zenoh, without ROS."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import lru_cache, partial
 from typing import Literal
 
@@ -12,7 +13,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import ANY, Stream
-from zstate.wire.messages import Message
+from zstate.wire.messages import Message, check_edges, check_size
 from zstate.wire.protocol import EntityId, SerializedSample
 from zstate.wire.ros2.attachment import session_from_gid, unpack
 from zstate.wire.ros2.decoder import RosDecoder
@@ -31,7 +32,6 @@ from zstate.wire.ros2.graph import (
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
 from zstate.wire.ros2.topics import SHARED, DdsKeys, RmwKeys, TopicKeys, robot_from_topic, ros_type
-from zstate.wire.sizes import check_edges, check_size
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 
@@ -45,15 +45,13 @@ class Ros2Wire:
 
     name = "ros2"
     shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
+    _topic_keys: Callable[[Ros2Options], TopicKeys] = RmwKeys
 
     def __init__(self, options: Ros2Options | None = None) -> None:
         self.options = options or Ros2Options()
-        self._keys = self._key_layout(self.options)
-        self._hearing = RosDecoder()
+        self._keys = self._topic_keys(self.options)
+        self._decoder = RosDecoder()
         self._frame_names = lru_cache(64)(partial(FrameNames, self.options))
-
-    def _key_layout(self, options: Ros2Options) -> TopicKeys:
-        return RmwKeys(options)
 
     def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
         self._frame_names(robot)  # raises InvalidInput before anything is declared
@@ -75,7 +73,7 @@ class Ros2Wire:
         return RosStreamEncoder(stream, address, self._frame_names(robot), sample_names)
 
     def _node(self, robot: str, program: str, node: EntityId) -> NodeToken:
-        namespace = f"/{self.options.namespace_of(robot)}"
+        namespace = f"/{self.options.robot_namespace(robot)}"
         name = self.options.node or re.sub(r"\W|^(?=\d|$)", "_", program, flags=re.ASCII)
         return NodeToken(self.options.domain, node.zid, node.number, "/", namespace, name)
 
@@ -84,7 +82,7 @@ class Ros2Wire:
     ) -> tuple[str, ...]:
         if robot == ANY:
             if self.options.namespace == ANY:
-                return ()  # a subscription in the graph is to one topic, and these are any number
+                return ()  # a subscription in the graph has one topic; these are any number of topics
             robot = SHARED
         node = self._node(robot, reader.program, EntityId(zid, number()))
         endpoints = [self._endpoint_token(node, robot, stream, "MS", number()) for stream in streams]
@@ -118,10 +116,10 @@ class Ros2Wire:
     def expression(self, robot: str, stream: Stream) -> str:
         return self._keys.expression(robot, stream)
 
-    def robot_of(self, key: str) -> str:
-        return self._keys.robot_of(key)
+    def robot_from_key(self, key: str) -> str:
+        return self._keys.robot_from_key(key)
 
-    def statics_writer(self, key: str) -> None:
+    def static_writer_name(self, key: str) -> None:
         """None: all static edges of ROS share one topic."""
 
     def decode(self, stream: Stream, arrival: SerializedSample, robot: str) -> Sequence[Message]:
@@ -131,8 +129,8 @@ class Ros2Wire:
         try:
             names = self._frame_names(robot)
         except InvalidInput as error:
-            raise MessageError(f"a namespace that ROS does not have: {error}", reason="foreign") from None
-        messages = self._hearing.messages(stream, arrival.payload, session, seq, names)
+            raise MessageError(f"a namespace that ROS does not allow: {error}", reason="foreign") from None
+        messages = self._decoder.messages(stream, arrival.payload, session, seq, names)
         if stream == "tf_static":
             for message in messages:
                 check_edges(message)
@@ -146,25 +144,21 @@ class Ros2Wire:
     def writers_expression(self, robot: str) -> str:
         return graph_expression(self.options.domain)
 
-    def announced(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> Announcement | None:
         parsed = parse_token(token)
         if not isinstance(parsed, EndpointToken) or parsed.kind != "MP":
             return None
         writer = WriterId(parsed.full_name, host="", pid=0, since=0, session=session_from_gid(gid(token)))
-        return self._announced(parsed.topic, parsed.dds_type, robot, writer)
+        return self._announcement(parsed.topic, parsed.dds_type, robot, writer)
 
-    def _announced(self, topic: str, dds_type: str, robot: str, writer: WriterId) -> Announcement | None:
+    def _announcement(self, topic: str, dds_type: str, robot: str, writer: WriterId) -> Announcement | None:
         named = robot_from_topic(topic) if robot == ANY else robot
         for stream in STREAMS:
-            if dds_type == ros_type(stream).dds and self._is_topic_of(topic, named, stream):
-                return Announcement(named, stream, writer)
+            # a namespace that ROS does not allow matches no topic
+            with suppress(InvalidInput):
+                if dds_type == ros_type(stream).dds and topic == self._keys.topic(named, stream):
+                    return Announcement(named, stream, writer)
         return None
-
-    def _is_topic_of(self, topic: str, robot: str, stream: Stream) -> bool:
-        try:
-            return topic == self._keys.topic(robot, stream)
-        except InvalidInput:
-            return False  # a namespace that ROS does not have
 
 
 class Ros2DdsWire(Ros2Wire):
@@ -174,13 +168,11 @@ class Ros2DdsWire(Ros2Wire):
     """
 
     name = "ros2dds"
+    _topic_keys = DdsKeys
 
     def __init__(self, options: Ros2Options | None = None) -> None:
         super().__init__(options)
         self._received: Counter[str] = Counter()
-
-    def _key_layout(self, options: Ros2Options) -> TopicKeys:
-        return DdsKeys(options)
 
     def _node_token(self, node: NodeToken) -> None:
         """None: the bridges announce no nodes."""
@@ -203,9 +195,9 @@ class Ros2DdsWire(Ros2Wire):
     def writers_expression(self, robot: str) -> str:
         return DDS_GRAPH_EXPRESSION
 
-    def announced(self, token: str, robot: str) -> Announcement | None:
+    def parse_token(self, token: str, robot: str) -> Announcement | None:
         parsed = parse_dds_token(token)
         if parsed is None or parsed.kind != "MP":
             return None
         writer = WriterId(f"ros2dds bridge {parsed.zid[:8]}", host="", pid=0, since=0, session=0)
-        return self._announced(f"/{parsed.topic}", parsed.dds_type, robot, writer)
+        return self._announcement(f"/{parsed.topic}", parsed.dds_type, robot, writer)

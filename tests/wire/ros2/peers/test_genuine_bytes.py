@@ -1,4 +1,4 @@
-"""What zstate says in CDR is, byte for byte, what a genuine ROS 2 says, and the other way round."""
+"""CDR payloads of zstate and of genuine ROS 2 are equal, byte for byte."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from ros_messages import (
 
 from zstate.wire.messages import to_block
 from zstate.wire.ros2 import types
+from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
 from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
-from zstate.wire.ros2.simple_messages import decode_clock, decode_string, encode_clock, encode_string
 from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
 
 pytestmark = [pytest.mark.heavy, pytest.mark.processes]
@@ -56,7 +56,7 @@ def kilted() -> Iterator[Program]:
 
 
 def mask(pieces: Sequence[Piece]) -> bytes:
-    """1 for each byte of a payload that says something, 0 for padding, which ROS leaves as it was."""
+    """1 for each defined byte of a payload, 0 for padding, which ROS leaves uninitialised."""
     out = bytearray(b"\1\1\1\1")
     for kind, value in pieces:
         size = 8 if kind == "f64" else 4
@@ -112,9 +112,9 @@ def test_joint_states_are_the_same_bytes(kilted: Program, stamp: int, state: Any
     floats = [piece for block in blocks for piece in sequence("f64", block or [])]
     assert_same(ours, genuine, mask([*header(), *sequence("text", names), *floats]))
     assert genuine_message(kilted, JOINT_STATE, ours) == message
-    said = JointStateDecoder().decode(genuine)
-    assert (said.stamp, list(said.names), said.positions) == (stamp, names, packed[0])
-    assert [said.velocities or b"", said.efforts or b""] == [block or b"" for block in packed[1:]]
+    decoded = JointStateDecoder().decode(genuine)
+    assert (decoded.stamp, list(decoded.names), decoded.positions) == (stamp, names, packed[0])
+    assert [decoded.velocities or b"", decoded.efforts or b""] == [block or b"" for block in packed[1:]]
 
 
 @many
@@ -130,8 +130,8 @@ def test_transforms_are_the_same_bytes(kilted: Program, stamp: int, transforms: 
         pieces += [*header(parent), ("text", child), *[("f64", 0.0)] * len(XYZ + XYZW)]
     assert_same(ours, genuine, mask(pieces))
     assert genuine_message(kilted, TF_MESSAGE, ours) == message
-    said = TfMessageDecoder().decode(genuine)
-    assert (said.stamps, said.edges, said.poses) == ((stamp,) * len(edges), edges, poses)
+    decoded = TfMessageDecoder().decode(genuine)
+    assert (decoded.stamps, decoded.edges, decoded.poses) == ((stamp,) * len(edges), edges, poses)
 
 
 @many

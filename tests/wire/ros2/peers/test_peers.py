@@ -1,4 +1,4 @@
-"""zstate and other implementations of ROS 2 over Zenoh hear each other, through a router process."""
+"""zstate and other implementations of ROS 2 over Zenoh exchange messages through a router process."""
 
 from __future__ import annotations
 
@@ -50,39 +50,39 @@ def publish_edges(peer: Peer) -> None:
 
 
 @every_peer
-def test_a_peer_hears_the_joint_states_as_they_were_published(peer: Peer, session: Session):
+def test_peer_receives_joint_states_as_published(peer: Peer, session: Session):
     peer.subscribe("/joint_states", JOINT_STATE)
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
-        heard = peer.hears("/joint_states", lambda: publisher.publish(POSITIONS, VELOCITIES, stamp=STAMP))
-    assert heard == joint_state(STAMP, RRBOT.joint_names, POSITIONS, VELOCITIES)
+        received = peer.hears("/joint_states", lambda: publisher.publish(POSITIONS, VELOCITIES, stamp=STAMP))
+    assert received == joint_state(STAMP, RRBOT.joint_names, POSITIONS, VELOCITIES)
 
 
 @every_peer
-def test_a_peer_hears_the_moving_edges_of_a_robot(peer: Peer, session: Session):
+def test_peer_receives_the_moving_edges_of_a_robot(peer: Peer, session: Session):
     peer.subscribe("/tf", TF_MESSAGE)
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
-        heard = peer.hears("/tf", lambda: publisher.publish(POSITIONS, stamp=STAMP))
+        received = peer.hears("/tf", lambda: publisher.publish(POSITIONS, stamp=STAMP))
         moving = publisher.description().moving_edges
-    assert {edge["header"]["stamp"]["nanosec"] for edge in heard["transforms"]} == {STAMP % SECOND}
-    assert set(edges_of(heard)) == set(moving)
-    for (parent, child), matrix in edges_of(heard).items():
+    assert {edge["header"]["stamp"]["nanosec"] for edge in received["transforms"]} == {STAMP % SECOND}
+    assert set(edges_of(received)) == set(moving)
+    for (parent, child), matrix in edges_of(received).items():
         assert np.allclose(matrix, kinematic_pose(RRBOT, POSITIONS, parent, child), rtol=0, atol=1e-12)
 
 
 @every_peer_that_latches
-def test_a_peer_that_joins_late_still_hears_the_model_and_the_fixed_edges(peer: Peer, session: Session):
+def test_late_peer_receives_the_model_and_the_fixed_edges(peer: Peer, session: Session):
     with StatePublisher(session, RRBOT, "r1", wires=(WIRE,)):
         peer.subscribe("/robot_description", STRING, latched=True)
         assert peer.hears("/robot_description") == {"data": RRBOT.urdf}
         peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
-        heard = peer.hears("/tf_static")
-    assert edges_of(heard)
-    for (parent, child), matrix in edges_of(heard).items():
+        received = peer.hears("/tf_static")
+    assert edges_of(received)
+    for (parent, child), matrix in edges_of(received).items():
         assert np.allclose(matrix, kinematic_pose(RRBOT, POSITIONS, parent, child), rtol=0, atol=1e-12)
 
 
 @every_peer_that_latches
-def test_a_peer_that_joins_late_still_hears_a_static_edge(peer: Peer, session: Session):
+def test_late_peer_receives_a_static_edge(peer: Peer, session: Session):
     with StaticPublisher(session, "r1", "camera_mount", wires=WIRE) as statics:
         statics.set(Transform.from_pose7("tool", "camera", TURN))
         peer.subscribe("/tf_static", TF_MESSAGE, latched=True)
@@ -95,20 +95,20 @@ def test_a_listener_computes_transforms_from_the_joint_states_of_a_peer(peer: Pe
     peer.advertise("/joint_states", JOINT_STATE)
     state = joint_state(STAMP, RRBOT.joint_names, POSITIONS, VELOCITIES)
 
-    def say() -> None:
+    def publish() -> None:
         peer.publish("/robot_description", {"data": RRBOT.urdf})
         peer.publish("/joint_states", state)
 
     with TransformListener(session, "r1", wire=WIRE) as listener:
         buffer = listener.buffer
-        repeat_until(say, lambda: buffer.can_lookup("world", "tool", STAMP))
+        repeat_until(publish, lambda: buffer.can_lookup("world", "tool", STAMP))
         expected = kinematic_pose(RRBOT, POSITIONS, "world", "tool")
         assert_pose(buffer.lookup("world", "tool", STAMP), expected)
         assert (listener.stats.refused, listener.stats.missed) == ({}, 0)
 
 
 @every_peer
-def test_a_listener_takes_moving_and_static_edges_from_a_peer(peer: Peer, session: Session):
+def test_listener_inserts_moving_and_static_edges_of_a_peer(peer: Peer, session: Session):
     advertise_edges(peer)
     with TransformListener(session, "r1", wire=WIRE, follow="tf") as listener:
         buffer = listener.buffer
@@ -119,7 +119,7 @@ def test_a_listener_takes_moving_and_static_edges_from_a_peer(peer: Peer, sessio
 
 
 @every_peer_that_signs
-def test_a_listener_calls_the_writer_of_an_edge_by_its_node(peer: Peer, session: Session):
+def test_listener_names_the_writer_of_an_edge_by_its_node(peer: Peer, session: Session):
     advertise_edges(peer)
     with TransformListener(session, "r1", wire=WIRE, follow="tf") as listener:
         wanted = {"r1/hand": f"/{peer.node}", "r1/camera": f"/{peer.node}"}
@@ -131,12 +131,12 @@ def test_a_listener_calls_the_writer_of_an_edge_by_its_node(peer: Peer, session:
 
 
 @pytest.mark.parametrize("peer", [KILTED], indirect=True)
-def test_a_listener_that_joins_late_still_hears_the_model_and_the_static_edges(peer: Peer, session: Session):
+def test_late_listener_receives_the_model_and_the_static_edges(peer: Peer, session: Session):
     peer.advertise("/robot_description", STRING, latched=True)
     advertise_edges(peer)
     peer.publish("/robot_description", {"data": RRBOT.urdf})
     publish_edges(peer)
-    # The bridge has them for sure when somebody else had them from it.
+    # A second reader of the bridge proves that the bridge has them.
     with TransformListener(session, "r1", wire=WIRE, follow="tf") as early:
         until(lambda: early.buffer.can_lookup("hand", "camera"))
     with TransformListener(session, "r1", wire=WIRE) as late:
@@ -144,7 +144,7 @@ def test_a_listener_that_joins_late_still_hears_the_model_and_the_static_edges(p
 
 
 @every_peer
-def test_a_peer_hears_and_is_heard_in_a_namespace(peer: Peer, session: Session):
+def test_peer_publishes_and_subscribes_in_a_namespace(peer: Peer, session: Session):
     wire = f"{WIRE},namespace=*"
     peer.subscribe("/r1/joint_states", JOINT_STATE)
     peer.advertise("/r2/joint_states", JOINT_STATE)

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.processes
 
 
 def tokens(session: Session) -> set[str]:
-    """All that live in the domain. Zenoh tells a session its own ones twice."""
+    """All tokens alive in the domain. Zenoh reports its own tokens to a session twice."""
     replies = session.zenoh.liveliness().get(f"@ros2_lv/{DOMAIN}/**")
     return {str(reply.ok.key_expr) for reply in replies if reply.ok}
 
@@ -105,21 +105,21 @@ def test_a_peer_would_write_our_tokens_and_gids_as_we_do(peer: Peer, session: Se
             )
 
 
-def test_what_we_put_is_signed_by_the_publisher_that_the_graph_shows(router: str, session: Session):
+def test_samples_have_the_gid_of_the_publisher_in_the_graph(router: str, session: Session):
     config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{router}"]}}}}')
-    heard: dict[str, list[bytes]] = {"/r1/joint_states": [], "/tf": []}
+    received: dict[str, list[bytes]] = {"/r1/joint_states": [], "/tf": []}
     with zenoh.open(config) as other, StatePublisher(session, RRBOT, "r1", wires=(WIRE,)) as publisher:
-        for topic, attachments in heard.items():
+        for topic, attachments in received.items():
             other.declare_subscriber(
                 f"{DOMAIN}{topic}/*/*",
                 lambda sample, kept=attachments: kept.append(sample.attachment.to_bytes()),
             )
         repeat_until(
             lambda: publisher.publish([0.1, 0.2], stamp=STAMP),
-            lambda: all(len(attachments) >= 5 for attachments in heard.values()),
+            lambda: all(len(attachments) >= 5 for attachments in received.values()),
         )
         writers = {gid(token): parse_token(token) for token in tokens(session)}
-    for topic, attachments in heard.items():
+    for topic, attachments in received.items():
         signed = [Attachment.parse(attachment) for attachment in attachments]
         (identity,) = {attachment.gid for attachment in signed}
         assert writers[identity].topic == topic

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
-from zstate.wire.ros2.simple_messages import decode_clock, decode_string, encode_clock, encode_string
+from zstate.wire.ros2.cdr import decode_clock, decode_string, encode_clock, encode_string
 
 STAMP = 1_700_000_000_123_456_789
 TEXTS = ["", "a", "abc", "<robot name='ü'/>", "日本", "x" * 3_000_000]
@@ -56,7 +56,7 @@ def test_a_message_cut_off_anywhere_is_truncated(decode, payload: bytes):
         assert caught.value.reason == "truncated"
 
 
-def test_what_ros_2_cannot_say_is_not_sent():
+def test_values_that_ros_2_cannot_represent_are_refused():
     with pytest.raises(InvalidInput):
         encode_string("a\0b")
     with pytest.raises(InvalidInput):

@@ -1,4 +1,4 @@
-"""What is too large is refused by its stream before it is decoded, and what waits is bounded in bytes."""
+"""Size limits: a payload too large for its stream is refused before decoding; queues are bounded in bytes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.wire.messages import JointState, StaticTransforms, Status, order_digest
+from zstate.wire.messages import MAX_BYTES, STATIC_EDGES, JointState, StaticTransforms, Status, order_digest
 from zstate.wire.native import ENCODINGS, NativeWire, decode, encode
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
-from zstate.wire.sizes import MOST_BYTES, STATIC_EDGES
 
 ORDER = order_digest(("a",))
 
@@ -35,7 +34,7 @@ def statics(count: int) -> StaticTransforms:
 @pytest.mark.parametrize("wire", ["native", "ros2"])
 @pytest.mark.parametrize("stream", ["joint_states", "tf", "tf_static", "robot_description"])
 def test_each_stream_has_a_largest_payload(wire, stream):
-    size = 4 * MOST_BYTES[stream] + 1
+    size = 4 * MAX_BYTES[stream] + 1
     for arrival in (
         SerializedSample("key", bytes(size), "any"),
         SerializedSample("key", b"\0", "any", None, size),
@@ -54,7 +53,7 @@ def test_more_than_ten_thousand_static_edges_are_too_many():
         NativeWire().decode("tf_static", arrival(STATIC_EDGES + 1), "r1")
 
 
-def test_what_travels_on_no_stream_is_bounded_too():
+def test_messages_without_a_stream_have_a_limit_too():
     with pytest.raises(MessageError) as caught:
         decode(bytes(64_001), ENCODINGS[Status], Status)
     assert caught.value.reason == "too large"
@@ -70,7 +69,7 @@ def test_samples_that_wait_for_a_description_are_bounded_in_bytes():
     assert (count - given_up) * len(block) <= EARLY_BYTES
 
 
-def test_too_large_messages_are_counted_and_the_next_are_taken(sessions):
+def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
     writer, reader = sessions
     with (
         StreamPublisher(writer, "zstate/r2/joint_states", ENCODINGS[JointState]) as stranger,
