@@ -21,7 +21,7 @@ from zstate.buffer.tracks import JointTrack
 from zstate.errors import LookupFailed
 from zstate.extension import kernel
 from zstate.model.load import load_model
-from zstate.nodes.robot_encoder import block_of
+from zstate.nodes.publisher import block_of
 from zstate.se3 import ARRAYS, conjugate, multiply, quaternion_from_rpy, unstack
 from zstate.transform import Transform
 from zstate.wire.messages import to_block

@@ -14,8 +14,7 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.ingest.static_transforms import StaticTransformIngest
-from zstate.ingest.transforms import TransformIngest
+from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
 from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
 from zstate.transform import Transform

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from zstate.ingest.counters import Counters
-from zstate.ingest.sequence import GapCounter, MissingSamples
+from zstate.ingest.counters import Counters, GapCounter, MissingSamples
 
 
 def test_of_a_new_session_everything_is_missing():

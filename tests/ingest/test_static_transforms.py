@@ -4,7 +4,7 @@ from helpers.robots import RRBOT
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.static_transforms import StaticTransformIngest
+from zstate.ingest.transforms import StaticTransformIngest
 from zstate.wire.messages import StaticTransforms, to_block
 
 

@@ -8,8 +8,7 @@ import pytest
 from helpers.recording_files import joint_states, write_run
 
 from zstate.errors import RecordingError
-from zstate.recording.bag_metadata import bag_files
-from zstate.recording.reader import RecordingReader
+from zstate.recording.reader import RecordingReader, bag_files
 
 # As `ros2 bag record` of Foxy, Humble and Jazzy writes it: yaml-cpp, lists one step in.
 BY_ROSBAG2 = """\

@@ -18,8 +18,7 @@ from zstate.ingest.events import EventLog, WriterEvent
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import StampCheck
-from zstate.ingest.static_transforms import StaticTransformIngest
-from zstate.ingest.transforms import TransformIngest
+from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
@@ -117,13 +116,12 @@ class TransformListener(Closeable):
             self._capacity = capacity_for(key)
             opening.enter_context(StreamSubscriber(session, key, self._on_samples))
             if history_on_join and self._wire.name == "native":
-                self._history = HistoryReader(
-                    session, self._observed(self._on_history), self._count_undecodable
+                on_history = self._observed(self._on_history)
+                self._history = opening.enter_context(
+                    HistoryReader(session, on_history, self._count_undecodable)
                 )
-                opening.enter_context(self._history)
             if not self._wire.shared:
-                self._clock_offsets = _WriterClockOffsets(session, self.buffer)
-                opening.enter_context(self._clock_offsets)
+                self._clock_offsets = opening.enter_context(_WriterClockOffsets(session, self.buffer))
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
             opening.enter_context(watch(session, robot, on_writer, wire, on_cut_off))
