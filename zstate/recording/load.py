@@ -28,9 +28,7 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters, ListenerStats
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.ingest.model_filter import ModelEdgeFilter
-from zstate.ingest.static_transforms import StaticTransformIngest
-from zstate.ingest.transforms import TransformIngest
+from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import (
     DecodedMessage,

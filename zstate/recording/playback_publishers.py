@@ -11,7 +11,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.model_filter import ModelEdgeFilter
+from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.ownership import Edge, WriterClaim, claim_edges, named_edges
