@@ -91,14 +91,14 @@ def test_samples_before_the_description_are_not_lost(following: Following):
     assert all(following.elbow_is([0.1 * n, 0.2 * n], at=n) for n in range(4))
 
 
-def test_samples_that_no_description_ever_fits_are_counted_in_the_end(following: Following):
+def test_samples_that_no_description_fits_are_counted(following: Following):
     following.take(*[following.sample(n, [0.0, 0.0]) for n in range(1030)])
     assert following.counters.stats().refused == {"no description": 6}
     following.ingest.describe(description())
     assert following.counters.stats().received == 1024
 
 
-def test_gaps_in_seq_are_counted_as_missed_or_as_dropped_by_our_own_ring(following: Following):
+def test_seq_gaps_count_as_missed_or_as_dropped_by_the_own_ring(following: Following):
     following.ingest.describe(description())
     following.take(following.sample(10, [0, 0]), following.sample(13, [0, 0]))
     following.ingest.insert_sample(following.sample(15, [0, 0]), overflowed=True)
@@ -107,7 +107,7 @@ def test_gaps_in_seq_are_counted_as_missed_or_as_dropped_by_our_own_ring(followi
     assert (stats.received, stats.missed, stats.dropped) == (5, 2, 1)
 
 
-def test_what_is_older_than_the_history_is_late(following: Following):
+def test_sample_older_than_the_history_counts_as_late(following: Following):
     following = Following(type(following.ingest), TransformBuffer(history_s=1e-6))
     following.ingest.describe(description())
     following.take(following.sample(0, [0, 0], stamp=5000), following.sample(1, [0, 0], stamp=3999))
@@ -115,7 +115,7 @@ def test_what_is_older_than_the_history_is_late(following: Following):
     assert (stats.received, stats.late, stats.refused) == (1, 1, {})
 
 
-def test_a_clock_that_was_set_back_is_a_new_epoch_at_the_second_sample(following: Following):
+def test_second_sample_of_a_clock_set_back_starts_a_new_epoch(following: Following):
     following = Following(type(following.ingest), TransformBuffer(history_s=1e-6))
     following.ingest.describe(description())
     stamps = (5000, 1000, 1100, 1200)
@@ -126,7 +126,7 @@ def test_a_clock_that_was_set_back_is_a_new_epoch_at_the_second_sample(following
     assert following.elbow_is([0, 0.2], 1100)
 
 
-def test_a_held_up_sample_does_not_end_the_epoch(following: Following):
+def test_delayed_sample_does_not_end_the_epoch(following: Following):
     following = Following(type(following.ingest), TransformBuffer(history_s=1e-6))
     following.ingest.describe(description())
     stamps = (5000, 1000, 6000, 1100, 7000)
@@ -134,7 +134,7 @@ def test_a_held_up_sample_does_not_end_the_epoch(following: Following):
     assert (following.counters.stats().received, following.counters.stats().late) == (3, 2)
 
 
-def test_a_writer_whose_clock_is_behind_does_not_take_the_edges_of_one_that_lives():
+def test_writer_with_a_slow_clock_does_not_take_over_edges_of_a_live_writer():
     ahead = Following(TransformIngest, TransformBuffer(history_s=1e-6))
     behind = Following(TransformIngest, beside=ahead)
     ahead.live |= {("r1", 7): "ahead", ("r1", 8): "behind"}
@@ -151,7 +151,7 @@ def test_a_writer_whose_clock_is_behind_does_not_take_the_edges_of_one_that_live
     assert behind.elbow_is([0, 0], 1003)
 
 
-def test_a_new_session_is_a_new_epoch_even_when_its_clock_is_behind(following: Following):
+def test_new_session_starts_a_new_epoch_even_if_its_clock_is_behind(following: Following):
     following.ingest.describe(description())
     following.take(following.sample(5, [1.0, 1.0], session=1, stamp=10**12))
     following.take(following.sample(0, [0.5, 0.5], session=2, stamp=7))
@@ -162,7 +162,7 @@ def test_a_new_session_is_a_new_epoch_even_when_its_clock_is_behind(following: F
     assert (stats.received, stats.missed, stats.late, stats.refused) == (2, 0, 0, {})
 
 
-def test_the_older_of_two_writers_is_counted_and_does_not_come_back(following: Following):
+def test_older_of_two_writers_is_counted_and_stays_refused(following: Following):
     following.ingest.describe(description())
     for seq in range(10):
         following.take(following.sample(seq, [1.0, 1.0], session=1, stamp=2 * seq))
@@ -172,7 +172,7 @@ def test_the_older_of_two_writers_is_counted_and_does_not_come_back(following: F
     assert following.buffer.explain("r1/upper", "r1/lower", 0) is not None
 
 
-def test_the_writer_that_gave_way_is_followed_again_once_the_other_has_left(following: Following):
+def test_replaced_writer_is_accepted_again_after_the_newer_one_left(following: Following):
     following.ingest.describe(description())
     following.take(following.sample(0, [1.0, 1.0], session=1), following.sample(1, [2.0, 2.0], session=2))
     following.ingest.writer_left(1)
@@ -186,7 +186,7 @@ def test_the_writer_that_gave_way_is_followed_again_once_the_other_has_left(foll
     assert following.counters.stats().refused == {"second writer": 2}
 
 
-def test_the_writers_name_is_known_whether_it_was_told_before_or_after_its_samples(following: Following):
+def test_writer_name_is_known_whether_announced_before_or_after_its_samples(following: Following):
     following.ingest.describe(description())
     following.ingest.name_writer(1, "driver@arm pid 4")
     following.take(following.sample(0, [0, 0], session=1))
@@ -199,7 +199,7 @@ def test_the_writers_name_is_known_whether_it_was_told_before_or_after_its_sampl
     assert names["r1/lower"] == "driver@arm pid 5"
 
 
-def test_a_changed_model_replaces_the_robot_and_its_history():
+def test_changed_model_replaces_the_robot_and_its_history():
     following = Following(JointStateIngest)
     following.ingest.describe(description())
     following.take(following.sample(0, [0.0, 0.0]))
@@ -230,7 +230,7 @@ def test_another_joint_order_than_the_models_is_refused():
         "<robot name='x'><xacro:if value='1'/></robot>",
     ],
 )
-def test_a_description_that_is_no_urdf_text_is_refused_and_opens_nothing(urdf: str):
+def test_description_that_is_no_urdf_text_is_refused_and_opens_no_file(urdf: str):
     following = Following(JointStateIngest)
     following.ingest.describe(description(urdf=urdf, digest="ff"))
     assert following.counters.stats().refused == {"robot description": 1}
@@ -241,7 +241,7 @@ def test_a_description_that_is_no_urdf_text_is_refused_and_opens_nothing(urdf: s
 
 
 @pytest.mark.parametrize("positions", [[0.0], [0.0, 0.0, 0.0], [0.0, float("nan")], [float("inf"), 0.0]])
-def test_positions_that_cannot_be_are_refused(positions: list[float]):
+def test_invalid_positions_are_refused(positions: list[float]):
     following = Following(JointStateIngest)
     following.ingest.describe(description())
     following.take(following.sample(0, positions), following.sample(1, [0.5, 0.5]))
@@ -249,7 +249,7 @@ def test_positions_that_cannot_be_are_refused(positions: list[float]):
     assert following.elbow_is([0.5, 0.5])
 
 
-def test_transforms_may_name_their_edges_and_need_no_description():
+def test_transforms_that_name_their_edges_need_no_description():
     following = Following(TransformIngest)
     following.take(following.sample(0, [0.5, 0.5], edges=edge_names(RRBOT)))
     assert following.elbow_is([0.5, 0.5])
@@ -257,14 +257,14 @@ def test_transforms_may_name_their_edges_and_need_no_description():
     assert following.buffer.latest("r1/upper", "r1/lower") == -5
 
 
-def test_transforms_that_name_their_edges_outlast_a_description_that_comes_later():
+def test_transforms_that_name_their_edges_stay_when_a_description_arrives():
     following = Following(TransformIngest)
     following.take(following.sample(0, [0.5, 0.5], stamp=5, edges=edge_names(RRBOT)))
     following.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
     assert following.elbow_is([0.5, 0.5], at=5)
 
 
-def test_transforms_of_another_robots_order_are_never_taken_for_this_ones():
+def test_transforms_in_the_order_of_another_robot_are_never_inserted():
     following = Following(TransformIngest)
     following.take(following.sample(0, [0.5, 0.5]))
     other = (("base", "left"), ("base", "right"))
@@ -273,7 +273,7 @@ def test_transforms_of_another_robots_order_are_never_taken_for_this_ones():
     assert following.buffer.frames() == ()
 
 
-def test_a_changed_description_without_a_sample_between_is_taken():
+def test_changed_description_before_any_sample_is_used():
     following = Following(TransformIngest)
     following.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
     following.ingest.describe(description())
@@ -281,7 +281,7 @@ def test_a_changed_description_without_a_sample_between_is_taken():
     assert following.elbow_is([0.5, 0.5])
 
 
-def test_a_description_with_impossible_frame_names_is_refused():
+def test_description_with_impossible_frame_names_is_refused():
     following = Following(TransformIngest)
     following.ingest.describe(RobotDescription(1, "", "", (), (("base", ""),)))
     assert following.counters.stats().refused == {"robot description": 1}
@@ -290,14 +290,14 @@ def test_a_description_with_impossible_frame_names_is_refused():
     assert following.elbow_is([0.5, 0.5])
 
 
-def test_a_robot_without_moving_edges_sends_samples_that_are_in_order():
+def test_samples_of_a_robot_without_moving_edges_are_valid():
     following = Following(TransformIngest)
     following.ingest.describe(RobotDescription(1, "", "", (), ()))
     following.take(TransformSample(1, 0, 7, order_digest(()), b""))
     assert (following.counters.stats().received, following.counters.stats().refused) == (1, {})
 
 
-def test_a_restart_leaves_what_a_static_writer_took_over():
+def test_restart_keeps_edges_that_a_static_writer_took_over():
     from zstate.transform import Transform
 
     following = Following(TransformIngest)
@@ -310,7 +310,7 @@ def test_a_restart_leaves_what_a_static_writer_took_over():
     assert following.buffer.lookup("r1/upper", "r1/lower").translation[0] == 1.0
 
 
-def test_fixed_edges_are_those_of_whoever_writes_the_model_and_moving_ones_of_the_driver():
+def test_fixed_edges_name_the_model_writer_and_moving_edges_the_driver():
     following = Following(JointStateIngest)
     following.ingest.describe(description())
     following.take(following.sample(0, [0, 0]))

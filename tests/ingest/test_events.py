@@ -31,7 +31,7 @@ def kinds(events: EventLog) -> list[str]:
     return [event.kind for event in events.recent()]
 
 
-def test_a_writer_joins_and_leaves():
+def test_writer_joins_and_leaves():
     before = time.time_ns()
     with quiet() as events:
         events.on_writer(said(), alive=True)
@@ -46,7 +46,7 @@ def test_a_writer_joins_and_leaves():
     assert "has left" in left.text
 
 
-def test_the_same_program_on_the_same_host_was_restarted_and_another_one_joined():
+def test_same_program_on_the_same_host_is_restarted_and_another_one_joined():
     with quiet() as events:
         for writer in (DRIVER, RESTARTED, OTHER):
             events.on_writer(said(writer), alive=True)
@@ -56,7 +56,7 @@ def test_the_same_program_on_the_same_host_was_restarted_and_another_one_joined(
 
 
 @pytest.mark.parametrize("loss", ["cut off", "left"])
-def test_who_is_the_same_as_before_is_back(loss):
+def test_same_writer_that_returns_is_back(loss):
     with quiet() as events:
         events.on_writer(said(), alive=True)
         if loss == "cut off":
@@ -86,7 +86,7 @@ def test_two_writers_of_one_stream_are_a_conflict_of_the_later_one(one, other):
     "other",
     [said(OTHER, "tf_static", "room"), said(OTHER, "robot_description"), said(OTHER, "tf_static")],
 )
-def test_writers_of_different_things_are_none(other):
+def test_writers_of_different_streams_do_not_conflict(other):
     with quiet() as events:
         events.on_writer(said(DRIVER, "tf_static", "mount"), alive=True)
         events.on_writer(said(), alive=True)
@@ -95,7 +95,7 @@ def test_writers_of_different_things_are_none(other):
 
 
 @pytest.mark.parametrize(("stream", "conflicts"), [("tf", 0), ("tf_static", 0), ("joint_states", 1)])
-def test_what_ros_nodes_say_together_is_none_but_joint_states(stream, conflicts):
+def test_ros_nodes_that_share_topics_conflict_only_on_joint_states(stream, conflicts):
     with EventLog((*HEARD, "tf"), "joint_states", ROS_SHARED) as events:
         for writer in (DRIVER, OTHER):
             events.on_writer(said(writer, stream), alive=True)
@@ -116,7 +116,7 @@ def test_two_static_writers_that_place_one_frame_conflict_once():
     assert conflict.text == "'room' of 'r1' places 'r1/camera', and so does 'mount' of 'r1'"
 
 
-def test_a_static_writer_that_is_gone_is_in_nobodys_way():
+def test_departed_static_writer_conflicts_with_none():
     with quiet() as events:
         events.on_writer(said(DRIVER, "tf_static", "mount"), alive=True)
         events.set_static_children("r1", "mount", frozenset({"r1/camera"}))
@@ -125,7 +125,7 @@ def test_a_static_writer_that_is_gone_is_in_nobodys_way():
         assert "conflict" not in kinds(events)
 
 
-def test_streams_that_are_not_heard_have_no_events():
+def test_streams_that_are_not_subscribed_have_no_events():
     with quiet() as events:
         events.on_writer(said(stream="tf"), alive=True)
         events.on_writer(said(stream="tf"), alive=False)
@@ -133,7 +133,7 @@ def test_streams_that_are_not_heard_have_no_events():
         assert events.recent() == ()
 
 
-def test_silence_is_told_to_who_asked_and_what_follows_it_is_cut_off():
+def test_silence_is_reported_to_on_event_and_then_the_writer_is_cut_off():
     told: list[WriterEvent] = []
     with EventLog(HEARD, "joint_states", (), told.append) as events:
         for stream in ("joint_states", "robot_description"):
@@ -152,7 +152,7 @@ def test_silence_is_told_to_who_asked_and_what_follows_it_is_cut_off():
     assert tuple(told) == events.recent()
 
 
-def test_of_who_never_spoke_silence_is_not_news():
+def test_writer_without_samples_is_never_stale():
     told: list[WriterEvent] = []
     with EventLog(HEARD, "joint_states", (), told.append) as events:
         for session in (7, 8):
@@ -164,7 +164,7 @@ def test_of_who_never_spoke_silence_is_not_news():
         assert told[-1].writer.session == 7  # type: ignore[union-attr]
 
 
-def test_exceptions_of_the_callback_are_counted_and_end_nothing(monkeypatch):
+def test_exceptions_of_the_callback_are_counted_and_stop_nothing(monkeypatch):
     monkeypatch.setattr("threading.excepthook", lambda _: None)
 
     def wrong(event: WriterEvent) -> None:
@@ -177,7 +177,7 @@ def test_exceptions_of_the_callback_are_counted_and_end_nothing(monkeypatch):
     assert kinds(events) == ["joined", "left"]
 
 
-def test_any_number_of_writers_that_come_and_go_takes_a_bounded_memory():
+def test_memory_is_bounded_for_any_number_of_writers():
     with quiet() as events:
         for session in range(2 * MAX_ENTRIES):
             one = said(WriterId("driver", f"host {session}", 1, 5, session), "tf_static", f"mount {session}")
@@ -192,7 +192,7 @@ def test_any_number_of_writers_that_come_and_go_takes_a_bounded_memory():
 MOUNT, ROOM = ("r1", "mount"), ("r2", "room")
 
 
-def test_who_places_the_same_is_named_until_it_does_not():
+def test_other_writer_of_a_frame_is_returned_until_it_withdraws():
     owners = StaticEdgeOwners()
     assert owners.replace(MOUNT, frozenset({"r1/a", "r1/b"})) == []
     assert owners.replace(ROOM, frozenset({"r1/c", "r1/b"})) == [("r1/b", [MOUNT])]

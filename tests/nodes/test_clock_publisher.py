@@ -14,7 +14,7 @@ from zstate.wire.ros2.simple_messages import decode_clock
 ROS = "ros2:domain=7,namespace=*,frame_prefix=*/"
 
 
-def test_the_time_is_said_on_both_wires(sessions):
+def test_time_is_published_on_both_wires(sessions):
     writer, reader = sessions
     native, ros = Tap(reader, "zstate/clock"), Tap(reader, "7/clock/**")
     with ClockPublisher(writer, ("native", ROS)) as clock:
@@ -29,7 +29,7 @@ def test_the_time_is_said_on_both_wires(sessions):
         assert [decode_clock(payload) for payload in ros.payloads(3)] == [clock.stamp for clock in told]
 
 
-def test_a_new_publisher_is_a_new_start(sessions):
+def test_new_clock_publisher_has_a_new_session(sessions):
     writer, reader = sessions
     tap = Tap(reader, "zstate/clock")
     await_reader(writer, "zstate/clock")
@@ -40,7 +40,7 @@ def test_a_new_publisher_is_a_new_start(sessions):
     assert told[0].session != told[1].session
 
 
-def test_what_cannot_be_said_is_refused_and_counts_for_nothing(sessions):
+def test_invalid_time_is_refused_and_not_counted(sessions):
     writer, reader = sessions
     tap = Tap(reader, "zstate/clock")
     with ClockPublisher(writer, ("native", ROS)) as clock:
@@ -53,7 +53,7 @@ def test_what_cannot_be_said_is_refused_and_counts_for_nothing(sessions):
         assert (told.stamp, told.seq) == (3, 0)
 
 
-def test_a_closed_clock_says_so(sessions):
+def test_closed_clock_publisher_raises_closed(sessions):
     clock = ClockPublisher(sessions[0])
     clock.close()
     clock.close()

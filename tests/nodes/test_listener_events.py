@@ -65,7 +65,7 @@ def ear() -> Iterator[Ear]:
             yield ear
 
 
-def test_killed_and_started_again_it_has_left_and_was_restarted(ear, spawn):
+def test_killed_writer_has_left_and_is_restarted(ear, spawn):
     first = spawn(WRITER)
     ear.await_samples()
     joined = ear.await_kinds("joined")
@@ -83,7 +83,7 @@ def test_killed_and_started_again_it_has_left_and_was_restarted(ear, spawn):
     )
 
 
-def test_frozen_it_is_stale_then_resumed(ear, spawn):
+def test_frozen_writer_is_stale_then_resumed(ear, spawn):
     writer = spawn(WRITER)
     ear.await_samples()
     writer.process.send_signal(signal.SIGSTOP)
@@ -95,7 +95,7 @@ def test_frozen_it_is_stale_then_resumed(ear, spawn):
     ear.await_samples()
 
 
-def test_frozen_for_longer_than_its_lease_it_is_cut_off_then_back(ear, spawn):
+def test_writer_frozen_for_longer_than_its_lease_is_cut_off_then_back(ear, spawn):
     writer = spawn(WRITER)
     ear.await_samples()
     writer.process.send_signal(signal.SIGSTOP)
@@ -107,7 +107,7 @@ def test_frozen_for_longer_than_its_lease_it_is_cut_off_then_back(ear, spawn):
     ear.await_samples()
 
 
-def test_with_its_router_it_is_cut_off_and_comes_back_with_it(spawn: Spawn, free_port: int):
+def test_writer_is_cut_off_with_its_router_and_comes_back_with_it(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = spawn(ROUTER, endpoint)
     router.line()
@@ -127,7 +127,7 @@ def test_with_its_router_it_is_cut_off_and_comes_back_with_it(spawn: Spawn, free
             ear.await_kinds("joined", "cut off", "back", "left")
 
 
-def test_a_callback_that_blocks_or_raises_delays_no_sample(sessions, monkeypatch):
+def test_blocking_or_raising_callback_delays_no_sample(sessions, monkeypatch):
     monkeypatch.setattr("threading.excepthook", lambda _: None)
     called, go_on = threading.Event(), threading.Event()
 
@@ -147,7 +147,7 @@ def test_a_callback_that_blocks_or_raises_delays_no_sample(sessions, monkeypatch
     assert listener.events()
 
 
-def test_who_wants_no_events_gets_no_thread_for_them_and_may_ask_later(sessions):
+def test_listener_without_on_event_has_no_thread_and_keeps_events(sessions):
     names = lambda: [thread.name for thread in threading.enumerate()]  # noqa: E731
     with TransformListener(sessions[1], "r1") as listener:
         assert "zstate events" not in names()

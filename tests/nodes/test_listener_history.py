@@ -63,9 +63,7 @@ def poses(listener: TransformListener, stamps: list[int]) -> list[list[float]]:
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_a_listener_that_opens_now_answers_for_the_last_two_seconds_bit_for_bit(
-    sessions: tuple[Session, Session], follow
-):
+def test_new_listener_knows_the_last_two_seconds_bit_for_bit(sessions: tuple[Session, Session], follow):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
@@ -87,7 +85,7 @@ def test_a_listener_that_opens_now_answers_for_the_last_two_seconds_bit_for_bit(
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_what_was_before_and_what_is_live_join_without_a_gap(sessions: tuple[Session, Session], follow):
+def test_history_and_live_samples_join_without_a_gap(sessions: tuple[Session, Session], follow):
     writer, reader = sessions
     model = load_model("gripper")
     sine, stop, stamps = SineSource(model), threading.Event(), []
@@ -125,7 +123,7 @@ def test_what_was_before_and_what_is_live_join_without_a_gap(sessions: tuple[Ses
 
 
 @pytest.mark.parametrize("how", ["lookup", "wait", "wait_async", "join"])
-def test_a_wait_for_the_recent_past_right_after_joining_ends_with_the_exact_pose(
+def test_wait_for_a_recent_instant_after_joining_ends_with_the_exact_pose(
     sessions: tuple[Session, Session], how: str
 ):
     """A publisher at 200 Hz, and one listener after the other; each asks for half a second ago at once."""
@@ -169,9 +167,7 @@ async def joined(buffer: TransformBuffer, at: int) -> Transform:
     raise AssertionError("the sample was dropped")
 
 
-def test_a_robot_of_many_samples_is_learned_page_by_page_through_a_router(
-    spawn: Callable[..., Child], free_port: int
-):
+def test_large_history_is_received_page_by_page_through_a_router(spawn: Callable[..., Child], free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     spawn(ROUTER, endpoint).line()
     with (
@@ -188,7 +184,7 @@ def test_a_robot_of_many_samples_is_learned_page_by_page_through_a_router(
                 assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
+def test_samples_published_while_the_router_was_away_are_received_afterwards(
     spawn: Callable[..., Child], free_port: int
 ):
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -218,7 +214,7 @@ def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
             assert answer.kind == "exact"
 
 
-def test_no_more_is_asked_for_than_the_buffer_keeps(sessions: tuple[Session, Session]):
+def test_listener_requests_no_more_history_than_its_buffer_keeps(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher:
         publish(publisher, 0, 1000)
@@ -229,7 +225,7 @@ def test_no_more_is_asked_for_than_the_buffer_keeps(sessions: tuple[Session, Ses
             assert listener.stats.recalled == 101
 
 
-def test_a_publisher_without_a_cache_and_a_listener_that_wants_none_have_no_past(
+def test_no_history_without_a_cache_or_with_history_on_join_off(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -249,7 +245,7 @@ def test_a_publisher_without_a_cache_and_a_listener_that_wants_none_have_no_past
         StatePublisher(writer, RRBOT, "r3", cache_s=-1.0)
 
 
-def test_a_wrong_cache_leaves_nothing_behind(sessions: tuple[Session, Session]):
+def test_invalid_cache_duration_is_refused_without_leaks(sessions: tuple[Session, Session]):
     writer, _ = sessions
     with pytest.raises(InvalidInput, match="cache_s"):
         StatePublisher(writer, RRBOT, "r1", cache_s=float("nan"))
@@ -257,7 +253,7 @@ def test_a_wrong_cache_leaves_nothing_behind(sessions: tuple[Session, Session]):
         pass
 
 
-def test_a_gap_in_what_was_remembered_counts_as_no_loss(sessions: tuple[Session, Session]):
+def test_gap_in_a_cache_counts_as_no_loss(sessions: tuple[Session, Session]):
     """A listener that hears sample 10 first and is told of 0 to 9 then has missed nothing."""
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -269,7 +265,7 @@ def test_a_gap_in_what_was_remembered_counts_as_no_loss(sessions: tuple[Session,
             assert listener.stats.missed == listener.stats.dropped == 0
 
 
-def test_only_what_the_present_writer_said_is_remembered(sessions: tuple[Session, Session]):
+def test_only_samples_of_the_current_writer_are_cached(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as first:
         publish(first, 0, 10)
@@ -281,7 +277,7 @@ def test_only_what_the_present_writer_said_is_remembered(sessions: tuple[Session
             assert not knows(listener, 9)()
 
 
-def test_a_writer_that_starts_while_we_listen_begins_a_history_of_its_own(
+def test_writer_that_joins_later_starts_its_own_history(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -297,7 +293,7 @@ def test_a_writer_that_starts_while_we_listen_begins_a_history_of_its_own(
             assert listener.stats.missed == 0
 
 
-def test_every_robot_of_a_fleet_tells_its_own_past(sessions: tuple[Session, Session]):
+def test_every_robot_of_a_fleet_provides_its_history(sessions: tuple[Session, Session]):
     writer, reader = sessions
     publishers = [StatePublisher(writer, RRBOT, f"r{number}") for number in range(10)]
     for number, publisher in enumerate(publishers):
@@ -316,7 +312,7 @@ def test_every_robot_of_a_fleet_tells_its_own_past(sessions: tuple[Session, Sess
         publisher.close()
 
 
-def test_a_publisher_that_only_derives_transforms_tells_their_past(sessions: tuple[Session, Session]):
+def test_publisher_that_only_derives_transforms_provides_their_history(sessions: tuple[Session, Session]):
     writer, reader = sessions
     streams = ("robot_description", "tf_static", "tf")
     with StatePublisher(writer, RRBOT, "r1", streams=streams) as publisher:
@@ -329,7 +325,7 @@ def test_a_publisher_that_only_derives_transforms_tells_their_past(sessions: tup
             assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Session, Session]):
+def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Session, Session]):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -347,7 +343,7 @@ def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Sessi
     tap.close()
 
 
-def test_statics_and_the_past_answer_together_at_an_instant_before_joining(
+def test_statics_and_history_give_a_transform_before_the_listener_joined(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -365,7 +361,7 @@ def test_statics_and_the_past_answer_together_at_an_instant_before_joining(
             assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_a_past_of_another_session_than_was_asked_is_refused(sessions):
+def test_history_of_another_session_is_refused(sessions):
     writer, reader = sessions
     memory = SampleCache(10.0, 2, 8)
     order = order_digest(RRBOT.joint_names)

@@ -43,7 +43,7 @@ class Read:
         return [said for said in self.said if isinstance(said.message, kind)]
 
 
-def test_a_joint_state_comes_back_with_its_writer_and_every_number(tmp_path: Path):
+def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm", {7: "driver@host pid 1"}) as tale:
         tale.describe("arm", session=7)
         states = [
@@ -63,7 +63,7 @@ def test_a_joint_state_comes_back_with_its_writer_and_every_number(tmp_path: Pat
     assert not read.refused
 
 
-def test_frames_of_several_robots_are_called_as_they_were(tmp_path: Path):
+def test_frames_of_several_robots_keep_their_names(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         for robot in ("r1", "r2"):
             tale.edges(robot, START, {("odom", "base"): pose(1.0), ("fleet/map", "odom"): pose(2.0)})
@@ -85,7 +85,7 @@ def test_static_writers_keep_their_names(tmp_path: Path):
     ]
 
 
-def test_a_restarted_writer_is_another_speaker(tmp_path: Path):
+def test_restarted_writer_is_another_writer(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.joints("arm", START, swing(0), session=1)
@@ -94,7 +94,7 @@ def test_a_restarted_writer_is_another_speaker(tmp_path: Path):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_a_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
+def test_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
     odom_from_base = Transform("odom", "base", [1.0, 2.0, 0.0], [0, 0, 0.6, 0.8], START + 5)
     base_from_lidar = Transform("base", "lidar", [0, 0, 0.3], [0, 0, 0, 1], 0)
     with Bag(tmp_path / "bag", storage) as bag:
@@ -118,14 +118,14 @@ def test_a_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
     assert ros.writer.session != dog.writer.session
 
 
-def test_the_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
+def test_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.0})
     assert [said.message.seq for said in Read(tmp_path / "bag").of(JointState)] == [1, 2, 3, 4, 5]
 
 
-def test_other_topics_of_a_bag_are_named_and_left_out(tmp_path: Path):
+def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"shoulder": 0.0}, "/joint_commands")
         bag.say("/chatter", START, STORE.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String")
@@ -134,7 +134,7 @@ def test_other_topics_of_a_bag_are_named_and_left_out(tmp_path: Path):
     assert (read.robots, read.said) == ((), [])
 
 
-def test_a_robot_is_chosen_with_what_stands_in_the_root_of_a_bag(tmp_path: Path):
+def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"knee": 1.0}, "/dog/joint_states")
         bag.joints(START, {"knee": 1.0}, "/cat/joint_states")
@@ -143,7 +143,7 @@ def test_a_robot_is_chosen_with_what_stands_in_the_root_of_a_bag(tmp_path: Path)
     assert {(s.writer.robot, s.writer.stream) for s in said} == {("dog", "joint_states"), ("ros", "tf")}
 
 
-def test_what_cannot_be_understood_is_told_and_left_out(tmp_path: Path):
+def test_undecodable_messages_are_reported_and_left_out(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.joints("arm", START, swing(0))
@@ -156,7 +156,7 @@ def test_what_cannot_be_understood_is_told_and_left_out(tmp_path: Path):
     assert read.refused == ["truncated"]
 
 
-def test_a_stretch_of_log_times_can_be_read_alone(tmp_path: Path):
+def test_interval_of_log_times_can_be_read_alone(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(10):
@@ -165,7 +165,7 @@ def test_a_stretch_of_log_times_can_be_read_alone(tmp_path: Path):
     assert [said.log_time for said in told.said] == [START + 3 * S, START + 4 * S]
 
 
-def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path):
+def test_truncated_recording_is_decoded_as_far_as_possible(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(2000):

@@ -97,7 +97,7 @@ def desk(tmp_path: Path) -> Desk:
     return Desk(tmp_path / "run.mcap", alone="cart", programs={1: "driver@host pid 7"})
 
 
-def test_each_number_of_a_joint_state_has_the_name_of_its_coordinate(desk: Desk):
+def test_numbers_of_a_joint_state_have_the_names_of_their_coordinates(desk: Desk):
     desk.encoder.write_message("cart", description(), NOW)
     desk.encoder.write_message("cart", joints(NOW - 5), NOW)
     (message,) = desk.read("/joint_states")
@@ -110,7 +110,7 @@ def test_each_number_of_a_joint_state_has_the_name_of_its_coordinate(desk: Desk)
     assert message.effort.size == 0
 
 
-def test_moving_and_fixed_edges_stand_under_their_names(desk: Desk):
+def test_moving_and_fixed_edges_are_written_under_their_names(desk: Desk):
     desk.encoder.write_message("cart", description(), NOW)
     desk.encoder.write_message("cart", transforms(), NOW)
     desk.encoder.write_message("cart", statics(("arm", "tool"), ("fleet/map", "world")), NOW, MODEL_WRITER)
@@ -125,7 +125,7 @@ def test_moving_and_fixed_edges_stand_under_their_names(desk: Desk):
     ]
 
 
-def test_a_channel_tells_the_robot_its_writer_and_the_program(desk: Desk):
+def test_channel_metadata_has_robot_writer_and_program(desk: Desk):
     desk.encoder.write_message("cart", description(), NOW)
     desk.encoder.write_message("cart", joints(seq=2**32 + 7), NOW)
     desk.encoder.write_message("cart", statics(("arm", "tool"), session=2), NOW, "mount")
@@ -143,7 +143,7 @@ def test_a_channel_tells_the_robot_its_writer_and_the_program(desk: Desk):
     assert records["/robot_description"].publish_time == records["/robot_description"].log_time == NOW
 
 
-def test_samples_that_come_before_the_description_are_written_when_it_comes(desk: Desk):
+def test_samples_before_the_description_are_written_after_it(desk: Desk):
     for number in range(3):
         desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
         desk.encoder.write_message("cart", transforms(NOW + number, number), NOW + number)
@@ -155,7 +155,7 @@ def test_samples_that_come_before_the_description_are_written_when_it_comes(desk
     assert log_times == [NOW, NOW + 1, NOW + 2]
 
 
-def test_of_samples_without_a_description_only_the_newest_are_kept_and_all_are_counted(desk: Desk):
+def test_newest_samples_without_a_description_are_kept_and_all_counted(desk: Desk):
     for number in range(MAX_PENDING + 5):
         desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
     assert desk.encoder.unwritten == MAX_PENDING + 5
@@ -175,7 +175,7 @@ def test_samples_of_another_model_wait_for_its_description(desk: Desk):
     assert message.name[-1] == "turn"
 
 
-def test_a_writer_that_names_its_numbers_needs_no_description(desk: Desk):
+def test_writer_that_names_its_numbers_needs_no_description(desk: Desk):
     names = ("b", "a")
     state = JointState(NOW, 0, 1, order_digest(names), to_block([1.0, 2.0]), None, None, names)
     edges = (("map", "odom"),)
@@ -186,7 +186,7 @@ def test_a_writer_that_names_its_numbers_needs_no_description(desk: Desk):
     assert desk.read("/tf")[0].transforms[0].child_frame_id == "odom"
 
 
-def test_a_model_that_cannot_be_used_is_recorded_and_told_and_the_transforms_are_written(desk: Desk):
+def test_unusable_model_is_recorded_and_reported_and_its_transforms_are_written(desk: Desk):
     desk.encoder.write_message("cart", description(urdf="<robot name='cart'/>"), NOW)
     desk.encoder.write_message("cart", joints(), NOW)
     desk.encoder.write_message("cart", transforms(), NOW)
@@ -196,7 +196,7 @@ def test_a_model_that_cannot_be_used_is_recorded_and_told_and_the_transforms_are
     assert len(desk.read("/tf")) == 1
 
 
-def test_what_cdr_cannot_say_is_counted_by_reason_and_the_rest_written(desk: Desk):
+def test_messages_that_cdr_cannot_represent_are_counted_by_reason(desk: Desk):
     desk.encoder.write_message("cart", description(), NOW)
     for stamp in (0, 2**31 * S, -(2**31) * S - 1, 2**31 * S - 1, -(2**31) * S):
         desk.encoder.write_message("cart", joints(stamp), NOW)
@@ -211,7 +211,7 @@ def test_what_cdr_cannot_say_is_counted_by_reason_and_the_rest_written(desk: Des
     assert published == [2**31 * S - 1, 0]
 
 
-def test_robots_beside_the_one_in_the_root_have_a_namespace_and_a_prefix_that_ros_allows(tmp_path: Path):
+def test_robots_outside_the_root_have_a_valid_ros_namespace_and_a_prefix(tmp_path: Path):
     desk = Desk(tmp_path / "run.mcap", alone="cart")
     for robot in ("cart", "arm-1", "arm.1", "2nd"):
         desk.encoder.write_message(robot, description(), NOW)
@@ -233,7 +233,7 @@ def test_robots_beside_the_one_in_the_root_have_a_namespace_and_a_prefix_that_ro
     }  # fmt: skip
 
 
-def test_a_writer_that_starts_again_has_a_channel_of_its_own(desk: Desk):
+def test_restarted_writer_has_its_own_channel(desk: Desk):
     for session in (1, 2):
         desk.encoder.write_message("cart", description(session), NOW + session)
         desk.encoder.write_message("cart", joints(session=session), NOW + session)
@@ -264,7 +264,7 @@ def repeated(desk: Desk) -> list[tuple[str, str, list[str]]]:
         ]
 
 
-def test_what_holds_is_said_again_in_the_next_file_and_what_was_replaced_is_not(desk: Desk):
+def test_latched_values_in_effect_are_repeated_in_the_next_file(desk: Desk):
     desk.encoder.write_message("cart", description(1), NOW)
     desk.encoder.write_message("cart", description(2), NOW)
     desk.encoder.write_message("cart", statics(("arm", "old"), session=1), NOW, "mount")
@@ -277,7 +277,7 @@ def test_what_holds_is_said_again_in_the_next_file_and_what_was_replaced_is_not(
     ]
 
 
-def test_statics_that_are_withdrawn_end_with_an_empty_message(desk: Desk):
+def test_withdrawn_statics_end_with_an_empty_message(desk: Desk):
     desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
     desk.encoder.withdraw("cart", "mount", NOW + 1)
     desk.encoder.withdraw("cart", "mount", NOW + 2)
@@ -286,14 +286,14 @@ def test_statics_that_are_withdrawn_end_with_an_empty_message(desk: Desk):
     assert [len(message.transforms) for message in desk.read("/tf_static")] == [1, 0]
 
 
-def test_a_static_writer_that_comes_back_holds_again(desk: Desk):
+def test_static_writer_that_returns_is_latched_again(desk: Desk):
     desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
     desk.encoder.withdraw("cart", "mount", NOW + 1)
     desk.encoder.write_message("cart", statics(("arm", "tool")), NOW + 2, "mount")
     assert repeated(desk) == [("/tf_static", "1", ["tool"])]
 
 
-def test_statics_without_a_writers_name_add_up_as_in_ros(desk: Desk):
+def test_statics_without_a_writer_name_accumulate_as_in_ros(desk: Desk):
     desk.encoder.write_message("cart", statics(("arm", "a")), NOW)
     desk.encoder.write_message("cart", statics(("arm", "b"), ("arm", "c")), NOW)
     desk.encoder.write_message("cart", statics(("base", "a")), NOW)
@@ -312,7 +312,7 @@ def test_statics_without_a_writers_name_add_up_as_in_ros(desk: Desk):
     assert writers == {"ros-1", "ros-2"}
 
 
-def test_simulated_time_is_recorded_from_zero_on(desk: Desk):
+def test_simulated_time_is_recorded_from_zero(desk: Desk):
     for number in range(3):
         desk.encoder.write_message("ros", ClockMessage(number * S, number, 5), NOW + number)
     assert [message.clock.sec for message in desk.read("/clock")] == [0, 1, 2]
@@ -320,7 +320,7 @@ def test_simulated_time_is_recorded_from_zero_on(desk: Desk):
     assert "zstate.robot" not in desk.records()[0].metadata
 
 
-def test_a_robot_whose_writer_starts_without_end_takes_no_channels_from_another(desk: Desk):
+def test_endlessly_restarting_writer_takes_no_channels_from_another_robot(desk: Desk):
     desk.encoder.write_message("cart", description(), NOW)
     desk.encoder.write_message("flapping", description(), NOW)
     for number in range(3 * CHANNEL_BURST):
@@ -343,7 +343,7 @@ def test_a_robot_whose_writer_starts_without_end_takes_no_channels_from_another(
     assert counts == {"cart": 3 * CHANNEL_BURST + 1, "flapping": CHANNEL_BURST + 10}
 
 
-def test_channels_of_writers_that_are_gone_are_released_and_those_that_hold_something_are_not(
+def test_channels_of_departed_writers_are_released_unless_latched(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("zstate.recording.encode.MAX_OPEN_CHANNELS", 10)
@@ -358,7 +358,7 @@ def test_channels_of_writers_that_are_gone_are_released_and_those_that_hold_some
     assert sessions == [*map(str, range(2, 40)), "2"]
 
 
-def test_static_writers_without_end_are_refused_and_counted(desk: Desk):
+def test_endless_static_writers_are_refused_and_counted(desk: Desk):
     for number in range(MAX_LATCHED + 3):
         desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, f"writer_{number}")
     assert desk.refused == {"too many writers": 3}
@@ -367,7 +367,7 @@ def test_static_writers_without_end_are_refused_and_counted(desk: Desk):
     assert desk.encoder.write_message("cart", statics(("arm", "other")), NOW, "another")
 
 
-def test_of_large_samples_without_a_description_fewer_are_kept():
+def test_fewer_large_samples_are_kept_without_a_description():
     early = PendingSamples()
     large = JointState(NOW, 0, 1, order_digest(CART.joint_names), bytes(MAX_PENDING_BYTES // 24 * 8))
     for number in range(5):

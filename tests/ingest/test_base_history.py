@@ -55,7 +55,7 @@ class World:
         ]
 
 
-def test_what_was_heard_is_not_taken_again():
+def test_received_samples_are_not_inserted_again_from_history():
     world = World()
     world.hear(*states(5, 10))
     assert world.ingest.insert_history(states(3, 10))
@@ -64,14 +64,14 @@ def test_what_was_heard_is_not_taken_again():
     assert (world.counts, world.known) == ((5, 0, 5), list(range(10)))
 
 
-def test_nothing_older_is_wanted_where_everything_was_heard():
+def test_no_older_history_is_requested_when_all_samples_were_received():
     world = World()
     world.hear(*states(0, 5))
     assert not world.ingest.insert_history(states(2, 5))
     assert world.counts == (5, 0, 0)
 
 
-def test_the_past_may_come_before_the_first_live_sample():
+def test_history_may_arrive_before_the_first_live_sample():
     world = World()
     assert world.ingest.insert_history(states(5, 10))
     world.hear(*states(10, 12))
@@ -79,7 +79,7 @@ def test_the_past_may_come_before_the_first_live_sample():
     assert (world.counts, world.known) == ((2, 0, 10), list(range(12)))
 
 
-def test_a_gap_is_filled_whether_or_not_it_has_shown_already():
+def test_gap_is_filled_whether_or_not_it_was_detected_before():
     for shows_first in (True, False):
         world = World()
         world.hear(*states(0, 5))
@@ -94,7 +94,7 @@ def test_a_gap_is_filled_whether_or_not_it_has_shown_already():
         assert world.counts == (6, 15, 15)
 
 
-def test_the_past_waits_for_the_description():
+def test_history_waits_for_the_description():
     world = World(described=False)
     assert world.ingest.insert_history(states(5, 10))
     assert world.ingest.insert_history(states(0, 5)) is False
@@ -104,7 +104,7 @@ def test_the_past_waits_for_the_description():
     assert (world.counts, world.known) == ((2, 0, 10), list(range(12)))
 
 
-def test_the_past_of_a_writer_that_has_ended_is_not_taken():
+def test_history_of_a_writer_that_has_left_is_refused():
     world = World()
     world.hear(*states(0, 5))
     world.hear(*states(20, 21, session=8))
@@ -112,14 +112,14 @@ def test_the_past_of_a_writer_that_has_ended_is_not_taken():
     assert (world.counts, world.known) == ((6, 0, 0), [20])
 
 
-def test_nothing_older_is_wanted_than_the_history_reaches():
+def test_no_history_older_than_the_buffer_keeps_is_requested():
     world = World(history_s=0.1)
     world.hear(*states(30, 31))
     assert not world.ingest.insert_history(states(0, 30))
     assert world.known == list(range(20, 31))
 
 
-def test_a_past_that_cannot_be_used_is_counted_once_for_its_page():
+def test_unusable_history_is_counted_once_per_page():
     world = World()
     world.hear(*states(30, 31))
     bad = [JointState(STAMP + seq * PERIOD, seq, 7, ORDER, to_block([0.0])) for seq in range(30)]

@@ -76,7 +76,7 @@ def test_mcap_ros2_support_decodes_by_the_schemas_in_the_file(tmp_path: Path):
         assert channel.message_encoding == "cdr"
 
 
-def test_a_channel_says_its_quality_of_service_its_types_hash_and_what_it_is_given(tmp_path: Path):
+def test_channel_metadata_has_qos_type_hash_and_given_values(tmp_path: Path):
     write_run(tmp_path / "run.mcap", [])
     with AnyReader([tmp_path / "run.mcap"]) as reader:
         (qos,) = next(
@@ -89,14 +89,14 @@ def test_a_channel_says_its_quality_of_service_its_types_hash_and_what_it_is_giv
     assert metadata["/joint_states"]["zstate.robot"] == "panda"
 
 
-def test_the_same_channel_is_declared_once(tmp_path: Path):
+def test_equal_channel_is_declared_once(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap") as writer:
         first = writer.channel("/a", STRING, Qos())
         assert writer.channel("/a", STRING, Qos()) == first
         assert writer.channel("/a", STRING, LATCHED) != first
 
 
-def test_the_latched_values_come_again_after_ten_seconds_at_the_start_of_a_chunk(tmp_path: Path):
+def test_latched_values_repeat_every_ten_seconds_at_the_start_of_a_chunk(tmp_path: Path):
     path = tmp_path / "run.mcap"
     stamps = [START + second * S for second in range(25)]
     with RecordingWriter(path) as writer:
@@ -114,7 +114,7 @@ def test_the_latched_values_come_again_after_ten_seconds_at_the_start_of_a_chunk
     assert {r.publish_time for r in repeated} == {START}
 
 
-def test_a_new_value_replaces_the_latched_one_and_a_forgotten_one_is_gone(tmp_path: Path):
+def test_new_value_replaces_the_latched_one_and_an_unlatched_one_is_gone(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as writer:
         described, joints = declared(writer)
@@ -127,7 +127,7 @@ def test_a_new_value_replaces_the_latched_one_and_a_forgotten_one_is_gone(tmp_pa
 
 
 @pytest.mark.parametrize("limit", [{"max_bytes": MIN_BYTES}, {"max_seconds": 5.0}])
-def test_each_of_the_files_of_a_split_recording_stands_for_itself(tmp_path: Path, limit: dict[str, float]):
+def test_each_split_file_is_readable_alone(tmp_path: Path, limit: dict[str, float]):
     states = joint_states(2000)
     write_run(tmp_path / "run.mcap", states, **limit)
     count = len(list(tmp_path.iterdir()))
@@ -143,14 +143,14 @@ def test_each_of_the_files_of_a_split_recording_stands_for_itself(tmp_path: Path
     assert payloads == [payload for _, payload in states]
 
 
-def test_a_limit_in_bytes_holds_but_for_the_latched_values_and_the_index(tmp_path: Path):
+def test_max_bytes_holds_except_for_latched_values_and_the_index(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(1500), max_bytes=100_000)
     sizes = [file.stat().st_size for file in tmp_path.iterdir()]
     assert all(size < 110_000 for size in sizes)
     assert sum(size > 80_000 for size in sizes) >= len(sizes) - 1
 
 
-def test_the_writer_names_its_files_and_counts_their_bytes(tmp_path: Path):
+def test_writer_lists_its_files_and_counts_their_bytes(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap", max_seconds=2.0) as writer:
         _, joints = declared(writer)
         for stamp, payload in joint_states(350):
@@ -160,7 +160,7 @@ def test_the_writer_names_its_files_and_counts_their_bytes(tmp_path: Path):
         assert writer.size == sum(file.stat().st_size for file in writer.files)
 
 
-def test_log_times_that_go_back_keep_the_index_right(tmp_path: Path):
+def test_decreasing_log_times_keep_the_index_correct(tmp_path: Path):
     path = tmp_path / "run.mcap"
     offsets = [0, 5, 3, 40, 20, 35, 1, 60, 50]
     with RecordingWriter(path) as writer:
@@ -186,7 +186,7 @@ def test_log_times_that_go_back_keep_the_index_right(tmp_path: Path):
         assert [bytes(raw)[0] for _, _, raw in reader.messages()] == sorted(offsets)
 
 
-def test_what_was_flushed_can_be_read_while_the_recording_goes_on(tmp_path: Path):
+def test_flushed_messages_can_be_read_during_the_recording(tmp_path: Path):
     path, states = tmp_path / "run.mcap", joint_states(30)
     with RecordingWriter(path) as writer:
         described, joints = declared(writer)
@@ -220,9 +220,9 @@ KILLED = """
 """
 
 
-def test_a_killed_recorder_leaves_all_that_it_flushed(tmp_path: Path, spawn: Callable[..., Child]):
+def test_killed_recorder_keeps_everything_flushed(tmp_path: Path, spawn: Callable[..., Child]):
     path = tmp_path / "run.mcap"
-    child = spawn(KILLED, str(path), str(Path(__file__).parents[1]))
+    child = spawn(KILLED, str(path), str(Path(__file__).parents[2]))
     assert child.line() == "written"
     child.kill()
     with RecordingReader(path) as reader:
@@ -257,9 +257,9 @@ FULL = """
 """
 
 
-def test_a_file_that_cannot_grow_is_said_and_keeps_whole_chunks(tmp_path: Path, spawn: Callable[..., Child]):
+def test_file_that_cannot_grow_raises_and_keeps_whole_chunks(tmp_path: Path, spawn: Callable[..., Child]):
     path = tmp_path / "run.mcap"
-    child = spawn(FULL, str(path), str(Path(__file__).parents[1]))
+    child = spawn(FULL, str(path), str(Path(__file__).parents[2]))
     refusal, closed, written = child.line(), child.line(), int(child.line())
     assert "cannot grow" in refusal and "zstate recover" in refusal
     assert "is closed" in closed
@@ -270,13 +270,13 @@ def test_a_file_that_cannot_grow_is_said_and_keeps_whole_chunks(tmp_path: Path, 
     assert payloads == [DESCRIPTION, *(payload for _, payload in joint_states(written))]
 
 
-def test_a_full_disk_is_said_as_such():
+def test_full_disk_error_says_so():
     with pytest.raises(RecordingError, match="No space left on device; free some space") as caught:
         RecordingWriter("/dev/full", overwrite=True)
     assert caught.value.path == "/dev/full"
 
 
-def test_an_existing_file_is_not_overwritten_unless_asked(tmp_path: Path):
+def test_existing_file_is_not_overwritten_by_default(tmp_path: Path):
     path = tmp_path / "run.mcap"
     path.write_text("mine")
     with pytest.raises(RecordingError, match=r"exists; choose another name.*overwrite=True"):
@@ -287,7 +287,7 @@ def test_an_existing_file_is_not_overwritten_unless_asked(tmp_path: Path):
         assert len(list(reader.records())) == 1
 
 
-def test_a_recording_that_may_split_asks_for_the_later_names_at_once(tmp_path: Path):
+def test_splitting_recording_refuses_existing_later_files_at_once(tmp_path: Path):
     (tmp_path / "run_2.mcap").touch()
     with pytest.raises(RecordingError, match=r"run_2.mcap' exists"):
         RecordingWriter(tmp_path / "run.mcap", max_seconds=60)
@@ -295,19 +295,19 @@ def test_a_recording_that_may_split_asks_for_the_later_names_at_once(tmp_path: P
     write_run(tmp_path / "run.mcap", [])
 
 
-def test_a_missing_folder_is_named(tmp_path: Path):
+def test_missing_folder_is_named(tmp_path: Path):
     with pytest.raises(RecordingError, match=r"there is no folder '.*nowhere'"):
         RecordingWriter(tmp_path / "nowhere" / "run.mcap")
 
 
 @pytest.mark.parametrize("limit", [{"max_bytes": 1000}, {"max_seconds": 0.0}, {"max_seconds": float("nan")}])
-def test_limits_that_would_make_a_file_of_every_message_are_refused(tmp_path: Path, limit: dict[str, float]):
+def test_limits_that_would_split_every_message_are_refused(tmp_path: Path, limit: dict[str, float]):
     with pytest.raises(InvalidInput, match=r"give .* or more"):
         RecordingWriter(tmp_path / "run.mcap", **limit)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_message_that_cannot_be_written_leaves_the_file_whole(tmp_path: Path):
+def test_unwritable_message_leaves_the_file_whole(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as writer:
         _, joints = declared(writer)
@@ -320,7 +320,7 @@ def test_a_message_that_cannot_be_written_leaves_the_file_whole(tmp_path: Path):
         assert reader.complete
 
 
-def test_after_close_nothing_is_written(tmp_path: Path):
+def test_closed_writer_writes_nothing(tmp_path: Path):
     writer = RecordingWriter(tmp_path / "run.mcap")
     _, joints = declared(writer)
     writer.close()
@@ -332,7 +332,7 @@ def test_after_close_nothing_is_written(tmp_path: Path):
         writer.channel("/late", STRING, Qos())
 
 
-def test_threads_may_write_and_flush_at_once(tmp_path: Path):
+def test_concurrent_writes_and_flushes_lose_nothing(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, max_bytes=70_000) as writer:
         described, joints = declared(writer)
@@ -355,7 +355,7 @@ def test_threads_may_write_and_flush_at_once(tmp_path: Path):
     assert sorted(payloads) == sorted(string_bytes(f"{sender} {number}" * 9) for sender, number in every)
 
 
-def test_a_file_with_all_channels_it_can_number_is_followed_by_another(
+def test_file_with_the_maximum_of_channels_is_followed_by_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("zstate.recording.mcap.writer.MAX_CHANNELS", 10)
@@ -375,7 +375,7 @@ def test_a_file_with_all_channels_it_can_number_is_followed_by_another(
     assert topics == [f"/topic_{number}" for number in range(25)]
 
 
-def test_a_released_channel_is_left_out_of_the_next_file_unless_it_is_declared_again(tmp_path: Path):
+def test_released_channel_is_left_out_of_the_next_file_unless_declared_again(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap", max_seconds=1.0) as writer:
         one, other, third = (writer.channel(f"/{name}", STRING, Qos()) for name in ("one", "other", "third"))
         writer.write(one, DESCRIPTION, START, START)

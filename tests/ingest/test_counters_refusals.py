@@ -36,7 +36,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_garbage_on_every_key_is_counted_by_reason_logged_once_and_stops_nothing(sessions, caplog, follow):
+def test_garbage_on_every_key_is_counted_by_reason_and_logged_once(sessions, caplog, follow):
     writer, reader = sessions
     keys = [key for key in KINDS if key not in ({"joint_states", "tf"} - {follow})]
     random = np.random.default_rng(4)
@@ -72,7 +72,7 @@ def test_garbage_on_every_key_is_counted_by_reason_logged_once_and_stops_nothing
 
 
 @pytest.mark.parametrize("positions", [[0.0], [0.0] * 3, [0.0, float("nan")], [float("-inf"), 0.0]])
-def test_a_message_with_impossible_positions_is_counted_and_the_next_is_taken(sessions, positions):
+def test_message_with_invalid_positions_is_counted_and_the_next_is_inserted(sessions, positions):
     writer, reader = sessions
     order = order_digest(RRBOT.joint_names)
     with (
@@ -88,7 +88,7 @@ def test_a_message_with_impossible_positions_is_counted_and_the_next_is_taken(se
         assert listener.stats.refused == {"bad numbers": 1}
 
 
-def test_a_description_that_cannot_be_used_is_counted_and_a_good_one_is_taken(sessions):
+def test_unusable_description_is_counted_and_a_good_one_is_used(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         bad = encode(RobotDescription(9, "<robot name='x'/>", "digest", (), ()))

@@ -27,7 +27,7 @@ def models(
     return found, refused
 
 
-def test_a_described_robot_whose_joints_are_told_has_a_model(tmp_path: Path):
+def test_described_robot_with_recorded_joints_has_a_model(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         for robot in ("r1", "r2"):
             tale.describe(robot)
@@ -41,14 +41,14 @@ def test_a_described_robot_whose_joints_are_told_has_a_model(tmp_path: Path):
     assert not refused
 
 
-def test_without_joint_states_a_description_is_of_no_use(tmp_path: Path):
+def test_description_without_joint_states_gives_no_model(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
     assert models(tmp_path / "r.mcap") == ({"arm": None}, [])
 
 
 @pytest.mark.parametrize(("after", "is_found"), [(99, True), (100, False)])
-def test_one_of_the_first_hundred_joint_states_must_tell_all_joints(
+def test_one_of_the_first_hundred_joint_states_must_have_all_joints(
     tmp_path: Path, after: int, is_found: bool
 ):
     with Bag(tmp_path / "bag") as bag:
@@ -60,7 +60,7 @@ def test_one_of_the_first_hundred_joint_states_must_tell_all_joints(
     assert (found["ros"] is not None) == is_found
 
 
-def test_a_description_that_is_no_urdf_is_told(tmp_path: Path):
+def test_invalid_urdf_is_reported(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.describe(urdf="hello")
         bag.joints(START, {"shoulder": 0.5})

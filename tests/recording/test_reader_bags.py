@@ -77,7 +77,7 @@ def bag(folder: Path, text: str, *names: str) -> Path:
         (9, "mcap", ("my bag_9.mcap", "my bag_10.mcap")),
     ],
 )
-def test_the_files_come_in_the_order_of_the_metadata(
+def test_files_come_in_the_order_of_the_metadata(
     tmp_path: Path, text: str, version: int, storage: str, paths: tuple[str, str]
 ):
     names = [Path(path).name for path in paths]
@@ -86,7 +86,7 @@ def test_the_files_come_in_the_order_of_the_metadata(
     assert bag_files(folder) == [folder / name for name in names]
 
 
-def test_a_path_that_leads_out_of_the_bag_is_not_followed(tmp_path: Path):
+def test_path_that_leads_out_of_the_bag_is_not_followed(tmp_path: Path):
     text = BY_ROSBAG2.format(version=9, storage="mcap", first="../secret.mcap", second="/etc/bag_1.mcap")
     folder = bag(tmp_path / "bag", text, "secret.mcap", "bag_1.mcap")
     assert bag_files(folder) == [folder / "secret.mcap", folder / "bag_1.mcap"]
@@ -121,9 +121,7 @@ GOOD = BY_ROSBAG2.format(version=9, storage="mcap", first="a_0.mcap", second="a_
         (GOOD, "", "does not begin with"),
     ],
 )
-def test_what_is_not_understood_is_refused_with_the_reason(
-    tmp_path: Path, before: str, after: str, said: str
-):
+def test_unsupported_metadata_is_refused_with_the_reason(tmp_path: Path, before: str, after: str, said: str):
     assert before in GOOD
     folder = bag(tmp_path / "bag", GOOD.replace(before, after), "a_0.mcap", "a_1.mcap")
     with pytest.raises(RecordingError) as caught:
@@ -139,7 +137,7 @@ def test_metadata_that_is_no_text_is_refused(tmp_path: Path):
         bag_files(folder)
 
 
-def test_a_bag_whose_recorder_was_killed_has_no_metadata_and_is_read_by_its_numbers(tmp_path: Path):
+def test_bag_without_metadata_is_read_by_file_numbers(tmp_path: Path):
     folder = tmp_path / "bag"
     folder.mkdir()
     for number in (0, 2, 10):
@@ -152,7 +150,7 @@ def test_a_bag_whose_recorder_was_killed_has_no_metadata_and_is_read_by_its_numb
         assert not reader.complete
 
 
-def test_a_folder_of_several_recordings_or_none_is_refused(tmp_path: Path):
+def test_folder_of_several_recordings_or_none_is_refused(tmp_path: Path):
     with pytest.raises(RecordingError, match=r"no .mcap or .db3 file; name a recording's file"):
         bag_files(tmp_path)
     for name in ("a.mcap", "b.mcap"):

@@ -33,7 +33,7 @@ async def stream(*scans: Scan) -> AsyncIterator[Scan]:
         yield scan
 
 
-def test_each_sample_comes_with_the_transform_of_its_own_instant() -> None:
+def test_each_sample_is_joined_with_the_transform_at_its_own_stamp() -> None:
     async def run() -> list[tuple[int, float]]:
         scans = stream(*(Scan("laser", stamp) for stamp in (5 * MS, 25 * MS, 95 * MS)))
         return [(scan.stamp, tf.translation[0]) async for scan, tf in a_buffer().join(scans, "map")]
@@ -43,7 +43,7 @@ def test_each_sample_comes_with_the_transform_of_its_own_instant() -> None:
     assert [x for _, x in joined] == pytest.approx([0.005, 0.025, 0.095], abs=1e-15)
 
 
-def test_a_sample_waits_for_the_transform_that_comes_after_it() -> None:
+def test_sample_waits_for_a_transform_that_arrives_later() -> None:
     async def run() -> float:
         buffer = a_buffer()
         join = buffer.join(stream(Scan("laser", 105 * MS)), "map", timeout_s=10.0)
@@ -56,7 +56,7 @@ def test_a_sample_waits_for_the_transform_that_comes_after_it() -> None:
     assert asyncio.run(run()) == pytest.approx(0.105, abs=1e-15)
 
 
-def test_drops_are_counted_by_their_reason_and_the_rest_goes_on() -> None:
+def test_dropped_samples_are_counted_by_reason_and_the_rest_continues() -> None:
     async def run() -> None:
         scans = (Scan("laser", -1), Scan("lidar", 5), Scan("laser", 200 * MS), Scan("laser", 50 * MS))
         join = a_buffer().join(stream(*scans), "map", timeout_s=0.01)
@@ -68,7 +68,7 @@ def test_drops_are_counted_by_their_reason_and_the_rest_goes_on() -> None:
     asyncio.run(run())
 
 
-def test_samples_of_any_shape_say_where_their_frame_and_stamp_are() -> None:
+def test_frame_and_stamp_functions_read_samples_of_any_type() -> None:
     async def pairs() -> AsyncIterator[tuple[str, int]]:
         yield ("laser", 20 * MS)
 
@@ -79,7 +79,7 @@ def test_samples_of_any_shape_say_where_their_frame_and_stamp_are() -> None:
     assert asyncio.run(run()) == pytest.approx([0.02], abs=1e-15)
 
 
-def test_a_join_can_be_left_and_taken_up_again() -> None:
+def test_loop_over_a_join_can_be_left_and_resumed() -> None:
     async def run() -> list[int]:
         join = a_buffer().join(stream(*(Scan("laser", k * MS) for k in range(4))), "map")
         seen: list[int] = []

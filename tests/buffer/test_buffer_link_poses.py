@@ -14,7 +14,7 @@ from zstate.errors import InsertRefused, InvalidInput
 MS = 1_000_000
 
 
-def test_link_poses_are_those_of_the_interpolated_joints() -> None:
+def test_link_poses_follow_the_interpolated_joints() -> None:
     model = load_model("gripper")
     buffer = TransformBuffer()
     track = buffer.add_robot(model, "left")
@@ -43,7 +43,7 @@ def test_link_poses_agree_with_lookups_link_by_link() -> None:
         assert abs(pose[3:] @ looked_up.rotation) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_outside_the_history_the_error_is_that_of_a_lookup() -> None:
+def test_link_poses_outside_the_history_raise_as_lookup() -> None:
     model = load_model("rrbot")
     buffer = TransformBuffer()
     track = buffer.add_robot(model)
@@ -57,7 +57,7 @@ def test_outside_the_history_the_error_is_that_of_a_lookup() -> None:
         buffer.link_poses(track, 11)
 
 
-def test_an_error_names_the_track_at_fault() -> None:
+def test_error_names_the_failing_track() -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(load_model("rrbot"), "left")
     buffer.insert_joints(track, 10, np.zeros(2))
@@ -89,7 +89,7 @@ def calls_on(buffer: TransformBuffer, track: JointTrack) -> dict[str, Callable[[
     }
 
 
-def test_the_track_of_a_removed_robot_takes_and_gives_nothing_and_says_so() -> None:
+def test_track_of_a_removed_robot_is_refused_with_that_reason() -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(load_model("rrbot"), "r1")
     buffer.insert_joints(track, 0, np.zeros(2))
@@ -103,7 +103,7 @@ def test_the_track_of_a_removed_robot_takes_and_gives_nothing_and_says_so() -> N
     assert buffer.lookup("r1/world", "r1/tool").stamp == 7
 
 
-def test_the_track_of_another_buffer_is_refused_and_left_alone() -> None:
+def test_track_of_another_buffer_is_refused_and_unchanged() -> None:
     ours, theirs = TransformBuffer(), TransformBuffer()
     ours.add_robot(load_model("rrbot"))
     track = theirs.add_robot(load_model("rrbot"))
@@ -118,6 +118,6 @@ def test_the_track_of_another_buffer_is_refused_and_left_alone() -> None:
         ours.restart(poses)
 
 
-def test_an_interpolation_that_does_not_exist_is_refused() -> None:
+def test_unknown_interpolation_is_refused() -> None:
     with pytest.raises(InvalidInput, match="linear, hermite; got 'cubic'"):
         TransformBuffer().add_robot(load_model("rrbot"), interpolation="cubic")  # type: ignore[arg-type]

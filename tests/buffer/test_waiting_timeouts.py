@@ -69,12 +69,12 @@ def waiting(request: pytest.FixtureRequest) -> Callable[..., Waiting]:
     return request.param
 
 
-def test_what_is_there_is_answered_at_once(waiting) -> None:
+def test_available_transform_is_returned_at_once(waiting) -> None:
     buffer = filled(moving("a", "b", 5, x=2.0))
     assert x_of(waiting(buffer, "a", "b", 5).result()) == 2.0
 
 
-def test_a_wait_ends_with_the_sample_that_makes_the_answer(waiting) -> None:
+def test_wait_ends_with_the_sample_that_completes_the_transform(waiting) -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
     wait = waiting(buffer, "a", "c", S)
     buffer.insert(moving("a", "b", 2 * S, x=2.0))
@@ -83,7 +83,7 @@ def test_a_wait_ends_with_the_sample_that_makes_the_answer(waiting) -> None:
     assert x_of(wait.result()) == 11.0
 
 
-def test_a_wait_for_unknown_unconnected_and_empty_frames_ends_with_the_last_of_them(waiting) -> None:
+def test_wait_for_unknown_unconnected_and_empty_frames_ends_with_the_last_missing_sample(waiting) -> None:
     buffer = TransformBuffer()
     wait = waiting(buffer, "a", "c")
     buffer.insert_static(static("a", "b", x=1.0))
@@ -93,19 +93,19 @@ def test_a_wait_for_unknown_unconnected_and_empty_frames_ends_with_the_last_of_t
     assert x_of(wait.result()) == 3.0
 
 
-def test_a_wait_for_a_robot_ends_with_its_first_sample(waiting) -> None:
+def test_wait_for_a_robot_ends_with_its_first_sample(waiting) -> None:
     buffer, track = every_joint()
     wait = waiting(buffer, "body", "arm")
     buffer.insert_joints(track, S, pose_of_every(track, bend=0.5))
     assert wait.result().rpy[2] == pytest.approx(0.5)
 
 
-def test_a_wait_for_what_lies_before_all_that_is_kept_fails_at_once(waiting) -> None:
+def test_wait_before_the_kept_history_fails_at_once(waiting) -> None:
     outcome = waiting(filled(moving("a", "b", 10 * S + 1)), "a", "b", 0).result()
     assert type(outcome) is InPast
 
 
-def test_a_wait_for_what_lies_before_the_only_sample_ends_with_the_history_behind_it(waiting) -> None:
+def test_wait_before_the_only_sample_ends_when_older_history_arrives(waiting) -> None:
     """As a listener that joins hears it: a live sample first, then the past, newest first."""
     buffer = filled(moving("a", "b", 10 * S, x=10.0))
     wait = waiting(buffer, "a", "b", 9 * S + S // 2)
@@ -114,7 +114,7 @@ def test_a_wait_for_what_lies_before_the_only_sample_ends_with_the_history_behin
     assert x_of(wait.result()) == 9.5
 
 
-def test_a_wait_for_the_past_ends_when_the_last_of_the_edges_knows_it(waiting) -> None:
+def test_wait_for_a_past_instant_ends_when_the_last_edge_covers_it(waiting) -> None:
     buffer, track = every_joint()
     buffer.insert(moving("map", "root", 10 * S, x=1.0))
     buffer.insert_joints(track, 10 * S, pose_of_every(track))
@@ -125,7 +125,7 @@ def test_a_wait_for_the_past_ends_when_the_last_of_the_edges_knows_it(waiting) -
     assert wait.result().translation.tolist() == [1.0, 0.0, 1.5]
 
 
-def test_a_wait_for_the_past_is_woken_once_however_many_samples_come(waiting) -> None:
+def test_wait_for_a_past_instant_wakes_once_however_many_samples_arrive(waiting) -> None:
     buffer = filled(moving("a", "b", 10 * S))
     wait = waiting(buffer, "a", "b", 5 * S)
     (waiter,) = buffer._waiters._waiters
@@ -138,14 +138,14 @@ def test_a_wait_for_the_past_is_woken_once_however_many_samples_come(waiting) ->
     assert len(wakes) <= 2  # the late sample that makes the answer, and the one behind it
 
 
-def test_a_wait_for_the_past_that_nobody_fills_runs_out_with_its_reason() -> None:
+def test_wait_for_a_past_instant_without_new_samples_times_out_with_its_reason() -> None:
     buffer = filled(moving("a", "b", 10 * S))
     with pytest.raises(InPast) as caught:
         buffer.lookup("a", "b", 5 * S, timeout_s=0.01)
     assert isinstance(caught.value, TimeoutError)
 
 
-def test_a_wait_for_the_past_ends_as_soon_as_the_history_has_moved_on(waiting) -> None:
+def test_wait_for_a_past_instant_fails_when_the_history_moves_past_it(waiting) -> None:
     buffer = filled(moving("a", "b", 10 * S))
     wait = waiting(buffer, "a", "b", 9 * S)
     buffer.insert(moving("a", "b", 19 * S))
@@ -156,7 +156,7 @@ def test_a_wait_for_the_past_ends_as_soon_as_the_history_has_moved_on(waiting) -
     assert not isinstance(outcome, TimeoutError)
 
 
-def test_a_wait_fails_at_once_when_a_jump_makes_it_hopeless(waiting) -> None:
+def test_wait_fails_at_once_when_a_jump_makes_it_hopeless(waiting) -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
     wait = waiting(buffer, "a", "c", S)
     buffer.insert(moving("b", "c", 100 * S))
@@ -164,7 +164,7 @@ def test_a_wait_fails_at_once_when_a_jump_makes_it_hopeless(waiting) -> None:
     assert (type(outcome), outcome.edge) == (InPast, ("b", "c"))
 
 
-def test_a_wait_for_the_newest_instant_outlasts_an_edge_that_lags_behind_the_others_history(waiting) -> None:
+def test_wait_for_the_newest_instant_survives_an_edge_that_lags_behind_the_history_of_others(waiting) -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 100 * S, x=1.0))
     wait = waiting(buffer, "a", "c")
     buffer.insert(moving("a", "b", 100 * S, x=5.0))
@@ -172,7 +172,7 @@ def test_a_wait_for_the_newest_instant_outlasts_an_edge_that_lags_behind_the_oth
 
 
 @pytest.mark.parametrize("name", ["", "/a", None, 5, b"a", ["a"]])
-def test_a_wait_for_a_name_that_can_never_be_fails_at_once(name) -> None:
+def test_wait_for_an_impossible_name_fails_at_once(name) -> None:
     buffer = TransformBuffer()
     for call in (
         lambda: buffer.wait(name, "b", timeout_s=LONG_S),
@@ -195,7 +195,7 @@ def cases() -> list:
 
 
 @pytest.mark.parametrize(("buffer", "question", "reason"), cases())
-def test_a_wait_that_runs_out_raises_its_reason_as_a_timeout(buffer, question, reason) -> None:
+def test_wait_that_times_out_raises_its_reason_as_a_timeout_error(buffer, question, reason) -> None:
     def check(call: Callable[[], object]) -> None:
         with pytest.raises(reason) as caught:
             call()
@@ -209,7 +209,7 @@ def test_a_wait_that_runs_out_raises_its_reason_as_a_timeout(buffer, question, r
     check(lambda: asyncio.run(buffer.wait_async(*question, timeout_s=0.01)))
 
 
-def test_a_wait_with_prediction_ends_as_soon_as_prediction_reaches() -> None:
+def test_wait_with_prediction_ends_when_prediction_reaches_the_stamp() -> None:
     buffer = filled(moving("a", "b", 0), moving("a", "b", 10 * MS, x=1.0))
     wait = Waiting(buffer, lambda: buffer.lookup("a", "b", 40 * MS, predict_s=0.02, timeout_s=LONG_S))
     buffer.insert(moving("a", "b", 20 * MS, x=2.0))
@@ -217,7 +217,7 @@ def test_a_wait_with_prediction_ends_as_soon_as_prediction_reaches() -> None:
     assert (outcome.kind, x_of(outcome)) == ("predicted", pytest.approx(4.0))
 
 
-def test_a_wait_for_what_cannot_be_predicted_runs_out_or_ends_with_the_sample() -> None:
+def test_wait_for_an_unpredictable_transform_times_out_or_ends_with_the_sample() -> None:
     buffer, track = every_joint()
     buffer.insert_joints(track, 0, pose_of_every(track))
     with pytest.raises(InFuture) as caught:
@@ -228,7 +228,7 @@ def test_a_wait_for_what_cannot_be_predicted_runs_out_or_ends_with_the_sample() 
     assert wait.result().rpy[2] == pytest.approx(0.25)
 
 
-def test_a_wait_for_something_fresher_ends_with_it() -> None:
+def test_wait_for_a_fresher_transform_ends_with_its_sample() -> None:
     clock = ManualClock(10 * S)
     buffer = TransformBuffer(clock=clock)
     buffer.insert(moving("a", "b", 8 * S))
@@ -238,7 +238,7 @@ def test_a_wait_for_something_fresher_ends_with_it() -> None:
     assert x_of(wait.result()) == 3.0
 
 
-def test_a_given_instant_that_is_too_old_grows_no_younger_by_waiting() -> None:
+def test_wait_does_not_make_a_stale_instant_valid() -> None:
     buffer = TransformBuffer(clock=ManualClock(10 * S))
     buffer.insert(moving("a", "b", 8 * S))
     with pytest.raises(Stale) as caught:
@@ -246,7 +246,7 @@ def test_a_given_instant_that_is_too_old_grows_no_younger_by_waiting() -> None:
     assert not isinstance(caught.value, TimeoutError)
 
 
-def test_a_wait_ends_in_time_though_data_pours_in() -> None:
+def test_wait_times_out_although_samples_keep_arriving() -> None:
     buffer = TransformBuffer(clock=ManualClock(2**62))
     buffer.insert(moving("a", "b", 0))
     stop = threading.Event()
@@ -268,7 +268,7 @@ def test_a_wait_ends_in_time_though_data_pours_in() -> None:
         writer.join()
 
 
-def test_a_wait_of_asyncio_can_be_cancelled_and_leaves_no_waiter() -> None:
+def test_asyncio_wait_can_be_cancelled_and_leaves_no_waiter() -> None:
     buffer = TransformBuffer()
 
     async def cancel() -> None:
@@ -283,7 +283,7 @@ def test_a_wait_of_asyncio_can_be_cancelled_and_leaves_no_waiter() -> None:
     assert buffer.waiter_count == 0
 
 
-def test_waits_of_asyncio_share_one_loop() -> None:
+def test_asyncio_waits_share_one_loop() -> None:
     buffer = TransformBuffer()
 
     async def both() -> list[Transform]:
@@ -296,7 +296,7 @@ def test_waits_of_asyncio_share_one_loop() -> None:
     assert [x_of(answer) for answer in asyncio.run(both())] == [0.0, 1.0, 2.0]
 
 
-def test_an_insert_survives_a_waiter_whose_loop_is_closed() -> None:
+def test_insert_survives_a_waiter_whose_loop_is_closed() -> None:
     buffer = TransformBuffer()
     loop = asyncio.new_event_loop()
     task = loop.create_task(buffer.wait_async("a", "b", timeout_s=LONG_S))

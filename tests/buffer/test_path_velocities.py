@@ -91,7 +91,7 @@ def test_pose_tracks_move_at_the_rate_between_their_samples() -> None:
         np.testing.assert_allclose(twist.angular, (0, 0, 0.5), atol=1e-14)
 
 
-def test_a_fixed_path_is_at_rest_and_a_single_sample_tells_no_rate() -> None:
+def test_fixed_path_has_zero_velocity_and_a_single_sample_has_no_rate() -> None:
     buffer = filled(static("a", "b"), moving("b", "c", 0))
     assert buffer.twist("b", "a", NOW).linear.tolist() == [0, 0, 0]
     assert buffer.twist("b", "a").stamp is None
@@ -117,16 +117,16 @@ def bent(*samples: tuple[int, float, float | None]) -> TransformBuffer:
 
 
 @pytest.mark.parametrize("seconds", [0, 1, 2])
-def test_at_a_sample_with_velocities_they_are_the_rate_though_its_neighbours_have_none(seconds: int) -> None:
+def test_velocities_of_a_sample_are_its_rate_even_if_its_neighbours_have_none(seconds: int) -> None:
     samples = [(n, 0.1 * n * n, 5.0 if n == seconds else None) for n in range(3)]
     assert bent(*samples).twist("arm", "body", seconds * S).angular[2] == 5.0
 
 
-def test_one_sample_with_velocities_tells_a_rate() -> None:
+def test_single_sample_with_velocities_has_a_rate() -> None:
     assert bent((0, 0.1, 3.0)).twist("arm", "body").angular[2] == 3.0
 
 
-def test_prediction_of_joints_goes_on_at_their_published_velocities() -> None:
+def test_joint_prediction_continues_at_the_published_velocities() -> None:
     buffer = bent((0, 0.0, None), (1, 0.5, 2.0))
     answer = buffer.lookup("body", "arm", S + 100 * MS, predict_s=0.2)
     assert answer.rpy[2] == pytest.approx(0.5 + 2.0 * 0.1)
@@ -134,7 +134,7 @@ def test_prediction_of_joints_goes_on_at_their_published_velocities() -> None:
     assert answer.predicted_s == pytest.approx(0.1)
 
 
-def test_prediction_reaches_as_far_as_asked_inclusive_and_no_nanosecond_more() -> None:
+def test_prediction_reaches_exactly_as_far_as_requested() -> None:
     buffer = bent((0, 0.0, 1.0))
     assert buffer.lookup("body", "arm", 20 * MS, predict_s=0.02).kind == "predicted"
     assert isinstance(failure(buffer, "body", "arm", 20 * MS + 1, predict_s=0.02), InFuture)
@@ -149,7 +149,7 @@ def test_prediction_of_joints_needs_published_velocities() -> None:
     assert "no velocity is known" in str(error)
 
 
-def test_what_cannot_be_predicted_is_blamed_not_what_is_merely_older() -> None:
+def test_unpredictable_edge_is_reported_rather_than_an_older_one() -> None:
     buffer = bent((2, 0.0, None))
     buffer.insert(moving("map", "root", 0))
     buffer.insert(moving("map", "root", S))
@@ -166,7 +166,7 @@ def test_poses_are_predicted_at_the_twist_between_their_last_samples() -> None:
     assert isinstance(failure(filled(start), "map", "a", 1, predict_s=1.0), InFuture)
 
 
-def test_a_floating_base_is_predicted_by_its_published_twist() -> None:
+def test_floating_base_is_predicted_by_its_published_twist() -> None:
     buffer, track = every_joint()
     buffer.insert_joints(track, 0, positions_at(track, 0.5), velocities_at(track, 0.5))
     answer = buffer.lookup("root", "body", 100 * MS, predict_s=0.1)
@@ -176,7 +176,7 @@ def test_a_floating_base_is_predicted_by_its_published_twist() -> None:
     np.testing.assert_allclose(answer.matrix, other.lookup("root", "body").matrix, atol=1e-14)
 
 
-def test_a_prediction_never_takes_the_place_of_a_sample() -> None:
+def test_prediction_never_replaces_a_sample() -> None:
     buffer = filled(moving("a", "b", 0), moving("a", "b", S, x=1.0), moving("a", "b", 2 * S, x=5.0))
     answer = buffer.lookup("a", "b", S + S // 2, predict_s=9.0)
     assert (x_of(answer), answer.kind) == (3.0, "interpolated")

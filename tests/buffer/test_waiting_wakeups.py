@@ -65,7 +65,7 @@ def fleet(buffer: TransformBuffer, count: int) -> list[JointTrack]:
     return tracks
 
 
-def test_a_sample_is_shown_only_to_those_who_wait_for_its_track() -> None:
+def test_sample_is_checked_only_by_waiters_of_its_track() -> None:
     buffer = TransformBuffer()
     one, other = fleet(buffer, 2)
     for _ in range(30):
@@ -79,7 +79,7 @@ def test_a_sample_is_shown_only_to_those_who_wait_for_its_track() -> None:
     assert len(asked) == 2 * 30
 
 
-def test_who_waits_for_two_tracks_is_shown_the_samples_of_both() -> None:
+def test_waiter_for_two_tracks_checks_samples_of_both() -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
     seen = watched(buffer, "a", "c")
     buffer.insert(moving("a", "b", S))
@@ -89,7 +89,7 @@ def test_who_waits_for_two_tracks_is_shown_the_samples_of_both() -> None:
     assert seen.stamps() == [0, S, 2 * S]
 
 
-def test_a_sample_of_many_tracks_is_shown_to_everybody_once() -> None:
+def test_sample_of_many_tracks_is_checked_by_each_waiter_once() -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 0))
     watched(buffer, "a", "c")
     with calls(WakeCondition.is_met) as asked:
@@ -97,7 +97,7 @@ def test_a_sample_of_many_tracks_is_shown_to_everybody_once() -> None:
     assert asked == ["notify", "expect"]
 
 
-def test_a_robot_that_joins_wakes_nobody_who_waits_for_others() -> None:
+def test_new_robot_wakes_no_waiter_of_another() -> None:
     buffer = TransformBuffer()
     fleet(buffer, 2)
     watched(buffer, "r0/base", "r0/tool")
@@ -108,7 +108,7 @@ def test_a_robot_that_joins_wakes_nobody_who_waits_for_others() -> None:
     assert (compiled, searched) == ([], [])
 
 
-def test_a_path_is_not_compiled_again_for_a_change_elsewhere_in_the_tree() -> None:
+def test_unrelated_tree_change_recompiles_no_path() -> None:
     buffer = TransformBuffer()
     fleet(buffer, 1)
     buffer.lookup("r0/base", "r0/tool")
@@ -118,7 +118,7 @@ def test_a_path_is_not_compiled_again_for_a_change_elsewhere_in_the_tree() -> No
     assert compiled == []
 
 
-def test_an_insert_of_a_static_edge_copies_no_tree() -> None:
+def test_static_insert_copies_no_tree() -> None:
     buffer = TransformBuffer()
     fleet(buffer, 20)
     frames = buffer._tree.frames
@@ -128,7 +128,7 @@ def test_an_insert_of_a_static_edge_copies_no_tree() -> None:
     assert buffer._tree.frames is frames
 
 
-def test_an_unknown_frame_is_looked_for_once_for_each_change_and_near_misses_never() -> None:
+def test_unknown_frame_is_searched_once_per_change_and_near_misses_never() -> None:
     buffer = TransformBuffer()
     for number in range(20):
         watched(buffer, f"r{number}/base", f"r{number}/tool")
@@ -140,7 +140,7 @@ def test_an_unknown_frame_is_looked_for_once_for_each_change_and_near_misses_nev
     assert searches == []
 
 
-def test_near_misses_are_those_of_when_the_frame_was_unknown() -> None:
+def test_near_misses_are_those_at_the_time_of_the_error() -> None:
     buffer = filled(static("base", "left_camera"))
     error = failure(buffer, "base", "left_camra")
     assert isinstance(error, UnknownFrame)
@@ -153,20 +153,20 @@ def test_near_misses_are_those_of_when_the_frame_was_unknown() -> None:
     assert set(late.near_misses) == {"left_camera", "left_camara"}
 
 
-def test_a_wait_that_runs_out_has_near_misses_too() -> None:
+def test_timed_out_wait_has_near_misses() -> None:
     buffer = filled(static("base", "camera"))
     with pytest.raises(UnknownFrame, match="did you mean 'camera'") as caught:
         buffer.wait("base", "camra", timeout_s=0.001)
     assert caught.value.near_misses == ("camera",)
 
 
-def test_an_error_crosses_processes_with_near_misses_that_nobody_has_read() -> None:
+def test_unread_near_misses_survive_pickling_between_processes() -> None:
     error = filled(static("base", "camera")).explain("base", "camra")
     copy = pickle.loads(pickle.dumps(error))
     assert copy.near_misses == ("camera",)
 
 
-def test_a_refused_insert_leaves_no_name_behind() -> None:
+def test_refused_insert_leaves_no_name() -> None:
     buffer = filled(static("r1/base", "r1/hand"))
     seen = watched(buffer, "r2/base", "r2/hand")
     edges = [("r2/base", "r2/hand"), ("r1/base", "r1/base")]
@@ -181,7 +181,7 @@ def test_a_refused_insert_leaves_no_name_behind() -> None:
     assert len(seen) == 1
 
 
-def test_a_watch_by_bare_names_answers_while_they_are_unique() -> None:
+def test_watch_by_bare_names_works_while_they_are_unique() -> None:
     buffer = TransformBuffer()
     seen = watched(buffer, "base", "tool")
     (one,) = fleet(buffer, 1)
@@ -191,7 +191,7 @@ def test_a_watch_by_bare_names_answers_while_they_are_unique() -> None:
     assert seen.stamps() == [0]
 
 
-def test_a_watch_goes_on_when_an_edge_comes_back_with_another_history() -> None:
+def test_watch_continues_when_an_edge_returns_with_another_history() -> None:
     buffer = filled(moving("a", "b", 5 * S, x=1.0))
     seen = watched(buffer, "a", "b")
     buffer.withdraw("b")
@@ -200,7 +200,7 @@ def test_a_watch_goes_on_when_an_edge_comes_back_with_another_history() -> None:
 
 
 @pytest.mark.parametrize("forget", [TransformBuffer.restart, lambda buffer, _: buffer.clear()])
-def test_a_watch_goes_on_in_a_new_epoch_whose_stamps_are_older(forget) -> None:
+def test_watch_continues_in_a_new_epoch_with_older_stamps(forget) -> None:
     buffer = TransformBuffer()
     (track,) = fleet(buffer, 1)
     seen = watched(buffer, "r0/base", "r0/tool")
@@ -211,7 +211,7 @@ def test_a_watch_goes_on_in_a_new_epoch_whose_stamps_are_older(forget) -> None:
     assert seen.stamps() == [0, 100 * S, 5 * S, 6 * S]
 
 
-def test_the_first_velocities_of_a_robot_reach_paths_that_were_compiled_before() -> None:
+def test_first_velocities_of_a_robot_reach_compiled_paths() -> None:
     buffer, track = every_joint()
     buffer.insert_joints(track, 0, pose_of_every(track))
     assert buffer.lookup("body", "lift").kind == "exact"
@@ -219,7 +219,7 @@ def test_the_first_velocities_of_a_robot_reach_paths_that_were_compiled_before()
     assert buffer.lookup("body", "lift", 2 * MS, predict_s=1.0).kind == "predicted"
 
 
-def test_who_has_left_is_nowhere() -> None:
+def test_closed_waiter_is_not_listed_anywhere() -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(RRBOT)
     # Closed while it is being told, after which it expects the next sample no more.

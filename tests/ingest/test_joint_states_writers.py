@@ -30,7 +30,7 @@ def received(listener: TransformListener, count: int) -> bool:
     return listener.stats.received == count
 
 
-def test_the_writers_name_stands_in_frames_and_in_errors(sessions, monkeypatch):
+def test_frames_and_errors_name_the_writer(sessions, monkeypatch):
     monkeypatch.setattr("sys.argv", ["/opt/arm_driver.py"])
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
@@ -43,7 +43,7 @@ def test_the_writers_name_stands_in_frames_and_in_errors(sessions, monkeypatch):
         assert caught.value.writer.startswith("arm_driver@")
 
 
-def test_a_changed_urdf_replaces_the_robot(sessions):
+def test_changed_urdf_replaces_the_robot(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -66,7 +66,7 @@ def test_a_changed_urdf_replaces_the_robot(sessions):
             assert not listener.buffer.can_lookup("world", "tool", STAMP)
 
 
-def test_the_model_places_its_links_and_another_writer_that_did_gives_way(sessions, caplog):
+def test_model_places_its_links_and_another_writer_yields(sessions, caplog):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener, StaticPublisher(writer, "r1", "mistake") as statics:
         statics.set(Transform("base", "upper", (9.0, 0.0, 0.0), UPRIGHT))
@@ -83,7 +83,7 @@ def test_the_model_places_its_links_and_another_writer_that_did_gives_way(sessio
         assert "'r1/upper' is written by the model of 'rrbot' already; refused: mistake" in caplog.text
 
 
-def test_a_writer_without_a_model_is_mapped_by_the_names_it_gives(sessions):
+def test_writer_without_a_model_is_mapped_by_its_joint_names(sessions):
     writer, reader = sessions
     names = ("elbow", "lid", "shoulder")
     state = JointState(STAMP, 0, 9, order_digest(names), to_block([2.0, 7.0, 1.0]), None, None, names)
@@ -98,7 +98,7 @@ def test_a_writer_without_a_model_is_mapped_by_the_names_it_gives(sessions):
         assert_pose(pose, kinematic_pose(RRBOT, [1.0, 2.0], "world", "tool"))
 
 
-def test_samples_that_were_lost_on_the_way_are_missed(sessions):
+def test_lost_samples_count_as_missed(sessions):
     writer, reader = sessions
     order = order_digest(RRBOT.joint_names)
     with (
@@ -113,7 +113,7 @@ def test_samples_that_were_lost_on_the_way_are_missed(sessions):
         assert (listener.stats.missed, listener.stats.dropped) == (3 + 3, 0)
 
 
-def test_samples_before_the_description_arrive_in_the_end(sessions):
+def test_samples_before_the_description_are_inserted_later(sessions):
     writer, reader = sessions
     with (
         TransformListener(reader, "r1") as listener,
@@ -130,7 +130,7 @@ def test_samples_before_the_description_arrive_in_the_end(sessions):
         assert_pose(pose, kinematic_pose(RRBOT, [0.1 * 3, 0.0], "world", "tool"))
 
 
-def test_of_two_writers_at_once_the_newer_is_followed_and_the_other_counted(sessions, caplog):
+def test_newer_of_two_writers_is_used_and_the_other_counted(sessions, caplog):
     writer, reader = sessions
     with (
         caplog.at_level(logging.WARNING),

@@ -81,7 +81,7 @@ def assert_same_answer(question: list[Any], ours: Transform, theirs: dict[str, A
         assert ours.stamp == theirs["stamp"], question
 
 
-def test_random_lookups_agree_with_tf2_but_for_the_table() -> None:
+def test_random_lookups_agree_with_tf2_except_for_the_listed_differences() -> None:
     rng = random.Random(20)
     scenarios = [a_scenario(rng, QUESTIONS) for _ in range(SCENARIOS)]
     agreed: Counter[str] = Counter()
@@ -147,7 +147,7 @@ INSERTS: dict[str, tuple[list[list[Any]], list[Any], float | str, float | str]] 
 
 
 @pytest.mark.parametrize("claim", INSERTS)
-def test_at_insert_we_differ_from_tf2_in_what_the_table_says(claim: str) -> None:
+def test_insert_differs_from_tf2_as_listed(claim: str) -> None:
     inserts, question, our_answer, their_answer = INSERTS[claim]
     scenario = {"history": 10 * S, "steps": [*inserts, ["ask", *question]]}
     (ours,), ((theirs,),) = ask_us(scenario), ask_tf2([scenario])

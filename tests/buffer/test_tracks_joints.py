@@ -48,22 +48,24 @@ def turns_equal(a: float, b: float) -> bool:
         (-PI, PI, -PI),
     ],
 )
-def test_continuous_joints_go_straight_but_for_an_encoder_that_wrapped(start, end, at_a_quarter) -> None:
+def test_continuous_joints_interpolate_linearly_except_when_the_encoder_wrapped(
+    start, end, at_a_quarter
+) -> None:
     answer = between({"spin": start}, {"spin": end}, "body", "wheel")
     assert turns_equal(yaw_of(answer), at_a_quarter)
 
 
-def test_half_a_turn_exactly_is_no_wrap() -> None:
+def test_exactly_half_a_turn_is_no_wrap() -> None:
     answer = between({"spin": -0.5 * PI}, {"spin": 0.5 * PI}, "body", "wheel", 2)
     assert yaw_of(answer) == pytest.approx(0.0, abs=1e-15)
 
 
-def test_revolute_joints_go_straight_whatever_the_numbers() -> None:
+def test_revolute_joints_interpolate_linearly_for_any_numbers() -> None:
     answer = between({"bend": -3.0}, {"bend": 3.0}, "body", "arm")
     assert yaw_of(answer) == pytest.approx(-1.5)
 
 
-def test_mimics_follow_their_master_and_chains_of_mimics_theirs() -> None:
+def test_mimic_joints_follow_their_master_through_chains() -> None:
     bend = 0.25 * 2.0
     follow = 2.0 * bend + 0.25
     answer = between({}, {"bend": 2.0}, "arm", "follower")
@@ -72,12 +74,12 @@ def test_mimics_follow_their_master_and_chains_of_mimics_theirs() -> None:
     assert answer.translation[0] == pytest.approx(-3.0 * follow + 0.5)
 
 
-def test_a_mimic_of_more_than_a_turn_between_samples_is_not_cut_short() -> None:
+def test_mimic_of_more_than_a_turn_between_samples_is_not_shortened() -> None:
     # The follower turns by 2 * 8 rad, which the poses of two samples could not tell.
     assert turns_equal(yaw_of(between({}, {"bend": 8.0}, "arm", "follower")), 2 * 2.0 + 0.25)
 
 
-def test_a_mimic_of_a_continuous_joint_follows_its_way_round() -> None:
+def test_mimic_of_a_continuous_joint_follows_its_direction() -> None:
     text = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
       <joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint>
       <joint name="k" type="continuous"><parent link="a"/><child link="c"/><axis xyz="0 0 1"/>
@@ -98,12 +100,12 @@ def test_prismatic_and_planar_joints_move_along_their_axes() -> None:
     assert yaw_of(answer) == pytest.approx(yaw)
 
 
-def test_the_yaw_of_a_planar_joint_goes_round_as_a_continuous_joint() -> None:
+def test_planar_yaw_rotates_as_a_continuous_joint() -> None:
     answer = between({"slide": (0, 0, 3.0)}, {"slide": (0, 0, -3.0)}, "lift", "sled", 2)
     assert turns_equal(yaw_of(answer), PI)
 
 
-def test_floating_joints_are_interpolated_as_poses_behind_their_origin() -> None:
+def test_floating_joints_interpolate_as_poses_behind_their_origin() -> None:
     half = 0.5 * 1.0
     end = {"free": (4.0, 8.0, 12.0, 0.0, 0.0, math.sin(half), math.cos(half))}
     answer = between({}, end, "root", "body")
@@ -115,7 +117,7 @@ def test_floating_joints_are_interpolated_as_poses_behind_their_origin() -> None
 @pytest.mark.parametrize(
     "name", ["rrbot", "diffbot", "gripper", pytest.param("panda", marks=pytest.mark.robots)]
 )
-def test_at_a_sample_every_link_is_where_kinematics_puts_it(name: str) -> None:
+def test_links_at_a_sample_equal_the_kinematics(name: str) -> None:
     model = load_model(name)
     buffer = TransformBuffer()
     track = buffer.add_robot(model)
@@ -136,14 +138,14 @@ def test_at_a_sample_every_link_is_where_kinematics_puts_it(name: str) -> None:
         ([0.0] * 6 + [1.0011] + [0.0] * 6, "quaternion"),
     ],
 )
-def test_positions_that_cannot_be_are_refused_and_leave_no_trace(positions, complaint: str) -> None:
+def test_invalid_positions_are_refused_and_change_nothing(positions, complaint: str) -> None:
     buffer, track = every_joint()
     with pytest.raises(InvalidInput, match=complaint):
         buffer.insert_joints(track, 0, positions)
     assert isinstance(failure(buffer, "root", "body"), NoData)
 
 
-def test_a_floating_joints_quaternion_within_a_thousandth_is_normalised() -> None:
+def test_floating_joints_quaternion_within_a_thousandth_is_normalised() -> None:
     buffer, track = every_joint()
     buffer.insert_joints(track, 0, pose_of_every(track, free=(0, 0, 0, 0, 0, 0, 1.0009), lift=5.0))
     # The origin lifts by 1 m and the joint by 5 m, which a stretched quaternion would scale.
@@ -151,7 +153,7 @@ def test_a_floating_joints_quaternion_within_a_thousandth_is_normalised() -> Non
 
 
 @pytest.mark.parametrize("model", [load_model("rrbot"), load_model(EVERY_JOINT)], ids=["plain", "floating"])
-def test_a_block_is_inserted_as_the_numbers_in_it_are(model) -> None:
+def test_block_of_bytes_is_inserted_as_its_numbers(model) -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(model, "r")
     numbers = model.neutral + 1e-4
@@ -165,7 +167,7 @@ def test_a_block_is_inserted_as_the_numbers_in_it_are(model) -> None:
     assert buffer.latest(*ends) == S
 
 
-def test_velocities_may_come_later_and_be_missing_again() -> None:
+def test_velocities_may_start_later_and_be_missing_again() -> None:
     buffer, track = every_joint()
     rates = np.zeros(track.model.velocity_count)
     for n, given in enumerate((None, rates, None)):
@@ -186,7 +188,7 @@ def swing(interpolation: str, *, missing: bool = False) -> tuple[TransformBuffer
     return buffer, track
 
 
-def test_hermite_goes_through_both_samples_with_both_velocities() -> None:
+def test_hermite_passes_through_both_samples_with_both_velocities() -> None:
     buffer, _ = swing("hermite")
     for tenth in range(0, 21):
         t = tenth / 10
@@ -196,6 +198,8 @@ def test_hermite_goes_through_both_samples_with_both_velocities() -> None:
 
 
 @pytest.mark.parametrize(("interpolation", "missing"), [("linear", False), ("hermite", True)])
-def test_without_hermite_or_without_velocities_the_way_is_straight(interpolation: str, missing: bool) -> None:
+def test_interpolation_is_linear_without_hermite_or_without_velocities(
+    interpolation: str, missing: bool
+) -> None:
     buffer, _ = swing(interpolation, missing=missing)
     assert yaw_of(buffer.lookup("body", "arm", S // 2)) == pytest.approx(0.25 * 6.0)

@@ -15,7 +15,7 @@ def payloads(heard: list[Batch]) -> list[bytes]:
     return [arrival.payload for one in heard for arrival in one.arrivals]
 
 
-def test_what_several_subscriptions_hear_comes_in_one_queue_with_its_time(sessions):
+def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
     writer, reader = sessions
     heard: list[Batch] = []
     with (
@@ -40,7 +40,7 @@ def test_what_several_subscriptions_hear_comes_in_one_queue_with_its_time(sessio
     assert b"holds" in payloads([one for one in heard if one.stream == "robot_description"])
 
 
-def test_who_takes_nothing_keeps_a_bounded_number_and_is_told_of_the_loss(sessions):
+def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
     writer, reader = sessions
     sent = QUEUE_LENGTH + 3 * CAPACITY
     with (
@@ -62,7 +62,7 @@ def test_who_takes_nothing_keeps_a_bounded_number_and_is_told_of_the_loss(sessio
     assert len(payloads(heard)) < sent
 
 
-def test_closing_is_quick_while_nobody_takes_and_what_waits_may_still_be_taken(sessions):
+def test_close_is_fast_without_a_reader_and_keeps_waiting_batches(sessions):
     writer, reader = sessions
     inbox = MessageQueue(reader)
     with StreamPublisher(writer, "a/samples", "") as samples:

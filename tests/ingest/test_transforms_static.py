@@ -33,7 +33,7 @@ def statics(
     return StaticTransforms(session, edges, to_block([pose] * len(edges)))
 
 
-def test_the_buffer_holds_what_the_writer_says_now_no_more_and_no_less(following: Following):
+def test_buffer_holds_exactly_the_edges_that_the_writer_publishes_now(following: Following):
     mount = following.writer("mount")
     mount.replace(statics(("tool", "camera"), ("camera", "lens")))
     mount.replace(statics(("tool", "camera"), ("tool", "laser")))
@@ -42,7 +42,7 @@ def test_the_buffer_holds_what_the_writer_says_now_no_more_and_no_less(following
     assert following.edges() == {}
 
 
-def test_one_message_may_move_a_child_to_another_parent_and_turn_an_edge_round(following: Following):
+def test_one_message_may_reparent_a_child_and_invert_an_edge(following: Following):
     mount = following.writer("mount")
     mount.replace(statics(("tool", "camera"), ("tool", "laser")))
     mount.replace(statics(("camera", "tool"), ("base", "laser")))
@@ -63,7 +63,7 @@ def test_one_message_may_move_a_child_to_another_parent_and_turn_an_edge_round(f
         (("tool", "lens"), (0, 0, 0, 0, 0, 0, 0), "bad numbers"),
     ],
 )
-def test_an_impossible_edge_is_counted_and_the_others_are_taken(following: Following, bad, pose, reason: str):
+def test_impossible_edge_is_counted_and_the_others_are_inserted(following: Following, bad, pose, reason: str):
     following.writer("mount").replace(statics(("tool", "camera")))
     following.writer("bad").replace(statics(bad, pose=pose))
     following.writer("good").replace(statics(("tool", "laser")))
@@ -71,7 +71,7 @@ def test_an_impossible_edge_is_counted_and_the_others_are_taken(following: Follo
     assert following.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "good")}
 
 
-def test_a_writer_withdraws_only_what_is_still_its_own(following: Following):
+def test_writer_withdraws_only_edges_it_still_owns(following: Following):
     old, new = following.writer("old"), following.writer("new")
     old.replace(statics(("tool", "camera"), ("tool", "laser")))
     new.replace(statics(("tool", "camera")))
@@ -82,7 +82,7 @@ def test_a_writer_withdraws_only_what_is_still_its_own(following: Following):
     assert following.edges() == {}
 
 
-def test_a_full_name_may_belong_to_another_robot(following: Following):
+def test_full_name_may_belong_to_another_robot(following: Following):
     following.writer("site").replace(statics(("fleet/map", "odom")))
     assert following.edges() == {"r1/odom": ("fleet/map", "site")}
 
@@ -96,7 +96,7 @@ def at(x: float) -> tuple[float, ...]:
     return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def test_in_ros_edges_add_up_and_the_newest_pose_counts_whoever_says_it(following: Following):
+def test_ros_static_edges_accumulate_and_the_newest_pose_of_any_writer_is_used(following: Following):
     one, other = following.writer("one"), following.writer("other")
     one.add(statics(("tool", "camera"), pose=at(1.0)))
     one.add(statics(("tool", "laser"), pose=at(2.0)))
@@ -107,7 +107,7 @@ def test_in_ros_edges_add_up_and_the_newest_pose_counts_whoever_says_it(followin
     assert following.counters.stats().refused == {}
 
 
-def test_in_ros_a_writer_may_move_its_child_to_another_parent(following: Following):
+def test_ros_writer_may_reparent_its_child(following: Following):
     mount = following.writer("mount")
     mount.add(statics(("tool", "camera"), ("camera", "lens")))
     mount.add(statics(("base", "camera")))
@@ -115,7 +115,7 @@ def test_in_ros_a_writer_may_move_its_child_to_another_parent(following: Followi
     assert following.counters.stats().refused == {}
 
 
-def test_in_ros_a_child_of_another_writer_is_moved_only_when_that_one_has_left(following: Following):
+def test_ros_child_of_another_writer_is_moved_only_after_that_writer_left(following: Following):
     old, new = following.writer("old"), following.writer("new")
     old.add(statics(("tool", "camera"), ("tool", "laser"), session=3))
     new.add(statics(("base", "camera"), session=4))
@@ -125,7 +125,7 @@ def test_in_ros_a_child_of_another_writer_is_moved_only_when_that_one_has_left(f
     assert following.counters.stats().refused == {"second parent": 2}
 
 
-def test_a_name_that_is_learned_late_is_put_on_what_is_still_this_writers(following: Following):
+def test_late_writer_name_is_set_on_edges_it_still_owns(following: Following):
     one, other = following.writer("a ROS node 1"), following.writer("a ROS node 2")
     one.add(statics(("tool", "camera"), ("tool", "laser"), pose=at(1.0)))
     other.add(statics(("tool", "camera"), pose=at(2.0)))
@@ -145,7 +145,7 @@ def own_edges(turned: float = 1.0) -> StaticTransforms:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_in_ros_what_the_model_says_too_is_neither_taken_nor_counted(following: Following, sign: float):
+def test_ros_edges_that_repeat_the_model_are_neither_inserted_nor_counted(following: Following, sign: float):
     following.buffer.add_robot(RRBOT, "r1")
     before = following.edges()
     following.writer("rsp").add(own_edges(sign))
@@ -161,7 +161,9 @@ def test_in_ros_what_the_model_says_too_is_neither_taken_nor_counted(following: 
         (("cart", "base"), "second parent"),
     ],
 )
-def test_what_contradicts_the_model_is_counted_and_not_taken(following: Following, edge, reason: str):
+def test_static_edge_that_contradicts_the_model_is_counted_and_refused(
+    following: Following, edge, reason: str
+):
     following.buffer.add_robot(RRBOT, "r1")
     before = following.edges()
     following.writer("wrong").add(statics(edge, pose=at(9.0)))

@@ -43,7 +43,7 @@ def fill(buffer: TransformBuffer, track: JointTrack, begin: int, count: int, ste
     return most
 
 
-def test_10_s_at_1_khz_of_a_robot_of_40_edges_take_at_most_8_mb() -> None:
+def test_forty_edge_robot_at_1_khz_needs_at_most_8_mb_for_10_s() -> None:
     gc.collect()
     tracemalloc.start()
     try:
@@ -60,7 +60,7 @@ def test_10_s_at_1_khz_of_a_robot_of_40_edges_take_at_most_8_mb() -> None:
     assert traced <= peak <= LIMIT
 
 
-def test_after_an_hour_of_simulated_time_it_is_still_the_same() -> None:
+def test_memory_is_unchanged_after_an_hour_of_simulated_time() -> None:
     buffer = TransformBuffer(history_s=10.0)
     track = a_robot_of_40_edges(buffer)
     most_at_first = fill(buffer, track, NOW, 1_000, 100 * MS)
@@ -78,7 +78,7 @@ def test_after_an_hour_of_simulated_time_it_is_still_the_same() -> None:
     assert after - before <= 2 * most
 
 
-def test_an_edge_that_comes_and_goes_leaves_nothing_behind() -> None:
+def test_edge_that_is_inserted_and_withdrawn_repeatedly_leaks_nothing() -> None:
     buffer = TransformBuffer()
 
     def come_and_go(count: int) -> None:
@@ -100,7 +100,7 @@ def test_an_edge_that_comes_and_goes_leaves_nothing_behind() -> None:
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_late_samples_take_no_more_room_than_those_in_order(late: int) -> None:
+def test_late_samples_need_no_more_memory_than_ordered_ones(late: int) -> None:
     buffer = TransformBuffer(history_s=1.0)
     for n in range(3_000):
         # Every second sample comes before its neighbour when ``late``.

@@ -28,7 +28,7 @@ def known(robot: str = "arm") -> ModelEdgeFilter:
     return model_filter
 
 
-def test_only_edges_that_no_model_has_are_left():
+def test_only_edges_outside_the_model_remain():
     said = sample((("base", "upper"), ("odom", "world"), ("tool", "lens")))
     rest = known().filter_sample("arm", said)
     assert rest is not None
@@ -37,34 +37,34 @@ def test_only_edges_that_no_model_has_are_left():
     assert (rest.stamp, rest.seq, rest.session) == (START, 4, 5)
 
 
-def test_nothing_is_left_of_a_model():
+def test_sample_of_model_edges_only_is_removed():
     assert known().filter_sample("arm", sample((("base", "upper"),))) is None
     assert known().filter_sample("arm", sample(())) is None
 
 
-def test_what_is_all_new_is_the_very_same():
+def test_unchanged_sample_is_returned_as_the_same_object():
     said = sample((("odom", "world"),))
     assert known().filter_sample("arm", said) is said
 
 
-def test_links_are_known_by_their_full_names_too():
+def test_links_are_recognised_by_their_full_names():
     said = sample((("arm/base", "arm/upper"), ("leg/base", "leg/upper")))
     rest = known().filter_sample("ros", said)
     assert rest is not None
     assert rest.edges == (("leg/base", "leg/upper"),)
 
 
-def test_a_link_of_another_robot_of_that_name_is_not_meant():
+def test_link_of_another_robot_with_the_same_name_remains():
     said = sample((("base", "upper"),))
     assert known().filter_sample("leg", said) is said
 
 
-def test_names_that_cannot_be_are_left_to_whoever_uses_them():
+def test_invalid_names_remain_for_the_ingest_to_refuse():
     said = sample((("a", "/b"), ("a", "")))
     assert known().filter_sample("arm", said) is said
 
 
-def test_static_edges_likewise():
+def test_static_edges_are_filtered_likewise():
     edges = (("world", "base"), ("tool", "lens"))
     statics = StaticTransforms(7, edges, to_block([pose(1.0), pose(2.0)]))
     rest = known().filter_statics("arm", statics)
@@ -72,7 +72,7 @@ def test_static_edges_likewise():
     assert np.array_equal(poses_from_block(rest.poses), [pose(2.0)])
 
 
-def test_a_model_that_is_replaced_is_forgotten():
+def test_replaced_model_is_no_longer_filtered():
     model_filter = known()
     said = sample((("odom", "lens"), ("base", "upper")))
     assert model_filter.filter_sample("arm", said) is not None

@@ -30,7 +30,7 @@ TURN = (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(4))))
-def test_samples_may_come_in_any_order(order) -> None:
+def test_samples_may_arrive_in_any_order(order) -> None:
     buffer = TransformBuffer()
     for n in order:
         assert buffer.insert(moving("a", "b", NOW + n * S, x=n * n))
@@ -39,7 +39,7 @@ def test_samples_may_come_in_any_order(order) -> None:
     assert x_of(buffer.lookup("a", "b", NOW + 2 * S + S // 2)) == 0.5 * (4 + 9)
 
 
-def test_the_later_of_two_samples_of_one_stamp_wins_wherever_it_lies() -> None:
+def test_later_of_two_samples_of_one_stamp_wins_at_any_position() -> None:
     for n in range(3):
         buffer = filled(*(moving("a", "b", k * S, x=k) for k in range(3)))
         assert buffer.insert(moving("a", "b", n * S, x=9.0))
@@ -47,14 +47,14 @@ def test_the_later_of_two_samples_of_one_stamp_wins_wherever_it_lies() -> None:
         assert buffer.frames()[1].count == 3
 
 
-def test_exactly_as_old_as_the_history_stays_and_one_nanosecond_more_goes() -> None:
+def test_sample_exactly_as_old_as_the_history_stays_and_an_older_one_is_dropped() -> None:
     buffer = filled(moving("a", "b", NOW - 1), moving("a", "b", NOW, x=1.0), moving("a", "b", NOW + 10 * S))
     assert x_of(buffer.lookup("a", "b", NOW)) == 1.0
     assert isinstance(failure(buffer, "a", "b", NOW - 1), InPast)
     assert buffer.frames()[1].oldest == NOW
 
 
-def test_a_late_sample_beyond_the_history_is_ignored_and_counted() -> None:
+def test_late_sample_beyond_the_history_is_ignored_and_counted() -> None:
     buffer = filled(moving("a", "b", 10 * S))
     assert buffer.insert(moving("a", "b", 0, x=1.0))
     assert buffer.ignored == 0
@@ -63,14 +63,14 @@ def test_a_late_sample_beyond_the_history_is_ignored_and_counted() -> None:
     assert buffer.frames()[1].oldest == 0
 
 
-def test_an_ignored_sample_of_a_robot_is_counted_too() -> None:
+def test_ignored_sample_of_a_robot_is_counted_too() -> None:
     buffer, track = every_joint()
     assert buffer.insert_joints(track, 11 * S, pose_of_every(track))
     assert not buffer.insert_joints(track, S - 1, pose_of_every(track))
     assert buffer.ignored == 1
 
 
-def test_an_ignored_sample_changes_no_edge_it_came_with() -> None:
+def test_ignored_sample_changes_none_of_its_edges() -> None:
     buffer = filled(moving("a", "b", 100 * S), static("a", "c", x=3.0))
     before = buffer.frames()
     poses = np.array([(0, 0, 0, *TURN)] * 3)
@@ -79,7 +79,7 @@ def test_an_ignored_sample_changes_no_edge_it_came_with() -> None:
     assert x_of(buffer.lookup("a", "c")) == 3.0
 
 
-def test_a_forward_jump_leaves_nothing_of_the_stretch_before() -> None:
+def test_forward_jump_drops_all_earlier_samples() -> None:
     buffer = filled(moving("a", "b", 106 * S), moving("a", "b", 300 * S))
     error = failure(buffer, "a", "b", 200 * S)
     assert isinstance(error, InPast)
@@ -91,7 +91,7 @@ def test_each_track_keeps_its_own_history() -> None:
     assert x_of(buffer.lookup("a", "b", 0)) == 1.0
 
 
-def test_a_restart_forgets_one_track_and_touches_no_other() -> None:
+def test_restart_clears_one_track_and_no_other() -> None:
     buffer, track = every_joint()
     buffer.insert_joints(track, 100 * S, pose_of_every(track, bend=1.0))
     buffer.insert(moving("map", "root", 100 * S, x=1.0))
@@ -103,7 +103,7 @@ def test_a_restart_forgets_one_track_and_touches_no_other() -> None:
 
 
 @pytest.mark.parametrize("stamp", [0, -5, -(2**63), 2**63 - 1])
-def test_no_stamp_is_magic(stamp: int) -> None:
+def test_no_stamp_has_a_special_meaning(stamp: int) -> None:
     buffer = filled(moving("a", "b", stamp, x=2.0))
     answer = buffer.lookup("a", "b", stamp)
     assert (answer.stamp, answer.kind, x_of(answer)) == (stamp, "exact", 2.0)
@@ -112,7 +112,7 @@ def test_no_stamp_is_magic(stamp: int) -> None:
     assert isinstance(failure(buffer, "a", "b", other), InFuture if stamp < 0 else InPast)
 
 
-def test_the_whole_range_of_stamps_does_not_overflow() -> None:
+def test_full_range_of_stamps_does_not_overflow() -> None:
     buffer = filled(moving("a", "b", -(2**63)), moving("a", "b", 2**63 - 1, x=1.0))
     assert buffer.frames()[1].count == 1
     assert not buffer.insert(moving("a", "b", -(2**63)))
@@ -120,7 +120,7 @@ def test_the_whole_range_of_stamps_does_not_overflow() -> None:
 
 
 @pytest.mark.parametrize("stamp", [1.5, np.float64(1e9), "1", True])
-def test_a_stamp_that_is_no_integer_is_refused_by_every_call(stamp) -> None:
+def test_non_integer_stamp_is_refused_by_every_call(stamp) -> None:
     buffer, track = every_joint()
     calls = (
         lambda: buffer.insert_joints(track, stamp, pose_of_every(track)),
@@ -137,7 +137,7 @@ def test_a_stamp_that_is_no_integer_is_refused_by_every_call(stamp) -> None:
             call()
 
 
-def test_a_moving_edge_needs_a_stamp() -> None:
+def test_moving_edge_needs_a_stamp() -> None:
     with pytest.raises(InsertRefused, match="insert_static") as caught:
         TransformBuffer().insert(static("a", "b"))
     assert (caught.value.reason, caught.value.edge) == ("no stamp", ("a", "b"))
@@ -161,14 +161,14 @@ def test_insert_many_refuses_a_quaternion_far_from_unit_length(norm: float) -> N
         TransformBuffer().insert_many([("a", "b")], 0, [(0, 0, 0, 0, 0, 0, norm)])
 
 
-def test_a_quaternion_within_a_thousandth_is_normalised() -> None:
+def test_quaternion_within_a_thousandth_is_normalised() -> None:
     buffer = TransformBuffer()
     buffer.insert_many([("a", "b")], 0, [(0, 0, 0, 0, 0.6 * 1.0009, 0, 0.8 * 1.0009)])
     np.testing.assert_allclose(buffer.lookup("a", "b").rotation, (0, 0.6, 0, 0.8), atol=1e-15)
 
 
 @pytest.mark.parametrize("poses", [[], [(0, 0, 0, *TURN)], [(0, 0, 0)] * 2, 1.0])
-def test_insert_many_wants_one_row_for_each_edge(poses) -> None:
+def test_insert_many_needs_one_row_for_each_edge(poses) -> None:
     with pytest.raises(InvalidInput, match=r"\(2, 7\)"):
         TransformBuffer().insert_many([("a", "b"), ("a", "c")], 0, poses)
 
@@ -196,7 +196,7 @@ def test_edges_of_one_call_are_checked_against_each_other_for_loops() -> None:
     assert isinstance(failure(buffer, "a", "b"), UnknownFrame)
 
 
-def test_an_edge_is_one_history_whichever_insert_feeds_it() -> None:
+def test_edge_has_one_history_whichever_insert_writes_it() -> None:
     buffer = TransformBuffer()
     both = [("a", "b"), ("b", "c")]
     buffer.insert_many(both, 0, [(0, 0, 0, *TURN), (100, 0, 0, *TURN)])
@@ -211,7 +211,7 @@ def test_an_edge_is_one_history_whichever_insert_feeds_it() -> None:
     assert x_of(buffer.lookup("b", "c")) == 200.0
 
 
-def test_the_same_edges_in_another_order_are_the_same_edges() -> None:
+def test_same_edges_in_another_order_are_the_same_edges() -> None:
     buffer = TransformBuffer()
     buffer.insert_many([("a", "b"), ("a", "c")], 0, [(1, 0, 0, *TURN), (2, 0, 0, *TURN)])
     buffer.insert_many([("a", "c"), ("a", "b")], S, [(4, 0, 0, *TURN), (3, 0, 0, *TURN)])
@@ -219,7 +219,7 @@ def test_the_same_edges_in_another_order_are_the_same_edges() -> None:
     assert x_of(buffer.lookup("a", "c", S // 2)) == 3.0
 
 
-def test_a_static_edge_in_the_place_of_a_moving_one_takes_its_history_away() -> None:
+def test_static_edge_that_replaces_a_moving_one_drops_its_history() -> None:
     buffer = filled(moving("a", "b", 0), moving("a", "b", S, x=1.0), static("a", "b", x=7.0))
     assert x_of(buffer.lookup("a", "b", 0)) == 7.0
     assert buffer.lookup("a", "b", 0).kind == "static"
@@ -228,7 +228,7 @@ def test_a_static_edge_in_the_place_of_a_moving_one_takes_its_history_away() -> 
     assert x_of(buffer.lookup("a", "b")) == 2.0
 
 
-def test_a_static_edge_leaves_the_edges_that_were_fed_beside_it_alone() -> None:
+def test_static_edge_keeps_edges_that_were_inserted_together_with_it() -> None:
     buffer = TransformBuffer()
     buffer.insert_many([("a", "b"), ("a", "c")], 0, [(1, 0, 0, *TURN), (2, 0, 0, *TURN)])
     buffer.insert_static(static("a", "b", x=7.0))
@@ -238,19 +238,19 @@ def test_a_static_edge_leaves_the_edges_that_were_fed_beside_it_alone() -> None:
     assert isinstance(failure(buffer, "a", "b", 0), InPast)
 
 
-def test_a_static_edge_is_replaced_by_a_later_one_whatever_its_stamp() -> None:
+def test_static_edge_is_replaced_by_a_later_one_regardless_of_stamps() -> None:
     buffer = filled(static("a", "b", x=1.0))
     buffer.insert_static(moving("a", "b", -5, x=2.0))
     assert x_of(buffer.lookup("a", "b", NOW)) == 2.0
 
 
-def test_the_history_given_must_be_a_positive_number_of_seconds() -> None:
+def test_history_s_must_be_a_positive_number() -> None:
     for history_s in (0.0, -1.0, math.nan, math.inf, "10", None, 1j):
         with pytest.raises(InvalidInput, match="history_s"):
             TransformBuffer(history_s)
 
 
-def test_a_caller_who_reuses_an_array_changes_no_history() -> None:
+def test_reused_array_of_the_caller_changes_no_history() -> None:
     buffer, track = every_joint()
     positions, poses = pose_of_every(track, bend=0.5), np.array([(1.0, 0, 0, *TURN)])
     buffer.insert_joints(track, 0, positions)
@@ -260,14 +260,14 @@ def test_a_caller_who_reuses_an_array_changes_no_history() -> None:
     assert x_of(buffer.lookup("m", "root")) == 1.0
 
 
-def test_the_writer_named_is_the_last_who_wrote() -> None:
+def test_edge_names_its_last_writer() -> None:
     buffer = TransformBuffer()
     for n, writer in enumerate(("first", "second", None)):
         buffer.insert(moving("a", "b", n), writer=writer)
     assert buffer.frames()[1].writer == "second"
 
 
-def test_a_robot_without_moving_joints_answers_without_a_sample() -> None:
+def test_robot_without_moving_joints_needs_no_sample() -> None:
     text = EVERY_JOINT.split("<joint name=")[0].split("<link")[0] + '<link name="only"/></robot>'
     buffer = TransformBuffer()
     track = buffer.add_robot(load_model(text))
@@ -275,7 +275,7 @@ def test_a_robot_without_moving_joints_answers_without_a_sample() -> None:
     np.testing.assert_array_equal(buffer.lookup("only", "only").matrix, np.eye(4))
 
 
-def test_at_exactly_half_a_turn_the_quaternion_is_taken_as_given() -> None:
+def test_quaternion_at_exactly_half_a_turn_is_used_as_given() -> None:
     for sign in (1.0, -1.0):
         end = Transform("a", "b", (0, 0, 0), (0, 0, sign, 0), S)
         buffer = filled(moving("a", "b", 0), end)
@@ -283,7 +283,7 @@ def test_at_exactly_half_a_turn_the_quaternion_is_taken_as_given() -> None:
         assert yaw == pytest.approx(sign * math.pi / 2)
 
 
-def test_of_many_frames_only_those_asked_for_are_told_of():
+def test_frames_of_selected_names_lists_only_those():
     buffer = TransformBuffer()
     for child in ("a", "b", "c"):
         buffer.insert_static(Transform.from_pose7("world", child, (0, 0, 0, 0, 0, 0, 1)))

@@ -66,7 +66,7 @@ def test_histories_keep_the_same_samples(column, order, width: int, shuffled: bo
 
 
 @given(st.lists(st.integers(0, 400), min_size=1, max_size=80, unique=True), st.lists(st.integers(-5, 405)))
-def test_any_spacing_of_stamps_is_searched_right(column: list[int], asked: list[int]) -> None:
+def test_search_is_correct_for_any_spacing_of_stamps(column: list[int], asked: list[int]) -> None:
     buffer = filled(*(moving("a", "b", NOW + n * n, x=float(n)) for n in sorted(column)), history_s=1e6)
     paths = both_paths(buffer, "a", "b")
     for stamp in [NOW + n for n in (*asked, *(n * n for n in asked))]:
@@ -162,7 +162,7 @@ def test_paths_over_every_type_of_joint_agree(samples, target: str, source: str,
 
 
 @given(positions, st.sampled_from(["spin", "bend", "raise"]))
-def test_where_the_arithmetic_is_the_same_every_bit_is(numbers, joint: str) -> None:
+def test_results_are_bit_identical_where_the_arithmetic_is_the_same(numbers, joint: str) -> None:
     """A single joint's own edge: nothing is multiplied out beforehand."""
     buffer, track = a_robot([numbers, numbers[::-1]])
     of = {one.name: one for one in track.model.joints}[joint]
@@ -178,13 +178,13 @@ def test_small_and_large_turns_agree(spread: float) -> None:
         assert_agree(*both_paths(buffer, "a", "b"), stamp)
 
 
-def test_hermite_paths_stay_with_the_reference() -> None:
+def test_hermite_paths_use_the_reference() -> None:
     buffer, track = every_joint("hermite")
     buffer.insert_joints(track, NOW, [*(0.0,) * 6, 1.0, *(0.0,) * 6], np.zeros(12))
     assert type(buffer.path("root", "tip")) is TransformPath
 
 
-def test_unusual_input_is_left_to_the_reference() -> None:
+def test_unusual_input_falls_back_to_the_reference() -> None:
     """What the extension cannot take at once it says so of, and the reference speaks."""
     history = History(3, SPAN_NS)
     row = np.zeros(3)
@@ -212,7 +212,7 @@ def test_unusual_input_is_left_to_the_reference() -> None:
     assert len(history.view.kept_rows()) == 2
 
 
-def test_a_block_is_made_of_plain_numbers_at_once_and_of_nothing_else() -> None:
+def test_block_of_accepts_plain_numbers_and_nothing_else() -> None:
     row = np.array([0.5, -1.0, 3.0])
     for numbers in (row, memoryview(row), array("d", row)):
         assert block_of(numbers, 3) == to_block(row)
@@ -228,7 +228,7 @@ def test_a_block_is_made_of_plain_numbers_at_once_and_of_nothing_else() -> None:
         assert block_of(numbers, 3) is None
 
 
-def test_views_cannot_be_written_to_and_outlive_their_history() -> None:
+def test_views_are_read_only_and_outlive_their_history() -> None:
     history = History(1, 10**9)
     history.insert(1, np.array([5.0]))
     view = history.view
@@ -241,7 +241,7 @@ def test_views_cannot_be_written_to_and_outlive_their_history() -> None:
     assert view.kept_rows().tolist() == [[5.0]]
 
 
-def test_one_instant_of_several_histories_is_all_or_nothing() -> None:
+def test_instant_of_several_histories_is_inserted_entirely_or_not_at_all() -> None:
     pair = History(1, SPAN_NS), History(2, SPAN_NS)
     insert_together(pair, 5, (np.ones(1), np.ones(2)))
     with pytest.raises(ValueError, match="as wide as its history"):
@@ -251,7 +251,7 @@ def test_one_instant_of_several_histories_is_all_or_nothing() -> None:
     assert [kept(history)[0] for history in pair] == [[5], [5]]
 
 
-def test_batches_run_beside_inserts_that_move_the_memory_they_read() -> None:
+def test_batch_lookups_survive_concurrent_inserts_that_reallocate() -> None:
     """A batch has no lock and no GIL: rows it reads must stay as they were, to the last."""
     buffer = TransformBuffer(history_s=0.01)
     written, stop = threading.Event(), threading.Event()

@@ -11,7 +11,7 @@ from zstate.errors import RecordingError
 from zstate.recording.info import read_info
 
 
-def test_a_recordings_facts_are_those_of_its_writer(tmp_path: Path):
+def test_info_has_the_facts_of_the_writer(tmp_path: Path):
     path = tmp_path / "run.mcap"
     write_run(path, joint_states(101))
     info = read_info(path)
@@ -27,7 +27,7 @@ def test_a_recordings_facts_are_those_of_its_writer(tmp_path: Path):
     assert (info.complete, info.losses) == (True, ())
 
 
-def test_all_files_of_a_split_recording_count(tmp_path: Path):
+def test_info_covers_all_files_of_a_split_recording(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
     info = read_info(tmp_path / "run.mcap")
     assert [file.name for file in info.files] == ["run.mcap", "run_1.mcap", "run_2.mcap"]
@@ -36,7 +36,7 @@ def test_all_files_of_a_split_recording_count(tmp_path: Path):
     assert info.duration_s == 4.99
 
 
-def test_a_cut_recording_says_so(tmp_path: Path):
+def test_info_of_a_truncated_recording_is_incomplete(tmp_path: Path):
     path = tmp_path / "run.mcap"
     write_run(path, joint_states(100))
     path.write_bytes(path.read_bytes()[:5000])
@@ -47,6 +47,6 @@ def test_a_cut_recording_says_so(tmp_path: Path):
     assert "cut off" in loss
 
 
-def test_what_is_no_recording_is_refused(tmp_path: Path):
+def test_file_that_is_no_recording_is_refused(tmp_path: Path):
     with pytest.raises(RecordingError):
         read_info(tmp_path / "nothing.mcap")

@@ -171,7 +171,7 @@ class Crowd:
             raise self.wrong[0]
 
 
-def test_readers_and_writers_at_full_speed_get_right_answers_or_the_right_errors() -> None:
+def test_readers_and_writers_at_full_speed_get_correct_transforms_or_errors() -> None:
     buffer, track = every_joint()
     write_pairs(buffer, 0)
     buffer.insert(moving("hall", "cart", NOW))
@@ -207,7 +207,7 @@ def test_readers_and_writers_at_full_speed_get_right_answers_or_the_right_errors
         assert answers[read.__name__] > 10, f"{read.__name__} hardly ever got an answer: {answers}"
 
 
-def test_an_instant_of_two_tracks_is_seen_whole_or_not_at_all() -> None:
+def test_instant_of_two_tracks_is_read_entirely_or_not_at_all() -> None:
     buffer = TransformBuffer()
     edges = [("hall", "left"), ("left", "right")]
     for edge in edges:
@@ -228,7 +228,7 @@ def test_an_instant_of_two_tracks_is_seen_whole_or_not_at_all() -> None:
     crowd.finish(SECONDS / 4)
 
 
-def test_a_lookup_waits_for_nobody_who_holds_the_writers_lock() -> None:
+def test_lookup_does_not_wait_for_the_lock_of_a_writer() -> None:
     buffer = TransformBuffer()
     buffer.insert(moving("a", "b", NOW))
     buffer.lookup("a", "b")
@@ -271,7 +271,7 @@ def test_every_wait_of_many_threads_is_woken() -> None:
     assert time.monotonic() - begin < 10.0
 
 
-def test_a_sample_that_comes_while_one_who_waits_leaves_wakes_the_others() -> None:
+def test_sample_during_unregistration_of_a_waiter_wakes_the_others() -> None:
     buffer = TransformBuffer()
     buffer.insert(moving("a", "b", NOW))
     heard: list[int | None] = []

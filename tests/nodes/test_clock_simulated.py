@@ -61,7 +61,7 @@ def telling(publisher: ClockPublisher, clock: SimulatedClock) -> Callable[[int],
         ("ros2dds", "clock"),
     ],
 )
-def test_now_is_the_newest_time_that_was_told(sessions, wire, key):
+def test_now_is_the_newest_received_time(sessions, wire, key):
     writer, reader = sessions
     with ClockPublisher(writer, (wire,)) as publisher, SimulatedClock(reader, wire) as clock:
         await_reader(writer, key)
@@ -72,7 +72,7 @@ def test_now_is_the_newest_time_that_was_told(sessions, wire, key):
         assert clock.domain == "sim"
 
 
-def test_who_tells_no_time_is_waited_for_as_long_as_was_said(sessions):
+def test_missing_time_raises_no_clock_after_the_timeout(sessions):
     with (
         SimulatedClock(sessions[1], timeout_s=0.05) as clock,
         pytest.raises(NoClock, match=r"no time was received on 'zstate/clock' for 0\.05 s") as caught,
@@ -82,7 +82,7 @@ def test_who_tells_no_time_is_waited_for_as_long_as_was_said(sessions):
     assert caught.value.waited_s == 0.05
 
 
-def test_the_first_time_ends_the_wait_for_it(sessions):
+def test_first_time_ends_the_wait(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
@@ -90,7 +90,7 @@ def test_the_first_time_ends_the_wait_for_it(sessions):
         assert clock.now() == 7
 
 
-def test_a_wait_ends_when_its_instant_comes_and_not_while_time_stands_still(sessions):
+def test_wait_ends_when_its_instant_is_reached_and_not_while_time_stands_still(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
@@ -108,7 +108,7 @@ def test_a_wait_ends_when_its_instant_comes_and_not_while_time_stands_still(sess
         assert clock.wait_until(5, threading.Event())
 
 
-def test_a_wait_ends_at_once_when_it_is_stopped_or_the_clock_closed(sessions):
+def test_wait_ends_at_once_when_stopped_or_the_clock_is_closed(sessions):
     with SimulatedClock(sessions[1]) as clock:
         stopped, left = Waiting(clock, SECOND), Waiting(clock, SECOND)
         stopped.stop.set()
@@ -123,7 +123,7 @@ def test_a_wait_ends_at_once_when_it_is_stopped_or_the_clock_closed(sessions):
         clock.now()
 
 
-def test_a_jump_back_ends_waits_and_is_told_once(sessions, caplog):
+def test_jump_back_ends_waits_and_is_logged_once(sessions, caplog):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
@@ -143,7 +143,7 @@ def test_a_jump_back_ends_waits_and_is_told_once(sessions, caplog):
     assert "'zstate/clock' went back by 89.9 s" in caplog.text or "by 90.0 s" in caplog.text
 
 
-def test_of_two_who_tell_the_time_the_newer_is_followed(sessions):
+def test_newer_of_two_clock_publishers_is_followed(sessions):
     writer, reader = sessions
     with (
         ClockPublisher(writer) as first,
@@ -159,7 +159,7 @@ def test_of_two_who_tell_the_time_the_newer_is_followed(sessions):
         assert clock.now() == 50 * SECOND
 
 
-def test_what_is_no_time_is_counted_and_changes_nothing(sessions):
+def test_invalid_clock_message_is_counted_and_changes_nothing(sessions):
     writer, reader = sessions
     with (
         ClockPublisher(writer) as publisher,
@@ -174,7 +174,7 @@ def test_what_is_no_time_is_counted_and_changes_nothing(sessions):
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 10.0])
-def test_a_rate_has_its_number_of_ticks_in_a_simulated_second_at_any_speed(sessions, speed):
+def test_rate_has_its_number_of_ticks_per_simulated_second_at_any_speed(sessions, speed):
     """The time is told a hundred times a real second, so one step is ``speed`` times 10 ms."""
     writer, reader = sessions
     step, start, seconds, rate_hz = round(speed * 10 * MS), 5 * SECOND, 2, 250.0
@@ -196,7 +196,7 @@ def test_a_rate_has_its_number_of_ticks_in_a_simulated_second_at_any_speed(sessi
     assert rate.report().rate_hz == pytest.approx(rate_hz, rel=1e-9)
 
 
-def test_a_rate_follows_a_time_that_goes_back_while_it_waits(sessions):
+def test_rate_follows_a_time_that_goes_back_during_a_wait(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
@@ -215,7 +215,7 @@ def test_a_rate_follows_a_time_that_goes_back_while_it_waits(sessions):
     assert ticks == [100 * SECOND, *(40 * SECOND + n * 100 * MS for n in range(4))]
 
 
-def test_a_jump_ahead_does_not_become_a_burst(sessions):
+def test_jump_ahead_causes_no_burst(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
@@ -232,7 +232,7 @@ def test_a_jump_ahead_does_not_become_a_burst(sessions):
     assert rate.report().skipped == 600 - 2
 
 
-def test_a_publisher_and_a_listener_on_simulated_time_agree(sessions):
+def test_publisher_and_a_listener_on_simulated_time_agree(sessions):
     writer, reader = sessions
     with (
         ClockPublisher(writer) as publisher,

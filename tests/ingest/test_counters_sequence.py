@@ -3,19 +3,19 @@ from __future__ import annotations
 from zstate.ingest.counters import Counters, GapCounter, MissingSamples
 
 
-def test_of_a_new_session_everything_is_missing():
+def test_every_sample_of_a_new_session_is_missing():
     missing = MissingSamples()
     assert missing
     assert all(seq in missing for seq in (0, 1, 10**12))
 
 
-def test_what_was_heard_live_is_not_missing_and_what_was_before_is():
+def test_samples_before_the_first_live_one_are_missing():
     missing = MissingSamples()
     missing.stop_at(5)
     assert [seq for seq in range(10) if seq in missing] == [0, 1, 2, 3, 4]
 
 
-def test_a_gap_is_missing_until_what_comes_after_it_was_learned():
+def test_gap_is_missing_until_later_samples_are_inserted():
     missing = MissingSamples()
     missing.stop_at(2)
     missing.add(7, 9)
@@ -26,14 +26,14 @@ def test_a_gap_is_missing_until_what_comes_after_it_was_learned():
     assert [seq for seq in range(12) if seq in missing] == [0, 1]
 
 
-def test_nothing_is_missing_once_the_first_sample_of_all_was_learned():
+def test_nothing_is_missing_after_the_first_sample_of_all():
     missing = MissingSamples()
     missing.stop_at(0)
     assert not missing
     assert 0 not in missing
 
 
-def test_of_many_gaps_the_newest_are_remembered():
+def test_newest_of_many_gaps_are_kept():
     missing = MissingSamples()
     missing.stop_at(0)
     for first in range(0, 1000, 10):
@@ -47,21 +47,21 @@ def counted(counters: Counters) -> tuple[int, int]:
     return stats.missed, stats.dropped
 
 
-def test_what_is_missing_between_the_samples_of_each_writer_is_counted():
+def test_gaps_between_the_samples_of_each_writer_are_counted():
     gap_counter = GapCounter(counters := Counters())
     for writer, seq in (("a", 5), ("b", 100), ("a", 6), ("b", 101), ("a", 9)):
         gap_counter.add(writer, seq)
     assert counted(counters) == (2, 0)
 
 
-def test_the_first_sample_and_one_that_comes_late_or_twice_is_no_gap():
+def test_first_late_and_repeated_samples_are_no_gap():
     gap_counter = GapCounter(counters := Counters())
     for seq in (5, 6, 6, 4, 7):
         gap_counter.add("a", seq)
     assert counted(counters) == (0, 0)
 
 
-def test_gaps_of_a_batch_that_overflowed_and_the_next_of_writers_that_are_not_in_it_are_our_own():
+def test_gaps_of_an_overflowed_batch_count_as_dropped_for_all_writers():
     gap_counter = GapCounter(counters := Counters())
     for writer in ("a", "b", "c"):
         gap_counter.add(writer, 0)

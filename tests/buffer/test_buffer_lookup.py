@@ -17,7 +17,7 @@ from zstate.errors import Disconnected, InFuture, InPast, InvalidInput, NoData, 
 from zstate.transform import Transform
 
 
-def test_a_lookup_is_the_pose_of_the_source_in_the_target() -> None:
+def test_lookup_returns_pose_of_source_in_target() -> None:
     buffer = filled(moving("map", "robot", NOW, x=2.0, yaw=math.pi / 2), static("robot", "lidar", x=1.0))
     map_from_lidar = buffer.lookup("map", "lidar", NOW)
     np.testing.assert_allclose(map_from_lidar.translation, (2, 1, 0), atol=1e-15)
@@ -25,14 +25,14 @@ def test_a_lookup_is_the_pose_of_the_source_in_the_target() -> None:
     np.testing.assert_allclose(buffer.lookup("lidar", "map", NOW).translation, (-1, 2, 0), atol=1e-15)
 
 
-def test_the_ratio_is_exact_to_the_nanosecond() -> None:
+def test_interpolation_ratio_is_exact_to_the_nanosecond() -> None:
     # Over 4 s a nanosecond is 2.5e-10 of the way; float seconds would round it by 238 ns.
     buffer = filled(moving("a", "b", NOW), moving("a", "b", NOW + 4 * S, x=4.0))
     assert x_of(buffer.lookup("a", "b", NOW + 1)) == pytest.approx(1e-9, rel=1e-12)
     assert x_of(buffer.lookup("a", "b", NOW + 3)) == pytest.approx(3e-9, rel=1e-12)
 
 
-def test_pose_edges_go_the_short_way_at_a_constant_rate() -> None:
+def test_pose_edges_rotate_the_short_way_at_a_constant_rate() -> None:
     buffer = filled(moving("a", "b", 0, x=1.0, yaw=3.0), moving("a", "b", 4 * S, x=3.0, yaw=-3.0))
     answer = buffer.lookup("a", "b", S)
     short_way = 2 * math.pi - 6.0
@@ -40,7 +40,7 @@ def test_pose_edges_go_the_short_way_at_a_constant_rate() -> None:
     assert x_of(answer) == 1.5
 
 
-def test_the_latest_instant_is_what_every_moving_edge_knows() -> None:
+def test_latest_is_the_newest_instant_that_every_moving_edge_has() -> None:
     buffer = filled(
         moving("a", "b", 0), moving("a", "b", 4 * S, x=4.0), moving("b", "c", 0), moving("b", "c", S, x=10.0),
         static("c", "d"),
@@ -52,7 +52,7 @@ def test_the_latest_instant_is_what_every_moving_edge_knows() -> None:
     assert buffer.latest("d", "a") == S
 
 
-def test_a_stale_edge_above_the_meeting_point_blocks_no_answer_below() -> None:
+def test_stale_edge_above_the_common_ancestor_does_not_block_lookups_below() -> None:
     buffer = filled(
         moving("map", "odom", 0), moving("odom", "base", 50 * S), moving("odom", "hand", 50 * S, x=1.0)
     )
@@ -60,7 +60,7 @@ def test_a_stale_edge_above_the_meeting_point_blocks_no_answer_below() -> None:
     assert buffer.latest("base", "hand") == 50 * S
 
 
-def test_each_answer_says_how_it_was_made() -> None:
+def test_transform_kind_states_how_it_was_computed() -> None:
     buffer = filled(moving("a", "b", 0), moving("a", "b", 2 * S), static("b", "c"))
     assert buffer.lookup("b", "c", S).kind == "static"
     assert buffer.lookup("a", "c", 0).kind == "exact"
@@ -68,7 +68,7 @@ def test_each_answer_says_how_it_was_made() -> None:
     assert buffer.lookup("a", "c", 3 * S, predict_s=1.0).kind == "predicted"
 
 
-def test_interpolated_goes_before_exact_and_predicted_before_both() -> None:
+def test_kind_interpolated_outranks_exact_and_predicted_outranks_both() -> None:
     buffer = filled(
         *(moving("a", "b", n * 2 * S) for n in range(2)), *(moving("b", "c", n * S) for n in range(4))
     )
@@ -79,7 +79,7 @@ def test_interpolated_goes_before_exact_and_predicted_before_both() -> None:
     assert buffer.lookup("c", "a", 3 * S, predict_s=1.0).kind == "predicted"
 
 
-def test_static_paths_hold_at_any_time_and_have_no_newest_instant() -> None:
+def test_static_paths_are_valid_at_any_time_and_have_no_newest_instant() -> None:
     buffer = filled(static("a", "b"), static("b", "c"))
     assert buffer.lookup("a", "c").stamp is None
     for stamp in (0, -5, NOW):
@@ -89,7 +89,7 @@ def test_static_paths_hold_at_any_time_and_have_no_newest_instant() -> None:
         buffer.latest("a", "c")
 
 
-def test_a_known_frame_in_itself_is_the_identity_at_any_time() -> None:
+def test_known_frame_in_itself_is_the_identity_at_any_time() -> None:
     buffer = filled(moving("a", "b", 0))
     for frame in "ab":
         for stamp in (None, -NOW, NOW):
@@ -99,7 +99,7 @@ def test_a_known_frame_in_itself_is_the_identity_at_any_time() -> None:
     assert isinstance(failure(buffer, "x", "x", 0), UnknownFrame)
 
 
-def test_beyond_the_newest_sample_is_in_the_future_and_says_everything() -> None:
+def test_lookup_after_newest_sample_raises_in_future_with_all_facts() -> None:
     buffer = TransformBuffer()
     for n in range(5):
         buffer.insert(moving("a", "b", n * S), writer="odom")
@@ -111,21 +111,21 @@ def test_beyond_the_newest_sample_is_in_the_future_and_says_everything() -> None
     assert (error.target, error.source) == ("c", "a")
 
 
-def test_before_the_oldest_sample_is_in_the_past_and_says_everything() -> None:
+def test_lookup_before_oldest_sample_raises_in_past_with_all_facts() -> None:
     buffer = filled(*(moving("a", "b", n * S) for n in range(5)))
     error = failure(buffer, "a", "b", -1)
     assert type(error) is InPast
     assert (error.edge, error.requested, error.oldest, error.newest) == (("a", "b"), -1, 0, 4 * S)
 
 
-def test_one_sample_asked_elsewhere_is_in_the_future_or_the_past() -> None:
+def test_single_sample_raises_in_future_or_in_past_at_other_stamps() -> None:
     buffer = filled(moving("a", "b", S))
     assert type(failure(buffer, "a", "b", S + 1)) is InFuture
     assert type(failure(buffer, "a", "b", S - 1)) is InPast
     assert failure(buffer, "a", "b", S - 1).rate_hz is None
 
 
-def test_in_future_blames_the_edge_with_the_oldest_news_and_in_past_the_one_with_the_youngest_start() -> None:
+def test_in_future_names_the_edge_with_the_oldest_end_and_in_past_the_one_with_the_latest_start() -> None:
     spans = {("a", "b"): (2, 9), ("b", "c"): (4, 8), ("c", "d"): (3, 7)}
     buffer = filled(*(moving(*edge, n * S) for edge, span in spans.items() for n in span))
     for target, source in (("a", "d"), ("d", "a")):
@@ -134,7 +134,7 @@ def test_in_future_blames_the_edge_with_the_oldest_news_and_in_past_the_one_with
         assert (type(past), past.edge) == (InPast, ("b", "c"))
 
 
-def test_where_past_and_future_both_hold_the_past_is_blamed() -> None:
+def test_in_past_takes_precedence_over_in_future() -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 20 * S))
     error = failure(buffer, "a", "c", 10 * S)
     assert (type(error), error.edge) == (InPast, ("b", "c"))
@@ -151,7 +151,7 @@ def silent() -> TransformBuffer:
 
 
 @pytest.mark.parametrize(("target", "source"), [("odom", "arm"), ("arm", "odom")])
-def test_of_an_edge_silent_for_longer_than_the_history_the_silent_one_is_blamed(target, source) -> None:
+def test_edge_silent_for_longer_than_the_history_is_named(target, source) -> None:
     buffer = silent()
     calls = (
         lambda: buffer.lookup(target, source),
@@ -177,19 +177,19 @@ def test_of_an_edge_silent_for_longer_than_the_history_the_silent_one_is_blamed(
     assert type(failure(buffer, target, source)) is Stale
 
 
-def test_an_edge_whose_last_sample_the_others_still_know_is_answered_there() -> None:
+def test_last_sample_of_an_edge_is_used_while_other_edges_cover_it() -> None:
     buffer = filled(moving("a", "b", 0), *(moving("b", "c", n * S) for n in range(11)))
     assert buffer.lookup("a", "c").stamp == buffer.latest("a", "c") == 0
 
 
-def test_edges_of_two_times_have_no_instant_in_common_and_the_reason_says_so() -> None:
+def test_edges_without_a_common_instant_raise_with_that_reason() -> None:
     buffer = filled(moving("a", "b", NOW // 1_000_000), moving("b", "c", NOW))
     reason = failure(buffer, "a", "c")
     assert (type(reason), reason.edge) == (Stale, ("a", "b"))
     assert "their writer gives milliseconds where nanoseconds are meant" in str(reason)
 
 
-def test_a_wait_for_an_edge_that_is_silent_ends_with_its_next_sample() -> None:
+def test_wait_for_a_silent_edge_ends_with_its_next_sample() -> None:
     buffer = silent()
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(buffer.wait, "odom", "arm", timeout_s=20.0)
@@ -207,7 +207,7 @@ def test_no_data_names_the_edge_without_a_sample() -> None:
     assert track.history.view.size == 0
 
 
-def test_explain_tells_the_reason_and_never_raises_it() -> None:
+def test_explain_returns_the_reason_and_never_raises_it() -> None:
     buffer = filled(moving("a", "b", 0), static("x", "y"))
     assert buffer.explain("a", "b") is None
     for target, source, stamp, reason in (
@@ -222,7 +222,7 @@ def test_explain_tells_the_reason_and_never_raises_it() -> None:
         assert type(buffer.explain(target, source, stamp)) is reason
 
 
-def test_looking_between_two_instants_goes_through_the_fixed_frame() -> None:
+def test_lookup_between_two_instants_goes_through_the_fixed_frame() -> None:
     buffer = filled(
         *(moving("map", "robot", n * S, x=10.0 * n) for n in range(3)),
         *(moving("map", "ball", n * S, x=100.0 * n) for n in range(3)),
@@ -238,7 +238,7 @@ def test_looking_between_two_instants_goes_through_the_fixed_frame() -> None:
     )
 
 
-def test_looking_between_takes_the_newest_of_either_side_and_the_targets_stamp() -> None:
+def test_lookup_between_uses_the_newest_instant_of_each_side_and_the_target_stamp() -> None:
     buffer = filled(
         moving("map", "robot", S, x=1.0), moving("map", "ball", 2 * S, x=7.0), static("map", "post", x=3.0)
     )
@@ -251,7 +251,7 @@ def test_looking_between_takes_the_newest_of_either_side_and_the_targets_stamp()
         buffer.lookup_between("robot", S + 1, "ball", None, "map")
 
 
-def test_an_answer_older_than_allowed_is_stale_by_the_buffers_clock() -> None:
+def test_transform_older_than_allowed_is_stale_by_the_clock_of_the_buffer() -> None:
     clock = ManualClock(10 * S)
     buffer = TransformBuffer(clock=clock)
     buffer.insert(moving("a", "b", 9 * S))
@@ -279,7 +279,7 @@ def test_options_are_finite_numbers_of_seconds(option: str, value: float) -> Non
         filled(static("a", "b")).lookup("a", "b", **{option: value})
 
 
-def test_many_instants_at_once_are_nan_where_there_is_no_answer() -> None:
+def test_lookup_many_returns_nan_where_there_is_no_transform() -> None:
     buffer = filled(*(moving("a", "b", n * S, x=n) for n in range(3)), moving("b", "c", S, x=5.0))
     poses, valid = buffer.lookup_many("a", "b", [-1, 0, S // 2, 2 * S, 2 * S + 1])
     assert valid.tolist() == [False, True, True, True, False]
@@ -292,7 +292,7 @@ def test_many_instants_at_once_are_nan_where_there_is_no_answer() -> None:
         filled(static("a", "b"), static("x", "y")).lookup_many("a", "x", [0])
 
 
-def test_many_instants_of_paths_without_moving_edges_or_samples() -> None:
+def test_lookup_many_handles_paths_without_moving_edges_or_samples() -> None:
     buffer, track = every_joint()
     poses, valid = buffer.lookup_many("sled", "tip", [0, NOW])
     assert valid.all()
@@ -303,7 +303,7 @@ def test_many_instants_of_paths_without_moving_edges_or_samples() -> None:
     assert buffer.lookup_many("root", "tip", [])[0].shape == (0, 7)
 
 
-def test_a_plan_follows_the_tree_and_raises_at_the_first_instant_without_an_answer() -> None:
+def test_plan_follows_the_tree_and_raises_at_the_first_instant_without_a_transform() -> None:
     buffer = filled(*(moving("a", "b", n * S, x=n) for n in range(3)))
     plan = buffer.plan("a", "b")
     np.testing.assert_allclose(plan.poses([0, S])[:, 0], (0, 1))
@@ -319,7 +319,7 @@ def test_a_plan_follows_the_tree_and_raises_at_the_first_instant_without_an_answ
         buffer.plan("a", "q")
 
 
-def test_a_plan_writes_into_out_or_leaves_it_alone() -> None:
+def test_plan_writes_into_out_or_leaves_it_unchanged() -> None:
     plan = filled(*(moving("a", "b", n * S, x=n) for n in range(3))).plan("a", "b")
     out = np.full((2, 7), 9.0)
     with pytest.raises(InFuture):
@@ -341,7 +341,7 @@ def test_stamps_are_a_flat_array_of_integers(stamps) -> None:
         buffer.plan("a", "b").poses(stamps)
 
 
-def test_prediction_is_only_on_request_and_never_by_a_plan() -> None:
+def test_prediction_happens_only_on_request_and_never_in_a_plan() -> None:
     buffer = filled(moving("a", "b", 0), moving("a", "b", S, x=1.0))
     assert isinstance(failure(buffer, "a", "b", S + MS), InFuture)
     with pytest.raises(InFuture):
@@ -361,7 +361,7 @@ def huge_moving() -> TransformBuffer:
 
 
 @pytest.mark.parametrize("buffer", [huge_static(), huge_moving()], ids=["static", "moving"])
-def test_a_result_that_is_not_finite_is_raised_and_never_returned(buffer: TransformBuffer) -> None:
+def test_non_finite_result_raises_not_finite(buffer: TransformBuffer) -> None:
     calls = (
         lambda: buffer.lookup("a", "c", S),
         lambda: buffer.lookup("c", "a", S),
@@ -386,7 +386,7 @@ def test_a_result_that_is_not_finite_is_raised_and_never_returned(buffer: Transf
     assert x_of(buffer.lookup("a", "b", S)) == HUGE
 
 
-def test_numbers_whose_sum_overflows_are_answered_while_each_of_them_is_finite() -> None:
+def test_finite_numbers_whose_sum_overflows_give_a_transform() -> None:
     buffer = filled(*(Transform("a", "b", (HUGE, HUGE, -HUGE), (0, 0, 0, 1), n * S) for n in range(2)))
     assert buffer.lookup("a", "b", S // 2).translation.tolist() == [HUGE, HUGE, -HUGE]
     poses, valid = buffer.lookup_many("a", "b", [0, S // 2])
@@ -394,7 +394,7 @@ def test_numbers_whose_sum_overflows_are_answered_while_each_of_them_is_finite()
     assert poses[1, :3].tolist() == [HUGE, HUGE, -HUGE]
 
 
-def test_a_wait_for_a_finite_result_ends_with_a_newer_sample() -> None:
+def test_wait_for_a_finite_result_ends_with_a_newer_sample() -> None:
     buffer = huge_moving()
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(buffer.wait, "a", "c", timeout_s=20.0)
@@ -404,7 +404,7 @@ def test_a_wait_for_a_finite_result_ends_with_a_newer_sample() -> None:
         assert x_of(answer.result(20.0)) == 2.0
 
 
-def test_joints_between_huge_positions_are_not_finite_and_no_error_of_python() -> None:
+def test_joints_between_huge_positions_raise_not_finite_and_no_python_error() -> None:
     buffer, track = every_joint()
     for stamp, sign in ((0, 1.0), (S, -1.0)):
         buffer.insert_joints(track, stamp, pose_of_every(track, bend=sign * HUGE, lift=sign * HUGE))
@@ -426,13 +426,13 @@ def test_joints_between_huge_positions_are_not_finite_and_no_error_of_python() -
 
 
 @pytest.mark.parametrize("seconds", [1e300, 1e10 * 3, math.inf, math.nan, -1.0, "1", None, 1j, 10**400])
-def test_a_length_of_time_that_cannot_be_is_refused(seconds) -> None:
+def test_invalid_duration_is_refused(seconds) -> None:
     buffer = filled(moving("a", "b", 0), moving("a", "b", S, x=1.0))
     with pytest.raises(InvalidInput, match="predict_s"):
         buffer.lookup("a", "b", 2 * S, predict_s=seconds)
 
 
-def test_a_prediction_that_overflows_is_not_finite() -> None:
+def test_prediction_that_overflows_is_not_finite() -> None:
     buffer = filled(moving("a", "b", 0, x=-1e308), moving("a", "b", S, x=1.0))
     with pytest.raises(NotFinite):
         buffer.lookup("a", "b", 2**62, predict_s=1e10)

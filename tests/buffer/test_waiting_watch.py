@@ -15,7 +15,7 @@ def moved(x: float, stamp: int, yaw: float = 0.0) -> Transform:
     return Transform.from_rpy("map", "base", (x, 0, 0), (0, 0, yaw), stamp=stamp)
 
 
-def test_each_new_instant_is_told_once_and_in_order() -> None:
+def test_watch_reports_each_new_instant_once_and_in_order() -> None:
     buffer, seen = TransformBuffer(), list[int | None]()
     with buffer.watch("map", "base", lambda transform: seen.append(transform.stamp)):
         for stamp in (1, 2, 2, 3):
@@ -23,14 +23,14 @@ def test_each_new_instant_is_told_once_and_in_order() -> None:
     assert seen == [1, 2, 3]
 
 
-def test_what_is_there_already_is_told_at_once() -> None:
+def test_watch_reports_an_available_transform_at_once() -> None:
     buffer, seen = TransformBuffer(), list[int | None]()
     buffer.insert(moved(0.0, 7))
     with buffer.watch("map", "base", lambda transform: seen.append(transform.stamp)):
         assert seen == [7]
 
 
-def test_a_late_sample_is_no_news() -> None:
+def test_late_sample_does_not_trigger_a_watch() -> None:
     buffer, seen = TransformBuffer(), list[int | None]()
     buffer.insert(moved(0.0, 7))
     with buffer.watch("map", "base", lambda transform: seen.append(transform.stamp)):
@@ -56,7 +56,7 @@ def test_thresholds_count_from_the_last_call(thresholds: dict[str, float], told:
     assert seen == told
 
 
-def test_frames_may_become_known_later_and_an_edge_may_change_parent() -> None:
+def test_watch_survives_later_frames_and_a_change_of_parent() -> None:
     buffer, seen = TransformBuffer(), list[float]()
     with buffer.watch("map", "camera", lambda transform: seen.append(float(transform.translation[0]))):
         buffer.insert(moved(1.0, 1))
@@ -67,7 +67,7 @@ def test_frames_may_become_known_later_and_an_edge_may_change_parent() -> None:
     assert seen == [1.5, 3.0]
 
 
-def test_a_callback_that_inserts_is_called_again_afterwards_not_within() -> None:
+def test_callback_that_inserts_is_called_again_afterwards_and_not_recursively() -> None:
     buffer, seen = TransformBuffer(), list[int | None]()
 
     def follow(transform: Transform) -> None:
@@ -81,7 +81,7 @@ def test_a_callback_that_inserts_is_called_again_afterwards_not_within() -> None
     assert seen == [1, 2, 3]
 
 
-def test_what_a_callback_raises_does_not_reach_the_writer() -> None:
+def test_exception_of_a_callback_does_not_reach_the_inserting_thread() -> None:
     buffer = TransformBuffer()
     with buffer.watch("map", "base", lambda _: 1 / 0) as watch:
         assert buffer.insert(moved(0.0, 1))
@@ -89,7 +89,7 @@ def test_what_a_callback_raises_does_not_reach_the_writer() -> None:
         assert isinstance(watch.last_failure, ZeroDivisionError)
 
 
-def test_a_closed_watch_is_silent() -> None:
+def test_closed_watch_makes_no_calls() -> None:
     buffer, seen = TransformBuffer(), list[int | None]()
     watch = buffer.watch("map", "base", lambda transform: seen.append(transform.stamp))
     watch.close()
@@ -98,7 +98,7 @@ def test_a_closed_watch_is_silent() -> None:
     assert seen == []
 
 
-def test_writers_on_several_threads_lose_no_last_news() -> None:
+def test_concurrent_inserts_lose_no_final_transform() -> None:
     buffer, seen = TransformBuffer(history_s=100.0), list[int]()
 
     def write(offset: int) -> None:
@@ -116,6 +116,6 @@ def test_writers_on_several_threads_lose_no_last_news() -> None:
 
 
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf])
-def test_a_threshold_is_zero_or_more(value: float) -> None:
+def test_threshold_is_zero_or_more(value: float) -> None:
     with pytest.raises(InvalidInput, match="translation_m"):
         TransformBuffer().watch("a", "b", print, translation_m=value)

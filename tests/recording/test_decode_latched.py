@@ -19,7 +19,7 @@ def described(urdf: str) -> DecodedMessage:
     return DecodedMessage(speaker, RobotDescription(1, urdf, "", (), ()), START)
 
 
-def test_a_repetition_says_nothing_new():
+def test_repeated_value_does_not_change_the_state():
     standing = LatchedState()
     lens = fixed({("tool", "lens"): pose(1.0)})
     assert standing.update(lens) == lens
@@ -29,7 +29,7 @@ def test_a_repetition_says_nothing_new():
     assert standing.statics == (moved,)
 
 
-def test_each_writer_stands_for_itself():
+def test_each_writer_has_its_own_latched_value():
     standing = LatchedState()
     one, other = fixed({("tool", "lens"): pose()}), fixed({("tool", "tip"): pose()}, "tip")
     standing.update(one)
@@ -48,7 +48,7 @@ def test_static_edges_of_a_bag_add_up():
     assert said.message.poses == to_block([pose(3.0), pose(2.0)])
 
 
-def test_another_description_takes_the_place_of_the_first():
+def test_new_description_replaces_the_previous_one():
     standing = LatchedState()
     first, again, second = described(RRBOT.urdf), described(RRBOT.urdf), described("<robot name='x'/>")
     assert standing.update(first) == first
@@ -57,7 +57,7 @@ def test_another_description_takes_the_place_of_the_first():
     assert standing.descriptions == {"arm": second}
 
 
-def test_samples_do_not_stand():
+def test_samples_are_not_latched():
     speaker = RecordedWriter("arm", "joint_states", 1, None, None, foreign=False)
     state = JointState(START, 0, 1, order_digest(()), b"")
     assert LatchedState().update(DecodedMessage(speaker, state, START)) is None

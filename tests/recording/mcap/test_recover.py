@@ -45,7 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[int], lis
     return path.read_bytes(), flushed, [DESCRIPTION, *(payload for _, payload in joint_states(60))]
 
 
-def test_after_any_cut_every_flushed_message_is_saved_and_the_latched_ones_come_first(
+def test_every_flushed_message_survives_any_cut_and_latched_ones_come_first(
     tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]
 ):
     data, flushed, payloads = run
@@ -64,7 +64,7 @@ def test_after_any_cut_every_flushed_message_is_saved_and_the_latched_ones_come_
             assert reader.complete == report.was_complete
 
 
-def test_a_cut_before_the_first_flush_leaves_nothing_or_an_error(
+def test_cut_before_the_first_flush_gives_an_empty_file_or_an_error(
     tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]
 ):
     data, flushed, _ = run
@@ -81,7 +81,7 @@ def test_a_cut_before_the_first_flush_leaves_nothing_or_an_error(
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_the_beginning_of_a_cut_chunk_is_saved_where_its_compression_allows(
+def test_beginning_of_a_cut_chunk_is_saved_if_its_compression_allows(
     tmp_path: Path, compression: CompressionType
 ):
     path = tmp_path / "run.mcap"
@@ -101,7 +101,7 @@ def test_the_beginning_of_a_cut_chunk_is_saved_where_its_compression_allows(
     assert f"but for {len(read)} messages" in str(report.losses[0])
 
 
-def test_a_damaged_chunk_is_left_out_and_named_and_what_follows_is_saved(
+def test_damaged_chunk_is_reported_and_the_rest_is_saved(
     tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]
 ):
     data, flushed, payloads = run
@@ -117,7 +117,7 @@ def test_a_damaged_chunk_is_left_out_and_named_and_what_follows_is_saved(
         assert 0 < report.dropped_bytes < flushed[damaged + 1] - flushed[damaged]
 
 
-def test_zeros_in_the_middle_cost_only_the_chunks_they_cover(
+def test_zeros_in_the_middle_lose_only_the_chunks_they_cover(
     tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]
 ):
     data, flushed, payloads = run
@@ -129,7 +129,7 @@ def test_zeros_in_the_middle_cost_only_the_chunks_they_cover(
     assert not report.was_complete
 
 
-def test_a_false_end_in_the_middle_ends_nothing(tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]):
+def test_false_end_in_the_middle_is_ignored(tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]):
     data, flushed, payloads = run
     for body in (b"", bytes(4)):
         false_end = b"\x0f" + len(body).to_bytes(8, "little") + body
@@ -142,7 +142,7 @@ def test_a_false_end_in_the_middle_ends_nothing(tmp_path: Path, run: tuple[bytes
         assert not report.was_complete
 
 
-def test_without_the_chunk_that_declares_the_channels_the_summary_tells_them(
+def test_summary_replaces_a_lost_channel_declaration(
     tmp_path: Path, run: tuple[bytes, list[int], list[bytes]]
 ):
     data, flushed, payloads = run
@@ -156,7 +156,7 @@ def test_without_the_chunk_that_declares_the_channels_the_summary_tells_them(
         assert any("description is lost" in loss.reason for loss in report.losses) == (saved == 0)
 
 
-def test_everything_else_in_the_file_is_kept(tmp_path: Path):
+def test_metadata_and_attachments_are_kept(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -187,7 +187,7 @@ def test_everything_else_in_the_file_is_kept(tmp_path: Path):
     assert (metadata.name, metadata.metadata) == ("run", {"operator": "Eva"})
 
 
-def test_recovered_splits_are_one_recording_still(tmp_path: Path):
+def test_recovered_splits_remain_one_recording(tmp_path: Path):
     (tmp_path / "saved").mkdir()
     write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
     for file in list(tmp_path.glob("*.mcap")):
@@ -199,7 +199,7 @@ def test_recovered_splits_are_one_recording_still(tmp_path: Path):
         assert len(list(reader.records(["/joint_states"]))) == 500
 
 
-def test_the_report_counts_by_topic_and_says_the_span(tmp_path: Path):
+def test_report_has_counts_by_topic_and_the_span(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(101))
     report = recover(tmp_path / "run.mcap", tmp_path / "saved.mcap")
     assert report.messages == {"/robot_description": 1, "/joint_states": 101}
@@ -207,7 +207,7 @@ def test_the_report_counts_by_topic_and_says_the_span(tmp_path: Path):
     assert (report.was_complete, report.losses, report.dropped_bytes) == (True, (), 0)
 
 
-def test_the_original_is_never_touched_nor_a_target_that_exists(tmp_path: Path):
+def test_original_and_existing_target_are_never_touched(tmp_path: Path):
     path, target = tmp_path / "run.mcap", tmp_path / "saved.mcap"
     write_run(path, joint_states(10))
     before = path.read_bytes()
@@ -221,7 +221,7 @@ def test_the_original_is_never_touched_nor_a_target_that_exists(tmp_path: Path):
     assert path.read_bytes() == before
 
 
-def test_what_is_no_mcap_file_is_refused_and_no_target_made(tmp_path: Path):
+def test_other_file_is_refused_and_no_target_created(tmp_path: Path):
     (tmp_path / "notes.txt").write_text("hello, this is a note")
     with pytest.raises(RecordingError, match="is not a recording"):
         recover(tmp_path / "notes.txt", tmp_path / "saved.mcap")

@@ -83,7 +83,7 @@ def doors(buffer: TransformBuffer, track: JointTrack, name: Any) -> dict[str, Ca
 
 
 @pytest.mark.parametrize("name", NO_NAMES, ids=repr)
-def test_what_can_be_no_frame_name_is_refused_at_every_door(name) -> None:
+def test_invalid_frame_name_is_refused_by_every_method(name) -> None:
     buffer, track = every_joint()
     buffer.insert_static(static("a", "b"))
     frames = buffer.frames()
@@ -100,7 +100,7 @@ def test_what_can_be_no_frame_name_is_refused_at_every_door(name) -> None:
             buffer.add_robot(track.model, name)
 
 
-def test_edges_that_are_no_pairs_of_names_are_refused() -> None:
+def test_edges_that_are_not_pairs_of_names_are_refused() -> None:
     buffer = TransformBuffer()
     for edges in (["ab", "c"], [("a",)], [("a", "b", "c")], [5], 5):
         with pytest.raises(InvalidInput):
@@ -126,11 +126,11 @@ def test_names_are_checked_before_connections_and_connections_before_times() -> 
         buffer.lookup_between("b", 99 * S, "a", 0, "a")
 
 
-def test_a_frame_cannot_be_placed_on_itself() -> None:
+def test_self_edge_is_refused() -> None:
     assert refusal(TransformBuffer(), "a", "a").reason == "self edge"
 
 
-def test_a_second_parent_is_refused_with_both_writers_named() -> None:
+def test_second_parent_is_refused_with_both_writers_named() -> None:
     buffer = TransformBuffer()
     buffer.insert(moving("a", "c", 0), writer="odom")
     error = refusal(buffer, "b", "c", writer="slam")
@@ -139,7 +139,7 @@ def test_a_second_parent_is_refused_with_both_writers_named() -> None:
         assert part in str(error)
 
 
-def test_a_loop_is_refused_with_its_ring_and_both_writers_named() -> None:
+def test_loop_is_refused_with_its_ring_and_both_writers_named() -> None:
     buffer = TransformBuffer()
     buffer.insert(moving("a", "b", 0), writer="odom")
     buffer.insert(moving("b", "c", 0))
@@ -149,7 +149,7 @@ def test_a_loop_is_refused_with_its_ring_and_both_writers_named() -> None:
         assert part in str(error)
 
 
-def test_a_frame_changes_its_parent_by_withdraw_and_insert() -> None:
+def test_frame_changes_its_parent_by_withdraw_and_insert() -> None:
     buffer = filled(moving("a", "c", 0), static("r", "a"), static("r", "b"))
     buffer.withdraw("c")
     assert isinstance(failure(buffer, "a", "c"), Disconnected)
@@ -157,7 +157,7 @@ def test_a_frame_changes_its_parent_by_withdraw_and_insert() -> None:
     assert x_of(buffer.lookup("r", "c")) == 2.0
 
 
-def test_withdraw_takes_the_history_and_leaves_the_frame_known() -> None:
+def test_withdraw_drops_the_history_and_keeps_the_frame() -> None:
     buffer = filled(moving("a", "b", 0), moving("b", "c", 0, x=3.0))
     buffer.withdraw("b")
     assert [frame.name for frame in buffer.frames()] == ["a", "b", "c"]
@@ -167,7 +167,7 @@ def test_withdraw_takes_the_history_and_leaves_the_frame_known() -> None:
     assert buffer.frames()[1].oldest == S
 
 
-def test_withdraw_leaves_edges_that_were_fed_together_with_it() -> None:
+def test_withdraw_keeps_edges_that_were_inserted_together_with_it() -> None:
     buffer = TransformBuffer()
     turn = (0, 0, 0, 1)
     buffer.insert_many([("a", "b"), ("a", "c")], 0, [(1, 0, 0, *turn), (2, 0, 0, *turn)])
@@ -178,7 +178,7 @@ def test_withdraw_leaves_edges_that_were_fed_together_with_it() -> None:
     assert buffer.frames()[1].count == 1
 
 
-def test_withdraw_of_what_nobody_named_is_an_error_with_near_misses() -> None:
+def test_withdraw_of_an_unknown_frame_lists_near_misses() -> None:
     with pytest.raises(InvalidInput, match="did you mean 'camera'"):
         filled(static("base", "camera")).withdraw("camra")
 
@@ -190,7 +190,7 @@ def test_withdraw_of_a_robots_link_points_to_remove_robot() -> None:
         buffer.withdraw("tool")
 
 
-def test_clear_forgets_samples_and_keeps_frames_statics_and_robots() -> None:
+def test_clear_drops_samples_and_keeps_frames_statics_and_robots() -> None:
     buffer = filled(moving("map", "world", 0), static("tool", "screw", x=1.0))
     track = buffer.add_robot(load_model("rrbot"))
     buffer.insert_joints(track, 0, [0.0, 0.0])
@@ -222,7 +222,7 @@ def test_frames_in_two_trees_are_disconnected_with_both_roots() -> None:
     assert error.roots == ("a", "x")
 
 
-def test_a_connection_that_was_there_is_told_with_who_gave_it() -> None:
+def test_disconnection_of_connected_frames_names_the_removed_edge_and_its_writer() -> None:
     buffer = filled(static("x", "y"))
     buffer.insert_static(static("a", "x"), writer="calibration")
     buffer.withdraw("x")
@@ -238,7 +238,7 @@ def test_a_connection_that_was_there_is_told_with_who_gave_it() -> None:
     assert error.gone_s is None, "its root is 'b' now, which nothing ever placed"
 
 
-def test_a_missing_connection_is_blamed_before_a_bad_time() -> None:
+def test_missing_connection_is_reported_before_a_bad_time() -> None:
     buffer = filled(moving("a", "b", 0), moving("x", "y", 0))
     for stamp in (-S, S):
         assert isinstance(failure(buffer, "b", "y", stamp), Disconnected)
@@ -256,7 +256,7 @@ def two_robots() -> TransformBuffer:
     return buffer
 
 
-def test_a_bare_name_stands_for_the_only_robots_frame() -> None:
+def test_bare_name_means_the_frame_of_the_only_robot() -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(load_model("rrbot"), "r1")
     buffer.insert_joints(track, 0, [0.5, 0.0])
@@ -268,7 +268,7 @@ def test_a_bare_name_stands_for_the_only_robots_frame() -> None:
     assert x_of(buffer.lookup("r1/tool", "screw")) == 1.0
 
 
-def test_a_bare_name_that_two_robots_have_is_an_error_that_lists_both() -> None:
+def test_bare_name_of_two_robots_raises_ambiguous_frame_that_lists_both() -> None:
     buffer = two_robots()
     for target, source in (("tool", "r1/base"), ("r1/base", "tool")):
         error = failure(buffer, target, source)
@@ -278,7 +278,7 @@ def test_a_bare_name_that_two_robots_have_is_an_error_that_lists_both() -> None:
         buffer.insert_static(static("tool", "screw"))
 
 
-def test_an_edge_between_robots_joins_them() -> None:
+def test_edge_between_robots_joins_them() -> None:
     buffer = two_robots()
     assert isinstance(failure(buffer, "r1/base", "r2/base"), Disconnected)
     buffer.insert_static(static("fleet/map", "r1/world", x=1.0))
@@ -286,7 +286,7 @@ def test_an_edge_between_robots_joins_them() -> None:
     assert x_of(buffer.lookup("r1/base", "r2/base")) == 2.0
 
 
-def test_a_full_name_goes_before_a_bare_one() -> None:
+def test_full_name_takes_precedence_over_a_bare_one() -> None:
     buffer = two_robots()
     buffer.insert_static(static("fleet/map", "r1/world", x=1.0))
     buffer.insert_static(static("fleet/map", "pole", x=5.0))
@@ -295,7 +295,7 @@ def test_a_full_name_goes_before_a_bare_one() -> None:
 
 
 @pytest.mark.parametrize("edge", [("base", "upper"), ("lower", "tool")])
-def test_a_robots_own_edges_take_no_second_writer(edge: tuple[str, str]) -> None:
+def test_edges_of_a_model_refuse_a_second_writer(edge: tuple[str, str]) -> None:
     buffer = TransformBuffer()
     buffer.add_robot(load_model("rrbot"))
     error = refusal(buffer, *edge, writer="intruder")
@@ -305,7 +305,7 @@ def test_a_robots_own_edges_take_no_second_writer(edge: tuple[str, str]) -> None
     assert refusal(buffer, "elsewhere", edge[1]).reason == "second parent"
 
 
-def test_a_robot_whose_link_has_a_parent_already_is_refused_whole() -> None:
+def test_robot_with_an_already_placed_link_is_refused_entirely() -> None:
     for edge in (("floor", "tool"), ("base", "upper")):
         buffer = filled(moving(*edge, 0))
         before = buffer.frames()
@@ -325,7 +325,7 @@ def test_one_prefix_is_one_robot_until_it_is_removed() -> None:
     assert buffer.lookup("r1/lower", "r1/tool").kind == "static"
 
 
-def test_a_removed_robot_leaves_its_frames_known_and_its_neighbours_alone() -> None:
+def test_removed_robot_leaves_its_frames_and_its_neighbours_unchanged() -> None:
     buffer = two_robots()
     track = buffer.add_robot(load_model("diffbot"), "r3")
     names = [frame.name for frame in buffer.frames()]
@@ -336,7 +336,7 @@ def test_a_removed_robot_leaves_its_frames_known_and_its_neighbours_alone() -> N
     assert buffer.can_lookup("r1/base", "r1/tool")
 
 
-def test_fixed_joints_answer_before_any_sample() -> None:
+def test_fixed_joints_can_be_looked_up_before_any_sample() -> None:
     buffer = TransformBuffer()
     buffer.add_robot(load_model("rrbot"))
     answer = buffer.lookup("lower", "tool", NOW)
@@ -344,7 +344,7 @@ def test_fixed_joints_answer_before_any_sample() -> None:
     assert isinstance(failure(buffer, "base", "tool"), NoData)
 
 
-def test_frames_are_told_in_order_of_first_mention_with_what_places_them() -> None:
+def test_frames_are_listed_in_order_of_first_mention_with_their_edges() -> None:
     buffer = TransformBuffer()
     buffer.insert_static(static("map", "odom"), writer="survey")
     for n in range(5):
