@@ -125,34 +125,34 @@ def tree_of(*parents: int) -> FrameTable:
     return FrameTable(names, np.array(parents, dtype=np.intp), kinds, (None,) * len(parents))
 
 
-def moment_of(tree: FrameTable, poses: object, *unknown: int) -> FramePoses:
+def poses_of(tree: FrameTable, poses: object, *unknown: int) -> FramePoses:
     known = np.ones(len(tree.names), dtype=np.bool_)
     known[list(unknown)] = False
     return FramePoses(5, tree, np.array(poses, dtype=np.float64), known)
 
 
 def test_frame_pose_builds_on_the_pose_of_its_parent():
-    moment = moment_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
+    moment = poses_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
     # One ahead and turned left; the next is one ahead of that, so one to the left.
     assert moment.poses_in("f0")[2] == pytest.approx((1.0, 1.0, 0.0, 0.0, 0.0, QUARTER, QUARTER))
     assert moment.poses_in("f0")[0] == pytest.approx(STILL)
 
 
 def test_poses_in_returns_poses_relative_to_the_selected_frame():
-    moment = moment_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
+    moment = poses_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
     assert moment.poses_in("f2")[2] == pytest.approx(STILL)
     assert moment.poses_in("f2")[1, :3] == pytest.approx((-1.0, 0.0, 0.0))
     assert moment.poses_in("f2")[0, :3] == pytest.approx((-1.0, 1.0, 0.0))
 
 
 def test_frames_of_another_tree_have_no_pose():
-    placed = moment_of(tree_of(-1, 0, -1, 2), [STILL, AHEAD, STILL, AHEAD]).poses_in("f1")
+    placed = poses_of(tree_of(-1, 0, -1, 2), [STILL, AHEAD, STILL, AHEAD]).poses_in("f1")
     assert np.isnan(placed[2:]).all()
     assert not np.isnan(placed[:2]).any()
 
 
 def test_unknown_edge_pose_separates_only_its_subtree():
-    moment = moment_of(tree_of(-1, 0, 1, 0), [STILL, STILL, AHEAD, AHEAD], 1)
+    moment = poses_of(tree_of(-1, 0, 1, 0), [STILL, STILL, AHEAD, AHEAD], 1)
     assert np.isnan(moment.poses_in("f0")[[1, 2]]).all()
     assert moment.poses_in("f0")[3, :3] == pytest.approx((1.0, 0.0, 0.0))
     assert moment.poses_in("f1")[2, :3] == pytest.approx((1.0, 0.0, 0.0))
@@ -160,7 +160,7 @@ def test_unknown_edge_pose_separates_only_its_subtree():
 
 def test_unknown_frame_raises_with_near_misses():
     with pytest.raises(UnknownFrame) as caught:
-        moment_of(tree_of(-1, 0), [STILL, AHEAD]).poses_in("f01")
+        poses_of(tree_of(-1, 0), [STILL, AHEAD]).poses_in("f01")
     assert "f1" in caught.value.near_misses
 
 
@@ -171,7 +171,7 @@ def test_poses_of_any_tree_equal_the_product_of_its_edges(seed: int, size: int):
     numbers = rng.normal(size=(size, 7))
     numbers[:, 3:] /= np.linalg.norm(numbers[:, 3:], axis=1)[:, None]
     numbers[[row for row, parent in enumerate(parents) if parent < 0]] = STILL
-    moment = moment_of(tree_of(*parents), numbers)
+    moment = poses_of(tree_of(*parents), numbers)
     fixed = int(rng.integers(size))
     matrices: list[np.ndarray] = []
     for row, parent in enumerate(parents):

@@ -33,11 +33,11 @@ def calls(function: Callable[..., object]) -> Iterator[list[str]]:
     """Who called ``function`` in this thread meanwhile."""
     callers: list[str] = []
 
-    def note(frame: FrameType, event: str, _: object) -> None:
+    def on_call(frame: FrameType, event: str, _: object) -> None:
         if event == "call" and frame.f_code is function.__code__:
             callers.append(frame.f_back.f_code.co_name if frame.f_back else "")
 
-    sys.setprofile(note)
+    sys.setprofile(on_call)
     try:
         yield callers
     finally:

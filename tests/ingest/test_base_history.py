@@ -23,7 +23,7 @@ def states(first: int, end: int, session: int = 7) -> list[JointState]:
     ]
 
 
-class World:
+class HistoryIngest:
     """A ingest, and what has become of the samples."""
 
     def __init__(self, *, described: bool = True, history_s: float = 10.0) -> None:
@@ -33,7 +33,7 @@ class World:
         if described:
             self.ingest.describe(DESCRIPTION)
 
-    def hear(self, *samples: JointState) -> None:
+    def receive(self, *samples: JointState) -> None:
         for sample in samples:
             self.ingest.insert_sample(sample, overflowed=False)
 
@@ -44,7 +44,7 @@ class World:
         return stats.received, stats.missed, stats.recalled
 
     @property
-    def known(self) -> list[int]:
+    def stamps_known(self) -> list[int]:
         """The numbers of the samples in the buffer."""
         stamps = [STAMP + number * PERIOD for number in range(-1, 60)]
         looked = [self.buffer.explain("world", "tool", stamp) for stamp in stamps]
@@ -56,72 +56,72 @@ class World:
 
 
 def test_received_samples_are_not_inserted_again_from_history():
-    world = World()
-    world.hear(*states(5, 10))
-    assert world.ingest.insert_history(states(3, 10))
-    assert (world.counts, world.known) == ((5, 0, 2), list(range(3, 10)))
-    assert not world.ingest.insert_history(states(0, 3))
-    assert (world.counts, world.known) == ((5, 0, 5), list(range(10)))
+    history = HistoryIngest()
+    history.receive(*states(5, 10))
+    assert history.ingest.insert_history(states(3, 10))
+    assert (history.counts, history.stamps_known) == ((5, 0, 2), list(range(3, 10)))
+    assert not history.ingest.insert_history(states(0, 3))
+    assert (history.counts, history.stamps_known) == ((5, 0, 5), list(range(10)))
 
 
 def test_no_older_history_is_requested_when_all_samples_were_received():
-    world = World()
-    world.hear(*states(0, 5))
-    assert not world.ingest.insert_history(states(2, 5))
-    assert world.counts == (5, 0, 0)
+    history = HistoryIngest()
+    history.receive(*states(0, 5))
+    assert not history.ingest.insert_history(states(2, 5))
+    assert history.counts == (5, 0, 0)
 
 
 def test_history_may_arrive_before_the_first_live_sample():
-    world = World()
-    assert world.ingest.insert_history(states(5, 10))
-    world.hear(*states(10, 12))
-    assert not world.ingest.insert_history(states(0, 5))
-    assert (world.counts, world.known) == ((2, 0, 10), list(range(12)))
+    history = HistoryIngest()
+    assert history.ingest.insert_history(states(5, 10))
+    history.receive(*states(10, 12))
+    assert not history.ingest.insert_history(states(0, 5))
+    assert (history.counts, history.stamps_known) == ((2, 0, 10), list(range(12)))
 
 
 def test_gap_is_filled_whether_or_not_it_was_detected_before():
     for shows_first in (True, False):
-        world = World()
-        world.hear(*states(0, 5))
+        history = HistoryIngest()
+        history.receive(*states(0, 5))
         if shows_first:
-            world.hear(*states(20, 21))
-        assert world.ingest.insert_history(states(10, 20))
-        assert not world.ingest.insert_history(states(3, 10))
+            history.receive(*states(20, 21))
+        assert history.ingest.insert_history(states(10, 20))
+        assert not history.ingest.insert_history(states(3, 10))
         if not shows_first:
-            world.hear(*states(20, 21))
-        assert world.known == list(range(21))
+            history.receive(*states(20, 21))
+        assert history.stamps_known == list(range(21))
         # It was missed all the same: a reader in a control loop did not have it in time.
-        assert world.counts == (6, 15, 15)
+        assert history.counts == (6, 15, 15)
 
 
 def test_history_waits_for_the_description():
-    world = World(described=False)
-    assert world.ingest.insert_history(states(5, 10))
-    assert world.ingest.insert_history(states(0, 5)) is False
-    world.hear(*states(10, 12))
-    assert world.counts == (0, 0, 0)
-    world.ingest.describe(DESCRIPTION)
-    assert (world.counts, world.known) == ((2, 0, 10), list(range(12)))
+    history = HistoryIngest(described=False)
+    assert history.ingest.insert_history(states(5, 10))
+    assert history.ingest.insert_history(states(0, 5)) is False
+    history.receive(*states(10, 12))
+    assert history.counts == (0, 0, 0)
+    history.ingest.describe(DESCRIPTION)
+    assert (history.counts, history.stamps_known) == ((2, 0, 10), list(range(12)))
 
 
 def test_history_of_a_writer_that_has_left_is_refused():
-    world = World()
-    world.hear(*states(0, 5))
-    world.hear(*states(20, 21, session=8))
-    assert not world.ingest.insert_history(states(0, 5))
-    assert (world.counts, world.known) == ((6, 0, 0), [20])
+    history = HistoryIngest()
+    history.receive(*states(0, 5))
+    history.receive(*states(20, 21, session=8))
+    assert not history.ingest.insert_history(states(0, 5))
+    assert (history.counts, history.stamps_known) == ((6, 0, 0), [20])
 
 
 def test_no_history_older_than_the_buffer_keeps_is_requested():
-    world = World(history_s=0.1)
-    world.hear(*states(30, 31))
-    assert not world.ingest.insert_history(states(0, 30))
-    assert world.known == list(range(20, 31))
+    history = HistoryIngest(history_s=0.1)
+    history.receive(*states(30, 31))
+    assert not history.ingest.insert_history(states(0, 30))
+    assert history.stamps_known == list(range(20, 31))
 
 
 def test_unusable_history_is_counted_once_per_page():
-    world = World()
-    world.hear(*states(30, 31))
+    history = HistoryIngest()
+    history.receive(*states(30, 31))
     bad = [JointState(STAMP + seq * PERIOD, seq, 7, ORDER, to_block([0.0])) for seq in range(30)]
-    assert not world.ingest.insert_history(bad)
-    assert (world.counters.stats().refused, world.counts) == ({"bad numbers": 1}, (1, 0, 0))
+    assert not history.ingest.insert_history(bad)
+    assert (history.counters.stats().refused, history.counts) == ({"bad numbers": 1}, (1, 0, 0))

@@ -98,7 +98,7 @@ class Network:
         return self.ownership.counters.stats().refused
 
 
-def say(robot: str, name: str, *edges: Edge) -> Step:
+def set_statics(robot: str, name: str, *edges: Edge) -> Step:
     return lambda network: network.statics(robot, name, *edges)
 
 
@@ -117,20 +117,23 @@ FOLLOWS = pytest.mark.parametrize("follow", [JointStateIngest, TransformIngest])
 @pytest.mark.parametrize(
     ("wrong", "right"),
     [
-        ([say("r1", "wrong", ("tool", "world"))], set()),
-        ([say("r1", "wrong", ("tool", "base"))], set()),
-        ([say("r1", "wrong", ("map", "upper"))], set()),
-        ([say("r1", "wrong", ("upper", "base"), ("base", "cart"))], {("r1/base", "r1/cart")}),
+        ([set_statics("r1", "wrong", ("tool", "world"))], set()),
+        ([set_statics("r1", "wrong", ("tool", "base"))], set()),
+        ([set_statics("r1", "wrong", ("map", "upper"))], set()),
+        ([set_statics("r1", "wrong", ("upper", "base"), ("base", "cart"))], {("r1/base", "r1/cart")}),
         (
-            [say("r1", "mount", ("tool", "jig")), say("r1", "wrong", ("jig", "world"))],
+            [set_statics("r1", "mount", ("tool", "jig")), set_statics("r1", "wrong", ("jig", "world"))],
             {("r1/tool", "r1/jig")},
         ),
         (
-            [say("r1", "both", ("jig", "world"), ("tool", "plate"), ("plate", "jig"))],
+            [set_statics("r1", "both", ("jig", "world"), ("tool", "plate"), ("plate", "jig"))],
             {("r1/tool", "r1/plate"), ("r1/plate", "r1/jig")},
         ),
         (
-            [say("r1", "wrong", ("tool", "world")), say("r1", "room", ("fleet/map", "world"))],
+            [
+                set_statics("r1", "wrong", ("tool", "world")),
+                set_statics("r1", "room", ("fleet/map", "world")),
+            ],
             {("fleet/map", "r1/world")},
         ),
     ],
@@ -149,7 +152,7 @@ def test_model_wins_over_conflicting_static_edges_in_every_order(follow, wrong: 
 @FOLLOWS
 def test_refusal_names_the_writer_and_the_loop(follow):
     for network in in_every_order(
-        lambda network: network.model(), say("r1", "mistake", ("lower", "world")), follow=follow
+        lambda network: network.model(), set_statics("r1", "mistake", ("lower", "world")), follow=follow
     ):
         assert network.refused == {"loop": 1}
         text = network.ownership.counters.refusals()["loop"]
@@ -158,7 +161,9 @@ def test_refusal_names_the_writer_and_the_loop(follow):
 
 
 def test_corrected_or_withdrawn_edge_leaves_no_refusal():
-    for network in in_every_order(lambda network: network.model(), say("r1", "one", ("tool", "world"))):
+    for network in in_every_order(
+        lambda network: network.model(), set_statics("r1", "one", ("tool", "world"))
+    ):
         network.statics("r1", "one", ("tool", "world"))
         assert network.refused == {"loop": 2}
         network.statics("r1", "one", ("map", "world"))
@@ -169,7 +174,7 @@ def test_corrected_or_withdrawn_edge_leaves_no_refusal():
 
 
 def test_refused_edge_is_accepted_when_a_new_model_allows_it():
-    for network in in_every_order(lambda network: network.model(), say("r1", "one", ("map", "tool"))):
+    for network in in_every_order(lambda network: network.model(), set_statics("r1", "one", ("map", "tool"))):
         assert network.edges == OWN
         network.model(model=SHORTER)
         assert ("r1/map", "r1/tool") in network.edges
@@ -190,8 +195,8 @@ def test_circular_placement_of_model_roots_is_accepted_except_one_edge():
     steps = (
         lambda network: network.model("r1"),
         lambda network: network.model("r2"),
-        say("r1", "one", ("r2/tool", "world")),
-        say("r2", "one", ("r1/tool", "world")),
+        set_statics("r1", "one", ("r2/tool", "world")),
+        set_statics("r2", "one", ("r1/tool", "world")),
     )
     for network in in_every_order(*steps):
         across = {edge for edge in network.edges if edge[0][:2] != edge[1][:2]}
@@ -203,8 +208,8 @@ def test_circular_placement_of_model_roots_is_accepted_except_one_edge():
 @FOLLOWS
 def test_own_writers_of_a_robot_win_over_others_in_every_order(follow):
     steps = (
-        say("r1", "mount", ("base", "camera")),
-        say("r2", "thief", ("r2/map", "r1/camera")),
+        set_statics("r1", "mount", ("base", "camera")),
+        set_statics("r2", "thief", ("r2/map", "r1/camera")),
         lambda network: network.model(),
     )
     for network in in_every_order(*steps, follow=follow):
@@ -218,8 +223,8 @@ def test_own_writers_of_a_robot_win_over_others_in_every_order(follow):
 
 def test_other_writers_may_place_the_root_in_their_frames_and_in_unowned_ones():
     for network in in_every_order(
-        say("cell", "site", ("map", "r1/world")),
-        say("cell", "site 2", ("fleet/map", "r2/world")),
+        set_statics("cell", "site", ("map", "r1/world")),
+        set_statics("cell", "site 2", ("fleet/map", "r2/world")),
         lambda network: network.model("r1"),
         lambda network: network.model("r2"),
     ):
@@ -230,7 +235,7 @@ def test_other_writers_may_place_the_root_in_their_frames_and_in_unowned_ones():
 @pytest.mark.parametrize("parent", ["r1/base", "r3/base"])
 def test_other_writers_cannot_place_frames_of_a_robot_in_a_third_robots_frames(parent: str):
     steps = (
-        say("r2", "thief", (parent, "r1/marker")),
+        set_statics("r2", "thief", (parent, "r1/marker")),
         lambda network: network.ownership.add_robot("r1"),
         lambda network: network.ownership.add_robot("r3"),
     )

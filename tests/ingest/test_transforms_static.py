@@ -8,7 +8,7 @@ from zstate.ingest.transforms import StaticTransformIngest
 from zstate.wire.messages import StaticTransforms, to_block
 
 
-class Following:
+class StaticIngests:
     """Static writers of one robot on one buffer."""
 
     def __init__(self) -> None:
@@ -23,8 +23,8 @@ class Following:
 
 
 @pytest.fixture
-def following() -> Following:
-    return Following()
+def ingests() -> StaticIngests:
+    return StaticIngests()
 
 
 def statics(
@@ -33,21 +33,21 @@ def statics(
     return StaticTransforms(session, edges, to_block([pose] * len(edges)))
 
 
-def test_buffer_holds_exactly_the_edges_that_the_writer_publishes_now(following: Following):
-    mount = following.writer("mount")
+def test_buffer_holds_exactly_the_edges_that_the_writer_publishes_now(ingests: StaticIngests):
+    mount = ingests.writer("mount")
     mount.replace(statics(("tool", "camera"), ("camera", "lens")))
     mount.replace(statics(("tool", "camera"), ("tool", "laser")))
-    assert following.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "mount")}
+    assert ingests.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "mount")}
     mount.replace(statics())
-    assert following.edges() == {}
+    assert ingests.edges() == {}
 
 
-def test_one_message_may_reparent_a_child_and_invert_an_edge(following: Following):
-    mount = following.writer("mount")
+def test_one_message_may_reparent_a_child_and_invert_an_edge(ingests: StaticIngests):
+    mount = ingests.writer("mount")
     mount.replace(statics(("tool", "camera"), ("tool", "laser")))
     mount.replace(statics(("camera", "tool"), ("base", "laser")))
-    assert following.edges() == {"r1/tool": ("r1/camera", "mount"), "r1/laser": ("r1/base", "mount")}
-    assert following.counters.stats().refused == {}
+    assert ingests.edges() == {"r1/tool": ("r1/camera", "mount"), "r1/laser": ("r1/base", "mount")}
+    assert ingests.counters.stats().refused == {}
 
 
 @pytest.mark.parametrize(
@@ -63,77 +63,79 @@ def test_one_message_may_reparent_a_child_and_invert_an_edge(following: Followin
         (("tool", "lens"), (0, 0, 0, 0, 0, 0, 0), "bad numbers"),
     ],
 )
-def test_impossible_edge_is_counted_and_the_others_are_inserted(following: Following, bad, pose, reason: str):
-    following.writer("mount").replace(statics(("tool", "camera")))
-    following.writer("bad").replace(statics(bad, pose=pose))
-    following.writer("good").replace(statics(("tool", "laser")))
-    assert following.counters.stats().refused == {reason: 1}
-    assert following.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "good")}
+def test_impossible_edge_is_counted_and_the_others_are_inserted(
+    ingests: StaticIngests, bad, pose, reason: str
+):
+    ingests.writer("mount").replace(statics(("tool", "camera")))
+    ingests.writer("bad").replace(statics(bad, pose=pose))
+    ingests.writer("good").replace(statics(("tool", "laser")))
+    assert ingests.counters.stats().refused == {reason: 1}
+    assert ingests.edges() == {"r1/camera": ("r1/tool", "mount"), "r1/laser": ("r1/tool", "good")}
 
 
-def test_writer_withdraws_only_edges_it_still_owns(following: Following):
-    old, new = following.writer("old"), following.writer("new")
+def test_writer_withdraws_only_edges_it_still_owns(ingests: StaticIngests):
+    old, new = ingests.writer("old"), ingests.writer("new")
     old.replace(statics(("tool", "camera"), ("tool", "laser")))
     new.replace(statics(("tool", "camera")))
     old.withdraw()
-    assert following.edges() == {"r1/camera": ("r1/tool", "new")}
+    assert ingests.edges() == {"r1/camera": ("r1/tool", "new")}
     new.withdraw()
     new.withdraw()
-    assert following.edges() == {}
+    assert ingests.edges() == {}
 
 
-def test_full_name_may_belong_to_another_robot(following: Following):
-    following.writer("site").replace(statics(("fleet/map", "odom")))
-    assert following.edges() == {"r1/odom": ("fleet/map", "site")}
+def test_full_name_may_belong_to_another_robot(ingests: StaticIngests):
+    ingests.writer("site").replace(statics(("fleet/map", "odom")))
+    assert ingests.edges() == {"r1/odom": ("fleet/map", "site")}
 
 
-def xs(following: Following) -> dict[str, float]:
-    statics = [frame for frame in following.buffer.frames() if frame.kind == "static"]
-    return {f.name: following.buffer.lookup(f.parent or "", f.name).translation[0] for f in statics}
+def xs(ingests: StaticIngests) -> dict[str, float]:
+    statics = [frame for frame in ingests.buffer.frames() if frame.kind == "static"]
+    return {f.name: ingests.buffer.lookup(f.parent or "", f.name).translation[0] for f in statics}
 
 
 def at(x: float) -> tuple[float, ...]:
     return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def test_ros_static_edges_accumulate_and_the_newest_pose_of_any_writer_is_used(following: Following):
-    one, other = following.writer("one"), following.writer("other")
+def test_ros_static_edges_accumulate_and_the_newest_pose_of_any_writer_is_used(ingests: StaticIngests):
+    one, other = ingests.writer("one"), ingests.writer("other")
     one.add(statics(("tool", "camera"), pose=at(1.0)))
     one.add(statics(("tool", "laser"), pose=at(2.0)))
     other.add(statics(("tool", "camera"), pose=at(3.0)))
-    assert xs(following) == {"r1/camera": 3.0, "r1/laser": 2.0}
+    assert xs(ingests) == {"r1/camera": 3.0, "r1/laser": 2.0}
     one.add(statics(("tool", "camera"), pose=at(4.0)))
-    assert xs(following) == {"r1/camera": 4.0, "r1/laser": 2.0}
-    assert following.counters.stats().refused == {}
+    assert xs(ingests) == {"r1/camera": 4.0, "r1/laser": 2.0}
+    assert ingests.counters.stats().refused == {}
 
 
-def test_ros_writer_may_reparent_its_child(following: Following):
-    mount = following.writer("mount")
+def test_ros_writer_may_reparent_its_child(ingests: StaticIngests):
+    mount = ingests.writer("mount")
     mount.add(statics(("tool", "camera"), ("camera", "lens")))
     mount.add(statics(("base", "camera")))
-    assert following.edges() == {"r1/camera": ("r1/base", "mount"), "r1/lens": ("r1/camera", "mount")}
-    assert following.counters.stats().refused == {}
+    assert ingests.edges() == {"r1/camera": ("r1/base", "mount"), "r1/lens": ("r1/camera", "mount")}
+    assert ingests.counters.stats().refused == {}
 
 
-def test_ros_child_of_another_writer_is_moved_only_after_that_writer_left(following: Following):
-    old, new = following.writer("old"), following.writer("new")
+def test_ros_child_of_another_writer_is_moved_only_after_that_writer_left(ingests: StaticIngests):
+    old, new = ingests.writer("old"), ingests.writer("new")
     old.add(statics(("tool", "camera"), ("tool", "laser"), session=3))
     new.add(statics(("base", "camera"), session=4))
-    assert following.counters.stats().refused == {"second parent": 1}
-    following.ownership.remove_writer("r1", 3)
-    assert following.edges() == {"r1/camera": ("r1/base", "new"), "r1/laser": ("r1/tool", "old")}
-    assert following.counters.stats().refused == {"second parent": 2}
+    assert ingests.counters.stats().refused == {"second parent": 1}
+    ingests.ownership.remove_writer("r1", 3)
+    assert ingests.edges() == {"r1/camera": ("r1/base", "new"), "r1/laser": ("r1/tool", "old")}
+    assert ingests.counters.stats().refused == {"second parent": 2}
 
 
-def test_late_writer_name_is_set_on_edges_it_still_owns(following: Following):
-    one, other = following.writer("a ROS node 1"), following.writer("a ROS node 2")
+def test_late_writer_name_is_set_on_edges_it_still_owns(ingests: StaticIngests):
+    one, other = ingests.writer("a ROS node 1"), ingests.writer("a ROS node 2")
     one.add(statics(("tool", "camera"), ("tool", "laser"), pose=at(1.0)))
     other.add(statics(("tool", "camera"), pose=at(2.0)))
     one.name_writer("/one")
-    assert following.edges() == {"r1/camera": ("r1/tool", "a ROS node 2"), "r1/laser": ("r1/tool", "/one")}
+    assert ingests.edges() == {"r1/camera": ("r1/tool", "a ROS node 2"), "r1/laser": ("r1/tool", "/one")}
     other.name_writer("/other")
-    assert following.edges()["r1/camera"] == ("r1/tool", "/other")
-    assert xs(following) == {"r1/camera": 2.0, "r1/laser": 1.0}
+    assert ingests.edges()["r1/camera"] == ("r1/tool", "/other")
+    assert xs(ingests) == {"r1/camera": 2.0, "r1/laser": 1.0}
 
 
 FIXED = [joint for joint in RRBOT.joints if joint.type == "fixed"]
@@ -145,12 +147,14 @@ def own_edges(turned: float = 1.0) -> StaticTransforms:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_ros_edges_that_repeat_the_model_are_neither_inserted_nor_counted(following: Following, sign: float):
-    following.buffer.add_robot(RRBOT, "r1")
-    before = following.edges()
-    following.writer("rsp").add(own_edges(sign))
-    assert following.edges() == before
-    assert following.counters.stats().refused == {}
+def test_ros_edges_that_repeat_the_model_are_neither_inserted_nor_counted(
+    ingests: StaticIngests, sign: float
+):
+    ingests.buffer.add_robot(RRBOT, "r1")
+    before = ingests.edges()
+    ingests.writer("rsp").add(own_edges(sign))
+    assert ingests.edges() == before
+    assert ingests.counters.stats().refused == {}
 
 
 @pytest.mark.parametrize(
@@ -162,10 +166,10 @@ def test_ros_edges_that_repeat_the_model_are_neither_inserted_nor_counted(follow
     ],
 )
 def test_static_edge_that_contradicts_the_model_is_counted_and_refused(
-    following: Following, edge, reason: str
+    ingests: StaticIngests, edge, reason: str
 ):
-    following.buffer.add_robot(RRBOT, "r1")
-    before = following.edges()
-    following.writer("wrong").add(statics(edge, pose=at(9.0)))
-    assert following.edges() == before
-    assert following.counters.stats().refused == {reason: 1}
+    ingests.buffer.add_robot(RRBOT, "r1")
+    before = ingests.edges()
+    ingests.writer("wrong").add(statics(edge, pose=at(9.0)))
+    assert ingests.edges() == before
+    assert ingests.counters.stats().refused == {reason: 1}

@@ -43,14 +43,14 @@ class Waiting:
         return not self._thread.is_alive()
 
 
-def telling(publisher: ClockPublisher, clock: SimulatedClock) -> Callable[[int], None]:
+def publishing(publisher: ClockPublisher, clock: SimulatedClock) -> Callable[[int], None]:
     """``tell(stamp)`` returns once ``clock`` has heard it."""
 
-    def tell(stamp: int) -> None:
+    def publish_time(stamp: int) -> None:
         publisher.publish(stamp)
         until(lambda: clock.wait() == stamp)
 
-    return tell
+    return publish_time
 
 
 @pytest.mark.parametrize(
@@ -65,9 +65,9 @@ def test_now_is_the_newest_received_time(sessions, wire, key):
     writer, reader = sessions
     with ClockPublisher(writer, (wire,)) as publisher, SimulatedClock(reader, wire) as clock:
         await_reader(writer, key)
-        tell = telling(publisher, clock)
+        publish_time = publishing(publisher, clock)
         for stamp in (5 * SECOND, 5 * SECOND + 1, 3600 * SECOND):
-            tell(stamp)
+            publish_time(stamp)
             assert clock.now() == stamp
         assert clock.domain == "sim"
 
@@ -94,16 +94,16 @@ def test_wait_ends_when_its_instant_is_reached_and_not_while_time_stands_still(s
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
-        tell = telling(publisher, clock)
-        tell(SECOND)
+        publish_time = publishing(publisher, clock)
+        publish_time(SECOND)
         early, late = Waiting(clock, 2 * SECOND), Waiting(clock, 3 * SECOND)
         for _ in range(3):
-            tell(SECOND)
+            publish_time(SECOND)
         assert early.reached is late.reached is None
-        tell(2 * SECOND)
+        publish_time(2 * SECOND)
         until(lambda: early.reached)
         assert late.reached is None
-        tell(3600 * SECOND)
+        publish_time(3600 * SECOND)
         until(lambda: late.reached)
         assert clock.wait_until(5, threading.Event())
 
@@ -127,16 +127,16 @@ def test_jump_back_ends_waits_and_is_logged_once(sessions, caplog):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
-        tell = telling(publisher, clock)
+        publish_time = publishing(publisher, clock)
         with caplog.at_level(logging.WARNING, "zstate"):
-            tell(100 * SECOND)
+            publish_time(100 * SECOND)
             waiting = Waiting(clock, 101 * SECOND)
-            tell(100 * SECOND - 50 * MS)
+            publish_time(100 * SECOND - 50 * MS)
             assert (waiting.reached, clock.epoch) == (None, 0)
-            tell(10 * SECOND)
+            publish_time(10 * SECOND)
             until(lambda: waiting.reached)
-            tell(20 * SECOND)
-            tell(10 * SECOND)
+            publish_time(20 * SECOND)
+            publish_time(10 * SECOND)
         assert clock.epoch == 2
     # From 99.95 s to 10 s.
     assert caplog.text.count("went back") == 1
@@ -151,8 +151,8 @@ def test_newer_of_two_clock_publishers_is_followed(sessions):
         SimulatedClock(reader) as clock,
     ):
         await_reader(writer, "zstate/clock")
-        telling(first, clock)(SECOND)
-        telling(second, clock)(50 * SECOND)
+        publishing(first, clock)(SECOND)
+        publishing(second, clock)(50 * SECOND)
         first.publish(2 * SECOND)
         first.publish(3 * SECOND)
         until(lambda: clock.refused == {"second clock": 2})
@@ -167,7 +167,7 @@ def test_invalid_clock_message_is_counted_and_changes_nothing(sessions):
         SimulatedClock(reader) as clock,
     ):
         await_reader(writer, "zstate/clock")
-        telling(publisher, clock)(SECOND)
+        publishing(publisher, clock)(SECOND)
         stranger.put(b"noon")
         until(lambda: clock.refused == {"foreign": 1})
         assert clock.now() == SECOND
@@ -180,8 +180,8 @@ def test_rate_has_its_number_of_ticks_per_simulated_second_at_any_speed(sessions
     step, start, seconds, rate_hz = round(speed * 10 * MS), 5 * SECOND, 2, 250.0
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
-        tell = telling(publisher, clock)
-        tell(start)
+        publish_time = publishing(publisher, clock)
+        publish_time(start)
         ticks: list[int] = []
         rate = Rate(rate_hz, clock, threading.Event(), float(seconds))
         counting = threading.Thread(target=lambda: ticks.extend(rate), daemon=True)
@@ -200,17 +200,17 @@ def test_rate_follows_a_time_that_goes_back_during_a_wait(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
-        tell = telling(publisher, clock)
-        tell(100 * SECOND)
+        publish_time = publishing(publisher, clock)
+        publish_time(100 * SECOND)
         ticks: list[int] = []
         counting = threading.Thread(
             target=lambda: ticks.extend(Rate(10.0, clock, threading.Event(), 0.5)), daemon=True
         )
         counting.start()
         until(lambda: len(ticks) == 1 and clock._waits)
-        tell(40 * SECOND)
+        publish_time(40 * SECOND)
         until(lambda: len(ticks) == 2)
-        tell(40 * SECOND + 300 * MS)
+        publish_time(40 * SECOND + 300 * MS)
         counting.join(10.0)
     assert ticks == [100 * SECOND, *(40 * SECOND + n * 100 * MS for n in range(4))]
 
@@ -219,14 +219,14 @@ def test_jump_ahead_causes_no_burst(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
         await_reader(writer, "zstate/clock")
-        tell = telling(publisher, clock)
-        tell(0)
+        publish_time = publishing(publisher, clock)
+        publish_time(0)
         ticks: list[int] = []
         rate = Rate(10.0, clock, threading.Event(), 60.0)
         counting = threading.Thread(target=lambda: ticks.extend(rate), daemon=True)
         counting.start()
         until(lambda: len(ticks) == 1)
-        tell(59 * SECOND + 900 * MS)
+        publish_time(59 * SECOND + 900 * MS)
         counting.join(10.0)
     assert ticks == [0, 59 * SECOND + 900 * MS]
     assert rate.report().skipped == 600 - 2
@@ -244,15 +244,15 @@ def test_publisher_and_a_listener_on_simulated_time_agree(sessions):
         assert robot.description().clock == "sim"
         await_reader(writer, "zstate/clock")
         await_reader(writer, "zstate/r1/joint_states")
-        tell = telling(publisher, told)
-        tell(SECOND)
+        publish_time = publishing(publisher, told)
+        publish_time(SECOND)
         running = threading.Thread(
             target=lambda: robot.run(SineSource(RRBOT), 100.0, seconds=1.0), daemon=True
         )
         running.start()
         until(lambda: robot.stats.sent)  # at the instant that was told last
         for n in range(1, 101):
-            tell(SECOND + n * 10 * MS)
+            publish_time(SECOND + n * 10 * MS)
         running.join(10.0)
         until(lambda: listener.stats.received == 100)
         assert listener.buffer.latest("world", "tool") == SECOND + 990 * MS

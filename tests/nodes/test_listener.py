@@ -194,16 +194,16 @@ def test_listener_imports_neither_pinocchio_nor_the_view(sessions, spawn, follow
 
 
 def test_gaps_in_a_batch_that_filled_the_ring_count_as_dropped(sessions, monkeypatch: pytest.MonkeyPatch):
-    def come(*seqs: int) -> None:
+    def receive(*seqs: int) -> None:
         states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
         key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
         listener._on_samples([SerializedSample(key, encode(state), encoding) for state in states])
 
     with TransformListener(sessions[0], "r1") as listener:
         monkeypatch.setattr(listener, "_capacity", 3)
-        come(0)
-        come(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
-        come(8)
+        receive(0)
+        receive(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
+        receive(8)
         assert (listener.stats.dropped, listener.stats.missed) == (3, 1)
 
 

@@ -52,7 +52,7 @@ def publish(publisher: StatePublisher, first: int, end: int, stamp: int = STAMP)
         publisher.publish(positions(number), stamp=stamp + number * PERIOD)
 
 
-def knows(listener: TransformListener, *numbers: int) -> Callable[[], bool]:
+def has_samples(listener: TransformListener, *numbers: int) -> Callable[[], bool]:
     """Whether it answers at these samples."""
     buffer = listener.buffer
     return lambda: all(buffer.can_lookup("world", "tool", STAMP + one * PERIOD) for one in numbers)
@@ -71,9 +71,9 @@ def test_new_listener_knows_the_last_two_seconds_bit_for_bit(sessions: tuple[Ses
     ):
         settle(writer, "r1", follow)
         publish(publisher, 0, 400)
-        until(knows(early, 399))
+        until(has_samples(early, 399))
         with TransformListener(reader, "r1", follow=follow) as late:
-            until(knows(late, 199, 399))
+            until(has_samples(late, 199, 399))
             until(lambda: late.stats.recalled == 201)
             stamps = [STAMP + number * PERIOD for number in range(199, 400)]
             stamps += [stamp + 3_333_333 for stamp in stamps[:-1]]
@@ -198,16 +198,16 @@ def test_samples_published_while_the_router_was_away_are_received_afterwards(
     ):
         settle(writer, "r1")
         publish(publisher, 0, 10)
-        until(knows(listener, 0, 9))
+        until(has_samples(listener, 0, 9))
         router.kill()
         until(lambda: not list(reader.zenoh.info.routers_zid()))
         until(lambda: not list(writer.zenoh.info.routers_zid()))
         publish(publisher, 10, 500)
-        assert not knows(listener, 10)()
+        assert not has_samples(listener, 10)()
         spawn(ROUTER, endpoint).line()
         settle(writer, "r1")
         publish(publisher, 500, 501)
-        until(knows(listener, 500))
+        until(has_samples(listener, 500))
         until(lambda: listener.stats.recalled >= 490)
         for number in range(501):
             answer = listener.buffer.lookup("world", "tool", STAMP + number * PERIOD)
@@ -221,7 +221,7 @@ def test_listener_requests_no_more_history_than_its_buffer_keeps(sessions: tuple
         with TransformListener(reader, "r1", history_s=1.0) as listener:
             until(lambda: listener.stats.recalled == 101)
             publish(publisher, 1000, 1001)
-            until(knows(listener, 1000))
+            until(has_samples(listener, 1000))
             assert listener.stats.recalled == 101
 
 
@@ -238,9 +238,9 @@ def test_no_history_without_a_cache_or_with_history_on_join_off(
         with TransformListener(reader, "r2", history_on_join=False) as listener:
             settle(writer, "r2")
             publish(publisher, 10, 12)
-            until(lambda: knows(listener, 10, 11)() and listener.stats.received == 2)
+            until(lambda: has_samples(listener, 10, 11)() and listener.stats.received == 2)
             assert listener.stats.recalled == 0
-            assert not knows(listener, 9)()
+            assert not has_samples(listener, 9)()
     with pytest.raises(InvalidInput, match="cache_s"):
         StatePublisher(writer, RRBOT, "r3", cache_s=-1.0)
 
@@ -261,7 +261,7 @@ def test_gap_in_a_cache_counts_as_no_loss(sessions: tuple[Session, Session]):
         with TransformListener(reader, "r1") as listener:
             settle(writer, "r1")
             publish(publisher, 10, 20)
-            until(lambda: knows(listener, 0, 19)() and listener.stats.received == 10)
+            until(lambda: has_samples(listener, 0, 19)() and listener.stats.received == 10)
             assert listener.stats.missed == listener.stats.dropped == 0
 
 
@@ -273,8 +273,8 @@ def test_only_samples_of_the_current_writer_are_cached(sessions: tuple[Session, 
         publish(second, 20, 30)
         with TransformListener(reader, "r1") as listener:
             until(lambda: listener.stats.recalled == 10)
-            assert knows(listener, 20, 29)()
-            assert not knows(listener, 9)()
+            assert has_samples(listener, 20, 29)()
+            assert not has_samples(listener, 9)()
 
 
 def test_writer_that_joins_later_starts_its_own_history(
@@ -285,11 +285,11 @@ def test_writer_that_joins_later_starts_its_own_history(
         with StatePublisher(writer, RRBOT, "r1") as first:
             settle(writer, "r1")
             publish(first, 0, 10)
-            until(knows(listener, 0, 9))
+            until(has_samples(listener, 0, 9))
         with StatePublisher(writer, RRBOT, "r1") as second:
             publish(second, 20, 30)
-            until(knows(listener, 20, 29))
-            assert not knows(listener, 9)()
+            until(has_samples(listener, 20, 29))
+            assert not has_samples(listener, 9)()
             assert listener.stats.missed == 0
 
 

@@ -201,21 +201,21 @@ def test_client_in_another_process_gets_replies_through_a_router(spawn: Callable
         await_answers(other)
         device = spawn(DEVICE, endpoint)
 
-        def said(parameters: str) -> tuple[bool, dict[str, object]]:
+        def reply(parameters: str) -> tuple[bool, dict[str, object]]:
             device.tell(f"{KEY}?{parameters}")
             is_answer, encoding, text = device.line().split(" ", 2)
             assert (encoding, device.line()) == ("application/json", "end")
             return is_answer == "True", json.loads(text)
 
-        assert said(f"target=world;source=tool;at={STAMP}") == (
+        assert reply(f"target=world;source=tool;at={STAMP}") == (
             True,
             buffer.lookup("world", "tool", STAMP).to_dict(),
         )
-        is_answer, error = said("target=world;source=tol")
+        is_answer, error = reply("target=world;source=tol")
         assert (is_answer, error["error"], error["near_misses"]) == (False, "UnknownFrame", ["tool"])
-        is_answer, error = said(f"target=world;source=tool;at={STAMP + 12_000_000}")
+        is_answer, error = reply(f"target=world;source=tool;at={STAMP + 12_000_000}")
         assert (is_answer, error["error"]) == (False, "InFuture")
         assert "12.0 ms after the only sample" in str(error["message"])
-        is_answer, error = said("target=world;source=tool;when=now")
+        is_answer, error = reply("target=world;source=tool;when=now")
         assert (is_answer, error["error"]) == (False, "InvalidInput")
         assert "no parameter 'when'" in str(error["message"])

@@ -58,7 +58,7 @@ def test_positions_may_be_given_by_name_in_any_order(sessions):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
         (([1.0],), r"takes 2 positions, shape \(2,\).*got shape \(1,\)"),
         (([[1.0, 2.0]],), r"got shape \(1, 2\)"),
@@ -76,13 +76,13 @@ def test_positions_may_be_given_by_name_in_any_order(sessions):
         (([0.0, 0.0], None, None, 2**63), "64-bit"),
     ],
 )
-def test_refused_sample_is_not_sent_and_leaves_no_gap(sessions, arguments, said: str):
+def test_refused_sample_is_not_sent_and_leaves_no_gap(sessions, arguments, text: str):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         await_reader(writer, JOINTS)
         publisher.publish([0.0, 0.0], stamp=1)
-        with pytest.raises(InvalidInput, match=said):
+        with pytest.raises(InvalidInput, match=text):
             publisher.publish(*arguments)
         publisher.publish([0.0, 0.0], stamp=2)
     assert [(state.stamp, state.seq) for state in tap.joint_states(2)] == [(1, 0), (2, 1)]
@@ -136,7 +136,7 @@ def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
 
-        def said() -> StreamStats:
+        def transform_stats() -> StreamStats:
             return publisher.stats.streams["native", "tf"]
 
         publisher.publish([0.0, 0.0], stamp=1)
@@ -145,10 +145,10 @@ def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions
         # Who has looked before is told of readers by itself, a moment after others know of them.
         until(lambda: publisher.publish([0.0, 0.0], stamp=2) or transforms.arrivals)
         first = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
-        assert (first.stamp, first.seq) == (2, said().suppressed)
+        assert (first.stamp, first.seq) == (2, transform_stats().suppressed)
         transforms.close()
-        until(lambda: publisher.publish([0.0, 0.0], stamp=3) or said().suppressed > first.seq)
-        assert len(computed) == said().samples
+        until(lambda: publisher.publish([0.0, 0.0], stamp=3) or transform_stats().suppressed > first.seq)
+        assert len(computed) == transform_stats().samples
 
 
 def test_stamp_is_the_time_of_the_clock_by_default(sessions):

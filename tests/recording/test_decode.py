@@ -28,7 +28,7 @@ from zstate.wire.ros2.types import JOINT_STATE
 STORAGES = (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
 
 
-class Read:
+class DecodedFile:
     """Everything that a transcript tells."""
 
     def __init__(self, path: Path, **choice: object) -> None:
@@ -49,7 +49,7 @@ def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path)
         states = [
             tale.joints("arm", START + n * MS + 1, swing(n / 10), swing(n / 7), session=7) for n in range(20)
         ]
-    read = Read(tmp_path / "r.mcap")
+    read = DecodedFile(tmp_path / "r.mcap")
     told = read.of(JointState)
     assert read.robots == ("arm",)
     assert [said.writer.robot for said in told] == ["arm"] * 20
@@ -67,7 +67,9 @@ def test_frames_of_several_robots_keep_their_names(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         for robot in ("r1", "r2"):
             tale.edges(robot, START, {("odom", "base"): pose(1.0), ("fleet/map", "odom"): pose(2.0)})
-    edges = {said.writer.robot: said.message.edges for said in Read(tmp_path / "r.mcap").of(TransformSample)}
+    edges = {
+        said.writer.robot: said.message.edges for said in DecodedFile(tmp_path / "r.mcap").of(TransformSample)
+    }
     expected = (("odom", "base"), ("fleet/map", "odom"))
     assert edges == {"r1": expected, "r2": expected}
 
@@ -77,7 +79,7 @@ def test_static_writers_keep_their_names(tmp_path: Path):
         tale.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
         tale.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
         tale.scribe.withdraw("arm", "camera", START + S)
-    told = Read(tmp_path / "r.mcap").of(StaticTransforms)
+    told = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
     assert [(said.writer.static_writer, said.message.edges) for said in told] == [
         ("camera", (("tool", "camera"),)),
         (MODEL_WRITER, (("world", "base"),)),
@@ -90,7 +92,7 @@ def test_restarted_writer_is_another_writer(tmp_path: Path):
         tale.describe("arm")
         tale.joints("arm", START, swing(0), session=1)
         tale.joints("arm", START + S, swing(1), session=2)
-    assert [said.writer.session for said in Read(tmp_path / "r.mcap").of(JointState)] == [1, 2]
+    assert [said.writer.session for said in DecodedFile(tmp_path / "r.mcap").of(JointState)] == [1, 2]
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -103,7 +105,7 @@ def test_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
         bag.tf(START + 5, [odom_from_base])
         bag.joints(START + 6, {"shoulder": 0.25, "elbow": -0.5})
         bag.joints(START + 7, {"knee": 1.0}, "/dog/joint_states")
-    read = Read(tmp_path / "bag")
+    read = DecodedFile(tmp_path / "bag")
     assert read.robots == ("dog", "ros")
     (description,), (statics,) = read.of(RobotDescription), read.of(StaticTransforms)
     (sample,), (ros, dog) = read.of(TransformSample), read.of(JointState)
@@ -122,14 +124,14 @@ def test_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.0})
-    assert [said.message.seq for said in Read(tmp_path / "bag").of(JointState)] == [1, 2, 3, 4, 5]
+    assert [said.message.seq for said in DecodedFile(tmp_path / "bag").of(JointState)] == [1, 2, 3, 4, 5]
 
 
 def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"shoulder": 0.0}, "/joint_commands")
         bag.say("/chatter", START, STORE.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String")
-    read = Read(tmp_path / "bag")
+    read = DecodedFile(tmp_path / "bag")
     assert {channel.topic for channel in read.ignored} == {"/joint_commands", "/chatter"}
     assert (read.robots, read.said) == ((), [])
 
@@ -139,7 +141,7 @@ def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
         bag.joints(START, {"knee": 1.0}, "/dog/joint_states")
         bag.joints(START, {"knee": 1.0}, "/cat/joint_states")
         bag.tf(START, [Transform("dog/odom", "dog/base", [0, 0, 0], [0, 0, 0, 1], START)])
-    said = Read(tmp_path / "bag", robots=("dog",)).said
+    said = DecodedFile(tmp_path / "bag", robots=("dog",)).said
     assert {(s.writer.robot, s.writer.stream) for s in said} == {("dog", "joint_states"), ("ros", "tf")}
 
 
@@ -151,7 +153,7 @@ def test_undecodable_messages_are_reported_and_left_out(tmp_path: Path):
         joints = tale.writer.channel("/joint_states", JOINT_STATE, STREAM_QOS["joint_states"], facts)
         tale.writer.write(joints, b"\0\1\0\0" + bytes(4), START + MS, START + MS)
         tale.joints("arm", START + 2 * MS, swing(1))
-    read = Read(tmp_path / "r.mcap")
+    read = DecodedFile(tmp_path / "r.mcap")
     assert len(read.of(JointState)) == 2
     assert read.refused == ["truncated"]
 
@@ -161,7 +163,7 @@ def test_interval_of_log_times_can_be_read_alone(tmp_path: Path):
         tale.describe("arm")
         for n in range(10):
             tale.joints("arm", START + n * S, swing(n), heard=START + n * S)
-    told = Read(tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S)
+    told = DecodedFile(tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S)
     assert [said.log_time for said in told.said] == [START + 3 * S, START + 4 * S]
 
 
@@ -175,8 +177,8 @@ def test_truncated_recording_is_decoded_as_far_as_possible(tmp_path: Path):
     whole = (tmp_path / "r.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: len(whole) // 2])
-    told, all_told = Read(cut), Read(tmp_path / "r.mcap")
+    told, all_told = DecodedFile(cut), DecodedFile(tmp_path / "r.mcap")
     assert 100 < len(told.said) < len(all_told.said)
     assert told.said == all_told.said[: len(told.said)]
     recover(cut, tmp_path / "saved.mcap")
-    assert Read(tmp_path / "saved.mcap").said == told.said
+    assert DecodedFile(tmp_path / "saved.mcap").said == told.said

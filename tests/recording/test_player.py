@@ -188,13 +188,13 @@ def test_start_within_the_recording_has_the_latched_values_of_that_time(sessions
     tap = Tap(reader, "zstate/arm/joint_states")
     heights: list[float] = []
 
-    def hear(arrival: SerializedSample) -> None:
+    def collect(arrival: SerializedSample) -> None:
         said = decode(arrival.payload, arrival.encoding, StaticTransforms)
         heights.append(from_block(said.poses)[2])
 
     await_reader(writer, "zstate/arm/joint_states")
     with (
-        LatchedSubscriber(reader, "zstate/arm/tf_static/camera", hear),
+        LatchedSubscriber(reader, "zstate/arm/tf_static/camera", collect),
         Player(writer, path, rate=math.inf, start_s=2.0, duration_s=2.5) as replayer,
     ):
         await_reader(writer, "zstate/arm/tf_static/camera")
