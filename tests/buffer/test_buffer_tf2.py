@@ -2,7 +2,7 @@
 
     apt-get install -y --no-install-recommends python3-tf2
 
-Where both answer, the poses agree to 1e-9. Where the kind of answer differs, the tables below say
+Where both answer, the poses agree to 1e-9. Where the kind of answer differs, the tables below state
 why; any other difference fails. tf2 0.7.6 takes turns below 2.1e-8 rad for none, which random
 samples do not meet.
 """

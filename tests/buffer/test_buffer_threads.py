@@ -36,7 +36,7 @@ def line(stamp: int) -> float:
 
 
 def write_pairs(buffer: TransformBuffer, tick: int) -> None:
-    """hall -> left and left -> right run apart at one speed, mostly told together."""
+    """hall -> left and left -> right run apart at one speed, mostly inserted together."""
     stamp = NOW + tick * STEP
     x = line(stamp)
     if tick % 50 == 10:
@@ -109,7 +109,7 @@ def read_many(buffer: TransformBuffer, at: int | None) -> None:
 
 
 READERS = [read_pairs, read_cart, read_robot, read_many]
-# What each reader may be told instead of an answer.
+# The errors that each reader may get instead of a transform.
 RIGHT_ERRORS: dict[Callable[..., None], tuple[type[LookupFailed], ...]] = {
     read_pairs: TIME,
     read_cart: (*TIME, Disconnected),
@@ -139,7 +139,7 @@ def many_switches() -> Iterator[None]:
 
 
 class Crowd:
-    """Threads that run until told to stop, and the first thing that went wrong in any of them."""
+    """Threads that run until they are stopped, and the first failure in any of them."""
 
     def __init__(self) -> None:
         self.stop = threading.Event()
@@ -274,14 +274,14 @@ def test_every_wait_of_many_threads_is_woken() -> None:
 def test_sample_during_unregistration_of_a_waiter_wakes_the_others() -> None:
     buffer = TransformBuffer()
     buffer.insert(moving("a", "b", NOW))
-    heard: list[int | None] = []
+    reported_stamps: list[int | None] = []
     threads: list[threading.Thread] = []
 
     def comes() -> None:
         stamp = NOW + 1 + len(threads)
         threads.append(threading.Thread(target=lambda: buffer.insert(moving("a", "b", stamp))))
         threads[-1].start()
-        until(lambda: heard[-1] == stamp, 5.0)
+        until(lambda: reported_stamps[-1] == stamp, 5.0)
 
     class Interrupted(dict[Any, Any]):
         """Whenever it is changed, a sample comes before the next step."""
@@ -295,7 +295,7 @@ def test_sample_during_unregistration_of_a_waiter_wakes_the_others() -> None:
             comes()
             super().__setitem__(key, value)
 
-    with buffer.watch("a", "b", lambda news: heard.append(news.stamp)):
+    with buffer.watch("a", "b", lambda news: reported_stamps.append(news.stamp)):
         leaving = buffer.watch("a", "b", lambda _: None)
         buffer._waiters._by_track = Interrupted(buffer._waiters._by_track)
         leaving.close()

@@ -1,4 +1,4 @@
-"""Memory: what the history holds, and nothing that grows beside it."""
+"""Memory of a buffer: its history, and no other structure that grows."""
 
 from __future__ import annotations
 

@@ -185,7 +185,7 @@ def test_hermite_paths_use_the_reference() -> None:
 
 
 def test_unusual_input_falls_back_to_the_reference() -> None:
-    """What the extension cannot take at once it says so of, and the reference speaks."""
+    """The extension reports input that it cannot handle, and the reference handles it."""
     history = History(3, SPAN_NS)
     row = np.zeros(3)
     for plain in (True, 1.5, "now", None, 2**63, np.int64(3)):

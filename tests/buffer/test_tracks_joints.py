@@ -75,7 +75,7 @@ def test_mimic_joints_follow_their_master_through_chains() -> None:
 
 
 def test_mimic_of_more_than_a_turn_between_samples_is_not_shortened() -> None:
-    # The follower turns by 2 * 8 rad, which the poses of two samples could not tell.
+    # The follower turns by 2 * 8 rad, which two poses could not show.
     assert turns_equal(yaw_of(between({}, {"bend": 8.0}, "arm", "follower")), 2 * 2.0 + 0.25)
 
 

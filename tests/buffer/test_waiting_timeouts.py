@@ -106,7 +106,7 @@ def test_wait_before_the_kept_history_fails_at_once(waiting) -> None:
 
 
 def test_wait_before_the_only_sample_ends_when_older_history_arrives(waiting) -> None:
-    """As a listener that joins hears it: a live sample first, then the past, newest first."""
+    """The order in which a joining listener receives: a live sample, then history, newest first."""
     buffer = filled(moving("a", "b", 10 * S, x=10.0))
     wait = waiting(buffer, "a", "b", 9 * S + S // 2)
     buffer.insert(moving("a", "b", 9 * S, x=9.0))

@@ -1,4 +1,4 @@
-"""What is not done: a sample, or a change of the tree, is nobody's work whom it does not concern.
+"""Work that is avoided: a sample or a tree change costs only the waiters that it concerns.
 
 Work is counted by calls of the functions that do it, as the interpreter sees them.
 """
@@ -30,7 +30,7 @@ ZERO = [0.0, 0.0]
 
 @contextmanager
 def calls(function: Callable[..., object]) -> Iterator[list[str]]:
-    """Who called ``function`` in this thread meanwhile."""
+    """The callers of ``function`` in this thread during the context."""
     callers: list[str] = []
 
     def on_call(frame: FrameType, event: str, _: object) -> None:
@@ -45,7 +45,7 @@ def calls(function: Callable[..., object]) -> Iterator[list[str]]:
 
 
 class Seen(list[Transform]):
-    """What a watch told."""
+    """The stamps that a watch reported."""
 
     def stamps(self) -> list[int | None]:
         return [transform.stamp for transform in self]
@@ -222,7 +222,7 @@ def test_first_velocities_of_a_robot_reach_compiled_paths() -> None:
 def test_closed_waiter_is_not_listed_anywhere() -> None:
     buffer = TransformBuffer()
     track = buffer.add_robot(RRBOT)
-    # Closed while it is being told, after which it expects the next sample no more.
+    # Closed during its callback; it then expects no further sample.
     watch = buffer.watch("base", "tool", lambda _: watch.close())
     buffer.insert_joints(track, S, ZERO)
     buffer.wait("base", "tool", S)

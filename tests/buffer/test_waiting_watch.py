@@ -39,21 +39,23 @@ def test_late_sample_does_not_trigger_a_watch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("thresholds", "told"),
+    ("thresholds", "expected_stamps"),
     [
         ({"translation_m": 0.1}, [1, 3]),
         ({"rotation_rad": 0.1}, [1, 4]),
         ({"translation_m": 0.1, "rotation_rad": 0.1}, [1, 3, 4]),
     ],
 )
-def test_thresholds_count_from_the_last_call(thresholds: dict[str, float], told: list[int]) -> None:
+def test_thresholds_count_from_the_last_call(
+    thresholds: dict[str, float], expected_stamps: list[int]
+) -> None:
     buffer, seen = TransformBuffer(), list[int | None]()
     with buffer.watch("map", "base", lambda transform: seen.append(transform.stamp), **thresholds):
         buffer.insert(moved(0.00, 1))
         buffer.insert(moved(0.06, 2))
         buffer.insert(moved(0.12, 3))
         buffer.insert(moved(0.12, 4, yaw=math.pi / 4))
-    assert seen == told
+    assert seen == expected_stamps
 
 
 def test_watch_survives_later_frames_and_a_change_of_parent() -> None:

@@ -1,4 +1,4 @@
-"""What a writer said before, on its way into a buffer that hears it live."""
+"""Insertion of cached samples into a buffer that also receives live ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DESCRIPTION = RobotDescription(7, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, (
 
 
 def states(first: int, end: int, session: int = 7) -> list[JointState]:
-    """Samples ``first`` up to ``end``; the shoulder tells which it is."""
+    """Samples ``first`` up to ``end``; the shoulder position identifies it."""
     return [
         JointState(STAMP + seq * PERIOD, seq, session, ORDER, to_block([0.01 * seq, 0.0]))
         for seq in range(first, end)

@@ -1,4 +1,4 @@
-"""What cannot be used is counted, said once, and stops nothing."""
+"""Unusable input is counted, logged once, and stops nothing."""
 
 from __future__ import annotations
 

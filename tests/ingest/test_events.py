@@ -35,7 +35,7 @@ def test_writer_joins_and_leaves():
     before = time.time_ns()
     with quiet() as events:
         events.on_writer(announced(), alive=True)
-        events.on_writer(announced(), alive=True)  # as after a token was heard twice
+        events.on_writer(announced(), alive=True)  # as after a token was received twice
         events.on_writer(announced(), alive=False)
         events.on_writer(announced(), alive=False)
         joined, left = events.recent()

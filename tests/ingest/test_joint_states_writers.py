@@ -1,4 +1,4 @@
-"""Who writes for a robot: what is taken from whom when writers come, go and disagree."""
+"""Writers of one robot: samples used when writers join, leave and conflict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LagDetector: a backlog is told from clocks that disagree, and from the burst after a cut."""
+"""LagDetector: distinguishes a backlog from clock offsets and from the burst after a cut."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ S = 1_000 * MS
 
 
 def warning_count(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.1) -> int:
-    """How often a lag is told of when samples with these ages at arrival come."""
+    """The number of lag warnings for samples with these ages at arrival."""
     lag = LagDetector(Counters())
     with caplog.at_level(logging.WARNING, "zstate"):
         for number, age_s in enumerate(ages_s):

@@ -1,4 +1,4 @@
-"""Simulated time: told on the network, followed by whoever waits for it."""
+"""Simulated time: published on the network, followed by waiting clocks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RRBOT = load_model("rrbot")
 
 
 class Waiting:
-    """Somebody who waits for an instant in a thread of their own."""
+    """A thread that waits for an instant."""
 
     def __init__(self, clock: SimulatedClock, stamp: int) -> None:
         self.stop = threading.Event()
@@ -44,7 +44,7 @@ class Waiting:
 
 
 def publishing(publisher: ClockPublisher, clock: SimulatedClock) -> Callable[[int], None]:
-    """``tell(stamp)`` returns once ``clock`` has heard it."""
+    """``publish_time(stamp)`` returns once ``clock`` has received it."""
 
     def publish_time(stamp: int) -> None:
         publisher.publish(stamp)
@@ -175,7 +175,7 @@ def test_invalid_clock_message_is_counted_and_changes_nothing(sessions):
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 10.0])
 def test_rate_has_its_number_of_ticks_per_simulated_second_at_any_speed(sessions, speed):
-    """The time is told a hundred times a real second, so one step is ``speed`` times 10 ms."""
+    """The time is published a hundred times per real second, so one step is ``speed`` times 10 ms."""
     writer, reader = sessions
     step, start, seconds, rate_hz = round(speed * 10 * MS), 5 * SECOND, 2, 250.0
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
@@ -236,27 +236,27 @@ def test_publisher_and_a_listener_on_simulated_time_agree(sessions):
     writer, reader = sessions
     with (
         ClockPublisher(writer) as publisher,
-        SimulatedClock(writer) as told,
-        SimulatedClock(reader) as heard,
-        StatePublisher(writer, RRBOT, "r1", clock=told) as robot,
-        TransformListener(reader, "r1", clock=heard) as listener,
+        SimulatedClock(writer) as writer_clock,
+        SimulatedClock(reader) as reader_clock,
+        StatePublisher(writer, RRBOT, "r1", clock=writer_clock) as robot,
+        TransformListener(reader, "r1", clock=reader_clock) as listener,
     ):
         assert robot.description().clock == "sim"
         await_reader(writer, "zstate/clock")
         await_reader(writer, "zstate/r1/joint_states")
-        publish_time = publishing(publisher, told)
+        publish_time = publishing(publisher, writer_clock)
         publish_time(SECOND)
         running = threading.Thread(
             target=lambda: robot.run(SineSource(RRBOT), 100.0, seconds=1.0), daemon=True
         )
         running.start()
-        until(lambda: robot.stats.sent)  # at the instant that was told last
+        until(lambda: robot.stats.sent)  # at the newest published instant
         for n in range(1, 101):
             publish_time(SECOND + n * 10 * MS)
         running.join(10.0)
         until(lambda: listener.stats.received == 100)
         assert listener.buffer.latest("world", "tool") == SECOND + 990 * MS
-        # Ten milliseconds old by the simulated time, whatever the system's clock says.
-        until(lambda: heard.now() == 2 * SECOND)
+        # Ten milliseconds old by the simulated time, independent of the system clock.
+        until(lambda: reader_clock.now() == 2 * SECOND)
         assert listener.buffer.lookup("world", "tool", max_age_s=0.5).stamp == SECOND + 990 * MS
         assert (listener.stats.refused, listener.stats.off_clock) == ({}, 0)

@@ -1,4 +1,4 @@
-"""What readers are told when writers and routers die, freeze and come back: real processes, real signals."""
+"""Events when writers and routers die, freeze and return: real processes, real signals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ROUTER = """
 
 
 class EventCollector:
-    """The events of the joint states, as a listener tells them."""
+    """Collects the joint-state events of a listener."""
 
     def __init__(self, session: Session) -> None:
         self.events: list[WriterEvent] = []
@@ -47,7 +47,7 @@ class EventCollector:
             self.events.append(event)
 
     def await_kinds(self, *kinds: str) -> WriterEvent:
-        """The last of them, when just these have been told."""
+        """The last event, once exactly these kinds were reported."""
         until(lambda: len(self.events) >= len(kinds))
         assert tuple(event.kind for event in self.events) == kinds
         return self.events[-1]

@@ -254,7 +254,7 @@ def test_invalid_cache_duration_is_refused_without_leaks(sessions: tuple[Session
 
 
 def test_gap_in_a_cache_counts_as_no_loss(sessions: tuple[Session, Session]):
-    """A listener that hears sample 10 first and is told of 0 to 9 then has missed nothing."""
+    """A listener that receives sample 10 first and 0 to 9 as history has missed nothing."""
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         publish(publisher, 0, 10)
@@ -333,12 +333,12 @@ def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Sess
         publisher.publish([0.5, 1.0], [0.1, 0.2], [3.0, 4.0], STAMP)
         publisher.publish([0.5, 1.0], stamp=STAMP + 1)
         assert publisher.cache is not None
-        said = tap.payloads(2)
+        expected = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
         with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
             past.ask(JOINTS, publisher.cache.since(0)[0].session)
             until(lambda: pages)
-    assert [one.payload for one in pages[0]] == said
+    assert [one.payload for one in pages[0]] == expected
     assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}
     tap.close()
 
@@ -366,11 +366,11 @@ def test_history_of_another_session_is_refused(sessions):
     memory = SampleCache(10.0, 2, 8)
     order = order_digest(RRBOT.joint_names)
     memory.append(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
-    said = Announcement("r1", "joint_states", WriterId("driver", "nuc", 1, 2, 8))
+    announced = Announcement("r1", "joint_states", WriterId("driver", "nuc", 1, 2, 8))
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
         serve_history(writer, "r1", "joint_states", memory, encode),
-        announce(writer, f"zstate/r1/@writer/joint_states/{said.identity}"),
+        announce(writer, f"zstate/r1/@writer/joint_states/{announced.identity}"),
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: listener.stats.refused == {"foreign answer": 1})

@@ -119,7 +119,7 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
 
 
 @pytest.mark.parametrize(
-    ("said", "reason"),
+    ("joint_state", "reason"),
     [
         ((0, NAMES, [0.0, 0.0], [], []), "no stamp"),
         ((STAMP, NAMES, [], [], []), "no positions"),
@@ -133,12 +133,12 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
         ((STAMP, NAMES, [0.0, float("inf")], [], []), "bad numbers"),
     ],
 )
-def test_unusable_joint_states_are_counted_by_reason(sessions, said, reason: str):
+def test_unusable_joint_states_are_counted_by_reason(sessions, joint_state, reason: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         described(writer)
         driver = following_joints(writer, listener)
-        stamp, names, *blocks = said
+        stamp, names, *blocks = joint_state
         driver.put(rosbags_joint_state(stamp, "", names, *blocks))
         driver.joints(STAMP + 1, NAMES, [0.5, 0.25])
         until(lambda: listener.stats.received == 1)
@@ -150,7 +150,7 @@ LABELLED = b"\x0fsequence_number" + bytes(8) + b"\x10source_timestamp" + bytes(8
 
 
 @pytest.mark.parametrize(
-    ("payload", "beside", "reason"),
+    ("payload", "raw_attachment", "reason"),
     [
         (GOOD[:-1], "next", "truncated"),
         (GOOD[:30], "next", "truncated"),
@@ -164,15 +164,15 @@ LABELLED = b"\x0fsequence_number" + bytes(8) + b"\x10source_timestamp" + bytes(8
     ],
     ids=range(9),
 )
-def test_invalid_ros_messages_are_counted_by_reason_on_every_topic(sessions, payload, beside, reason):
+def test_invalid_ros_messages_are_counted_by_reason_on_every_topic(sessions, payload, raw_attachment, reason):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         node = RosNode(writer, "strange")
         driver = node.publisher(JOINT_STATES).announce().await_reader()
-        driver.put(payload, beside)
+        driver.put(payload, raw_attachment)
         until(lambda: listener.stats.refused == {reason: 1})
         for topic in (TF_STATIC, DESCRIPTION):
-            node.publisher(topic).announce().await_reader().put(payload, beside)
+            node.publisher(topic).announce().await_reader().put(payload, raw_attachment)
         until(lambda: sum(listener.stats.refused.values()) == 3)
         described(writer)
         following_joints(writer, listener).joints(STAMP + 1, NAMES, [0.5, 0.25])

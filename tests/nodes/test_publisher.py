@@ -142,7 +142,7 @@ def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions
         publisher.publish([0.0, 0.0], stamp=1)
         assert computed == []
         transforms = Tap(reader, TF)
-        # Who has looked before is told of readers by itself, a moment after others know of them.
+        # A second observer learns of readers a moment later than the first.
         until(lambda: publisher.publish([0.0, 0.0], stamp=2) or transforms.arrivals)
         first = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
         assert (first.stamp, first.seq) == (2, transform_stats().suppressed)

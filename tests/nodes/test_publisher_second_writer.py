@@ -35,7 +35,7 @@ WRITER = """
         publisher.run(SineSource(model), 100.0)
 """
 
-# Rounds: "go" opens it, on a network that it has just joined; it writes until it is refused or told to end.
+# Rounds: "go" opens it, on a network that it has just joined; it writes until it is refused or stopped.
 RIVAL = """
     import select, sys
     from zstate import StatePublisher, connect, load_model
@@ -102,9 +102,9 @@ def test_exactly_one_of_two_simultaneous_processes_survives_each_of_20_times(spa
         for _ in range(20):
             for rival in rivals:
                 rival.tell("go")
-            said = {pool.submit(rival.line): rival for rival in rivals}
-            (refused, *_), others = wait(said, return_when=FIRST_COMPLETED)
-            (winner,) = [rival for rival in rivals if rival is not said[refused]]
+            answer = {pool.submit(rival.line): rival for rival in rivals}
+            (refused, *_), others = wait(answer, return_when=FIRST_COMPLETED)
+            (winner,) = [rival for rival in rivals if rival is not answer[refused]]
             assert refused.result() == f"refused by {winner.process.pid}"
             assert others
             winner.tell("end")
@@ -152,9 +152,9 @@ def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_pu
                 publisher.publish([0.0, 0.0])
             description = replace(publisher.description(), session=stranger.session)
             state = JointState(1, 0, stranger.session, order_digest(RRBOT.joint_names), bytes(16))
-            said = state if stream == "joint_states" else description
+            answer = state if stream == "joint_states" else description
             with pytest.raises(SecondWriter) as raised:
-                until(lambda: put(theirs, stream, said) or publisher.publish([0.0, 0.0]))
+                until(lambda: put(theirs, stream, answer) or publisher.publish([0.0, 0.0]))
     assert raised.value.first == stranger
 
 
@@ -179,19 +179,19 @@ def test_streams_of_a_robot_may_have_separate_writers(sessions):
 
 
 def test_takeover_makes_listeners_use_the_newest_writer_and_log_once(sessions):
-    told: list[WriterEvent] = []
+    reported: list[WriterEvent] = []
     with (
-        TransformListener(sessions[1], "r1", on_event=told.append) as listener,
+        TransformListener(sessions[1], "r1", on_event=reported.append) as listener,
         StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"], program="driver") as first,
     ):
-        until(lambda: [event.kind for event in told] == ["joined"])
+        until(lambda: [event.kind for event in reported] == ["joined"])
         with StatePublisher(
             sessions[1], RRBOT, "r1", streams=["joint_states"], program="simulator", takeover=True
         ) as second:
             until(lambda: listener.stats.refused.get("second writer", 0) >= 200 or fought(first, second))
-            assert [event.kind for event in told] == ["joined", "joined", "conflict"]
-        until(lambda: told[-1].kind == "left")
-    conflict = told[2]
+            assert [event.kind for event in reported] == ["joined", "joined", "conflict"]
+        until(lambda: reported[-1].kind == "left")
+    conflict = reported[2]
     assert "simulator@" in conflict.text
     assert "driver@" in conflict.text
     assert conflict.writer is not None

@@ -1,4 +1,4 @@
-"""What the counts of a publisher say of how it does."""
+"""Health of a publisher, derived from its counts."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def test_newest_message_of_two_static_writers_is_used(sessions):
         for number, node in enumerate((one, other, one, other)):
             node.edge(0, "tool", "camera", float(number))
             until(lambda number=number: x_of(listener, "tool", "camera") == float(number))
-        # Their names come later, and leave what was said last.
+        # Their names arrive later and leave the last values unchanged.
         one.announce()
         other.announce()
         until(lambda: writers(listener)["camera"] == "/other")

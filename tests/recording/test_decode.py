@@ -29,7 +29,7 @@ STORAGES = (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
 
 
 class DecodedFile:
-    """Everything that a transcript tells."""
+    """All messages and reports of a decoded recording."""
 
     def __init__(self, path: Path, **choice: object) -> None:
         self.refused: list[str] = []
@@ -37,10 +37,10 @@ class DecodedFile:
             transcript = DecodedRecording(reader, lambda reason, _: self.refused.append(reason))
             self.robots = transcript.robots
             self.ignored = transcript.ignored
-            self.said: list[DecodedMessage] = list(transcript.messages(**choice))
+            self.decoded: list[DecodedMessage] = list(transcript.messages(**choice))
 
     def of(self, kind: type) -> list[DecodedMessage]:
-        return [said for said in self.said if isinstance(said.message, kind)]
+        return [decoded for decoded in self.decoded if isinstance(decoded.message, kind)]
 
 
 def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path):
@@ -50,16 +50,18 @@ def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path)
             tale.joints("arm", START + n * MS + 1, swing(n / 10), swing(n / 7), session=7) for n in range(20)
         ]
     read = DecodedFile(tmp_path / "r.mcap")
-    told = read.of(JointState)
+    found = read.of(JointState)
     assert read.robots == ("arm",)
-    assert [said.writer.robot for said in told] == ["arm"] * 20
-    assert {(said.writer.session, said.writer.program) for said in told} == {(7, "driver@host pid 1")}
-    for state, said in zip(states, told, strict=True):
-        message = said.message
+    assert [decoded.writer.robot for decoded in found] == ["arm"] * 20
+    assert {(decoded.writer.session, decoded.writer.program) for decoded in found} == {
+        (7, "driver@host pid 1")
+    }
+    for state, decoded in zip(states, found, strict=True):
+        message = decoded.message
         assert isinstance(message, JointState)
         assert (message.stamp, message.seq, message.session) == (state.stamp, state.seq, state.session)
         assert (message.positions, message.velocities) == (state.positions, state.velocities)
-        assert said.log_time == state.stamp + LATENCY
+        assert decoded.log_time == state.stamp + LATENCY
     assert not read.refused
 
 
@@ -68,7 +70,8 @@ def test_frames_of_several_robots_keep_their_names(tmp_path: Path):
         for robot in ("r1", "r2"):
             tale.edges(robot, START, {("odom", "base"): pose(1.0), ("fleet/map", "odom"): pose(2.0)})
     edges = {
-        said.writer.robot: said.message.edges for said in DecodedFile(tmp_path / "r.mcap").of(TransformSample)
+        decoded.writer.robot: decoded.message.edges
+        for decoded in DecodedFile(tmp_path / "r.mcap").of(TransformSample)
     }
     expected = (("odom", "base"), ("fleet/map", "odom"))
     assert edges == {"r1": expected, "r2": expected}
@@ -79,8 +82,8 @@ def test_static_writers_keep_their_names(tmp_path: Path):
         tale.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
         tale.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
         tale.scribe.withdraw("arm", "camera", START + S)
-    told = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
-    assert [(said.writer.static_writer, said.message.edges) for said in told] == [
+    found = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
+    assert [(decoded.writer.static_writer, decoded.message.edges) for decoded in found] == [
         ("camera", (("tool", "camera"),)),
         (MODEL_WRITER, (("world", "base"),)),
         ("camera", ()),
@@ -92,7 +95,7 @@ def test_restarted_writer_is_another_writer(tmp_path: Path):
         tale.describe("arm")
         tale.joints("arm", START, swing(0), session=1)
         tale.joints("arm", START + S, swing(1), session=2)
-    assert [said.writer.session for said in DecodedFile(tmp_path / "r.mcap").of(JointState)] == [1, 2]
+    assert [decoded.writer.session for decoded in DecodedFile(tmp_path / "r.mcap").of(JointState)] == [1, 2]
 
 
 @pytest.mark.parametrize("storage", STORAGES)
@@ -124,7 +127,13 @@ def test_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.0})
-    assert [said.message.seq for said in DecodedFile(tmp_path / "bag").of(JointState)] == [1, 2, 3, 4, 5]
+    assert [decoded.message.seq for decoded in DecodedFile(tmp_path / "bag").of(JointState)] == [
+        1,
+        2,
+        3,
+        4,
+        5,
+    ]
 
 
 def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
@@ -133,7 +142,7 @@ def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
         bag.say("/chatter", START, STORE.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String")
     read = DecodedFile(tmp_path / "bag")
     assert {channel.topic for channel in read.ignored} == {"/joint_commands", "/chatter"}
-    assert (read.robots, read.said) == ((), [])
+    assert (read.robots, read.decoded) == ((), [])
 
 
 def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
@@ -141,8 +150,8 @@ def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
         bag.joints(START, {"knee": 1.0}, "/dog/joint_states")
         bag.joints(START, {"knee": 1.0}, "/cat/joint_states")
         bag.tf(START, [Transform("dog/odom", "dog/base", [0, 0, 0], [0, 0, 0, 1], START)])
-    said = DecodedFile(tmp_path / "bag", robots=("dog",)).said
-    assert {(s.writer.robot, s.writer.stream) for s in said} == {("dog", "joint_states"), ("ros", "tf")}
+    decoded = DecodedFile(tmp_path / "bag", robots=("dog",)).decoded
+    assert {(s.writer.robot, s.writer.stream) for s in decoded} == {("dog", "joint_states"), ("ros", "tf")}
 
 
 def test_undecodable_messages_are_reported_and_left_out(tmp_path: Path):
@@ -163,8 +172,10 @@ def test_interval_of_log_times_can_be_read_alone(tmp_path: Path):
         tale.describe("arm")
         for n in range(10):
             tale.joints("arm", START + n * S, swing(n), heard=START + n * S)
-    told = DecodedFile(tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S)
-    assert [said.log_time for said in told.said] == [START + 3 * S, START + 4 * S]
+    found = DecodedFile(
+        tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S
+    )
+    assert [decoded.log_time for decoded in found.decoded] == [START + 3 * S, START + 4 * S]
 
 
 def test_truncated_recording_is_decoded_as_far_as_possible(tmp_path: Path):
@@ -177,8 +188,8 @@ def test_truncated_recording_is_decoded_as_far_as_possible(tmp_path: Path):
     whole = (tmp_path / "r.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: len(whole) // 2])
-    told, all_told = DecodedFile(cut), DecodedFile(tmp_path / "r.mcap")
-    assert 100 < len(told.said) < len(all_told.said)
-    assert told.said == all_told.said[: len(told.said)]
+    found, all_told = DecodedFile(cut), DecodedFile(tmp_path / "r.mcap")
+    assert 100 < len(found.decoded) < len(all_told.decoded)
+    assert found.decoded == all_told.decoded[: len(found.decoded)]
     recover(cut, tmp_path / "saved.mcap")
-    assert DecodedFile(tmp_path / "saved.mcap").said == told.said
+    assert DecodedFile(tmp_path / "saved.mcap").decoded == found.decoded

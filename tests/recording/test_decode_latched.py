@@ -42,10 +42,10 @@ def test_static_edges_of_a_bag_add_up():
     standing.update(fixed({("a", "b"): pose(1.0)}, None))
     standing.update(fixed({("a", "c"): pose(2.0)}, None))
     standing.update(fixed({("a", "b"): pose(3.0)}, None))
-    (said,) = standing.statics
-    assert isinstance(said.message, StaticTransforms)
-    assert said.message.edges == (("a", "b"), ("a", "c"))
-    assert said.message.poses == to_block([pose(3.0), pose(2.0)])
+    (decoded,) = standing.statics
+    assert isinstance(decoded.message, StaticTransforms)
+    assert decoded.message.edges == (("a", "b"), ("a", "c"))
+    assert decoded.message.poses == to_block([pose(3.0), pose(2.0)])
 
 
 def test_new_description_replaces_the_previous_one():

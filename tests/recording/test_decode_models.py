@@ -23,7 +23,9 @@ def models(
     with RecordingReader(path) as reader:
         transcript = DecodedRecording(reader, refuse)
         described = first_descriptions(transcript, robots)
-        found = {robot: recorded_model(transcript, said, refuse) for robot, said in described.items()}
+        found = {
+            robot: recorded_model(transcript, description, refuse) for robot, description in described.items()
+        }
     return found, refused
 
 

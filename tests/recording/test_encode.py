@@ -1,4 +1,4 @@
-"""What robots say stands in a recording as a ROS 2 node would have said it."""
+"""Robot messages are recorded as a ROS 2 node would have published them."""
 
 from __future__ import annotations
 
@@ -298,11 +298,11 @@ def test_statics_without_a_writer_name_accumulate_as_in_ros(case: EncoderCase):
     case.encoder.write_message("cart", statics(("arm", "b"), ("arm", "c")), NOW)
     case.encoder.write_message("cart", statics(("base", "a")), NOW)
     case.encoder.write_message("cart", statics(("arm", "d"), session=2), NOW)
-    said = [
+    edges_written = [
         [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
         for message in case.read("/tf_static")
     ]
-    assert said == [
+    assert edges_written == [
         [("arm", "a")],
         [("arm", "a"), ("arm", "b"), ("arm", "c")],
         [("base", "a"), ("arm", "b"), ("arm", "c")],

@@ -1,4 +1,4 @@
-"""What is said of a recording, against what was put into it."""
+"""The summary of a recording, compared with its contents."""
 
 from __future__ import annotations
 

@@ -149,7 +149,7 @@ def test_edges_outside_the_model_come_from_tf(tmp_path: Path):
             tale.edges("arm", stamp, {("odom", "world"): pose(n), ("base", "upper"): IDENTITY})
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("odom", "world", START + 45 * MS).translation[0] == 4.5
-    # The model knows better where its links are than what was said of them on tf.
+    # The model defines its links; transforms on tf do not override it.
     kinds = {frame.name: frame.kind for frame in buffer.frames()}
     assert (kinds["arm/upper"], kinds["arm/world"]) == ("joint", "pose")
 

@@ -1,4 +1,4 @@
-"""Who replays what somebody writes now is told, whether or not its model is known."""
+"""Playback of a stream with an active writer is refused, with or without a model."""
 
 from __future__ import annotations
 

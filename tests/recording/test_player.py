@@ -1,4 +1,4 @@
-"""A recording said again on a real network: the same samples, the same answers, at its own pace."""
+"""Playback on a real network: the same samples and transforms, at the recorded spacing."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def assert_same(one: list[np.ndarray], other: list[np.ndarray]) -> None:
 
 @contextmanager
 def replaying(replayer: Player) -> Iterator[list[PlayerReport]]:
-    """Runs it meanwhile; its report is there afterwards."""
+    """Runs the player during the context; its report is available afterwards."""
     reports: list[PlayerReport] = []
     thread = threading.Thread(target=lambda: reports.append(replayer.run()))
     thread.start()
@@ -126,7 +126,7 @@ def test_live_played_back_and_recorded_lookups_agree(sessions, tmp_path: Path):
     assert_same(live, answers(recorded_buffer(path), stamps))
     with Recording(path, "arm") as recording:
         assert_same(live, [recording.lookup_many(*frames, stamps)[0] for frames in PATHS])
-    # The publisher of the lens has gone since, which the replay says as well: its edge is withdrawn.
+    # The publisher of the lens has left since; playback withdraws its edge too.
     with TransformListener(reader, "arm", history_s=100.0) as listener:
         settle(writer, "arm")
         with Player(writer, path, ["arm"], rate=10.0) as replayer:
@@ -158,9 +158,9 @@ def test_playback_keeps_the_spacing_of_samples(sessions, arm: Path):
     clock = Stepping(5)
     with Player(sessions[0], arm, rate=2.0, clock=clock) as replayer:
         report = replayer.run()
-    heard = {(LATENCY + n * 10 * MS + n % 3) // 2 + 5 for n in range(COUNT)}
+    expected = {(LATENCY + n * 10 * MS + n % 3) // 2 + 5 for n in range(COUNT)}
     # Half nanoseconds are rounded to even ones.
-    assert len(heard - {wait + off for wait in clock.waits for off in (-1, 0, 1)}) == 0
+    assert len(expected - {wait + off for wait in clock.waits for off in (-1, 0, 1)}) == 0
     assert clock.waits == sorted(clock.waits)
     assert (report.samples, report.lateness_max, report.delays) == (COUNT, 0, 0)
     assert math.isclose(report.rate, 2.0, rel_tol=1e-6)
@@ -189,8 +189,8 @@ def test_start_within_the_recording_has_the_latched_values_of_that_time(sessions
     heights: list[float] = []
 
     def collect(arrival: SerializedSample) -> None:
-        said = decode(arrival.payload, arrival.encoding, StaticTransforms)
-        heights.append(from_block(said.poses)[2])
+        message = decode(arrival.payload, arrival.encoding, StaticTransforms)
+        heights.append(from_block(message.poses)[2])
 
     await_reader(writer, "zstate/arm/joint_states")
     with (

@@ -257,7 +257,7 @@ def test_non_cdr_channels_are_skipped_and_listed(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("beginning", "said"),
+    ("beginning", "reason"),
     [
         (b"", "is empty"),
         (MAGIC[:5], "is cut off within its first 8 bytes"),
@@ -270,12 +270,12 @@ def test_non_cdr_channels_are_skipped_and_listed(tmp_path: Path):
         (b"hello world, hello", "is not a recording: it begins with b'hello world,'"),
     ],
 )
-def test_other_file_is_refused_with_its_recognised_format(tmp_path: Path, beginning: bytes, said: str):
+def test_other_file_is_refused_with_its_recognised_format(tmp_path: Path, beginning: bytes, reason: str):
     path = tmp_path / "run.mcap"
     path.write_bytes(beginning)
     with pytest.raises(RecordingError) as caught:
         RecordingReader(path)
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
     assert str(path) in str(caught.value)
     assert caught.value.path == str(path)
 
@@ -362,7 +362,7 @@ def test_damage_anywhere_is_refused_or_read_without_crash(
 
 
 def a_chunk(compression: str, content: bytes, size: int) -> bytes:
-    """An MCAP file that is not closed, with one chunk that says it holds ``size`` bytes."""
+    """An MCAP file that is not closed, with one chunk that states ``size`` bytes."""
     word = compression.encode()
     body = struct.pack("<QQQII", 1, 1, size, 0, len(word)) + word + struct.pack("<Q", len(content)) + content
     header = struct.pack("<I", 0) * 2
@@ -375,13 +375,13 @@ BOMB = (1 << 28) + 1000
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-@pytest.mark.parametrize("says", [1 << 40, 1000])
-def test_chunk_that_decompresses_without_bounds_is_refused(tmp_path: Path, compression: str, says: int):
+@pytest.mark.parametrize("stated", [1 << 40, 1000])
+def test_chunk_that_decompresses_without_bounds_is_refused(tmp_path: Path, compression: str, stated: int):
     """A quarter of a gigabyte of zeros, whose chunk states a larger or smaller size."""
     zeros = bytes(BOMB)
     packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
-    (tmp_path / "bomb.mcap").write_bytes(a_chunk(compression, packed, says))
-    (tmp_path / "cut.mcap").write_bytes(a_chunk(compression, packed, says)[:-1000])
+    (tmp_path / "bomb.mcap").write_bytes(a_chunk(compression, packed, stated))
+    (tmp_path / "cut.mcap").write_bytes(a_chunk(compression, packed, stated)[:-1000])
     del zeros
     code = """
         import sys
@@ -397,9 +397,9 @@ def test_chunk_that_decompresses_without_bounds_is_refused(tmp_path: Path, compr
     child = Child(code, str(tmp_path))
     bomb, cut, peak_mb = child.line(60.0), child.line(60.0), int(child.line())
     assert child.wait() == 0
-    assert f"states {says} bytes" in bomb or "disagree on their size" in bomb
+    assert f"states {stated} bytes" in bomb or "disagree on their size" in bomb
     assert "longer than its record" in cut or "cut off" in cut
-    assert says > BOMB or peak_mb < 250
+    assert stated > BOMB or peak_mb < 250
 
 
 def test_view_instead_of_a_table_is_refused(tmp_path: Path):

@@ -96,7 +96,7 @@ GOOD = BY_ROSBAG2.format(version=9, storage="mcap", first="a_0.mcap", second="a_
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "said"),
+    ("before", "after", "reason"),
     [
         ("version: 9", "version: 10", "version is '10', and 1 to 9 are known"),
         ("version: 9", "version: nine", "version is 'nine'"),
@@ -121,12 +121,14 @@ GOOD = BY_ROSBAG2.format(version=9, storage="mcap", first="a_0.mcap", second="a_
         (GOOD, "", "does not begin with"),
     ],
 )
-def test_unsupported_metadata_is_refused_with_the_reason(tmp_path: Path, before: str, after: str, said: str):
+def test_unsupported_metadata_is_refused_with_the_reason(
+    tmp_path: Path, before: str, after: str, reason: str
+):
     assert before in GOOD
     folder = bag(tmp_path / "bag", GOOD.replace(before, after), "a_0.mcap", "a_1.mcap")
     with pytest.raises(RecordingError) as caught:
         bag_files(folder)
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
     assert caught.value.path == str(folder / "metadata.yaml")
 
 

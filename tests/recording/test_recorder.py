@@ -70,7 +70,7 @@ def count(recorder: Recorder, robot: str, stream: str = "joint_states") -> int:
 def publish_paced(
     publisher: StatePublisher, recorder: Recorder, reader: Session, number: int
 ) -> list[np.ndarray]:
-    """So many samples of a sine, as fast as ``reader`` hears those of "r1"; their positions."""
+    """Publishes samples of a sine as fast as ``reader`` receives those of "r1"; their positions."""
     sine = SineSource(publisher.model)
     sent = [sine.read(STAMP + k * PERIOD * 10).positions for k in range(number)]
     with closing(Tap(reader, "zstate/r1/tf")) as tap:
@@ -162,16 +162,16 @@ def test_several_robots_have_a_namespace_and_a_prefix_each(sessions, tmp_path: P
         *("/tf", "/tf_static", "/left/joint_states", "/left/robot_description"),
         *("/right/joint_states", "/right/robot_description"),
     }
-    said = {
+    recorded = {
         edge.child_frame_id for message in read(tmp_path / "run.mcap", "/tf") for edge in message.transforms
     }
-    said |= {
+    recorded |= {
         edge.child_frame_id
         for message in read(tmp_path / "run.mcap", "/tf_static")
         for edge in message.transforms
     }
     links = {f"left/{joint.child}" for joint in RRBOT.joints}
-    assert said == links | {f"right/{joint.child}" for joint in GRIPPER.joints}
+    assert recorded == links | {f"right/{joint.child}" for joint in GRIPPER.joints}
 
 
 def test_later_robot_gets_its_own_namespace(sessions, tmp_path: Path):
@@ -250,11 +250,11 @@ def test_changed_and_withdrawn_static_edges_are_recorded(sessions, tmp_path: Pat
             statics.set(Transform("fleet/map", "camera", (1.0, 0.0, 0.0), UPRIGHT))
             until(lambda: count(recorder, "r1", "tf_static") == 2)
         until(lambda: count(recorder, "r1", "tf_static") == 3)
-    said = [
+    recorded = [
         [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
         for message in read(tmp_path / "run.mcap", "/tf_static")
     ]
-    assert said == [[("tool", "hook")], [("tool", "hook"), ("fleet/map", "camera")], []]
+    assert recorded == [[("tool", "hook")], [("tool", "hook"), ("fleet/map", "camera")], []]
 
 
 def put_state(publisher: StreamPublisher, seq: int, stamp: int = STAMP) -> None:
@@ -316,8 +316,8 @@ def test_ros_messages_are_recorded_unchanged(sessions, tmp_path: Path):
     state = read(tmp_path / "run.mcap", "/joint_states")[-1]
     assert (state.name, state.position.tolist()) == (list(RRBOT.joint_names), positions)
     fixed = {joint.child for joint in RRBOT.joints if joint.type == "fixed"}
-    (said,) = read(tmp_path / "run.mcap", "/tf_static")
-    assert {edge.child_frame_id for edge in said.transforms} == fixed
+    (recorded,) = read(tmp_path / "run.mcap", "/tf_static")
+    assert {edge.child_frame_id for edge in recorded.transforms} == fixed
     with RecordingReader(tmp_path / "run.mcap") as recording:
         programs = {channel.metadata["zstate.program"] for channel in recording.channels()}
     assert len(programs) == 1

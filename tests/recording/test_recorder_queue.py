@@ -11,13 +11,13 @@ from zstate.net.streams import CAPACITY, StreamPublisher
 from zstate.recording.recorder import QUEUE_LENGTH, Batch, MessageQueue
 
 
-def payloads(heard: list[Batch]) -> list[bytes]:
-    return [arrival.payload for one in heard for arrival in one.arrivals]
+def payloads(batches: list[Batch]) -> list[bytes]:
+    return [arrival.payload for one in batches for arrival in one.arrivals]
 
 
 def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
     writer, reader = sessions
-    heard: list[Batch] = []
+    batches: list[Batch] = []
     with (
         MessageQueue(reader) as inbox,
         StreamPublisher(writer, "a/samples", "") as samples,
@@ -31,13 +31,13 @@ def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
         before = time.time_ns()
         for number in range(5):
             samples.put(b"%d" % number)
-        until(lambda: heard.extend(inbox.pop_all()) or len(payloads(heard)) >= 11)
+        until(lambda: batches.extend(inbox.pop_all()) or len(payloads(batches)) >= 11)
         assert inbox.pop_all() == []
-    ours = [one for one in heard if one.robot == "r1"]
+    ours = [one for one in batches if one.robot == "r1"]
     assert payloads(ours) == [b"0", b"1", b"2", b"3", b"4"]
     assert all(before <= one.stamp <= time.time_ns() and not one.overflowed for one in ours)
     assert {one.stream for one in ours} == {"joint_states"}
-    assert b"holds" in payloads([one for one in heard if one.stream == "robot_description"])
+    assert b"holds" in payloads([one for one in batches if one.stream == "robot_description"])
 
 
 def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
@@ -54,12 +54,12 @@ def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
             samples.put(b"%d" % number)
             if number % 50 == 49:  # what comes too fast is lost on the way
                 tap.payloads(number + 1)
-        heard: list[Batch] = []
-        until(lambda: heard.extend(inbox.pop_all()) or any(one.overflowed for one in heard))
+        batches: list[Batch] = []
+        until(lambda: batches.extend(inbox.pop_all()) or any(one.overflowed for one in batches))
         samples.put(b"last")
-        until(lambda: heard.extend(inbox.pop_all()) or payloads(heard)[-1] == b"last")
-    assert QUEUE_LENGTH <= len(payloads(heard)) <= QUEUE_LENGTH + 3 * CAPACITY
-    assert len(payloads(heard)) < sent
+        until(lambda: batches.extend(inbox.pop_all()) or payloads(batches)[-1] == b"last")
+    assert QUEUE_LENGTH <= len(payloads(batches)) <= QUEUE_LENGTH + 3 * CAPACITY
+    assert len(payloads(batches)) < sent
 
 
 def test_close_is_fast_without_a_reader_and_keeps_waiting_batches(sessions):

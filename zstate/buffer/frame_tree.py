@@ -402,9 +402,9 @@ class FrameTree:
                 if first is None:
                     first, common = edge, domain
                 elif domain != common:
-                    edges, domains = (first.names, edge.names), (common, domain)
+                    pair, domains = (first.names, edge.names), (common, domain)
                     robots = (self.robot_of(first), self.robot_of(edge))
-                    raise ClockMismatch(target, source, edges=edges, robots=robots, domains=domains)
+                    raise ClockMismatch(target, source, edges=pair, robots=robots, domains=domains)
         return common
 
     def dependencies(self, target: str, source: str) -> PathDependencies:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -320,7 +320,7 @@ def _product(first: NDArray[np.float64], second: NDArray[np.float64], form: NDAr
     return (second[:, None] @ matrices)[:, 0]
 
 
-_UNITS = np.eye(4).tolist()
+_UNITS: Any = np.eye(4).tolist()
 _FORM = np.array([[se3.multiply(first, second) for second in _UNITS] for first in _UNITS])
 _DUAL = np.zeros((8, 8, 8))
 _DUAL[:4, :4, :4] = _DUAL[:4, 4:, 4:] = _DUAL[4:, :4, 4:] = _FORM

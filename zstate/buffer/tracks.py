@@ -186,7 +186,7 @@ class Coverage(NamedTuple):
     oldest: int | None
     newest: int | None
     rate_hz: float | None
-    count: int
+    samples: int
 
 
 def coverage(view: HistoryView) -> Coverage:

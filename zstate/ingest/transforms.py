@@ -233,7 +233,7 @@ class ModelEdgeFilter:
     def _kept(self, robot: str, edges: Edges) -> list[int]:
         rows = self._rows.get((robot, edges))
         if rows is None:
-            rows = []
+            rows = list[int]()
             for row, (_, child) in enumerate(edges):
                 name = ""  # an invalid name is refused and counted when it is inserted
                 with suppress(InvalidInput):
