@@ -231,12 +231,8 @@ class TransformListener(Closeable):
 
     def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
         robot = self._robot_from_key(arrivals[0].key)  # the key of the request
-        samples = [
-            sample
-            for arrival in arrivals
-            for sample in self._decode(self._follow, arrival, robot)
-            if isinstance(sample, Sample)
-        ]
+        messages = (message for one in arrivals for message in self._decode(self._follow, one, robot))
+        samples = [message for message in messages if isinstance(message, Sample)]
         if any(sample.session != writer for sample in samples):
             text = f"{robot!r}: samples of another session than {writer}, whose history was requested"
             self._counters.count_refusal("foreign answer", text)
@@ -304,15 +300,12 @@ class TransformListener(Closeable):
     def _count_foreign(self, key: str, error: InvalidInput) -> None:
         self._counters.count_refusal("foreign", f"{shortened(key)}: {error}")
 
-    def _on_writer(self, announced: Announcement, alive: bool) -> None:
-        self._events.on_writer(announced, alive)
-        self._set_writer(announced, alive=alive)
-
     def _on_cut_off(self, announced: Announcement) -> None:
         self._events.on_cut_off(announced)
-        self._set_writer(announced, alive=False)
+        self._on_writer(announced, alive=False)  # adds no second event
 
-    def _set_writer(self, announced: Announcement, *, alive: bool) -> None:
+    def _on_writer(self, announced: Announcement, alive: bool) -> None:
+        self._events.on_writer(announced, alive)
         robot, session, stream = announced.robot, announced.writer.session, announced.stream
         name = str(announced.writer)
         if alive:
@@ -375,11 +368,4 @@ class _WriterClockOffsets(Closeable):
 
 
 _LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()
-
-
-def _end_after_fork() -> None:
-    for listener in tuple(_LISTENERS):
-        listener.end_after_fork()
-
-
-os.register_at_fork(after_in_child=_end_after_fork)
+os.register_at_fork(after_in_child=lambda: [listener.end_after_fork() for listener in tuple(_LISTENERS)])

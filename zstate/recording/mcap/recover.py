@@ -84,10 +84,7 @@ def _copy(file: BoundedFile, scan: Scan, output: McapOutput) -> Counter[str]:
     }
     copied = {
         number: writer.register_channel(
-            channel.topic,
-            channel.message_encoding,
-            schemas.get(channel.schema_id, 0),
-            dict(channel.metadata),
+            channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), dict(channel.metadata)
         )
         for number, channel in index.channels.items()
     }
