@@ -75,12 +75,12 @@ class Fuzz:
             self.make_history,
             *(self.write,) * 8,
             self.replace,
-            self.forget,
+            self.clear,
             self.write_together,
             self.make_path,
             self.make_good_path,
-            *(self.ask,) * 6,
-            *(self.ask_many,) * 2,
+            *(self.lookup,) * 6,
+            *(self.lookup_many,) * 2,
             self.make_facts,
             self.edges,
             self.keep_memory,
@@ -142,7 +142,7 @@ class Fuzz:
         rows = self.array(size * history.width)
         history.replace(self.pick(stamps, stamps[::-1], stamps.astype("i4"), self.array(3)), rows)
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         self.history().clear()
 
     def write_together(self) -> None:
@@ -184,14 +184,14 @@ class Fuzz:
         )
         del self.paths[: max(0, len(self.paths) - 8)]
 
-    def ask(self) -> None:
+    def lookup(self) -> None:
         for path in self.paths[-3:]:
             answer = path.at(*self.pick((), (self.stamp(),), (1, 2)))
             if answer is not None:
                 repr((answer._pose, answer.stamp, answer.kind, answer.target, answer.predicted_s))
             path.failure_at(self.stamp())
 
-    def ask_many(self) -> None:
+    def lookup_many(self) -> None:
         for path in self.paths[-3:]:
             count = self.random.randrange(40)
             stamps = self.numbers.integers(-50, 1000, count)
@@ -243,7 +243,7 @@ class Fuzz:
         return "fine"
 
 
-def beside_each_other(kernel: Any, seconds: float) -> None:
+def run_concurrently(kernel: Any, seconds: float) -> None:
     """Batches without the GIL while another thread writes, late samples and clears included."""
     history = kernel.History(7, 5000)
     transform = type("Transform", (kernel.TransformFields,), {"__slots__": ()})
@@ -292,7 +292,7 @@ def main() -> int:
     while time.monotonic() < deadline:
         outcomes += Fuzz(kernel, seed).run(2000)
         seed += 1
-    beside_each_other(kernel, 0.2 * seconds)
+    run_concurrently(kernel, 0.2 * seconds)
     print(f"{outcomes.total()} calls from {seed} seeds, no crash: {dict(outcomes.most_common())}")
     return 0
 

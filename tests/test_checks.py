@@ -16,7 +16,7 @@ from zstate.clock import check_stamp, check_stamps
 from zstate.errors import InvalidInput
 from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
-from zstate.nodes.robot_encoder import RobotEncoder
+from zstate.nodes.publisher import RobotEncoder
 from zstate.transform import Transform
 
 MODEL = load_model("rrbot")

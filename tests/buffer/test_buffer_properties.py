@@ -61,7 +61,7 @@ def assert_same(
 
 
 @given(worlds(), names, names, instants | st.none())
-def test_asking_the_other_way_round_gives_the_inverse(world: World, a: str, b: str, at: int | None) -> None:
+def test_lookup_in_the_other_direction_is_the_inverse(world: World, a: str, b: str, at: int | None) -> None:
     buffer = filled(*world)
     there, back = answer(lambda: buffer.lookup(a, b, at)), answer(lambda: buffer.lookup(b, a, at))
     if isinstance(there, Transform) and isinstance(back, Transform):
@@ -71,7 +71,7 @@ def test_asking_the_other_way_round_gives_the_inverse(world: World, a: str, b: s
 
 
 @given(worlds(), names, names, names, instants)
-def test_at_one_stamp_two_lookups_make_the_third(world: World, a: str, b: str, c: str, at: int) -> None:
+def test_two_lookups_at_one_stamp_compose_to_the_third(world: World, a: str, b: str, c: str, at: int) -> None:
     buffer = filled(*world)
     first, second = answer(lambda: buffer.lookup(a, b, at)), answer(lambda: buffer.lookup(b, c, at))
     if isinstance(first, Transform) and isinstance(second, Transform):
@@ -80,7 +80,7 @@ def test_at_one_stamp_two_lookups_make_the_third(world: World, a: str, b: str, c
 
 
 @given(worlds(), names, names, st.lists(instants, max_size=6))
-def test_lookup_plan_and_lookup_many_say_the_same(world: World, a: str, b: str, stamps: list[int]) -> None:
+def test_lookup_plan_and_lookup_many_agree(world: World, a: str, b: str, stamps: list[int]) -> None:
     buffer = filled(*world)
     try:
         plan = buffer.plan(a, b)
@@ -104,7 +104,7 @@ def test_lookup_plan_and_lookup_many_say_the_same(world: World, a: str, b: str, 
 
 
 @given(worlds(), st.randoms(use_true_random=False), names, names, instants | st.none())
-def test_the_order_of_inserts_does_not_matter(world: World, rng, a: str, b: str, at: int | None) -> None:
+def test_order_of_inserts_does_not_matter(world: World, rng, a: str, b: str, at: int | None) -> None:
     shuffled = list(world)
     rng.shuffle(shuffled)
     one, other = filled(*world), filled(*shuffled)
@@ -116,7 +116,7 @@ def test_the_order_of_inserts_does_not_matter(world: World, rng, a: str, b: str,
 
 
 @given(worlds(), names, names, instants | st.none())
-def test_what_was_asked_meanwhile_changes_nothing(world: World, a: str, b: str, at: int | None) -> None:
+def test_lookups_between_inserts_change_no_result(world: World, a: str, b: str, at: int | None) -> None:
     live = TransformBuffer()
     for transform in world:
         with suppress(LookupFailed):
@@ -148,7 +148,7 @@ def failing_calls(buffer: TransformBuffer, parent: str, child: str, at: int) -> 
 
 
 @given(worlds(), names, names, instants, st.integers(0, 11))
-def test_a_failed_call_leaves_no_trace(world: World, a: str, b: str, at: int, which: int) -> None:
+def test_failed_call_changes_nothing(world: World, a: str, b: str, at: int, which: int) -> None:
     buffer, untouched = filled(*world), filled(*world)
     with pytest.raises(ZStateError):
         failing_calls(buffer, a, b, at)[which]()
@@ -162,7 +162,7 @@ def test_a_failed_call_leaves_no_trace(world: World, a: str, b: str, at: int, wh
 
 
 @given(worlds(), st.floats(), names)
-def test_a_stamp_that_is_no_integer_is_never_taken(world: World, at: float, a: str) -> None:
+def test_non_integer_stamp_is_never_accepted(world: World, at: float, a: str) -> None:
     buffer = filled(*world)
     with pytest.raises(InvalidInput):
         buffer.lookup("f0", a, at)  # type: ignore[arg-type]

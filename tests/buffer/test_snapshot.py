@@ -29,7 +29,7 @@ def filled(history_s: float = 10.0, seconds: float = 1.0, rate_hz: int = 100) ->
     return buffer
 
 
-def test_a_frame_is_told_of_with_its_edge_and_the_rate_of_its_samples():
+def test_frame_table_lists_the_edge_and_its_writer():
     buffer = filled(rate_hz=50)
     (moving,) = [joint for joint in RRBOT.joints if joint.name == RRBOT.joint_names[0]]
     (info,) = buffer.frames([f"r1/{moving.child}"])
@@ -40,7 +40,7 @@ def test_a_frame_is_told_of_with_its_edge_and_the_rate_of_its_samples():
     assert "r2" not in buffer.frame_table().robots
 
 
-def test_a_frame_that_comes_later_is_known_then():
+def test_frame_added_later_appears_in_the_next_snapshot():
     buffer = filled()
     assert "camera" not in buffer.frame_table().names
     buffer.insert_static(Transform("r1/base", "camera", [1, 0, 0], [0, 0, 0, 1]))
@@ -49,18 +49,18 @@ def test_a_frame_that_comes_later_is_known_then():
     assert buffer.frame_table() is table
 
 
-def test_what_can_be_looked_at_reaches_from_the_oldest_sample_to_the_newest():
+def test_span_reaches_from_the_oldest_sample_to_the_newest():
     assert filled(seconds=2.0).span() == TimeSpan(0, 2 * SECOND)
     assert TransformBuffer().span() is None
 
 
-def test_a_robot_that_went_silent_long_ago_does_not_stretch_what_can_be_looked_at():
+def test_robot_silent_for_long_does_not_extend_the_span():
     buffer = filled(history_s=10.0)
     buffer.insert(Transform("map", "odom", [0, 0, 0], [0, 0, 0, 1], stamp=100 * SECOND))
     assert buffer.span() == TimeSpan(90 * SECOND, 100 * SECOND)
 
 
-def test_the_past_of_joints_ends_at_the_instant_that_is_looked_at():
+def test_joint_history_ends_at_the_requested_instant():
     buffer = filled(seconds=3.0)
     history = buffer.joint_history(buffer.frame_table().robots["r1"], 2 * SECOND, 1.0, points=1000)
     assert (history.stamps[0], history.stamps[-1]) == (1 * SECOND, 2 * SECOND)
@@ -68,7 +68,7 @@ def test_the_past_of_joints_ends_at_the_instant_that_is_looked_at():
     assert not history.positions[:, 1].any()
 
 
-def test_the_past_of_joints_is_thinned_to_what_can_be_drawn():
+def test_joint_history_is_reduced_to_the_requested_points():
     buffer = filled(seconds=9.0)
     history = buffer.joint_history(buffer.frame_table().robots["r1"], 9 * SECOND, 8.0, points=100)
     assert 80 <= len(history.stamps) <= 101
@@ -79,7 +79,7 @@ def shifted(x: float, stamp: int) -> Transform:
     return Transform("odom", "base", (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp=stamp)
 
 
-def test_beyond_the_newest_sample_poses_are_known_only_for_the_hold_time():
+def test_poses_after_the_newest_sample_are_known_only_for_the_hold_time():
     buffer = TransformBuffer()
     buffer.insert(shifted(1.0, SECOND))
     buffer.insert(shifted(2.0, 2 * SECOND))
@@ -92,7 +92,7 @@ def test_beyond_the_newest_sample_poses_are_known_only_for_the_hold_time():
     assert beyond.reasons[row] == "100 ns after the newest sample of 'odom -> base' (no writer)"
 
 
-def test_a_snapshot_is_every_lookup_bit_for_bit_at_samples_and_to_rounding_between():
+def test_snapshot_equals_lookups_exactly_at_samples_and_to_rounding_between():
     buffer = filled()
     edges = [("map", "r1/world"), ("map", "cart")]
     turned = [1.0, 2.0, 0.0, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]
@@ -109,7 +109,7 @@ def test_a_snapshot_is_every_lookup_bit_for_bit_at_samples_and_to_rounding_betwe
                 np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
 
 
-def test_a_snapshot_of_some_robots_has_their_frames_and_those_above():
+def test_snapshot_of_selected_robots_has_their_frames_and_those_above():
     buffer = filled()
     buffer.add_robot(RRBOT, "r2")
     buffer.insert_static(Transform("map", f"r1/{RRBOT.root}", [0, 0, 0], [0, 0, 0, 1]))
@@ -125,53 +125,53 @@ def tree_of(*parents: int) -> FrameTable:
     return FrameTable(names, np.array(parents, dtype=np.intp), kinds, (None,) * len(parents))
 
 
-def moment_of(tree: FrameTable, poses: object, *unknown: int) -> FramePoses:
+def poses_of(tree: FrameTable, poses: object, *unknown: int) -> FramePoses:
     known = np.ones(len(tree.names), dtype=np.bool_)
     known[list(unknown)] = False
     return FramePoses(5, tree, np.array(poses, dtype=np.float64), known)
 
 
-def test_each_frame_goes_on_from_its_parent():
-    moment = moment_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
+def test_frame_pose_builds_on_the_pose_of_its_parent():
+    moment = poses_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
     # One ahead and turned left; the next is one ahead of that, so one to the left.
     assert moment.poses_in("f0")[2] == pytest.approx((1.0, 1.0, 0.0, 0.0, 0.0, QUARTER, QUARTER))
     assert moment.poses_in("f0")[0] == pytest.approx(STILL)
 
 
-def test_a_chosen_frame_is_where_everything_is_measured_from():
-    moment = moment_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
+def test_poses_in_returns_poses_relative_to_the_selected_frame():
+    moment = poses_of(tree_of(-1, 0, 1), [STILL, AHEAD_AND_LEFT, AHEAD])
     assert moment.poses_in("f2")[2] == pytest.approx(STILL)
     assert moment.poses_in("f2")[1, :3] == pytest.approx((-1.0, 0.0, 0.0))
     assert moment.poses_in("f2")[0, :3] == pytest.approx((-1.0, 1.0, 0.0))
 
 
-def test_frames_under_another_root_have_no_place():
-    placed = moment_of(tree_of(-1, 0, -1, 2), [STILL, AHEAD, STILL, AHEAD]).poses_in("f1")
+def test_frames_of_another_tree_have_no_pose():
+    placed = poses_of(tree_of(-1, 0, -1, 2), [STILL, AHEAD, STILL, AHEAD]).poses_in("f1")
     assert np.isnan(placed[2:]).all()
     assert not np.isnan(placed[:2]).any()
 
 
-def test_an_edge_without_a_pose_cuts_the_tree_there_and_nowhere_else():
-    moment = moment_of(tree_of(-1, 0, 1, 0), [STILL, STILL, AHEAD, AHEAD], 1)
+def test_unknown_edge_pose_separates_only_its_subtree():
+    moment = poses_of(tree_of(-1, 0, 1, 0), [STILL, STILL, AHEAD, AHEAD], 1)
     assert np.isnan(moment.poses_in("f0")[[1, 2]]).all()
     assert moment.poses_in("f0")[3, :3] == pytest.approx((1.0, 0.0, 0.0))
     assert moment.poses_in("f1")[2, :3] == pytest.approx((1.0, 0.0, 0.0))
 
 
-def test_a_frame_that_nobody_named_is_an_error_with_its_near_misses():
+def test_unknown_frame_raises_with_near_misses():
     with pytest.raises(UnknownFrame) as caught:
-        moment_of(tree_of(-1, 0), [STILL, AHEAD]).poses_in("f01")
+        poses_of(tree_of(-1, 0), [STILL, AHEAD]).poses_in("f01")
     assert "f1" in caught.value.near_misses
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40))
-def test_any_tree_is_placed_as_its_edges_multiplied_one_by_one(seed: int, size: int):
+def test_poses_of_any_tree_equal_the_product_of_its_edges(seed: int, size: int):
     rng = np.random.default_rng(seed)
     parents = [int(rng.integers(-1, row)) for row in range(size)]
     numbers = rng.normal(size=(size, 7))
     numbers[:, 3:] /= np.linalg.norm(numbers[:, 3:], axis=1)[:, None]
     numbers[[row for row, parent in enumerate(parents) if parent < 0]] = STILL
-    moment = moment_of(tree_of(*parents), numbers)
+    moment = poses_of(tree_of(*parents), numbers)
     fixed = int(rng.integers(size))
     matrices: list[np.ndarray] = []
     for row, parent in enumerate(parents):

@@ -17,7 +17,9 @@ The figures are printed (``-rP``); hold them against the bounds where nothing el
 """
 
 TESTS = str(Path(__file__).parents[1])
-_CODE = f"import sys; sys.path.insert(0, {TESTS!r}); from helpers import fault_programs; fault_programs.main()"
+_CODE = (
+    f"import sys; sys.path.insert(0, {TESTS!r}); from helpers import fault_programs; fault_programs.main()"
+)
 
 
 class Party:

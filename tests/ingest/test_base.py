@@ -40,14 +40,17 @@ def description(model: RobotModel = RRBOT, urdf: str | None = None, digest: str 
     )
 
 
-class Following:
+class IngestCase:
     """An ingest with its buffer and its counters."""
 
     def __init__(
-        self, make: type[StreamIngest], buffer: TransformBuffer | None = None, beside: Following | None = None
+        self,
+        make: type[StreamIngest],
+        buffer: TransformBuffer | None = None,
+        sharing: IngestCase | None = None,
     ) -> None:
         self.ownership = (
-            beside.ownership if beside else FrameOwnership(buffer or TransformBuffer(), Counters())
+            sharing.ownership if sharing else FrameOwnership(buffer or TransformBuffer(), Counters())
         )
         self.buffer, self.counters, self.live = (
             self.ownership.buffer,
@@ -56,7 +59,7 @@ class Following:
         )
         self.ingest: StreamIngest = make("r1", self.ownership)
 
-    def take(self, *samples: Sample) -> None:
+    def receive(self, *samples: Sample) -> None:
         for sample in samples:
             self.ingest.insert_sample(sample, overflowed=False)
 
@@ -79,145 +82,145 @@ class Following:
 
 
 @pytest.fixture(params=EVERY)
-def following(request: pytest.FixtureRequest) -> Following:
-    return Following(request.param)
+def case(request: pytest.FixtureRequest) -> IngestCase:
+    return IngestCase(request.param)
 
 
-def test_samples_before_the_description_are_not_lost(following: Following):
-    following.take(*[following.sample(n, [0.1 * n, 0.2 * n]) for n in range(4)])
-    assert following.counters.stats().received == 0
-    following.ingest.describe(description())
-    assert following.counters.stats().received == 4
-    assert all(following.elbow_is([0.1 * n, 0.2 * n], at=n) for n in range(4))
+def test_samples_before_the_description_are_not_lost(case: IngestCase):
+    case.receive(*[case.sample(n, [0.1 * n, 0.2 * n]) for n in range(4)])
+    assert case.counters.stats().received == 0
+    case.ingest.describe(description())
+    assert case.counters.stats().received == 4
+    assert all(case.elbow_is([0.1 * n, 0.2 * n], at=n) for n in range(4))
 
 
-def test_samples_that_no_description_ever_fits_are_counted_in_the_end(following: Following):
-    following.take(*[following.sample(n, [0.0, 0.0]) for n in range(1030)])
-    assert following.counters.stats().refused == {"no description": 6}
-    following.ingest.describe(description())
-    assert following.counters.stats().received == 1024
+def test_samples_that_no_description_fits_are_counted(case: IngestCase):
+    case.receive(*[case.sample(n, [0.0, 0.0]) for n in range(1030)])
+    assert case.counters.stats().refused == {"no description": 6}
+    case.ingest.describe(description())
+    assert case.counters.stats().received == 1024
 
 
-def test_gaps_in_seq_are_counted_as_missed_or_as_dropped_by_our_own_ring(following: Following):
-    following.ingest.describe(description())
-    following.take(following.sample(10, [0, 0]), following.sample(13, [0, 0]))
-    following.ingest.insert_sample(following.sample(15, [0, 0]), overflowed=True)
-    following.take(following.sample(14, [0, 0]), following.sample(16, [0, 0]))
-    stats = following.counters.stats()
+def test_seq_gaps_count_as_missed_or_as_dropped_by_the_own_ring(case: IngestCase):
+    case.ingest.describe(description())
+    case.receive(case.sample(10, [0, 0]), case.sample(13, [0, 0]))
+    case.ingest.insert_sample(case.sample(15, [0, 0]), overflowed=True)
+    case.receive(case.sample(14, [0, 0]), case.sample(16, [0, 0]))
+    stats = case.counters.stats()
     assert (stats.received, stats.missed, stats.dropped) == (5, 2, 1)
 
 
-def test_what_is_older_than_the_history_is_late(following: Following):
-    following = Following(type(following.ingest), TransformBuffer(history_s=1e-6))
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0, 0], stamp=5000), following.sample(1, [0, 0], stamp=3999))
-    stats = following.counters.stats()
+def test_sample_older_than_the_history_counts_as_late(case: IngestCase):
+    case = IngestCase(type(case.ingest), TransformBuffer(history_s=1e-6))
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0, 0], stamp=5000), case.sample(1, [0, 0], stamp=3999))
+    stats = case.counters.stats()
     assert (stats.received, stats.late, stats.refused) == (1, 1, {})
 
 
-def test_a_clock_that_was_set_back_is_a_new_epoch_at_the_second_sample(following: Following):
-    following = Following(type(following.ingest), TransformBuffer(history_s=1e-6))
-    following.ingest.describe(description())
+def test_second_sample_of_a_clock_set_back_starts_a_new_epoch(case: IngestCase):
+    case = IngestCase(type(case.ingest), TransformBuffer(history_s=1e-6))
+    case.ingest.describe(description())
     stamps = (5000, 1000, 1100, 1200)
-    following.take(*(following.sample(seq, [0, 0.1 * seq], stamp=at) for seq, at in enumerate(stamps)))
-    stats = following.counters.stats()
+    case.receive(*(case.sample(seq, [0, 0.1 * seq], stamp=at) for seq, at in enumerate(stamps)))
+    stats = case.counters.stats()
     assert (stats.received, stats.late, stats.refused) == (3, 1, {})
-    assert following.buffer.latest("r1/upper", "r1/lower") == 1200
-    assert following.elbow_is([0, 0.2], 1100)
+    assert case.buffer.latest("r1/upper", "r1/lower") == 1200
+    assert case.elbow_is([0, 0.2], 1100)
 
 
-def test_a_held_up_sample_does_not_end_the_epoch(following: Following):
-    following = Following(type(following.ingest), TransformBuffer(history_s=1e-6))
-    following.ingest.describe(description())
+def test_delayed_sample_does_not_end_the_epoch(case: IngestCase):
+    case = IngestCase(type(case.ingest), TransformBuffer(history_s=1e-6))
+    case.ingest.describe(description())
     stamps = (5000, 1000, 6000, 1100, 7000)
-    following.take(*(following.sample(seq, [0, 0], stamp=at) for seq, at in enumerate(stamps)))
-    assert (following.counters.stats().received, following.counters.stats().late) == (3, 2)
+    case.receive(*(case.sample(seq, [0, 0], stamp=at) for seq, at in enumerate(stamps)))
+    assert (case.counters.stats().received, case.counters.stats().late) == (3, 2)
 
 
-def test_a_writer_whose_clock_is_behind_does_not_take_the_edges_of_one_that_lives():
-    ahead = Following(TransformIngest, TransformBuffer(history_s=1e-6))
-    behind = Following(TransformIngest, beside=ahead)
+def test_writer_with_a_slow_clock_does_not_take_over_edges_of_a_live_writer():
+    ahead = IngestCase(TransformIngest, TransformBuffer(history_s=1e-6))
+    behind = IngestCase(TransformIngest, sharing=ahead)
     ahead.live |= {("r1", 7): "ahead", ("r1", 8): "behind"}
-    for following, session in ((ahead, 7), (behind, 8)):
-        following.ingest.describe(description())
-        following.ingest.name_writer(session, behind.live["r1", session])
-    ahead.take(ahead.sample(0, [0, 0.5], stamp=9000))
+    for case, session in ((ahead, 7), (behind, 8)):
+        case.ingest.describe(description())
+        case.ingest.name_writer(session, behind.live["r1", session])
+    ahead.receive(ahead.sample(0, [0, 0.5], stamp=9000))
     late = [behind.sample(seq, [0, 0], session=8, stamp=1000 + seq) for seq in range(3)]
-    behind.take(*late)
+    behind.receive(*late)
     assert behind.counters.stats().late == 3
     assert ahead.elbow_is([0, 0.5])
     del behind.live["r1", 7]
-    behind.take(behind.sample(3, [0, 0], session=8, stamp=1003))
+    behind.receive(behind.sample(3, [0, 0], session=8, stamp=1003))
     assert behind.elbow_is([0, 0], 1003)
 
 
-def test_a_new_session_is_a_new_epoch_even_when_its_clock_is_behind(following: Following):
-    following.ingest.describe(description())
-    following.take(following.sample(5, [1.0, 1.0], session=1, stamp=10**12))
-    following.take(following.sample(0, [0.5, 0.5], session=2, stamp=7))
-    assert following.buffer.latest("r1/upper", "r1/lower") == 7
-    assert following.elbow_is([0.5, 0.5])
-    assert following.buffer.explain("r1/upper", "r1/lower", 10**12) is not None
-    stats = following.counters.stats()
+def test_new_session_starts_a_new_epoch_even_if_its_clock_is_behind(case: IngestCase):
+    case.ingest.describe(description())
+    case.receive(case.sample(5, [1.0, 1.0], session=1, stamp=10**12))
+    case.receive(case.sample(0, [0.5, 0.5], session=2, stamp=7))
+    assert case.buffer.latest("r1/upper", "r1/lower") == 7
+    assert case.elbow_is([0.5, 0.5])
+    assert case.buffer.explain("r1/upper", "r1/lower", 10**12) is not None
+    stats = case.counters.stats()
     assert (stats.received, stats.missed, stats.late, stats.refused) == (2, 0, 0, {})
 
 
-def test_the_older_of_two_writers_is_counted_and_does_not_come_back(following: Following):
-    following.ingest.describe(description())
+def test_older_of_two_writers_is_counted_and_stays_refused(case: IngestCase):
+    case.ingest.describe(description())
     for seq in range(10):
-        following.take(following.sample(seq, [1.0, 1.0], session=1, stamp=2 * seq))
-        following.take(following.sample(seq, [2.0, 2.0], session=2, stamp=2 * seq + 1))
-    assert following.counters.stats().refused == {"second writer": 9}
-    assert following.elbow_is([2.0, 2.0])
-    assert following.buffer.explain("r1/upper", "r1/lower", 0) is not None
+        case.receive(case.sample(seq, [1.0, 1.0], session=1, stamp=2 * seq))
+        case.receive(case.sample(seq, [2.0, 2.0], session=2, stamp=2 * seq + 1))
+    assert case.counters.stats().refused == {"second writer": 9}
+    assert case.elbow_is([2.0, 2.0])
+    assert case.buffer.explain("r1/upper", "r1/lower", 0) is not None
 
 
-def test_the_writer_that_gave_way_is_followed_again_once_the_other_has_left(following: Following):
-    following.ingest.describe(description())
-    following.take(following.sample(0, [1.0, 1.0], session=1), following.sample(1, [2.0, 2.0], session=2))
-    following.ingest.writer_left(1)
-    following.take(following.sample(2, [1.0, 1.0], session=1))
-    assert following.counters.stats().refused == {"second writer": 1}
-    following.ingest.writer_left(2)
-    following.take(following.sample(3, [1.0, 1.0], session=1))
-    assert following.counters.stats().refused == {"second writer": 1}
-    assert following.elbow_is([1.0, 1.0])
-    following.take(following.sample(4, [2.0, 2.0], session=2))
-    assert following.counters.stats().refused == {"second writer": 2}
+def test_replaced_writer_is_accepted_again_after_the_newer_one_left(case: IngestCase):
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [1.0, 1.0], session=1), case.sample(1, [2.0, 2.0], session=2))
+    case.ingest.writer_left(1)
+    case.receive(case.sample(2, [1.0, 1.0], session=1))
+    assert case.counters.stats().refused == {"second writer": 1}
+    case.ingest.writer_left(2)
+    case.receive(case.sample(3, [1.0, 1.0], session=1))
+    assert case.counters.stats().refused == {"second writer": 1}
+    assert case.elbow_is([1.0, 1.0])
+    case.receive(case.sample(4, [2.0, 2.0], session=2))
+    assert case.counters.stats().refused == {"second writer": 2}
 
 
-def test_the_writers_name_is_known_whether_it_was_told_before_or_after_its_samples(following: Following):
-    following.ingest.describe(description())
-    following.ingest.name_writer(1, "driver@arm pid 4")
-    following.take(following.sample(0, [0, 0], session=1))
-    names = {frame.name: frame.writer for frame in following.buffer.frames()}
+def test_writer_name_is_known_whether_announced_before_or_after_its_samples(case: IngestCase):
+    case.ingest.describe(description())
+    case.ingest.name_writer(1, "driver@arm pid 4")
+    case.receive(case.sample(0, [0, 0], session=1))
+    names = {frame.name: frame.writer for frame in case.buffer.frames()}
     assert names["r1/lower"] == "driver@arm pid 4"
-    following.take(following.sample(0, [0, 0], session=2))
-    following.ingest.name_writer(2, "driver@arm pid 5")
-    following.take(following.sample(1, [0, 0], session=2))
-    names = {frame.name: frame.writer for frame in following.buffer.frames()}
+    case.receive(case.sample(0, [0, 0], session=2))
+    case.ingest.name_writer(2, "driver@arm pid 5")
+    case.receive(case.sample(1, [0, 0], session=2))
+    names = {frame.name: frame.writer for frame in case.buffer.frames()}
     assert names["r1/lower"] == "driver@arm pid 5"
 
 
-def test_a_changed_model_replaces_the_robot_and_its_history():
-    following = Following(JointStateIngest)
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0.0, 0.0]))
-    assert following.buffer.lookup("r1/lower", "r1/tool").translation[2] == 0.6
-    following.ingest.describe(description(LONGER))
-    assert following.buffer.lookup("r1/lower", "r1/tool").translation[2] == 0.9
+def test_changed_model_replaces_the_robot_and_its_history():
+    case = IngestCase(JointStateIngest)
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0.0, 0.0]))
+    assert case.buffer.lookup("r1/lower", "r1/tool").translation[2] == 0.6
+    case.ingest.describe(description(LONGER))
+    assert case.buffer.lookup("r1/lower", "r1/tool").translation[2] == 0.9
     with pytest.raises(LookupFailed):
-        following.buffer.lookup("r1/upper", "r1/lower")
-    following.take(following.sample(1, [0.3, 0.4]))
-    assert following.elbow_is([0.3, 0.4])
-    assert following.counters.stats().refused == {}
+        case.buffer.lookup("r1/upper", "r1/lower")
+    case.receive(case.sample(1, [0.3, 0.4]))
+    assert case.elbow_is([0.3, 0.4])
+    assert case.counters.stats().refused == {}
 
 
 def test_another_joint_order_than_the_models_is_refused():
-    following = Following(JointStateIngest)
-    following.ingest.describe(description(SWAPPED))
-    following.take(following.sample(0, [0.0, 0.0]))
-    assert following.counters.stats().refused == {"other joint order": 1}
+    case = IngestCase(JointStateIngest)
+    case.ingest.describe(description(SWAPPED))
+    case.receive(case.sample(0, [0.0, 0.0]))
+    assert case.counters.stats().refused == {"other joint order": 1}
 
 
 @pytest.mark.parametrize(
@@ -230,94 +233,94 @@ def test_another_joint_order_than_the_models_is_refused():
         "<robot name='x'><xacro:if value='1'/></robot>",
     ],
 )
-def test_a_description_that_is_no_urdf_text_is_refused_and_opens_nothing(urdf: str):
-    following = Following(JointStateIngest)
-    following.ingest.describe(description(urdf=urdf, digest="ff"))
-    assert following.counters.stats().refused == {"robot description": 1}
-    assert following.buffer.frames() == ()
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0.5, 0.5]))
-    assert following.elbow_is([0.5, 0.5])
+def test_description_that_is_no_urdf_text_is_refused_and_opens_no_file(urdf: str):
+    case = IngestCase(JointStateIngest)
+    case.ingest.describe(description(urdf=urdf, digest="ff"))
+    assert case.counters.stats().refused == {"robot description": 1}
+    assert case.buffer.frames() == ()
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0.5, 0.5]))
+    assert case.elbow_is([0.5, 0.5])
 
 
 @pytest.mark.parametrize("positions", [[0.0], [0.0, 0.0, 0.0], [0.0, float("nan")], [float("inf"), 0.0]])
-def test_positions_that_cannot_be_are_refused(positions: list[float]):
-    following = Following(JointStateIngest)
-    following.ingest.describe(description())
-    following.take(following.sample(0, positions), following.sample(1, [0.5, 0.5]))
-    assert following.counters.stats().refused == {"bad numbers": 1}
-    assert following.elbow_is([0.5, 0.5])
+def test_invalid_positions_are_refused(positions: list[float]):
+    case = IngestCase(JointStateIngest)
+    case.ingest.describe(description())
+    case.receive(case.sample(0, positions), case.sample(1, [0.5, 0.5]))
+    assert case.counters.stats().refused == {"bad numbers": 1}
+    assert case.elbow_is([0.5, 0.5])
 
 
-def test_transforms_may_name_their_edges_and_need_no_description():
-    following = Following(TransformIngest)
-    following.take(following.sample(0, [0.5, 0.5], edges=edge_names(RRBOT)))
-    assert following.elbow_is([0.5, 0.5])
-    following.take(following.sample(0, [0.7, 0.7], session=8, stamp=-5, edges=edge_names(RRBOT)))
-    assert following.buffer.latest("r1/upper", "r1/lower") == -5
+def test_transforms_that_name_their_edges_need_no_description():
+    case = IngestCase(TransformIngest)
+    case.receive(case.sample(0, [0.5, 0.5], edges=edge_names(RRBOT)))
+    assert case.elbow_is([0.5, 0.5])
+    case.receive(case.sample(0, [0.7, 0.7], session=8, stamp=-5, edges=edge_names(RRBOT)))
+    assert case.buffer.latest("r1/upper", "r1/lower") == -5
 
 
-def test_transforms_that_name_their_edges_outlast_a_description_that_comes_later():
-    following = Following(TransformIngest)
-    following.take(following.sample(0, [0.5, 0.5], stamp=5, edges=edge_names(RRBOT)))
-    following.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
-    assert following.elbow_is([0.5, 0.5], at=5)
+def test_transforms_that_name_their_edges_stay_when_a_description_arrives():
+    case = IngestCase(TransformIngest)
+    case.receive(case.sample(0, [0.5, 0.5], stamp=5, edges=edge_names(RRBOT)))
+    case.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
+    assert case.elbow_is([0.5, 0.5], at=5)
 
 
-def test_transforms_of_another_robots_order_are_never_taken_for_this_ones():
-    following = Following(TransformIngest)
-    following.take(following.sample(0, [0.5, 0.5]))
+def test_transforms_in_the_order_of_another_robot_are_never_inserted():
+    case = IngestCase(TransformIngest)
+    case.receive(case.sample(0, [0.5, 0.5]))
     other = (("base", "left"), ("base", "right"))
-    following.ingest.describe(RobotDescription(1, "", "", (), other))
-    assert following.counters.stats().refused == {"no description": 1}
-    assert following.buffer.frames() == ()
+    case.ingest.describe(RobotDescription(1, "", "", (), other))
+    assert case.counters.stats().refused == {"no description": 1}
+    assert case.buffer.frames() == ()
 
 
-def test_a_changed_description_without_a_sample_between_is_taken():
-    following = Following(TransformIngest)
-    following.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0.5, 0.5]))
-    assert following.elbow_is([0.5, 0.5])
+def test_changed_description_before_any_sample_is_used():
+    case = IngestCase(TransformIngest)
+    case.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0.5, 0.5]))
+    assert case.elbow_is([0.5, 0.5])
 
 
-def test_a_description_with_impossible_frame_names_is_refused():
-    following = Following(TransformIngest)
-    following.ingest.describe(RobotDescription(1, "", "", (), (("base", ""),)))
-    assert following.counters.stats().refused == {"robot description": 1}
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0.5, 0.5]))
-    assert following.elbow_is([0.5, 0.5])
+def test_description_with_impossible_frame_names_is_refused():
+    case = IngestCase(TransformIngest)
+    case.ingest.describe(RobotDescription(1, "", "", (), (("base", ""),)))
+    assert case.counters.stats().refused == {"robot description": 1}
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0.5, 0.5]))
+    assert case.elbow_is([0.5, 0.5])
 
 
-def test_a_robot_without_moving_edges_sends_samples_that_are_in_order():
-    following = Following(TransformIngest)
-    following.ingest.describe(RobotDescription(1, "", "", (), ()))
-    following.take(TransformSample(1, 0, 7, order_digest(()), b""))
-    assert (following.counters.stats().received, following.counters.stats().refused) == (1, {})
+def test_samples_of_a_robot_without_moving_edges_are_valid():
+    case = IngestCase(TransformIngest)
+    case.ingest.describe(RobotDescription(1, "", "", (), ()))
+    case.receive(TransformSample(1, 0, 7, order_digest(()), b""))
+    assert (case.counters.stats().received, case.counters.stats().refused) == (1, {})
 
 
-def test_a_restart_leaves_what_a_static_writer_took_over():
+def test_restart_keeps_edges_that_a_static_writer_took_over():
     from zstate.transform import Transform
 
-    following = Following(TransformIngest)
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0.5, 0.5]))
-    following.buffer.insert_static(
+    case = IngestCase(TransformIngest)
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0.5, 0.5]))
+    case.buffer.insert_static(
         Transform("r1/upper", "r1/lower", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), writer="fixture"
     )
-    following.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
-    assert following.buffer.lookup("r1/upper", "r1/lower").translation[0] == 1.0
+    case.ingest.describe(RobotDescription(1, "", "", (), (("base", "left"),)))
+    assert case.buffer.lookup("r1/upper", "r1/lower").translation[0] == 1.0
 
 
-def test_fixed_edges_are_those_of_whoever_writes_the_model_and_moving_ones_of_the_driver():
-    following = Following(JointStateIngest)
-    following.ingest.describe(description())
-    following.take(following.sample(0, [0, 0]))
-    following.ingest.name_writer(7, "driver")
-    assert {frame.writer for frame in following.buffer.frames() if frame.kind == "static"} == {
+def test_fixed_edges_name_the_model_writer_and_moving_edges_the_driver():
+    case = IngestCase(JointStateIngest)
+    case.ingest.describe(description())
+    case.receive(case.sample(0, [0, 0]))
+    case.ingest.name_writer(7, "driver")
+    assert {frame.writer for frame in case.buffer.frames() if frame.kind == "static"} == {
         "the model of 'rrbot'"
     }
-    following.ingest.name_writer(1, "publisher")
-    writers = {(frame.kind, frame.writer) for frame in following.buffer.frames() if frame.parent}
+    case.ingest.name_writer(1, "publisher")
+    writers = {(frame.kind, frame.writer) for frame in case.buffer.frames() if frame.parent}
     assert writers == {("static", "publisher"), ("joint", "driver")}

@@ -6,7 +6,7 @@ import pytest
 from zstate.ingest.counters import Counters, ListenerStats
 
 
-def test_counts_begin_at_nothing_and_add_up():
+def test_counts_start_at_zero_and_add_up():
     counters = Counters()
     assert counters.stats() == ListenerStats(0, 0, 0, 0, {})
     counters.count("received", 3)
@@ -15,7 +15,7 @@ def test_counts_begin_at_nothing_and_add_up():
     assert counters.stats() == ListenerStats(received=4, dropped=0, missed=1, late=0, refused={})
 
 
-def test_the_first_refusal_of_each_reason_is_logged_and_all_are_counted(caplog: pytest.LogCaptureFixture):
+def test_first_refusal_of_each_reason_is_logged_and_all_are_counted(caplog: pytest.LogCaptureFixture):
     counters = Counters()
     with caplog.at_level(logging.WARNING, "zstate"):
         for number in range(3):
@@ -28,7 +28,7 @@ def test_the_first_refusal_of_each_reason_is_logged_and_all_are_counted(caplog: 
     ]
 
 
-def test_stats_are_of_their_moment():
+def test_stats_do_not_change_after_they_are_read():
     counters = Counters()
     counters.count_refusal("loop", "")
     before = counters.stats()
@@ -36,7 +36,7 @@ def test_stats_are_of_their_moment():
     assert before.refused == {"loop": 1}
 
 
-def test_threads_lose_no_count():
+def test_concurrent_counts_lose_nothing():
     counters = Counters()
 
     def work() -> None:
@@ -52,7 +52,7 @@ def test_threads_lose_no_count():
     assert (counters.stats().received, counters.stats().refused["loop"]) == (4000, 4000)
 
 
-def test_the_first_refusal_of_each_reason_is_kept_in_words():
+def test_text_of_the_first_refusal_of_each_reason_is_kept():
     counters = Counters()
     counters.count_refusal("malformed", "one")
     counters.count_refusal("malformed", "two")

@@ -20,7 +20,7 @@ def monitored(*times_s: float) -> DeadlineMonitor:
 
 
 @pytest.mark.parametrize(("period_s", "silence_s"), [(0.01, 0.5), (0.05, 0.5), (0.2, 2.0)])
-def test_stale_is_ten_periods_and_half_a_second_at_least(period_s: float, silence_s: float):
+def test_deadline_is_ten_periods_and_at_least_half_a_second(period_s: float, silence_s: float):
     monitor = monitored(*(100.0 + period_s * number for number in range(50)))
     due_s = 100.0 + period_s * 49 + silence_s
     stale, next_s = monitor.expired(due_s - 1e-3)
@@ -31,7 +31,7 @@ def test_stale_is_ten_periods_and_half_a_second_at_least(period_s: float, silenc
     assert next_s == math.inf
 
 
-def test_it_is_stale_once_until_a_sample_comes():
+def test_writer_becomes_stale_once_until_its_next_sample():
     monitor = monitored(1.0, 1.1)
     assert monitor.expired(9.0)[0]
     assert not monitor.expired(10.0)[0]
@@ -40,19 +40,19 @@ def test_it_is_stale_once_until_a_sample_comes():
     assert monitor.expired(19.0)[0]
 
 
-def test_who_has_not_said_two_things_yet_is_not_stale():
+def test_writer_with_fewer_than_two_samples_is_not_stale():
     assert monitored().expired(1e9) == ({}, math.inf)
     assert monitored(1.0).expired(1e9) == ({}, math.inf)
 
 
-def test_samples_of_nobody_announced_are_nobodys():
+def test_samples_of_unregistered_writers_are_ignored():
     monitor = DeadlineMonitor()
     for now_s in (1.0, 2.0):
         assert monitor.on_sample(WRITER, now_s) is None
     assert monitor.expired(1e9) == ({}, math.inf)
 
 
-def test_each_stream_that_ends_tells_whether_its_writer_was_stale():
+def test_unregister_returns_whether_the_writer_was_stale():
     monitor = monitored(1.0, 1.1)
     monitor.register(WRITER)
     monitor.expired(9.0)
@@ -64,11 +64,11 @@ def test_each_stream_that_ends_tells_whether_its_writer_was_stale():
     ("silent_s", "rate_hz", "expected"),
     [(0.4, 100.0, False), (0.6, 100.0, True), (1e9, None, False), (9.0, 1.0, False), (11.0, 1.0, True)],
 )
-def test_a_known_rate_gives_the_same_deadline(silent_s: float, rate_hz: float | None, expected: bool):
+def test_known_rate_gives_the_same_deadline(silent_s: float, rate_hz: float | None, expected: bool):
     assert is_stale(silent_s, rate_hz) == expected
 
 
-def test_a_writer_that_slows_down_misses_two_deadlines_and_no_third():
+def test_slower_writer_misses_two_deadlines_and_no_third():
     deadline = Deadline()
     for number in range(100):
         deadline.on_sample(0.01 * number)
@@ -79,14 +79,14 @@ def test_a_writer_that_slows_down_misses_two_deadlines_and_no_third():
     assert missed == [True, True, False, False, False]
 
 
-def test_a_silence_is_no_period():
+def test_silence_does_not_count_as_a_period():
     deadline = Deadline()
     for now_s in (0.0, 0.1, 0.2, 60.0, 60.1):
         deadline.on_sample(now_s)
     assert deadline.due_s == pytest.approx(60.1 + 1.0)
 
 
-def test_a_second_sample_may_be_awaited_for_a_fixed_time():
+def test_fixed_time_limits_the_wait_for_a_second_sample():
     deadline = Deadline(unknown_s=2.0)
     assert not deadline.is_missed(1e9)
     deadline.on_sample(10.0)

@@ -12,32 +12,32 @@ from zstate.ingest.events import KEPT, EventLog, StaticEdgeOwners, WriterEvent
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import Stream
 
-HEARD: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states")
+SUBSCRIBED: tuple[Stream, ...] = ("robot_description", "tf_static", "joint_states")
 ROS_SHARED: tuple[Stream, ...] = ("tf", "tf_static")
 DRIVER = WriterId("driver", "jetson", 412, 5, 7)
 RESTARTED = WriterId("driver", "jetson", 413, 6, 8)
 OTHER = WriterId("simulator", "laptop", 9, 6, 9)
 
 
-def said(writer: WriterId = DRIVER, stream: Stream = "joint_states", name: str = "") -> Announcement:
+def announced(writer: WriterId = DRIVER, stream: Stream = "joint_states", name: str = "") -> Announcement:
     return Announcement("r1", stream, writer, name)
 
 
 def quiet() -> EventLog:
-    return EventLog(HEARD, "joint_states", ())
+    return EventLog(SUBSCRIBED, "joint_states", ())
 
 
 def kinds(events: EventLog) -> list[str]:
     return [event.kind for event in events.recent()]
 
 
-def test_a_writer_joins_and_leaves():
+def test_writer_joins_and_leaves():
     before = time.time_ns()
     with quiet() as events:
-        events.on_writer(said(), alive=True)
-        events.on_writer(said(), alive=True)  # as after a token was heard twice
-        events.on_writer(said(), alive=False)
-        events.on_writer(said(), alive=False)
+        events.on_writer(announced(), alive=True)
+        events.on_writer(announced(), alive=True)  # as after a token was received twice
+        events.on_writer(announced(), alive=False)
+        events.on_writer(announced(), alive=False)
         joined, left = events.recent()
     assert (joined.kind, left.kind) == ("joined", "left")
     assert (joined.robot, joined.stream, joined.writer) == ("r1", "joint_states", DRIVER)
@@ -46,30 +46,33 @@ def test_a_writer_joins_and_leaves():
     assert "has left" in left.text
 
 
-def test_the_same_program_on_the_same_host_was_restarted_and_another_one_joined():
+def test_same_program_on_the_same_host_is_restarted_and_another_one_joined():
     with quiet() as events:
         for writer in (DRIVER, RESTARTED, OTHER):
-            events.on_writer(said(writer), alive=True)
-            events.on_writer(said(writer), alive=False)
+            events.on_writer(announced(writer), alive=True)
+            events.on_writer(announced(writer), alive=False)
         assert kinds(events) == ["joined", "left", "restarted", "left", "joined", "left"]
         assert "pid 412 before" in events.recent()[2].text
 
 
 @pytest.mark.parametrize("loss", ["cut off", "left"])
-def test_who_is_the_same_as_before_is_back(loss):
+def test_same_writer_that_returns_is_back(loss):
     with quiet() as events:
-        events.on_writer(said(), alive=True)
+        events.on_writer(announced(), alive=True)
         if loss == "cut off":
-            events.on_cut_off(said())
+            events.on_cut_off(announced())
         else:
-            events.on_writer(said(), alive=False)
-        events.on_writer(said(), alive=True)
+            events.on_writer(announced(), alive=False)
+        events.on_writer(announced(), alive=True)
         assert kinds(events) == ["joined", loss, "back"]
 
 
 @pytest.mark.parametrize(
     ("one", "other"),
-    [(said(), said(OTHER)), (said(DRIVER, "tf_static", "mount"), said(OTHER, "tf_static", "mount"))],
+    [
+        (announced(), announced(OTHER)),
+        (announced(DRIVER, "tf_static", "mount"), announced(OTHER, "tf_static", "mount")),
+    ],
 )
 def test_two_writers_of_one_stream_are_a_conflict_of_the_later_one(one, other):
     with quiet() as events:
@@ -84,28 +87,32 @@ def test_two_writers_of_one_stream_are_a_conflict_of_the_later_one(one, other):
 
 @pytest.mark.parametrize(
     "other",
-    [said(OTHER, "tf_static", "room"), said(OTHER, "robot_description"), said(OTHER, "tf_static")],
+    [
+        announced(OTHER, "tf_static", "room"),
+        announced(OTHER, "robot_description"),
+        announced(OTHER, "tf_static"),
+    ],
 )
-def test_writers_of_different_things_are_none(other):
+def test_writers_of_different_streams_do_not_conflict(other):
     with quiet() as events:
-        events.on_writer(said(DRIVER, "tf_static", "mount"), alive=True)
-        events.on_writer(said(), alive=True)
+        events.on_writer(announced(DRIVER, "tf_static", "mount"), alive=True)
+        events.on_writer(announced(), alive=True)
         events.on_writer(other, alive=True)
         assert "conflict" not in kinds(events)
 
 
 @pytest.mark.parametrize(("stream", "conflicts"), [("tf", 0), ("tf_static", 0), ("joint_states", 1)])
-def test_what_ros_nodes_say_together_is_none_but_joint_states(stream, conflicts):
-    with EventLog((*HEARD, "tf"), "joint_states", ROS_SHARED) as events:
+def test_ros_nodes_that_share_topics_conflict_only_on_joint_states(stream, conflicts):
+    with EventLog((*SUBSCRIBED, "tf"), "joint_states", ROS_SHARED) as events:
         for writer in (DRIVER, OTHER):
-            events.on_writer(said(writer, stream), alive=True)
+            events.on_writer(announced(writer, stream), alive=True)
         assert kinds(events).count("conflict") == conflicts
 
 
 def test_two_static_writers_that_place_one_frame_conflict_once():
     with quiet() as events:
-        events.on_writer(said(DRIVER, "tf_static", "mount"), alive=True)
-        events.on_writer(said(OTHER, "tf_static", "room"), alive=True)
+        events.on_writer(announced(DRIVER, "tf_static", "mount"), alive=True)
+        events.on_writer(announced(OTHER, "tf_static", "room"), alive=True)
         events.set_static_children("r1", "mount", frozenset({"r1/camera", "r1/laser"}))
         for _ in range(50):
             events.set_static_children("r1", "room", frozenset({"r1/camera"}))
@@ -116,71 +123,73 @@ def test_two_static_writers_that_place_one_frame_conflict_once():
     assert conflict.text == "'room' of 'r1' places 'r1/camera', and so does 'mount' of 'r1'"
 
 
-def test_a_static_writer_that_is_gone_is_in_nobodys_way():
+def test_departed_static_writer_conflicts_with_none():
     with quiet() as events:
-        events.on_writer(said(DRIVER, "tf_static", "mount"), alive=True)
+        events.on_writer(announced(DRIVER, "tf_static", "mount"), alive=True)
         events.set_static_children("r1", "mount", frozenset({"r1/camera"}))
-        events.on_writer(said(DRIVER, "tf_static", "mount"), alive=False)
+        events.on_writer(announced(DRIVER, "tf_static", "mount"), alive=False)
         events.set_static_children("r1", "room", frozenset({"r1/camera"}))
         assert "conflict" not in kinds(events)
 
 
-def test_streams_that_are_not_heard_have_no_events():
+def test_streams_that_are_not_subscribed_have_no_events():
     with quiet() as events:
-        events.on_writer(said(stream="tf"), alive=True)
-        events.on_writer(said(stream="tf"), alive=False)
-        events.on_cut_off(said(stream="tf"))
+        events.on_writer(announced(stream="tf"), alive=True)
+        events.on_writer(announced(stream="tf"), alive=False)
+        events.on_cut_off(announced(stream="tf"))
         assert events.recent() == ()
 
 
-def test_silence_is_told_to_who_asked_and_what_follows_it_is_cut_off():
-    told: list[WriterEvent] = []
-    with EventLog(HEARD, "joint_states", (), told.append) as events:
+def test_silence_is_reported_to_on_event_and_then_the_writer_is_cut_off():
+    reported: list[WriterEvent] = []
+    with EventLog(SUBSCRIBED, "joint_states", (), reported.append) as events:
         for stream in ("joint_states", "robot_description"):
-            events.on_writer(said(stream=stream), alive=True)
+            events.on_writer(announced(stream=stream), alive=True)
         for _ in range(3):
             events.on_sample("r1", DRIVER.session)
-        until(lambda: [event.kind for event in told] == ["joined", "joined", "stale"])
-        assert "published nothing on joint_states for" in told[-1].text
+        until(lambda: [event.kind for event in reported] == ["joined", "joined", "stale"])
+        assert "published nothing on joint_states for" in reported[-1].text
         events.on_sample("r1", DRIVER.session)
-        until(lambda: told[-1].kind == "resumed")
-        until(lambda: told[-1].kind == "stale")
+        until(lambda: reported[-1].kind == "resumed")
+        until(lambda: reported[-1].kind == "stale")
         for stream in ("robot_description", "joint_states"):
-            events.on_writer(said(stream=stream), alive=False)
-        until(lambda: len(told) == 7)
-    assert [event.kind for event in told[-2:]] == ["cut off", "cut off"]
-    assert tuple(told) == events.recent()
+            events.on_writer(announced(stream=stream), alive=False)
+        until(lambda: len(reported) == 7)
+    assert [event.kind for event in reported[-2:]] == ["cut off", "cut off"]
+    assert tuple(reported) == events.recent()
 
 
-def test_of_who_never_spoke_silence_is_not_news():
-    told: list[WriterEvent] = []
-    with EventLog(HEARD, "joint_states", (), told.append) as events:
+def test_writer_without_samples_is_never_stale():
+    reported: list[WriterEvent] = []
+    with EventLog(SUBSCRIBED, "joint_states", (), reported.append) as events:
         for session in (7, 8):
-            events.on_writer(said(WriterId("driver", f"host {session}", 1, 5, session)), alive=True)
+            events.on_writer(announced(WriterId("driver", f"host {session}", 1, 5, session)), alive=True)
         for _ in range(2):
             events.on_sample("r1", 7)
-        until(lambda: told[-1:] and told[-1].kind == "stale")
-        assert [event.kind for event in told] == ["joined", "joined", "conflict", "stale"]
-        assert told[-1].writer.session == 7  # type: ignore[union-attr]
+        until(lambda: reported[-1:] and reported[-1].kind == "stale")
+        assert [event.kind for event in reported] == ["joined", "joined", "conflict", "stale"]
+        assert reported[-1].writer.session == 7  # type: ignore[union-attr]
 
 
-def test_exceptions_of_the_callback_are_counted_and_end_nothing(monkeypatch):
+def test_exceptions_of_the_callback_are_counted_and_stop_nothing(monkeypatch):
     monkeypatch.setattr("threading.excepthook", lambda _: None)
 
     def wrong(event: WriterEvent) -> None:
         raise ValueError(event.text)
 
-    with EventLog(HEARD, "joint_states", (), wrong) as events:
-        events.on_writer(said(), alive=True)
-        events.on_writer(said(), alive=False)
+    with EventLog(SUBSCRIBED, "joint_states", (), wrong) as events:
+        events.on_writer(announced(), alive=True)
+        events.on_writer(announced(), alive=False)
         until(lambda: events.failures == 2)
     assert kinds(events) == ["joined", "left"]
 
 
-def test_any_number_of_writers_that_come_and_go_takes_a_bounded_memory():
+def test_memory_is_bounded_for_any_number_of_writers():
     with quiet() as events:
         for session in range(2 * MAX_ENTRIES):
-            one = said(WriterId("driver", f"host {session}", 1, 5, session), "tf_static", f"mount {session}")
+            one = announced(
+                WriterId("driver", f"host {session}", 1, 5, session), "tf_static", f"mount {session}"
+            )
             events.on_writer(one, alive=True)
             events.set_static_children("r1", one.name, frozenset({"r1/camera"}))
             events.on_writer(one, alive=False)
@@ -192,7 +201,7 @@ def test_any_number_of_writers_that_come_and_go_takes_a_bounded_memory():
 MOUNT, ROOM = ("r1", "mount"), ("r2", "room")
 
 
-def test_who_places_the_same_is_named_until_it_does_not():
+def test_other_writer_of_a_frame_is_returned_until_it_withdraws():
     owners = StaticEdgeOwners()
     assert owners.replace(MOUNT, frozenset({"r1/a", "r1/b"})) == []
     assert owners.replace(ROOM, frozenset({"r1/c", "r1/b"})) == [("r1/b", [MOUNT])]

@@ -14,8 +14,7 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.ingest.static_transforms import StaticTransformIngest
-from zstate.ingest.transforms import TransformIngest
+from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
 from zstate.model.kinematics import Kinematics
 from zstate.model.load import load_model
 from zstate.transform import Transform
@@ -99,7 +98,7 @@ class Network:
         return self.ownership.counters.stats().refused
 
 
-def say(robot: str, name: str, *edges: Edge) -> Step:
+def set_statics(robot: str, name: str, *edges: Edge) -> Step:
     return lambda network: network.statics(robot, name, *edges)
 
 
@@ -118,25 +117,28 @@ FOLLOWS = pytest.mark.parametrize("follow", [JointStateIngest, TransformIngest])
 @pytest.mark.parametrize(
     ("wrong", "right"),
     [
-        ([say("r1", "wrong", ("tool", "world"))], set()),
-        ([say("r1", "wrong", ("tool", "base"))], set()),
-        ([say("r1", "wrong", ("map", "upper"))], set()),
-        ([say("r1", "wrong", ("upper", "base"), ("base", "cart"))], {("r1/base", "r1/cart")}),
+        ([set_statics("r1", "wrong", ("tool", "world"))], set()),
+        ([set_statics("r1", "wrong", ("tool", "base"))], set()),
+        ([set_statics("r1", "wrong", ("map", "upper"))], set()),
+        ([set_statics("r1", "wrong", ("upper", "base"), ("base", "cart"))], {("r1/base", "r1/cart")}),
         (
-            [say("r1", "mount", ("tool", "jig")), say("r1", "wrong", ("jig", "world"))],
+            [set_statics("r1", "mount", ("tool", "jig")), set_statics("r1", "wrong", ("jig", "world"))],
             {("r1/tool", "r1/jig")},
         ),
         (
-            [say("r1", "both", ("jig", "world"), ("tool", "plate"), ("plate", "jig"))],
+            [set_statics("r1", "both", ("jig", "world"), ("tool", "plate"), ("plate", "jig"))],
             {("r1/tool", "r1/plate"), ("r1/plate", "r1/jig")},
         ),
         (
-            [say("r1", "wrong", ("tool", "world")), say("r1", "room", ("fleet/map", "world"))],
+            [
+                set_statics("r1", "wrong", ("tool", "world")),
+                set_statics("r1", "room", ("fleet/map", "world")),
+            ],
             {("fleet/map", "r1/world")},
         ),
     ],
 )
-def test_the_model_wins_over_static_edges_that_exclude_it_in_every_order(follow, wrong: list[Step], right):
+def test_model_wins_over_conflicting_static_edges_in_every_order(follow, wrong: list[Step], right):
     for network in in_every_order(lambda network: network.model(), *wrong, follow=follow):
         assert network.edges == OWN | right
         assert sum(network.refused.values()) >= 1
@@ -148,9 +150,9 @@ def test_the_model_wins_over_static_edges_that_exclude_it_in_every_order(follow,
 
 
 @FOLLOWS
-def test_a_refused_edge_is_named_with_its_writer_and_the_loop(follow):
+def test_refusal_names_the_writer_and_the_loop(follow):
     for network in in_every_order(
-        lambda network: network.model(), say("r1", "mistake", ("lower", "world")), follow=follow
+        lambda network: network.model(), set_statics("r1", "mistake", ("lower", "world")), follow=follow
     ):
         assert network.refused == {"loop": 1}
         text = network.ownership.counters.refusals()["loop"]
@@ -158,8 +160,10 @@ def test_a_refused_edge_is_named_with_its_writer_and_the_loop(follow):
         assert network.conflicts == [("r1", "mistake", "r1/world")]
 
 
-def test_a_writer_that_mends_its_edge_or_withdraws_it_leaves_nothing_behind():
-    for network in in_every_order(lambda network: network.model(), say("r1", "one", ("tool", "world"))):
+def test_corrected_or_withdrawn_edge_leaves_no_refusal():
+    for network in in_every_order(
+        lambda network: network.model(), set_statics("r1", "one", ("tool", "world"))
+    ):
         network.statics("r1", "one", ("tool", "world"))
         assert network.refused == {"loop": 2}
         network.statics("r1", "one", ("map", "world"))
@@ -169,8 +173,8 @@ def test_a_writer_that_mends_its_edge_or_withdraws_it_leaves_nothing_behind():
         assert network.refused == {"loop": 2}
 
 
-def test_what_another_model_allows_is_taken_when_the_model_changes():
-    for network in in_every_order(lambda network: network.model(), say("r1", "one", ("map", "tool"))):
+def test_refused_edge_is_accepted_when_a_new_model_allows_it():
+    for network in in_every_order(lambda network: network.model(), set_statics("r1", "one", ("map", "tool"))):
         assert network.edges == OWN
         network.model(model=SHORTER)
         assert ("r1/map", "r1/tool") in network.edges
@@ -178,7 +182,7 @@ def test_what_another_model_allows_is_taken_when_the_model_changes():
         assert network.edges == OWN
 
 
-def test_an_edge_put_in_by_hand_gives_way_to_the_model_too():
+def test_edge_inserted_by_the_caller_yields_to_the_model():
     network = Network()
     network.buffer.insert_static(Transform("r1/tool", "r1/world", (0, 0, 0), (0, 0, 0, 1)))
     network.buffer.insert(Transform("r1/map", "r1/upper", (0, 0, 0), (0, 0, 0, 1), 5))
@@ -187,12 +191,12 @@ def test_an_edge_put_in_by_hand_gives_way_to_the_model_too():
     assert network.refused == {"loop": 1, "second writer": 1}
 
 
-def test_roots_of_two_models_are_placed_in_a_circle_but_for_one():
+def test_circular_placement_of_model_roots_is_accepted_except_one_edge():
     steps = (
         lambda network: network.model("r1"),
         lambda network: network.model("r2"),
-        say("r1", "one", ("r2/tool", "world")),
-        say("r2", "one", ("r1/tool", "world")),
+        set_statics("r1", "one", ("r2/tool", "world")),
+        set_statics("r2", "one", ("r1/tool", "world")),
     )
     for network in in_every_order(*steps):
         across = {edge for edge in network.edges if edge[0][:2] != edge[1][:2]}
@@ -202,10 +206,10 @@ def test_roots_of_two_models_are_placed_in_a_circle_but_for_one():
 
 
 @FOLLOWS
-def test_a_robots_own_word_on_its_frame_wins_over_that_of_others_in_every_order(follow):
+def test_own_writers_of_a_robot_win_over_others_in_every_order(follow):
     steps = (
-        say("r1", "mount", ("base", "camera")),
-        say("r2", "thief", ("r2/map", "r1/camera")),
+        set_statics("r1", "mount", ("base", "camera")),
+        set_statics("r2", "thief", ("r2/map", "r1/camera")),
         lambda network: network.model(),
     )
     for network in in_every_order(*steps, follow=follow):
@@ -217,10 +221,10 @@ def test_a_robots_own_word_on_its_frame_wins_over_that_of_others_in_every_order(
         assert ("r2/map", "r1/camera") in network.edges
 
 
-def test_others_place_a_robots_root_in_their_own_frames_and_in_those_of_nobody():
+def test_other_writers_may_place_the_root_in_their_frames_and_in_unowned_ones():
     for network in in_every_order(
-        say("cell", "site", ("map", "r1/world")),
-        say("cell", "site 2", ("fleet/map", "r2/world")),
+        set_statics("cell", "site", ("map", "r1/world")),
+        set_statics("cell", "site 2", ("fleet/map", "r2/world")),
         lambda network: network.model("r1"),
         lambda network: network.model("r2"),
     ):
@@ -229,9 +233,9 @@ def test_others_place_a_robots_root_in_their_own_frames_and_in_those_of_nobody()
 
 
 @pytest.mark.parametrize("parent", ["r1/base", "r3/base"])
-def test_nobody_else_places_frames_of_a_robot_in_other_robots_frames(parent: str):
+def test_other_writers_cannot_place_frames_of_a_robot_in_a_third_robots_frames(parent: str):
     steps = (
-        say("r2", "thief", (parent, "r1/marker")),
+        set_statics("r2", "thief", (parent, "r1/marker")),
         lambda network: network.ownership.add_robot("r1"),
         lambda network: network.ownership.add_robot("r3"),
     )
@@ -241,7 +245,7 @@ def test_nobody_else_places_frames_of_a_robot_in_other_robots_frames(parent: str
         assert "(--robot r1)" in network.ownership.counters.refusals()["foreign frame"]
 
 
-def test_frames_of_no_robot_are_placed_by_all_until_it_is_one():
+def test_unowned_frames_may_be_placed_by_every_writer_until_a_robot_owns_them():
     network = Network()
     network.statics("r1", "one", ("map", "fleet/map"))
     network.statics("r2", "two", ("fleet/map", "fleet/dock"))
@@ -250,7 +254,7 @@ def test_frames_of_no_robot_are_placed_by_all_until_it_is_one():
     assert network.edges == {("r1/map", "fleet/map")}
 
 
-def test_only_placers_place_the_roots_of_others():
+def test_only_placers_may_place_roots_of_other_robots():
     network = Network(placers=["site"])
     network.model()
     network.statics("r2", "thief", ("r2/map", "r1/world"))
@@ -260,7 +264,7 @@ def test_only_placers_place_the_roots_of_others():
     assert network.edges == OWN | {("site/map", "r1/world")}
 
 
-def test_two_static_writers_of_one_name_and_two_robots_are_two():
+def test_static_writers_of_one_name_and_two_robots_are_separate():
     network = Network()
     network.statics("r1", "calib", ("fleet/map", "fleet/board"))
     network.statics("r2", "calib", ("fleet/map", "fleet/board"))
@@ -270,7 +274,7 @@ def test_two_static_writers_of_one_name_and_two_robots_are_two():
     assert network.edges == set()
 
 
-def test_a_static_writer_that_is_gone_gives_way_to_one_that_is_there():
+def test_departed_static_writer_yields_to_an_announced_one():
     network = Network()
     network.statics("r1", "old", ("base", "camera"), session=3)
     network.statics("r1", "new", ("tool", "camera"), session=4)
@@ -282,7 +286,7 @@ def test_a_static_writer_that_is_gone_gives_way_to_one_that_is_there():
     assert network.edges == {("r1/base", "r1/camera")}
 
 
-def test_ready_transforms_of_another_robot_neither_take_nor_forget_this_ones():
+def test_transforms_of_another_robot_neither_insert_nor_drop_edges_of_this_one():
     network = Network(TransformIngest)
     network.ownership.live |= {("r1", 7): "driver@arm pid 4", ("r2", 8): "driver@arm pid 4"}
     network.ingest("r1").name_writer(7, "driver@arm pid 4")
@@ -301,7 +305,7 @@ def test_ready_transforms_of_another_robot_neither_take_nor_forget_this_ones():
 
 
 @pytest.mark.parametrize("own_first", [True, False])
-def test_a_moving_root_placed_by_others_gives_way_to_the_robots_own_word(own_first: bool):
+def test_moving_root_placed_by_others_yields_to_the_robots_own_edge(own_first: bool):
     network = Network(TransformIngest)
 
     def own() -> None:
@@ -319,7 +323,7 @@ def test_a_moving_root_placed_by_others_gives_way_to_the_robots_own_word(own_fir
     assert network.edges == {("site/map", "r1/odom"), ("site/map", "site/dock")}
 
 
-def test_a_description_that_names_frames_of_another_robot_does_not_get_them():
+def test_description_that_names_frames_of_another_robot_gets_none_of_them():
     network = Network(TransformIngest)
     network.model("r1")
     moving = (("r1/base", "r1/upper"), ("base", "arm"))
@@ -331,7 +335,7 @@ def test_a_description_that_names_frames_of_another_robot_does_not_get_them():
     assert network.refused == {"foreign frame": 1}
 
 
-def test_a_bare_name_with_a_slash_is_no_way_into_another_robots_frames():
+def test_bare_name_with_a_slash_gives_no_access_to_frames_of_another_robot():
     network = Network()
     slashed = load_model(RRBOT.urdf.replace('"upper"', '"x/y"'))
     network.model("r1", slashed)
@@ -340,7 +344,7 @@ def test_a_bare_name_with_a_slash_is_no_way_into_another_robots_frames():
     assert network.edges == before | {("r2/map", "x/y")}
 
 
-def test_edges_in_the_buffer_that_are_not_published_stand():
+def test_unpublished_edges_in_the_buffer_remain():
     network = Network()
     network.buffer.insert_static(Transform("a/x", "a/y", (0, 0, 0), (0, 0, 0, 1)))
     network.statics("a", "one", ("z", "y"))

@@ -1,4 +1,4 @@
-"""LagDetector: a backlog is told from clocks that disagree, and from the burst after a cut."""
+"""LagDetector: distinguishes a backlog from clock offsets and from the burst after a cut."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ MS = 1_000_000
 S = 1_000 * MS
 
 
-def told(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.1) -> int:
-    """How often a lag is told of when samples with these ages at arrival come."""
+def warning_count(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float = 0.1) -> int:
+    """The number of lag warnings for samples with these ages at arrival."""
     lag = LagDetector(Counters())
     with caplog.at_level(logging.WARNING, "zstate"):
         for number, age_s in enumerate(ages_s):
@@ -22,8 +22,8 @@ def told(caplog: pytest.LogCaptureFixture, ages_s: list[float], every_s: float =
     return len(caplog.records)
 
 
-def test_samples_that_come_ever_later_are_told_of_once(caplog):
-    assert told(caplog, [1.0 + 0.1 * number for number in range(50)]) == 1
+def test_growing_lag_is_logged_once(caplog):
+    assert warning_count(caplog, [1.0 + 0.1 * number for number in range(50)]) == 1
     assert "samples of 'r1', which driver writes, come 2.1 s after their stamps" in caplog.text
     assert "1.0 s shortly before" in caplog.text
 
@@ -37,9 +37,9 @@ def test_samples_that_come_ever_later_are_told_of_once(caplog):
     ],
     ids=["a clock that is off", "a burst after a cut", "an unsteady network"],
 )
-def test_what_does_not_grow_by_a_second_is_not_told(caplog, ages_s):
-    assert told(caplog, ages_s) == 0
+def test_lag_that_grows_by_less_than_a_second_is_not_logged(caplog, ages_s):
+    assert warning_count(caplog, ages_s) == 0
 
 
-def test_another_backlog_after_a_pause_begins_with_its_own_least_age(caplog):
-    assert told(caplog, [1.0, 4.0, 7.0], every_s=2.5) == 0
+def test_backlog_after_a_pause_starts_with_its_own_least_age(caplog):
+    assert warning_count(caplog, [1.0, 4.0, 7.0], every_s=2.5) == 0

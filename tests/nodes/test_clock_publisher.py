@@ -14,7 +14,7 @@ from zstate.wire.ros2.cdr import decode_clock
 ROS = "ros2:domain=7,namespace=*,frame_prefix=*/"
 
 
-def test_the_time_is_said_on_both_wires(sessions):
+def test_time_is_published_on_both_wires(sessions):
     writer, reader = sessions
     native, ros = Tap(reader, "zstate/clock"), Tap(reader, "7/clock/**")
     with ClockPublisher(writer, ("native", ROS)) as clock:
@@ -22,25 +22,25 @@ def test_the_time_is_said_on_both_wires(sessions):
         await_reader(writer, "7/clock/x/y")
         for stamp in (0, 5, 1_700_000_000_000_000_001):
             clock.publish(stamp)
-        told = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in native.payloads(3)]
-        assert [clock.stamp for clock in told] == [0, 5, 1_700_000_000_000_000_001]
-        assert [clock.seq for clock in told] == [0, 1, 2]
-        assert len({clock.session for clock in told}) == 1
-        assert [decode_clock(payload) for payload in ros.payloads(3)] == [clock.stamp for clock in told]
+        received = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in native.payloads(3)]
+        assert [clock.stamp for clock in received] == [0, 5, 1_700_000_000_000_000_001]
+        assert [clock.seq for clock in received] == [0, 1, 2]
+        assert len({clock.session for clock in received}) == 1
+        assert [decode_clock(payload) for payload in ros.payloads(3)] == [clock.stamp for clock in received]
 
 
-def test_a_new_publisher_is_a_new_start(sessions):
+def test_new_clock_publisher_has_a_new_session(sessions):
     writer, reader = sessions
     tap = Tap(reader, "zstate/clock")
     await_reader(writer, "zstate/clock")
     for _ in range(2):
         with ClockPublisher(writer) as clock:
             clock.publish(1)
-    told = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(2)]
-    assert told[0].session != told[1].session
+    received = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(2)]
+    assert received[0].session != received[1].session
 
 
-def test_what_cannot_be_said_is_refused_and_counts_for_nothing(sessions):
+def test_invalid_time_is_refused_and_not_counted(sessions):
     writer, reader = sessions
     tap = Tap(reader, "zstate/clock")
     with ClockPublisher(writer, ("native", ROS)) as clock:
@@ -49,11 +49,11 @@ def test_what_cannot_be_said_is_refused_and_counts_for_nothing(sessions):
             with pytest.raises(InvalidInput):
                 clock.publish(wrong)
         clock.publish(3)
-        (told,) = (decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(1))
-        assert (told.stamp, told.seq) == (3, 0)
+        (received,) = (decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in tap.payloads(1))
+        assert (received.stamp, received.seq) == (3, 0)
 
 
-def test_a_closed_clock_says_so(sessions):
+def test_closed_clock_publisher_raises_closed(sessions):
     clock = ClockPublisher(sessions[0])
     clock.close()
     clock.close()

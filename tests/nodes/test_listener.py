@@ -30,7 +30,7 @@ GRIPPER = load_model("gripper")
 
 
 @pytest.mark.parametrize("model", [RRBOT, load_model("diffbot"), GRIPPER], ids=lambda model: model.name)
-def test_both_ways_of_following_agree_with_kinematics_at_every_stamp(sessions, model):
+def test_both_follow_modes_agree_with_kinematics_at_every_stamp(sessions, model):
     writer, reader = sessions
     sine = SineSource(model)
     stamps = [STAMP + number * PERIOD for number in range(20)]
@@ -59,7 +59,7 @@ def test_both_ways_of_following_agree_with_kinematics_at_every_stamp(sessions, m
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_who_joins_late_has_the_model_and_all_statics_before_any_sample(sessions, follow):
+def test_late_listener_has_model_and_statics_before_any_sample(sessions, follow):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1"), StaticPublisher(writer, "r1", "mount") as statics:
         statics.set(Transform("tool", "hook", (0.0, 0.0, 0.25), UPRIGHT))
@@ -72,7 +72,7 @@ def test_who_joins_late_has_the_model_and_all_statics_before_any_sample(sessions
             assert listener.stats.received == 0
 
 
-def test_frames_answer_to_their_bare_and_their_full_names(sessions):
+def test_frames_are_found_by_bare_and_full_names(sessions):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
         settle(writer, "r1")
@@ -84,7 +84,7 @@ def test_frames_answer_to_their_bare_and_their_full_names(sessions):
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_of_two_robots_of_one_model_bare_names_are_ambiguous_and_full_ones_exact(sessions, follow):
+def test_bare_names_of_two_robots_of_one_model_are_ambiguous(sessions, follow):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as first,
@@ -104,7 +104,7 @@ def test_of_two_robots_of_one_model_bare_names_are_ambiguous_and_full_ones_exact
         assert listener.robots() == ("r1", "r2")
 
 
-def test_a_listener_of_one_robot_hears_nothing_of_another(sessions):
+def test_listener_of_one_robot_receives_nothing_of_another(sessions):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as mine,
@@ -119,7 +119,7 @@ def test_a_listener_of_one_robot_hears_nothing_of_another(sessions):
         assert all(frame.name.startswith("r1/") for frame in listener.buffer.frames())
 
 
-def test_two_listeners_fill_one_buffer_that_was_handed_in(sessions):
+def test_two_listeners_fill_one_given_buffer(sessions):
     writer, reader = sessions
     buffer = TransformBuffer(history_s=3.0, clock=ManualClock(5))
     buffer.insert_static(Transform("hall", "r1/world", (1.0, 0.0, 0.0), UPRIGHT))
@@ -136,13 +136,13 @@ def test_two_listeners_fill_one_buffer_that_was_handed_in(sessions):
         assert np.allclose(palm_from_base.translation, [-1.0, 2.0, 0.01], rtol=0, atol=1e-12)
 
 
-def test_history_and_clock_are_those_of_the_listeners_own_buffer(sessions):
+def test_history_and_clock_configure_the_listeners_own_buffer(sessions):
     clock = ManualClock(5)
     with TransformListener(sessions[1], "r1", history_s=2.5, clock=clock) as listener:
         assert (listener.buffer.history_s, listener.buffer.clock) == (2.5, clock)
 
 
-def test_what_cannot_be_followed_is_refused(sessions):
+def test_invalid_follow_and_placers_are_refused(sessions):
     with pytest.raises(InvalidInput, match="follow is 'joint_states' or 'tf', not 'joints'"):
         TransformListener(sessions[0], "r1", follow="joints")
     with pytest.raises(InvalidInput, match="no wire 'dds'"):
@@ -153,7 +153,7 @@ def test_what_cannot_be_followed_is_refused(sessions):
         TransformListener(sessions[0], "r1", history_s=0.0)
 
 
-def test_closing_is_quick_ends_hearing_and_may_be_repeated(sessions):
+def test_close_is_fast_ends_reception_and_may_be_repeated(sessions):
     writer, reader = sessions
     listener = TransformListener(reader, "r1")
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -180,7 +180,7 @@ READER = """
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_a_reader_loads_neither_pinocchio_nor_a_window(sessions, spawn, follow):
+def test_listener_imports_neither_pinocchio_nor_the_view(sessions, spawn, follow):
     reader: Child = spawn(READER, follow)
     assert reader.line() == "ready"
     writer = sessions[0]
@@ -193,21 +193,21 @@ def test_a_reader_loads_neither_pinocchio_nor_a_window(sessions, spawn, follow):
     assert (reader.wait(), reader.stderr) == (0, "")
 
 
-def test_gaps_in_a_batch_that_filled_the_ring_are_our_own(sessions, monkeypatch: pytest.MonkeyPatch):
-    def come(*seqs: int) -> None:
+def test_gaps_in_a_batch_that_filled_the_ring_count_as_dropped(sessions, monkeypatch: pytest.MonkeyPatch):
+    def receive(*seqs: int) -> None:
         states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
         key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
         listener._on_samples([SerializedSample(key, encode(state), encoding) for state in states])
 
     with TransformListener(sessions[0], "r1") as listener:
         monkeypatch.setattr(listener, "_capacity", 3)
-        come(0)
-        come(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
-        come(8)
+        receive(0)
+        receive(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
+        receive(8)
         assert (listener.stats.dropped, listener.stats.missed) == (3, 1)
 
 
-def test_a_key_of_no_robot_is_foreign_and_costs_no_robot_a_sample(sessions):
+def test_key_without_a_robot_is_foreign_and_loses_no_sample(sessions):
     writer, reader = sessions
     strange = ("zstate/*/joint_states", "zstate/r$*/joint_states", "zstate/a b/joint_states")
     with (
@@ -229,7 +229,7 @@ def test_a_key_of_no_robot_is_foreign_and_costs_no_robot_a_sample(sessions):
 
 
 @pytest.mark.parametrize("robot", ["*", "r1"])
-def test_a_token_that_no_writer_declares_hides_no_other(sessions, robot):
+def test_invalid_token_hides_no_other(sessions, robot):
     writer, reader = sessions
     broken = ["p,h," + "1" * 5000 + ",1,1", "p,h,1," + "1" * 30 + ",1", "p,h,1,1," + "1" * 21]
     keys = [
@@ -251,7 +251,7 @@ def test_a_token_that_no_writer_declares_hides_no_other(sessions, robot):
         token.undeclare()
 
 
-def test_observers_are_called_after_each_batch_that_was_processed(sessions):
+def test_observers_are_called_after_each_processed_batch(sessions):
     writer, reader = sessions
     seen: list[int] = []
     with TransformListener(reader, "r1", history_on_join=False) as listener:

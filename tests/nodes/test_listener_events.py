@@ -1,4 +1,4 @@
-"""What readers are told when writers and routers die, freeze and come back: real processes, real signals."""
+"""Events when writers and routers die, freeze and return: real processes, real signals."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ ROUTER = """
 """
 
 
-class Ear:
-    """The events of the joint states, as a listener tells them."""
+class EventCollector:
+    """Collects the joint-state events of a listener."""
 
     def __init__(self, session: Session) -> None:
-        self.told: list[WriterEvent] = []
-        self.listener = TransformListener(session, "r1", on_event=self._take)
+        self.events: list[WriterEvent] = []
+        self.listener = TransformListener(session, "r1", on_event=self._add)
 
-    def _take(self, event: WriterEvent) -> None:
+    def _add(self, event: WriterEvent) -> None:
         if event.stream == "joint_states":
-            self.told.append(event)
+            self.events.append(event)
 
     def await_kinds(self, *kinds: str) -> WriterEvent:
-        """The last of them, when just these have been told."""
-        until(lambda: len(self.told) >= len(kinds))
-        assert tuple(event.kind for event in self.told) == kinds
-        return self.told[-1]
+        """The last event, once exactly these kinds were reported."""
+        until(lambda: len(self.events) >= len(kinds))
+        assert tuple(event.kind for event in self.events) == kinds
+        return self.events[-1]
 
     def await_samples(self) -> None:
         received = self.listener.stats.received
@@ -58,76 +58,76 @@ class Ear:
 
 
 @pytest.fixture
-def ear() -> Iterator[Ear]:
+def collector() -> Iterator[EventCollector]:
     with connect() as session:
-        ear = Ear(session)
-        with ear.listener:
-            yield ear
+        collector = EventCollector(session)
+        with collector.listener:
+            yield collector
 
 
-def test_killed_and_started_again_it_has_left_and_was_restarted(ear, spawn):
+def test_killed_writer_has_left_and_is_restarted(collector, spawn):
     first = spawn(WRITER)
-    ear.await_samples()
-    joined = ear.await_kinds("joined")
+    collector.await_samples()
+    joined = collector.await_kinds("joined")
     assert joined.writer.pid == first.process.pid
     first.kill()
-    left = ear.await_kinds("joined", "left")
+    left = collector.await_kinds("joined", "left")
     assert left.writer == joined.writer
     second = spawn(WRITER)
-    restarted = ear.await_kinds("joined", "left", "restarted")
+    restarted = collector.await_kinds("joined", "left", "restarted")
     assert restarted.writer.pid == second.process.pid
     assert f"pid {first.process.pid} before" in restarted.text
-    ear.await_samples()
-    assert tuple(ear.told) == tuple(
-        event for event in ear.listener.events() if event.stream == "joint_states"
+    collector.await_samples()
+    assert tuple(collector.events) == tuple(
+        event for event in collector.listener.events() if event.stream == "joint_states"
     )
 
 
-def test_frozen_it_is_stale_then_resumed(ear, spawn):
+def test_frozen_writer_is_stale_then_resumed(collector, spawn):
     writer = spawn(WRITER)
-    ear.await_samples()
+    collector.await_samples()
     writer.process.send_signal(signal.SIGSTOP)
-    stale = ear.await_kinds("joined", "stale")
+    stale = collector.await_kinds("joined", "stale")
     assert "driver@" in stale.text
     assert stale.writer.pid == writer.process.pid
     writer.process.send_signal(signal.SIGCONT)
-    ear.await_kinds("joined", "stale", "resumed")
-    ear.await_samples()
+    collector.await_kinds("joined", "stale", "resumed")
+    collector.await_samples()
 
 
-def test_frozen_for_longer_than_its_lease_it_is_cut_off_then_back(ear, spawn):
+def test_writer_frozen_for_longer_than_its_lease_is_cut_off_then_back(collector, spawn):
     writer = spawn(WRITER)
-    ear.await_samples()
+    collector.await_samples()
     writer.process.send_signal(signal.SIGSTOP)
-    cut_off = ear.await_kinds("joined", "stale", "cut off")
+    cut_off = collector.await_kinds("joined", "stale", "cut off")
     assert "fell silent" in cut_off.text
     writer.process.send_signal(signal.SIGCONT)
-    back = ear.await_kinds("joined", "stale", "cut off", "back")
+    back = collector.await_kinds("joined", "stale", "cut off", "back")
     assert back.writer.pid == writer.process.pid
-    ear.await_samples()
+    collector.await_samples()
 
 
-def test_with_its_router_it_is_cut_off_and_comes_back_with_it(spawn: Spawn, free_port: int):
+def test_writer_is_cut_off_with_its_router_and_comes_back_with_it(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = spawn(ROUTER, endpoint)
     router.line()
     with connect(mode="client", endpoints=endpoint) as session:
-        ear = Ear(session)
-        with ear.listener:
+        collector = EventCollector(session)
+        with collector.listener:
             writer = spawn(WRITER, endpoint)
-            ear.await_samples()
+            collector.await_samples()
             router.kill()
-            cut_off = ear.await_kinds("joined", "cut off")
+            cut_off = collector.await_kinds("joined", "cut off")
             assert "is cut off: the router" in cut_off.text
             spawn(ROUTER, endpoint).line()
-            back = ear.await_kinds("joined", "cut off", "back")
+            back = collector.await_kinds("joined", "cut off", "back")
             assert back.writer == cut_off.writer
-            ear.await_samples()
+            collector.await_samples()
             writer.kill()
-            ear.await_kinds("joined", "cut off", "back", "left")
+            collector.await_kinds("joined", "cut off", "back", "left")
 
 
-def test_a_callback_that_blocks_or_raises_delays_no_sample(sessions, monkeypatch):
+def test_blocking_or_raising_callback_delays_no_sample(sessions, monkeypatch):
     monkeypatch.setattr("threading.excepthook", lambda _: None)
     called, go_on = threading.Event(), threading.Event()
 
@@ -147,7 +147,7 @@ def test_a_callback_that_blocks_or_raises_delays_no_sample(sessions, monkeypatch
     assert listener.events()
 
 
-def test_who_wants_no_events_gets_no_thread_for_them_and_may_ask_later(sessions):
+def test_listener_without_on_event_has_no_thread_and_keeps_events(sessions):
     names = lambda: [thread.name for thread in threading.enumerate()]  # noqa: E731
     with TransformListener(sessions[1], "r1") as listener:
         assert "zstate events" not in names()

@@ -52,7 +52,7 @@ def publish(publisher: StatePublisher, first: int, end: int, stamp: int = STAMP)
         publisher.publish(positions(number), stamp=stamp + number * PERIOD)
 
 
-def knows(listener: TransformListener, *numbers: int) -> Callable[[], bool]:
+def has_samples(listener: TransformListener, *numbers: int) -> Callable[[], bool]:
     """Whether it answers at these samples."""
     buffer = listener.buffer
     return lambda: all(buffer.can_lookup("world", "tool", STAMP + one * PERIOD) for one in numbers)
@@ -63,9 +63,7 @@ def poses(listener: TransformListener, stamps: list[int]) -> list[list[float]]:
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_a_listener_that_opens_now_answers_for_the_last_two_seconds_bit_for_bit(
-    sessions: tuple[Session, Session], follow
-):
+def test_new_listener_knows_the_last_two_seconds_bit_for_bit(sessions: tuple[Session, Session], follow):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
@@ -73,9 +71,9 @@ def test_a_listener_that_opens_now_answers_for_the_last_two_seconds_bit_for_bit(
     ):
         settle(writer, "r1", follow)
         publish(publisher, 0, 400)
-        until(knows(early, 399))
+        until(has_samples(early, 399))
         with TransformListener(reader, "r1", follow=follow) as late:
-            until(knows(late, 199, 399))
+            until(has_samples(late, 199, 399))
             until(lambda: late.stats.recalled == 201)
             stamps = [STAMP + number * PERIOD for number in range(199, 400)]
             stamps += [stamp + 3_333_333 for stamp in stamps[:-1]]
@@ -87,7 +85,7 @@ def test_a_listener_that_opens_now_answers_for_the_last_two_seconds_bit_for_bit(
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_what_was_before_and_what_is_live_join_without_a_gap(sessions: tuple[Session, Session], follow):
+def test_history_and_live_samples_join_without_a_gap(sessions: tuple[Session, Session], follow):
     writer, reader = sessions
     model = load_model("gripper")
     sine, stop, stamps = SineSource(model), threading.Event(), []
@@ -125,7 +123,7 @@ def test_what_was_before_and_what_is_live_join_without_a_gap(sessions: tuple[Ses
 
 
 @pytest.mark.parametrize("how", ["lookup", "wait", "wait_async", "join"])
-def test_a_wait_for_the_recent_past_right_after_joining_ends_with_the_exact_pose(
+def test_wait_for_a_recent_instant_after_joining_ends_with_the_exact_pose(
     sessions: tuple[Session, Session], how: str
 ):
     """A publisher at 200 Hz, and one listener after the other; each asks for half a second ago at once."""
@@ -169,9 +167,7 @@ async def joined(buffer: TransformBuffer, at: int) -> Transform:
     raise AssertionError("the sample was dropped")
 
 
-def test_a_robot_of_many_samples_is_learned_page_by_page_through_a_router(
-    spawn: Callable[..., Child], free_port: int
-):
+def test_large_history_is_received_page_by_page_through_a_router(spawn: Callable[..., Child], free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     spawn(ROUTER, endpoint).line()
     with (
@@ -188,7 +184,7 @@ def test_a_robot_of_many_samples_is_learned_page_by_page_through_a_router(
                 assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
+def test_samples_published_while_the_router_was_away_are_received_afterwards(
     spawn: Callable[..., Child], free_port: int
 ):
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -202,34 +198,34 @@ def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
     ):
         settle(writer, "r1")
         publish(publisher, 0, 10)
-        until(knows(listener, 0, 9))
+        until(has_samples(listener, 0, 9))
         router.kill()
         until(lambda: not list(reader.zenoh.info.routers_zid()))
         until(lambda: not list(writer.zenoh.info.routers_zid()))
         publish(publisher, 10, 500)
-        assert not knows(listener, 10)()
+        assert not has_samples(listener, 10)()
         spawn(ROUTER, endpoint).line()
         settle(writer, "r1")
         publish(publisher, 500, 501)
-        until(knows(listener, 500))
+        until(has_samples(listener, 500))
         until(lambda: listener.stats.recalled >= 490)
         for number in range(501):
             answer = listener.buffer.lookup("world", "tool", STAMP + number * PERIOD)
             assert answer.kind == "exact"
 
 
-def test_no_more_is_asked_for_than_the_buffer_keeps(sessions: tuple[Session, Session]):
+def test_listener_requests_no_more_history_than_its_buffer_keeps(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher:
         publish(publisher, 0, 1000)
         with TransformListener(reader, "r1", history_s=1.0) as listener:
             until(lambda: listener.stats.recalled == 101)
             publish(publisher, 1000, 1001)
-            until(knows(listener, 1000))
+            until(has_samples(listener, 1000))
             assert listener.stats.recalled == 101
 
 
-def test_a_publisher_without_a_cache_and_a_listener_that_wants_none_have_no_past(
+def test_no_history_without_a_cache_or_with_history_on_join_off(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -242,14 +238,14 @@ def test_a_publisher_without_a_cache_and_a_listener_that_wants_none_have_no_past
         with TransformListener(reader, "r2", history_on_join=False) as listener:
             settle(writer, "r2")
             publish(publisher, 10, 12)
-            until(lambda: knows(listener, 10, 11)() and listener.stats.received == 2)
+            until(lambda: has_samples(listener, 10, 11)() and listener.stats.received == 2)
             assert listener.stats.recalled == 0
-            assert not knows(listener, 9)()
+            assert not has_samples(listener, 9)()
     with pytest.raises(InvalidInput, match="cache_s"):
         StatePublisher(writer, RRBOT, "r3", cache_s=-1.0)
 
 
-def test_a_wrong_cache_leaves_nothing_behind(sessions: tuple[Session, Session]):
+def test_invalid_cache_duration_is_refused_without_leaks(sessions: tuple[Session, Session]):
     writer, _ = sessions
     with pytest.raises(InvalidInput, match="cache_s"):
         StatePublisher(writer, RRBOT, "r1", cache_s=float("nan"))
@@ -257,19 +253,19 @@ def test_a_wrong_cache_leaves_nothing_behind(sessions: tuple[Session, Session]):
         pass
 
 
-def test_a_gap_in_what_was_remembered_counts_as_no_loss(sessions: tuple[Session, Session]):
-    """A listener that hears sample 10 first and is told of 0 to 9 then has missed nothing."""
+def test_gap_in_a_cache_counts_as_no_loss(sessions: tuple[Session, Session]):
+    """A listener that receives sample 10 first and 0 to 9 as history has missed nothing."""
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         publish(publisher, 0, 10)
         with TransformListener(reader, "r1") as listener:
             settle(writer, "r1")
             publish(publisher, 10, 20)
-            until(lambda: knows(listener, 0, 19)() and listener.stats.received == 10)
+            until(lambda: has_samples(listener, 0, 19)() and listener.stats.received == 10)
             assert listener.stats.missed == listener.stats.dropped == 0
 
 
-def test_only_what_the_present_writer_said_is_remembered(sessions: tuple[Session, Session]):
+def test_only_samples_of_the_current_writer_are_cached(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as first:
         publish(first, 0, 10)
@@ -277,11 +273,11 @@ def test_only_what_the_present_writer_said_is_remembered(sessions: tuple[Session
         publish(second, 20, 30)
         with TransformListener(reader, "r1") as listener:
             until(lambda: listener.stats.recalled == 10)
-            assert knows(listener, 20, 29)()
-            assert not knows(listener, 9)()
+            assert has_samples(listener, 20, 29)()
+            assert not has_samples(listener, 9)()
 
 
-def test_a_writer_that_starts_while_we_listen_begins_a_history_of_its_own(
+def test_writer_that_joins_later_starts_its_own_history(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -289,15 +285,15 @@ def test_a_writer_that_starts_while_we_listen_begins_a_history_of_its_own(
         with StatePublisher(writer, RRBOT, "r1") as first:
             settle(writer, "r1")
             publish(first, 0, 10)
-            until(knows(listener, 0, 9))
+            until(has_samples(listener, 0, 9))
         with StatePublisher(writer, RRBOT, "r1") as second:
             publish(second, 20, 30)
-            until(knows(listener, 20, 29))
-            assert not knows(listener, 9)()
+            until(has_samples(listener, 20, 29))
+            assert not has_samples(listener, 9)()
             assert listener.stats.missed == 0
 
 
-def test_every_robot_of_a_fleet_tells_its_own_past(sessions: tuple[Session, Session]):
+def test_every_robot_of_a_fleet_provides_its_history(sessions: tuple[Session, Session]):
     writer, reader = sessions
     publishers = [StatePublisher(writer, RRBOT, f"r{number}") for number in range(10)]
     for number, publisher in enumerate(publishers):
@@ -316,7 +312,7 @@ def test_every_robot_of_a_fleet_tells_its_own_past(sessions: tuple[Session, Sess
         publisher.close()
 
 
-def test_a_publisher_that_only_derives_transforms_tells_their_past(sessions: tuple[Session, Session]):
+def test_publisher_that_only_derives_transforms_provides_their_history(sessions: tuple[Session, Session]):
     writer, reader = sessions
     streams = ("robot_description", "tf_static", "tf")
     with StatePublisher(writer, RRBOT, "r1", streams=streams) as publisher:
@@ -329,7 +325,7 @@ def test_a_publisher_that_only_derives_transforms_tells_their_past(sessions: tup
             assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Session, Session]):
+def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Session, Session]):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -337,17 +333,17 @@ def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Sessi
         publisher.publish([0.5, 1.0], [0.1, 0.2], [3.0, 4.0], STAMP)
         publisher.publish([0.5, 1.0], stamp=STAMP + 1)
         assert publisher.cache is not None
-        said = tap.payloads(2)
+        expected = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
         with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
             past.ask(JOINTS, publisher.cache.since(0)[0].session)
             until(lambda: pages)
-    assert [one.payload for one in pages[0]] == said
+    assert [one.payload for one in pages[0]] == expected
     assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}
     tap.close()
 
 
-def test_statics_and_the_past_answer_together_at_an_instant_before_joining(
+def test_statics_and_history_give_a_transform_before_the_listener_joined(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -365,16 +361,16 @@ def test_statics_and_the_past_answer_together_at_an_instant_before_joining(
             assert np.allclose(pose.matrix, expected, rtol=0.0, atol=1e-12)
 
 
-def test_a_past_of_another_session_than_was_asked_is_refused(sessions):
+def test_history_of_another_session_is_refused(sessions):
     writer, reader = sessions
     memory = SampleCache(10.0, 2, 8)
     order = order_digest(RRBOT.joint_names)
     memory.append(JointState(STAMP, 0, 9, order, to_block([0.5, 0.25])))
-    said = Announcement("r1", "joint_states", WriterId("driver", "nuc", 1, 2, 8))
+    announced = Announcement("r1", "joint_states", WriterId("driver", "nuc", 1, 2, 8))
     with (
         StatePublisher(writer, RRBOT, "r1", streams=["robot_description"]),
         serve_history(writer, "r1", "joint_states", memory, encode),
-        announce(writer, f"zstate/r1/@writer/joint_states/{said.identity}"),
+        announce(writer, f"zstate/r1/@writer/joint_states/{announced.identity}"),
         TransformListener(reader, "r1") as listener,
     ):
         until(lambda: listener.stats.refused == {"foreign answer": 1})

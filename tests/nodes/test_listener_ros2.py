@@ -31,7 +31,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
-def test_several_writers_of_transforms_make_one_tree_and_do_not_fight(sessions):
+def test_several_transform_writers_build_one_tree_without_conflict(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         arm = RosNode(writer, "robot_state_publisher").publisher(TF).announce().await_reader()
@@ -53,7 +53,7 @@ def test_several_writers_of_transforms_make_one_tree_and_do_not_fight(sessions):
         until(are_named)
 
 
-def test_a_message_may_have_transforms_of_several_instants(sessions):
+def test_message_may_have_transforms_of_several_instants(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         bag = RosNode(writer, "player").publisher(TF).announce().await_reader()
@@ -68,7 +68,7 @@ def test_a_message_may_have_transforms_of_several_instants(sessions):
         assert (listener.stats.refused, listener.stats.missed) == ({}, 0)
 
 
-def test_writers_are_named_by_their_nodes_also_when_they_are_announced_late(sessions):
+def test_writers_are_named_by_their_nodes_even_if_announced_late(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         node = RosNode(writer, "arm", "/fleet/r1")
@@ -88,7 +88,7 @@ def test_writers_are_named_by_their_nodes_also_when_they_are_announced_late(sess
 
 
 @pytest.mark.parametrize("written", ["", HUMBLE])
-def test_writers_of_every_distribution_are_heard(sessions, written: str):
+def test_writers_of_every_distribution_are_received(sessions, written: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         described = RosNode(writer, "rsp").publisher(DESCRIPTION, written)
@@ -119,7 +119,7 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
 
 
 @pytest.mark.parametrize(
-    ("said", "reason"),
+    ("joint_state", "reason"),
     [
         ((0, NAMES, [0.0, 0.0], [], []), "no stamp"),
         ((STAMP, NAMES, [], [], []), "no positions"),
@@ -133,12 +133,12 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
         ((STAMP, NAMES, [0.0, float("inf")], [], []), "bad numbers"),
     ],
 )
-def test_joint_states_that_cannot_be_used_are_counted_by_reason(sessions, said, reason: str):
+def test_unusable_joint_states_are_counted_by_reason(sessions, joint_state, reason: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         described(writer)
         driver = following_joints(writer, listener)
-        stamp, names, *blocks = said
+        stamp, names, *blocks = joint_state
         driver.put(rosbags_joint_state(stamp, "", names, *blocks))
         driver.joints(STAMP + 1, NAMES, [0.5, 0.25])
         until(lambda: listener.stats.received == 1)
@@ -150,7 +150,7 @@ LABELLED = b"\x0fsequence_number" + bytes(8) + b"\x10source_timestamp" + bytes(8
 
 
 @pytest.mark.parametrize(
-    ("payload", "beside", "reason"),
+    ("payload", "raw_attachment", "reason"),
     [
         (GOOD[:-1], "next", "truncated"),
         (GOOD[:30], "next", "truncated"),
@@ -164,15 +164,15 @@ LABELLED = b"\x0fsequence_number" + bytes(8) + b"\x10source_timestamp" + bytes(8
     ],
     ids=range(9),
 )
-def test_what_is_no_message_of_ros_is_counted_by_reason_on_every_topic(sessions, payload, beside, reason):
+def test_invalid_ros_messages_are_counted_by_reason_on_every_topic(sessions, payload, raw_attachment, reason):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         node = RosNode(writer, "strange")
         driver = node.publisher(JOINT_STATES).announce().await_reader()
-        driver.put(payload, beside)
+        driver.put(payload, raw_attachment)
         until(lambda: listener.stats.refused == {reason: 1})
         for topic in (TF_STATIC, DESCRIPTION):
-            node.publisher(topic).announce().await_reader().put(payload, beside)
+            node.publisher(topic).announce().await_reader().put(payload, raw_attachment)
         until(lambda: sum(listener.stats.refused.values()) == 3)
         described(writer)
         following_joints(writer, listener).joints(STAMP + 1, NAMES, [0.5, 0.25])
@@ -180,7 +180,7 @@ def test_what_is_no_message_of_ros_is_counted_by_reason_on_every_topic(sessions,
         assert listener.stats.missed == 0
 
 
-def test_gaps_in_the_numbers_beside_messages_are_missed(sessions):
+def test_gaps_in_attachment_numbers_count_as_missed(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         one, other = (RosNode(writer, name).publisher(TF).announce().await_reader() for name in "ab")
@@ -193,7 +193,7 @@ def test_gaps_in_the_numbers_beside_messages_are_missed(sessions):
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_a_bag_that_begins_again_is_a_new_epoch(sessions, follow: str):
+def test_restarted_bag_starts_a_new_epoch(sessions, follow: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
         described(writer)
@@ -221,7 +221,7 @@ def test_a_bag_that_begins_again_is_a_new_epoch(sessions, follow: str):
 
 @pytest.mark.parametrize("behind", [3 * SECOND, 30 * SECOND, -SECOND])
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_a_node_that_starts_again_begins_a_new_epoch_wherever_its_clock_stands(sessions, follow, behind: int):
+def test_restarted_node_starts_a_new_epoch_whatever_its_clock(sessions, follow, behind: int):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
         described(writer)
@@ -247,7 +247,7 @@ def test_a_node_that_starts_again_begins_a_new_epoch_wherever_its_clock_stands(s
         assert listener.stats.refused == {}
 
 
-def test_a_namespace_is_heard_alone_and_the_root_alone(sessions):
+def test_namespace_and_root_are_subscribed_separately(sessions):
     writer, reader = sessions
     with (
         TransformListener(reader, "r1", wire="ros2:namespace=r1") as listener,
@@ -262,7 +262,7 @@ def test_a_namespace_is_heard_alone_and_the_root_alone(sessions):
         assert root.robots() == ()
 
 
-def test_all_robots_that_stand_in_namespaces_of_their_own_are_followed(sessions):
+def test_all_robots_in_namespaces_are_followed(sessions):
     writer, reader = sessions
     wire = "ros2:namespace=*,frame_prefix=*/"
     with TransformListener(reader, wire=wire) as listener:

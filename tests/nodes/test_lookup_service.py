@@ -56,7 +56,7 @@ def two_robots() -> TransformBuffer:
     return buffer
 
 
-def test_an_answer_that_does_not_come_on_the_robots_key_is_none(sessions: tuple[Session, Session]):
+def test_reply_on_another_key_is_ignored(sessions: tuple[Session, Session]):
     pose = to_json(Transform("world", "tool", (9.0, 0.0, 0.0), UPRIGHT))
     wide = "zstate/*/lookup"
     forged = sessions[0].zenoh.declare_queryable(wide, lambda query: query.reply(wide, pose))
@@ -66,7 +66,7 @@ def test_an_answer_that_does_not_come_on_the_robots_key_is_none(sessions: tuple[
     forged.undeclare()
 
 
-def test_each_answer_is_that_of_the_buffer(sessions: tuple[Session, Session]):
+def test_replies_equal_lookups_in_the_buffer(sessions: tuple[Session, Session]):
     buffer = TransformBuffer()
     track = buffer.add_robot(RRBOT, "r1")
     for number in range(3):
@@ -94,7 +94,7 @@ def test_each_answer_is_that_of_the_buffer(sessions: tuple[Session, Session]):
         (("world", "tool", STAMP - 5), InPast),
     ],
 )
-def test_what_the_buffer_refuses_is_raised_where_it_was_asked(sessions, asked, error):
+def test_lookup_error_of_the_buffer_is_raised_at_the_client(sessions, asked, error):
     buffer = TransformBuffer()
     buffer.insert_joints(buffer.add_robot(RRBOT, "r1"), STAMP, [0.5, 0.25])
     buffer.insert_static(Transform("sea", "island", (0.0, 0.0, 0.0), UPRIGHT))
@@ -111,7 +111,7 @@ def test_what_the_buffer_refuses_is_raised_where_it_was_asked(sessions, asked, e
     assert there.value.facts() == here.value.facts()
 
 
-def test_a_bare_name_is_the_robots_own_where_several_have_it(sessions: tuple[Session, Session]):
+def test_ambiguous_bare_name_means_the_robots_own_frame(sessions: tuple[Session, Session]):
     buffer = two_robots()
     with LookupService(sessions[0], buffer, "r1"), LookupService(sessions[0], buffer, "r2"):
         for robot, height in (("r1", 1.0), ("r2", 2.0)):
@@ -120,7 +120,7 @@ def test_a_bare_name_is_the_robots_own_where_several_have_it(sessions: tuple[Ses
         assert query_lookup(sessions[1], "r1", "r2/base", "r2/tool").translation[2] == 2.0
 
 
-def test_where_nobody_answers_it_is_said_what_to_run(sessions: tuple[Session, Session]):
+def test_missing_lookup_service_error_names_the_command_to_run(sessions: tuple[Session, Session]):
     with pytest.raises(Unreachable, match=r"zstate/r1/lookup.*zstate publish r1") as caught:
         query_lookup(sessions[1], "r1", "world", "tool")
     assert caught.value.endpoints == (KEY,)
@@ -128,7 +128,7 @@ def test_where_nobody_answers_it_is_said_what_to_run(sessions: tuple[Session, Se
         query_lookup(sessions[1], "r1", "world", "tool", timeout_s=0.0)
 
 
-def test_every_publisher_answers_of_what_it_sent_last(sessions: tuple[Session, Session]):
+def test_every_publisher_answers_lookups_of_its_recent_samples(sessions: tuple[Session, Session]):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", cache_s=1.0) as publisher:
         await_answers(reader)
@@ -149,7 +149,7 @@ def test_every_publisher_answers_of_what_it_sent_last(sessions: tuple[Session, S
         query_lookup(reader, "r1", "world", "tool", timeout_s=0.2)
 
 
-def test_without_a_cache_a_publisher_answers_of_its_newest_sample(sessions: tuple[Session, Session]):
+def test_publisher_without_a_cache_answers_from_its_newest_sample(sessions: tuple[Session, Session]):
     with StatePublisher(sessions[0], RRBOT, "r1", cache_s=0.0) as publisher:
         await_answers(sessions[1])
         for number in range(3):
@@ -161,7 +161,7 @@ def test_without_a_cache_a_publisher_answers_of_its_newest_sample(sessions: tupl
             query_lookup(sessions[1], "r1", "world", "tool", STAMP + PERIOD)
 
 
-def test_a_driver_and_the_state_publisher_beside_it_answer_the_same(sessions: tuple[Session, Session]):
+def test_driver_and_state_publisher_of_one_robot_answer_the_same(sessions: tuple[Session, Session]):
     driver, other = sessions
     derived: tuple[Stream, ...] = ("robot_description", "tf_static", "tf")
     with (
@@ -176,7 +176,7 @@ def test_a_driver_and_the_state_publisher_beside_it_answer_the_same(sessions: tu
             assert (answer.stamp, answer.kind) == (STAMP, "exact")
 
 
-def test_a_publisher_whose_clock_was_set_back_answers_of_the_time_since(sessions):
+def test_publisher_with_a_clock_set_back_answers_from_the_new_epoch(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         assert publisher.cache is not None
         recent = RecentBuffer(RRBOT, "r1", publisher.cache)
@@ -188,7 +188,7 @@ def test_a_publisher_whose_clock_was_set_back_answers_of_the_time_since(sessions
         assert recent.buffer().lookup("world", "tool", 0).kind == "exact"
 
 
-def test_a_stranger_in_another_process_asks_through_a_router(spawn: Callable[..., Child], free_port: int):
+def test_client_in_another_process_gets_replies_through_a_router(spawn: Callable[..., Child], free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     spawn(ROUTER, endpoint).line()
     buffer = TransformBuffer()
@@ -201,21 +201,21 @@ def test_a_stranger_in_another_process_asks_through_a_router(spawn: Callable[...
         await_answers(other)
         device = spawn(DEVICE, endpoint)
 
-        def said(parameters: str) -> tuple[bool, dict[str, object]]:
+        def reply(parameters: str) -> tuple[bool, dict[str, object]]:
             device.tell(f"{KEY}?{parameters}")
             is_answer, encoding, text = device.line().split(" ", 2)
             assert (encoding, device.line()) == ("application/json", "end")
             return is_answer == "True", json.loads(text)
 
-        assert said(f"target=world;source=tool;at={STAMP}") == (
+        assert reply(f"target=world;source=tool;at={STAMP}") == (
             True,
             buffer.lookup("world", "tool", STAMP).to_dict(),
         )
-        is_answer, error = said("target=world;source=tol")
+        is_answer, error = reply("target=world;source=tol")
         assert (is_answer, error["error"], error["near_misses"]) == (False, "UnknownFrame", ["tool"])
-        is_answer, error = said(f"target=world;source=tool;at={STAMP + 12_000_000}")
+        is_answer, error = reply(f"target=world;source=tool;at={STAMP + 12_000_000}")
         assert (is_answer, error["error"]) == (False, "InFuture")
         assert "12.0 ms after the only sample" in str(error["message"])
-        is_answer, error = said("target=world;source=tool;when=now")
+        is_answer, error = reply("target=world;source=tool;when=now")
         assert (is_answer, error["error"]) == (False, "InvalidInput")
         assert "no parameter 'when'" in str(error["message"])

@@ -48,7 +48,7 @@ def test_every_number_arrives_bit_for_bit(sessions):
     assert (bare.session, bare.seq) == (full.session, full.seq + 1)
 
 
-def test_positions_may_come_by_name_in_any_order(sessions):
+def test_positions_may_be_given_by_name_in_any_order(sessions):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -58,7 +58,7 @@ def test_positions_may_come_by_name_in_any_order(sessions):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "text"),
     [
         (([1.0],), r"takes 2 positions, shape \(2,\).*got shape \(1,\)"),
         (([[1.0, 2.0]],), r"got shape \(1, 2\)"),
@@ -76,19 +76,19 @@ def test_positions_may_come_by_name_in_any_order(sessions):
         (([0.0, 0.0], None, None, 2**63), "64-bit"),
     ],
 )
-def test_what_cannot_be_published_is_refused_with_nothing_sent_and_no_gap(sessions, arguments, said: str):
+def test_refused_sample_is_not_sent_and_leaves_no_gap(sessions, arguments, text: str):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         await_reader(writer, JOINTS)
         publisher.publish([0.0, 0.0], stamp=1)
-        with pytest.raises(InvalidInput, match=said):
+        with pytest.raises(InvalidInput, match=text):
             publisher.publish(*arguments)
         publisher.publish([0.0, 0.0], stamp=2)
     assert [(state.stamp, state.seq) for state in tap.joint_states(2)] == [(1, 0), (2, 1)]
 
 
-def test_a_floating_joint_without_a_unit_quaternion_is_refused_on_every_stream(sessions):
+def test_floating_joint_without_a_unit_quaternion_is_refused_on_every_stream(sessions):
     writer, reader = sessions
     taps = [Tap(reader, JOINTS), Tap(reader, TF)]
     with StatePublisher(writer, DRONE, "r1") as publisher:
@@ -100,7 +100,7 @@ def test_a_floating_joint_without_a_unit_quaternion_is_refused_on_every_stream(s
         assert [len(tap.payloads(1)) for tap in taps] == [1, 1]
 
 
-def test_both_streams_say_the_same_instant_and_agree_with_kinematics(sessions):
+def test_both_streams_carry_the_same_instant_and_agree_with_kinematics(sessions):
     writer, reader = sessions
     model = load_model("gripper")
     joints, transforms = Tap(reader, JOINTS), Tap(reader, TF)
@@ -119,7 +119,7 @@ def test_both_streams_say_the_same_instant_and_agree_with_kinematics(sessions):
     assert poses_from_block(sample.poses).tolist() == [edges[edge].tolist() for edge in moving]
 
 
-def test_moving_and_fixed_edges_are_told_apart_and_are_all_there(sessions):
+def test_moving_and_fixed_edges_are_separate_and_complete(sessions):
     with StatePublisher(sessions[0], RRBOT) as publisher:
         description, statics = publisher.description(), publisher.statics()
     edges = dict(zip(statics.edges, poses_from_block(statics.poses).tolist(), strict=True))
@@ -129,29 +129,29 @@ def test_moving_and_fixed_edges_are_told_apart_and_are_all_there(sessions):
     assert description.joint_names == RRBOT.joint_names
 
 
-def test_transforms_are_computed_and_sent_while_somebody_reads_them_only(sessions, monkeypatch):
+def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions, monkeypatch):
     computed = []
     poses = JointTransforms.poses
     monkeypatch.setattr(JointTransforms, "poses", lambda *given: computed.append(given) or poses(*given))
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher:
 
-        def said() -> StreamStats:
+        def transform_stats() -> StreamStats:
             return publisher.stats.streams["native", "tf"]
 
         publisher.publish([0.0, 0.0], stamp=1)
         assert computed == []
         transforms = Tap(reader, TF)
-        # Who has looked before is told of readers by itself, a moment after others know of them.
+        # A second observer learns of readers a moment later than the first.
         until(lambda: publisher.publish([0.0, 0.0], stamp=2) or transforms.arrivals)
         first = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
-        assert (first.stamp, first.seq) == (2, said().suppressed)
+        assert (first.stamp, first.seq) == (2, transform_stats().suppressed)
         transforms.close()
-        until(lambda: publisher.publish([0.0, 0.0], stamp=3) or said().suppressed > first.seq)
-        assert len(computed) == said().samples
+        until(lambda: publisher.publish([0.0, 0.0], stamp=3) or transform_stats().suppressed > first.seq)
+        assert len(computed) == transform_stats().samples
 
 
-def test_the_stamp_is_the_clocks_unless_given(sessions):
+def test_stamp_is_the_time_of_the_clock_by_default(sessions):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1", clock=ManualClock(STAMP)) as publisher:
@@ -161,7 +161,7 @@ def test_the_stamp_is_the_clocks_unless_given(sessions):
     assert [state.stamp for state in tap.joint_states(2)] == [STAMP, 0]
 
 
-def test_after_close_publishing_says_closed_and_a_second_close_nothing(sessions):
+def test_closed_publisher_raises_closed_and_closes_twice(sessions):
     publisher = StatePublisher(sessions[0], RRBOT, "r1")
     began = time.monotonic()
     publisher.close()
@@ -171,7 +171,7 @@ def test_after_close_publishing_says_closed_and_a_second_close_nothing(sessions)
         publisher.publish([0.0, 0.0])
 
 
-def test_after_its_session_closed_publishing_says_closed():
+def test_publisher_of_a_closed_session_raises_closed():
     with connect() as session:
         publisher = StatePublisher(session, RRBOT)
     with pytest.raises(Closed, match="session is closed"):
@@ -180,12 +180,12 @@ def test_after_its_session_closed_publishing_says_closed():
 
 
 @pytest.mark.parametrize("name", ["a/b", "a b", "*", "a$", "@a", "r?", "r#1", "tab\t"])
-def test_a_robot_name_that_is_no_chunk_of_a_key_is_refused(sessions, name: str):
+def test_robot_name_that_is_no_key_chunk_is_refused(sessions, name: str):
     with pytest.raises(InvalidInput, match=r"robot name .* one chunk of a Zenoh key"):
         StatePublisher(sessions[0], RRBOT, name)
 
 
-def test_an_unknown_wire_and_an_unknown_stream_are_refused_naming_those_there_are(sessions):
+def test_unknown_wire_and_stream_errors_list_the_known_ones(sessions):
     with pytest.raises(InvalidInput, match="no wire 'dds'; known: 'native'"):
         StatePublisher(sessions[0], RRBOT, wires=["native", "dds"])
     with pytest.raises(InvalidInput, match="'joints' is not one of the streams 'joint_states', 'tf'"):
@@ -194,7 +194,7 @@ def test_an_unknown_wire_and_an_unknown_stream_are_refused_naming_those_there_ar
 
 
 @pytest.mark.parametrize("streams", [STREAMS, ("joint_states",), ("tf", "tf_static", "robot_description")])
-def test_a_publisher_announces_the_streams_it_writes_until_it_closes(sessions, streams):
+def test_publisher_announces_the_streams_it_writes_until_it_closes(sessions, streams):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", streams=streams):
         (robot,) = discover(reader)
@@ -204,7 +204,7 @@ def test_a_publisher_announces_the_streams_it_writes_until_it_closes(sessions, s
     assert discover(reader, timeout_s=0.3) == ()
 
 
-def test_a_robot_without_a_moving_joint_can_be_published(sessions):
+def test_robot_without_moving_joints_can_be_published(sessions):
     writer, reader = sessions
     model = load_model('<robot name="stone"><link name="only"/></robot>')
     tap = Tap(reader, JOINTS)
@@ -214,7 +214,7 @@ def test_a_robot_without_a_moving_joint_can_be_published(sessions):
     assert tap.joint_states(1)[0].positions == b""
 
 
-def test_samples_of_several_threads_all_go_out_numbered_without_a_gap(sessions):
+def test_samples_of_several_threads_are_numbered_without_a_gap(sessions):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -257,7 +257,7 @@ def test_positions_outside_limits_are_published_counted_and_logged_once(sessions
     tap.close()
 
 
-def test_the_first_sample_outside_limits_is_logged_at_once(sessions, caplog):
+def test_first_sample_outside_limits_is_logged_at_once(sessions, caplog):
     with caplog.at_level(logging.WARNING, "zstate"), StatePublisher(sessions[0], ARM, "r1") as publisher:
         publisher.publish({"lift": -3.5}, stamp=STAMP)
         assert publisher.stats.outside_limits == 1

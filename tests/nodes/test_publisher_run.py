@@ -16,7 +16,7 @@ NAN, INF = float("nan"), float("inf")
 JOINTS = "zstate/r1/joint_states"
 
 
-class Held:
+class ScriptedSource:
     """Positions that stay, or nothing on every second tick."""
 
     def __init__(self, every: int = 1, stamp: int | None = None) -> None:
@@ -29,20 +29,20 @@ class Held:
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -5.0, NAN, INF, 20_000.0])
-def test_running_at_an_impossible_rate_is_refused(sessions, rate_hz: float):
+def test_invalid_rate_is_refused(sessions, rate_hz: float):
     with (
         StatePublisher(sessions[0], RRBOT) as publisher,
         pytest.raises(InvalidInput, match="a rate is above 0"),
     ):
-        publisher.run(Held(), rate_hz)
+        publisher.run(ScriptedSource(), rate_hz)
 
 
-def test_a_run_sends_one_sample_for_each_tick_with_the_ticks_stamp(sessions):
+def test_run_publishes_one_sample_per_tick_with_its_stamp(sessions):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1", clock=Stepping(STAMP)) as publisher:
         await_reader(writer, JOINTS)
-        report = publisher.run(Held(), 30.0, seconds=2.0)
+        report = publisher.run(ScriptedSource(), 30.0, seconds=2.0)
     assert (report.ticks, report.skipped, report.commanded_hz) == (60, 0, 30.0)
     assert report.rate_hz == pytest.approx(30.0, rel=1e-8)
     states = tap.joint_states(60)
@@ -50,17 +50,17 @@ def test_a_run_sends_one_sample_for_each_tick_with_the_ticks_stamp(sessions):
     assert [state.seq for state in states] == list(range(60))
 
 
-def test_a_tick_without_news_sends_nothing_and_a_readings_own_stamp_is_kept(sessions):
+def test_tick_without_a_reading_publishes_nothing_and_a_reading_keeps_its_stamp(sessions):
     writer, reader = sessions
     tap = Tap(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1", clock=Stepping(STAMP)) as publisher:
         await_reader(writer, JOINTS)
-        assert publisher.run(Held(every=2, stamp=77), 10.0, seconds=1.0).ticks == 10
+        assert publisher.run(ScriptedSource(every=2, stamp=77), 10.0, seconds=1.0).ticks == 10
         publisher.publish([0.0, 0.0], stamp=78)
     assert [state.stamp for state in tap.joint_states(6)] == [77] * 5 + [78]
 
 
-def test_close_from_another_thread_ends_a_run(sessions):
+def test_close_from_another_thread_ends_run(sessions):
     publisher = StatePublisher(sessions[0], RRBOT, clock=SystemClock())
     reports = []
     runner = threading.Thread(target=lambda: reports.append(publisher.run(SineSource(RRBOT), 0.01)))

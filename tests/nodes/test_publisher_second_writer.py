@@ -35,7 +35,7 @@ WRITER = """
         publisher.run(SineSource(model), 100.0)
 """
 
-# Rounds: "go" opens it, on a network that it has just joined; it writes until it is refused or told to end.
+# Rounds: "go" opens it, on a network that it has just joined; it writes until it is refused or stopped.
 RIVAL = """
     import select, sys
     from zstate import StatePublisher, connect, load_model
@@ -63,7 +63,7 @@ def edge(child: str) -> Transform:
     return Transform("base", child, [1, 0, 0], [0, 0, 0, 1])
 
 
-def test_a_second_process_is_refused_naming_the_first_which_goes_on(spawn, sessions):
+def test_second_process_is_refused_with_the_name_of_the_first_which_continues(spawn, sessions):
     first = spawn(WRITER)
     first.line()
     with TransformListener(sessions[1], "r1", history_on_join=False) as listener:
@@ -78,7 +78,7 @@ def test_a_second_process_is_refused_naming_the_first_which_goes_on(spawn, sessi
         assert "conflict" not in {event.kind for event in listener.events()}
 
 
-def test_after_kill_9_it_may_be_started_again_at_once(spawn):
+def test_publisher_can_be_restarted_at_once_after_kill_9(spawn):
     for _ in range(3):
         writer = spawn(WRITER)
         assert writer.line() == "writing"
@@ -86,7 +86,7 @@ def test_after_kill_9_it_may_be_started_again_at_once(spawn):
 
 
 @pytest.mark.parametrize("same_session", [True, False])
-def test_after_close_it_may_be_opened_again_at_once(sessions, same_session):
+def test_publisher_can_be_reopened_at_once_after_close(sessions, same_session):
     for number in range(5):
         session = sessions[0 if same_session else number % 2]
         with StatePublisher(session, RRBOT, "r1") as publisher:
@@ -94,7 +94,7 @@ def test_after_close_it_may_be_opened_again_at_once(sessions, same_session):
 
 
 @pytest.mark.processes
-def test_of_two_processes_that_start_together_exactly_one_survives_each_of_20_times(spawn):
+def test_exactly_one_of_two_simultaneous_processes_survives_each_of_20_times(spawn):
     rivals = [spawn(RIVAL), spawn(RIVAL)]
     for rival in rivals:
         rival.line()
@@ -102,9 +102,9 @@ def test_of_two_processes_that_start_together_exactly_one_survives_each_of_20_ti
         for _ in range(20):
             for rival in rivals:
                 rival.tell("go")
-            said = {pool.submit(rival.line): rival for rival in rivals}
-            (refused, *_), others = wait(said, return_when=FIRST_COMPLETED)
-            (winner,) = [rival for rival in rivals if rival is not said[refused]]
+            answer = {pool.submit(rival.line): rival for rival in rivals}
+            (refused, *_), others = wait(answer, return_when=FIRST_COMPLETED)
+            (winner,) = [rival for rival in rivals if rival is not answer[refused]]
             assert refused.result() == f"refused by {winner.process.pid}"
             assert others
             winner.tell("end")
@@ -112,7 +112,7 @@ def test_of_two_processes_that_start_together_exactly_one_survives_each_of_20_ti
 
 
 @pytest.mark.parametrize("later_publishes_first", [True, False])
-def test_of_two_on_networks_that_are_joined_later_the_later_one_ends(later_publishes_first):
+def test_later_publisher_ends_when_two_networks_are_joined(later_publishes_first):
     endpoints = [f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2)]
     with ExitStack() as opened:
         ours, theirs = (opened.enter_context(connect(listen=endpoint)) for endpoint in endpoints)
@@ -136,7 +136,7 @@ def test_of_two_on_networks_that_are_joined_later_the_later_one_ends(later_publi
 
 
 @pytest.mark.parametrize("stream", ["joint_states", "robot_description"])
-def test_a_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_publishes(
+def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_publishes(
     sessions, monkeypatch: pytest.MonkeyPatch, stream
 ):
     monkeypatch.setattr("zstate.net.ownership._AT_ONCE_S", 0.0)
@@ -152,9 +152,9 @@ def test_a_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_
                 publisher.publish([0.0, 0.0])
             description = replace(publisher.description(), session=stranger.session)
             state = JointState(1, 0, stranger.session, order_digest(RRBOT.joint_names), bytes(16))
-            said = state if stream == "joint_states" else description
+            answer = state if stream == "joint_states" else description
             with pytest.raises(SecondWriter) as raised:
-                until(lambda: put(theirs, stream, said) or publisher.publish([0.0, 0.0]))
+                until(lambda: put(theirs, stream, answer) or publisher.publish([0.0, 0.0]))
     assert raised.value.first == stranger
 
 
@@ -162,7 +162,7 @@ def put(session: Session, stream: Stream, message: JointState | RobotDescription
     session.zenoh.put(stream_key("r1", stream), encode(message), encoding=ENCODINGS[type(message)])
 
 
-def test_parts_of_a_robot_may_have_a_writer_each(sessions):
+def test_streams_of_a_robot_may_have_separate_writers(sessions):
     with (
         StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"]) as joints,
         StatePublisher(sessions[1], RRBOT, "r1", streams=["tf", "tf_static", "robot_description"]) as rest,
@@ -178,20 +178,20 @@ def test_parts_of_a_robot_may_have_a_writer_each(sessions):
     assert raised.value.stream == "tf"
 
 
-def test_with_takeover_the_newest_is_followed_and_readers_are_told_once(sessions):
-    told: list[WriterEvent] = []
+def test_takeover_makes_listeners_use_the_newest_writer_and_log_once(sessions):
+    reported: list[WriterEvent] = []
     with (
-        TransformListener(sessions[1], "r1", on_event=told.append) as listener,
+        TransformListener(sessions[1], "r1", on_event=reported.append) as listener,
         StatePublisher(sessions[0], RRBOT, "r1", streams=["joint_states"], program="driver") as first,
     ):
-        until(lambda: [event.kind for event in told] == ["joined"])
+        until(lambda: [event.kind for event in reported] == ["joined"])
         with StatePublisher(
             sessions[1], RRBOT, "r1", streams=["joint_states"], program="simulator", takeover=True
         ) as second:
             until(lambda: listener.stats.refused.get("second writer", 0) >= 200 or fought(first, second))
-            assert [event.kind for event in told] == ["joined", "joined", "conflict"]
-        until(lambda: told[-1].kind == "left")
-    conflict = told[2]
+            assert [event.kind for event in reported] == ["joined", "joined", "conflict"]
+        until(lambda: reported[-1].kind == "left")
+    conflict = reported[2]
     assert "simulator@" in conflict.text
     assert "driver@" in conflict.text
     assert conflict.writer is not None
@@ -203,7 +203,7 @@ def fought(*publishers: StatePublisher) -> None:
         publisher.publish([0.0, 0.0])
 
 
-def test_on_the_ros_wire_nobody_is_refused(sessions):
+def test_ros_wire_allows_several_static_writers(sessions):
     with (
         StatePublisher(sessions[0], RRBOT, "r1", ("ros2",)),
         StatePublisher(sessions[1], RRBOT, "r1", ("ros2",)) as second,
@@ -215,7 +215,7 @@ def test_on_the_ros_wire_nobody_is_refused(sessions):
         again.set(edge("camera"))
 
 
-def test_an_edge_that_another_static_writer_places_is_refused_and_nothing_is_said(sessions):
+def test_edge_of_another_static_writer_is_refused_and_not_published(sessions):
     with (
         StaticPublisher(sessions[0], "r1", "mount", program="calibration") as mount,
         StaticPublisher(sessions[1], "r2", "room") as room,
@@ -237,7 +237,7 @@ def test_an_edge_that_another_static_writer_places_is_refused_and_nothing_is_sai
         listener.buffer.wait("r2/base", "r1/camera", timeout_s=5.0)
 
 
-def test_readers_are_told_of_an_edge_that_two_place_with_takeover(sessions):
+def test_takeover_of_an_edge_is_reported_to_listeners(sessions):
     with (
         TransformListener(sessions[1], "r1") as listener,
         StaticPublisher(sessions[0], "r1", "mount") as mount,
@@ -253,7 +253,7 @@ def test_readers_are_told_of_an_edge_that_two_place_with_takeover(sessions):
         assert [event.kind for event in listener.events()].count("conflict") == 1
 
 
-def test_two_static_writers_of_one_name_are_one_too_many(sessions):
+def test_second_static_writer_of_one_name_is_refused(sessions):
     with StaticPublisher(sessions[0], "r1", "mount"):
         until(lambda: current_tokens(sessions[1], "zstate/r1/@writer/tf_static/*", 1.0))
         with pytest.raises(SecondWriter, match="under the name 'mount'"):

@@ -1,4 +1,4 @@
-"""What the counts of a publisher say of how it does."""
+"""Health of a publisher, derived from its counts."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ def counts(
     return PublisherStats(sent, refused, refusal, {}, rate)
 
 
-def test_a_publisher_that_publishes_in_time_is_well():
+def test_punctual_publisher_is_ok():
     assert assess_health(counts(5), counts(6), quiet_ns=0) == OK
     assert assess_health(counts(5, rate_hz=100.0), counts(105, rate_hz=100.0), quiet_ns=0) == OK
 
 
-def test_one_that_has_nothing_new_to_say_is_stale_after_two_seconds():
+def test_publisher_without_new_samples_is_stale_after_two_seconds():
     assert assess_health(counts(5), counts(5), quiet_ns=2 * SECOND) == OK
     level, text = assess_health(counts(5), counts(5), quiet_ns=2 * SECOND + 1)
     assert (level, text) == ("stale", "nothing was published for 2.0 s")
     assert assess_health(counts(), counts(), quiet_ns=3 * SECOND).text.endswith("since this publisher opened")
 
 
-def test_a_slow_rate_that_was_asked_for_is_not_stale_before_two_periods():
+def test_slow_commanded_rate_is_not_stale_before_two_periods():
     slow = counts(5, rate_hz=0.25)
     assert assess_health(slow, slow, quiet_ns=8 * SECOND) == OK
     assert assess_health(slow, slow, quiet_ns=8 * SECOND + 1).level == "stale"
 
 
-def test_ticks_that_were_late_or_skipped_since_the_last_time_are_a_warning():
+def test_newly_late_or_skipped_ticks_are_a_warning():
     before = counts(100, rate_hz=100.0, late=3, skipped=1)
     level, text = assess_health(before, counts(140, rate_hz=100.0, late=43, skipped=21), quiet_ns=0)
     assert level == "warn"
@@ -61,15 +61,13 @@ def test_samples_outside_joint_limits_are_a_warning_that_names_the_joint():
     assert assess_health(now, replace(now, sent=12), quiet_ns=0) == OK
 
 
-def test_the_ticks_of_an_earlier_run_are_not_those_of_this_one():
+def test_ticks_of_an_earlier_run_are_not_counted_again():
     before = counts(100, rate_hz=100.0, late=50, skipped=20)
     assert assess_health(before, counts(110, rate_hz=10.0), quiet_ns=0) == OK
 
 
 @pytest.mark.parametrize(("sent", "level", "share"), [(3, "warn", "2 of 5"), (0, "error", "2 of 2")])
-def test_samples_that_cannot_be_published_are_a_warning_and_an_error_when_there_are_no_others(
-    sent: int, level: str, share: str
-):
+def test_refused_samples_are_a_warning_and_an_error_if_none_was_published(sent: int, level: str, share: str):
     now = counts(10 + sent, refused=2, refusal="joint 'elbow' is nan")
     assert assess_health(counts(10), now, quiet_ns=0) == (
         level,
@@ -77,7 +75,7 @@ def test_samples_that_cannot_be_published_are_a_warning_and_an_error_when_there_
     )
 
 
-def test_a_status_tells_who_how_much_and_what_is_commanded():
+def test_status_has_writer_counts_and_commanded_rate():
     read = [counts(), counts(7, rate_hz=50.0, late=2)]
     reporter = StatusReporter(WriterId("driver", "nuc", 412, 5, 9), lambda: read.pop(0))
     status = reporter.status()

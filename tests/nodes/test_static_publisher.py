@@ -26,7 +26,7 @@ def x_of(buffer: TransformBuffer, target: str, source: str) -> float | None:
     return None if reason is not None else buffer.lookup(target, source).translation[0]
 
 
-def test_who_joins_late_is_given_all_edges_of_all_writers(sessions):
+def test_late_listener_gets_all_edges_of_all_writers(sessions):
     writer, reader = sessions
     with (
         StaticPublisher(writer, "r1", "mount") as mount,
@@ -43,7 +43,7 @@ def test_who_joins_late_is_given_all_edges_of_all_writers(sessions):
     assert writers == {"r1/camera": "mount", "r1/lens": "mount", "r1/tool": "room"}
 
 
-def test_edges_are_said_on_several_wires_at_once(sessions):
+def test_edges_are_published_on_several_wires_at_once(sessions):
     writer, reader = sessions
     with (
         StaticPublisher(writer, "r1", "mount", ("native", "ros2")) as statics,
@@ -55,7 +55,7 @@ def test_edges_are_said_on_several_wires_at_once(sessions):
             assert listener.buffer.wait("tool", "camera", timeout_s=5.0).translation[0] == 1.0
 
 
-def test_an_update_reaches_everybody_and_leaves_the_other_edges(sessions):
+def test_update_reaches_every_listener_and_keeps_the_other_edges(sessions):
     writer, reader = sessions
     with (
         StaticPublisher(writer, "r1", "mount") as statics,
@@ -72,7 +72,7 @@ def test_an_update_reaches_everybody_and_leaves_the_other_edges(sessions):
             assert x_of(listener.buffer, "tool", "laser") == 5.0
 
 
-def test_withdrawing_takes_one_edge_back_and_closing_the_rest(sessions):
+def test_withdraw_removes_one_edge_and_close_the_rest(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         buffer = listener.buffer
@@ -97,7 +97,7 @@ def test_closing_one_writer_leaves_the_other_ones_edges(sessions):
         assert x_of(listener.buffer, "map", "tool") == 4.0
 
 
-def test_an_edge_that_another_writer_took_over_stays_when_the_first_one_leaves(sessions):
+def test_edge_taken_over_by_another_writer_stays_when_the_first_one_closes(sessions):
     writer, reader = sessions
     with (
         TransformListener(reader, "r1") as listener,
@@ -113,7 +113,7 @@ def test_an_edge_that_another_writer_took_over_stays_when_the_first_one_leaves(s
         assert x_of(listener.buffer, "tool", "camera") == 2.0
 
 
-def test_a_child_moves_to_another_parent_after_it_was_withdrawn_and_not_before(sessions):
+def test_child_can_be_reparented_only_after_it_was_withdrawn(sessions):
     writer, reader = sessions
     with StaticPublisher(writer, "r1", "mount") as statics, TransformListener(reader, "r1") as listener:
         statics.set(edge("tool", "camera", 1.0))
@@ -132,7 +132,7 @@ def test_a_child_moves_to_another_parent_after_it_was_withdrawn_and_not_before(s
     ("parent", "child", "reason"),
     [("camera", "camera", "self edge"), ("camera", "tool", "loop"), ("r1/camera", "tool", "loop")],
 )
-def test_an_edge_that_readers_would_refuse_is_refused_where_it_is_set(sessions, parent, child, reason):
+def test_edge_that_listeners_would_refuse_raises_in_set(sessions, parent, child, reason):
     with StaticPublisher(sessions[0], "r1", "mount") as statics:
         statics.set(edge("tool", "camera"))
         with pytest.raises(InsertRefused) as caught:
@@ -154,7 +154,7 @@ def test_an_edge_that_readers_would_refuse_is_refused_where_it_is_set(sessions, 
         ("map", "world", ""),
     ],
 )
-def test_an_edge_that_every_reader_would_refuse_is_refused_where_it_is_set(sessions, parent, child, reason):
+def test_edge_that_every_listener_would_refuse_raises_in_set(sessions, parent, child, reason):
     with (
         StatePublisher(sessions[1], RRBOT, "r1"),
         StatePublisher(sessions[1], RRBOT, "r2"),
@@ -176,7 +176,7 @@ def test_an_edge_that_every_reader_would_refuse_is_refused_where_it_is_set(sessi
             assert listener.stats.refused == {}
 
 
-def test_what_another_robot_says_of_a_frame_does_not_keep_its_own_writer_out(sessions):
+def test_edge_of_another_robot_does_not_exclude_the_own_writer(sessions):
     with (
         StaticPublisher(sessions[0], "r2", "thief") as thief,
         StaticPublisher(sessions[1], "r1", "mount") as mount,
@@ -192,7 +192,7 @@ def test_what_another_robot_says_of_a_frame_does_not_keep_its_own_writer_out(ses
         assert listener.buffer.wait("r2/map", "r1/camera", timeout_s=5.0).translation[0] == 9.0
 
 
-def test_one_map_for_two_robots_is_a_frame_that_belongs_to_neither(sessions):
+def test_map_shared_by_two_robots_is_an_unowned_frame(sessions):
     with (
         StatePublisher(sessions[0], RRBOT, "a") as one,
         StatePublisher(sessions[1], RRBOT, "b") as other,
@@ -216,7 +216,7 @@ def test_one_map_for_two_robots_is_a_frame_that_belongs_to_neither(sessions):
 
 
 @pytest.mark.parametrize("name", ["/camera", "camera/", ""])
-def test_a_name_that_is_no_frame_is_refused_and_what_was_set_stays(sessions, name: str):
+def test_invalid_frame_name_is_refused_and_earlier_edges_stay(sessions, name: str):
     writer, reader = sessions
     with StaticPublisher(writer, "r1", "mount") as statics, TransformListener(reader, "r1") as listener:
         statics.set(edge("tool", "camera"))
@@ -226,7 +226,7 @@ def test_a_name_that_is_no_frame_is_refused_and_what_was_set_stays(sessions, nam
         listener.buffer.wait("camera", "laser", timeout_s=5.0)
 
 
-def test_the_models_own_writer_name_is_reserved_and_a_bad_one_refused(sessions):
+def test_model_writer_name_is_reserved_and_an_invalid_one_refused(sessions):
     with pytest.raises(InvalidInput, match="belongs to the robot's own model"):
         StaticPublisher(sessions[0], "r1", "robot_description")
     for name in ("a/b", "a b", "", "@x"):
@@ -239,7 +239,7 @@ def test_the_models_own_writer_name_is_reserved_and_a_bad_one_refused(sessions):
     assert discover(sessions[1], timeout_s=0.3) == ()
 
 
-def test_withdrawing_what_is_not_ours_names_what_is(sessions):
+def test_withdraw_of_an_unknown_edge_lists_the_edges_of_the_writer(sessions):
     with StaticPublisher(sessions[0], "r1", "mount") as statics:
         with pytest.raises(InvalidInput, match="its edges: none"):
             statics.withdraw("camera")
@@ -249,7 +249,7 @@ def test_withdrawing_what_is_not_ours_names_what_is(sessions):
 
 
 @pytest.mark.parametrize("name", [None, 5, "", "/tool", ["tool"]], ids=repr)
-def test_what_can_be_no_frame_name_is_refused_by_a_static_publisher(sessions, name):
+def test_invalid_frame_name_is_refused_by_static_publisher(sessions, name):
     with StaticPublisher(sessions[0], "r1", "mount") as statics:
         statics.set(edge("tool", "camera", 1.0))
         with pytest.raises(InvalidInput, match="frame name"):
@@ -292,7 +292,7 @@ def test_publishers_without_a_name_coexist_in_one_process(sessions, monkeypatch:
         assert listener.buffer.wait("camera", "laser", timeout_s=5.0).translation[0] == 4.0
 
 
-def test_after_close_it_says_closed_and_a_second_close_nothing(sessions):
+def test_closed_static_publisher_raises_closed_and_closes_twice(sessions):
     statics = StaticPublisher(sessions[0], "r1", "mount")
     statics.set(edge("tool", "camera"))
     began = time.monotonic()
@@ -304,7 +304,7 @@ def test_after_close_it_says_closed_and_a_second_close_nothing(sessions):
             use()
 
 
-def test_it_may_outlive_its_session():
+def test_static_publisher_may_outlive_its_session():
     with connect() as session:
         statics = StaticPublisher(session, "r1", "mount")
         statics.set(edge("tool", "camera"))

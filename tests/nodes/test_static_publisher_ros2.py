@@ -24,7 +24,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
-def test_static_edges_of_several_writers_add_up_and_nothing_is_withdrawn(sessions):
+def test_ros_static_edges_of_several_writers_accumulate_and_none_is_withdrawn(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         mount, room = (
@@ -44,7 +44,7 @@ def test_static_edges_of_several_writers_add_up_and_nothing_is_withdrawn(session
         assert listener.stats.refused == {}
 
 
-def test_a_static_writer_that_starts_again_may_place_its_child_elsewhere(sessions):
+def test_restarted_static_writer_may_reparent_its_child(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         old = RosNode(writer, "mount").publisher(TF_STATIC).announce()
@@ -60,7 +60,7 @@ def test_a_static_writer_that_starts_again_may_place_its_child_elsewhere(session
         assert x_of(listener, "tool", "camera") is None
 
 
-def test_late_listeners_get_the_last_words_of_every_static_writer(sessions):
+def test_late_listeners_get_the_last_message_of_every_static_writer(sessions):
     writer, reader = sessions
     nodes = [RosNode(writer, f"static_{number}").publisher(TF_STATIC).announce() for number in range(5)]
     humble = RosNode(writer, "old").publisher(TF_STATIC, HUMBLE).announce()
@@ -74,14 +74,14 @@ def test_late_listeners_get_the_last_words_of_every_static_writer(sessions):
         assert listener.buffer.wait("map", "humble", timeout_s=5.0).translation[0] == 9.0
 
 
-def test_of_two_writers_of_one_static_edge_the_newest_word_counts(sessions):
+def test_newest_message_of_two_static_writers_is_used(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         one, other = (RosNode(writer, name).publisher(TF_STATIC) for name in ("one", "other"))
         for number, node in enumerate((one, other, one, other)):
             node.edge(0, "tool", "camera", float(number))
             until(lambda number=number: x_of(listener, "tool", "camera") == float(number))
-        # Their names come later, and leave what was said last.
+        # Their names arrive later and leave the last values unchanged.
         one.announce()
         other.announce()
         until(lambda: writers(listener)["camera"] == "/other")
@@ -90,7 +90,7 @@ def test_of_two_writers_of_one_static_edge_the_newest_word_counts(sessions):
 
 
 @pytest.mark.parametrize("order", ["statics first", "model first", "together"])
-def test_the_models_own_fixed_edges_are_no_second_writer_whenever_they_come(sessions, order: str):
+def test_fixed_edges_of_the_model_are_no_second_writer_in_any_order(sessions, order: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         statics = RosNode(writer, "robot_state_publisher").publisher(TF_STATIC).announce()
@@ -113,7 +113,7 @@ def test_the_models_own_fixed_edges_are_no_second_writer_whenever_they_come(sess
 
 
 @pytest.mark.parametrize("model_first", [True, False])
-def test_a_static_edge_that_contradicts_the_model_is_counted_in_either_order(sessions, model_first: bool):
+def test_static_edge_that_contradicts_the_model_is_counted_in_either_order(sessions, model_first: bool):
     writer, reader = sessions
     (edge, *_) = FIXED
     with TransformListener(reader, "r1", wire="ros2") as listener:

@@ -28,8 +28,8 @@ from zstate.wire.ros2.types import JOINT_STATE
 STORAGES = (StoragePlugin.SQLITE3, StoragePlugin.MCAP)
 
 
-class Read:
-    """Everything that a transcript tells."""
+class DecodedFile:
+    """All messages and reports of a decoded recording."""
 
     def __init__(self, path: Path, **choice: object) -> None:
         self.refused: list[str] = []
@@ -37,37 +37,42 @@ class Read:
             transcript = DecodedRecording(reader, lambda reason, _: self.refused.append(reason))
             self.robots = transcript.robots
             self.ignored = transcript.ignored
-            self.said: list[DecodedMessage] = list(transcript.messages(**choice))
+            self.decoded: list[DecodedMessage] = list(transcript.messages(**choice))
 
     def of(self, kind: type) -> list[DecodedMessage]:
-        return [said for said in self.said if isinstance(said.message, kind)]
+        return [decoded for decoded in self.decoded if isinstance(decoded.message, kind)]
 
 
-def test_a_joint_state_comes_back_with_its_writer_and_every_number(tmp_path: Path):
+def test_joint_state_is_decoded_with_its_writer_and_every_number(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm", {7: "driver@host pid 1"}) as tale:
         tale.describe("arm", session=7)
         states = [
             tale.joints("arm", START + n * MS + 1, swing(n / 10), swing(n / 7), session=7) for n in range(20)
         ]
-    read = Read(tmp_path / "r.mcap")
-    told = read.of(JointState)
+    read = DecodedFile(tmp_path / "r.mcap")
+    found = read.of(JointState)
     assert read.robots == ("arm",)
-    assert [said.writer.robot for said in told] == ["arm"] * 20
-    assert {(said.writer.session, said.writer.program) for said in told} == {(7, "driver@host pid 1")}
-    for state, said in zip(states, told, strict=True):
-        message = said.message
+    assert [decoded.writer.robot for decoded in found] == ["arm"] * 20
+    assert {(decoded.writer.session, decoded.writer.program) for decoded in found} == {
+        (7, "driver@host pid 1")
+    }
+    for state, decoded in zip(states, found, strict=True):
+        message = decoded.message
         assert isinstance(message, JointState)
         assert (message.stamp, message.seq, message.session) == (state.stamp, state.seq, state.session)
         assert (message.positions, message.velocities) == (state.positions, state.velocities)
-        assert said.log_time == state.stamp + LATENCY
+        assert decoded.log_time == state.stamp + LATENCY
     assert not read.refused
 
 
-def test_frames_of_several_robots_are_called_as_they_were(tmp_path: Path):
+def test_frames_of_several_robots_keep_their_names(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         for robot in ("r1", "r2"):
             tale.edges(robot, START, {("odom", "base"): pose(1.0), ("fleet/map", "odom"): pose(2.0)})
-    edges = {said.writer.robot: said.message.edges for said in Read(tmp_path / "r.mcap").of(TransformSample)}
+    edges = {
+        decoded.writer.robot: decoded.message.edges
+        for decoded in DecodedFile(tmp_path / "r.mcap").of(TransformSample)
+    }
     expected = (("odom", "base"), ("fleet/map", "odom"))
     assert edges == {"r1": expected, "r2": expected}
 
@@ -77,24 +82,24 @@ def test_static_writers_keep_their_names(tmp_path: Path):
         tale.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
         tale.statics("arm", START, {("world", "base"): pose()}, writer=MODEL_WRITER)
         tale.scribe.withdraw("arm", "camera", START + S)
-    told = Read(tmp_path / "r.mcap").of(StaticTransforms)
-    assert [(said.writer.static_writer, said.message.edges) for said in told] == [
+    found = DecodedFile(tmp_path / "r.mcap").of(StaticTransforms)
+    assert [(decoded.writer.static_writer, decoded.message.edges) for decoded in found] == [
         ("camera", (("tool", "camera"),)),
         (MODEL_WRITER, (("world", "base"),)),
         ("camera", ()),
     ]
 
 
-def test_a_restarted_writer_is_another_speaker(tmp_path: Path):
+def test_restarted_writer_is_another_writer(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.joints("arm", START, swing(0), session=1)
         tale.joints("arm", START + S, swing(1), session=2)
-    assert [said.writer.session for said in Read(tmp_path / "r.mcap").of(JointState)] == [1, 2]
+    assert [decoded.writer.session for decoded in DecodedFile(tmp_path / "r.mcap").of(JointState)] == [1, 2]
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_a_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
+def test_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
     odom_from_base = Transform("odom", "base", [1.0, 2.0, 0.0], [0, 0, 0.6, 0.8], START + 5)
     base_from_lidar = Transform("base", "lidar", [0, 0, 0.3], [0, 0, 0, 1], 0)
     with Bag(tmp_path / "bag", storage) as bag:
@@ -103,7 +108,7 @@ def test_a_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
         bag.tf(START + 5, [odom_from_base])
         bag.joints(START + 6, {"shoulder": 0.25, "elbow": -0.5})
         bag.joints(START + 7, {"knee": 1.0}, "/dog/joint_states")
-    read = Read(tmp_path / "bag")
+    read = DecodedFile(tmp_path / "bag")
     assert read.robots == ("dog", "ros")
     (description,), (statics,) = read.of(RobotDescription), read.of(StaticTransforms)
     (sample,), (ros, dog) = read.of(TransformSample), read.of(JointState)
@@ -118,32 +123,38 @@ def test_a_bag_is_read_by_its_topics(tmp_path: Path, storage: StoragePlugin):
     assert ros.writer.session != dog.writer.session
 
 
-def test_the_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
+def test_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n in range(5):
             bag.joints(START + n, {"shoulder": 0.0})
-    assert [said.message.seq for said in Read(tmp_path / "bag").of(JointState)] == [1, 2, 3, 4, 5]
+    assert [decoded.message.seq for decoded in DecodedFile(tmp_path / "bag").of(JointState)] == [
+        1,
+        2,
+        3,
+        4,
+        5,
+    ]
 
 
-def test_other_topics_of_a_bag_are_named_and_left_out(tmp_path: Path):
+def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"shoulder": 0.0}, "/joint_commands")
         bag.say("/chatter", START, STORE.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String")
-    read = Read(tmp_path / "bag")
+    read = DecodedFile(tmp_path / "bag")
     assert {channel.topic for channel in read.ignored} == {"/joint_commands", "/chatter"}
-    assert (read.robots, read.said) == ((), [])
+    assert (read.robots, read.decoded) == ((), [])
 
 
-def test_a_robot_is_chosen_with_what_stands_in_the_root_of_a_bag(tmp_path: Path):
+def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"knee": 1.0}, "/dog/joint_states")
         bag.joints(START, {"knee": 1.0}, "/cat/joint_states")
         bag.tf(START, [Transform("dog/odom", "dog/base", [0, 0, 0], [0, 0, 0, 1], START)])
-    said = Read(tmp_path / "bag", robots=("dog",)).said
-    assert {(s.writer.robot, s.writer.stream) for s in said} == {("dog", "joint_states"), ("ros", "tf")}
+    decoded = DecodedFile(tmp_path / "bag", robots=("dog",)).decoded
+    assert {(s.writer.robot, s.writer.stream) for s in decoded} == {("dog", "joint_states"), ("ros", "tf")}
 
 
-def test_what_cannot_be_understood_is_told_and_left_out(tmp_path: Path):
+def test_undecodable_messages_are_reported_and_left_out(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.joints("arm", START, swing(0))
@@ -151,21 +162,23 @@ def test_what_cannot_be_understood_is_told_and_left_out(tmp_path: Path):
         joints = tale.writer.channel("/joint_states", JOINT_STATE, STREAM_QOS["joint_states"], facts)
         tale.writer.write(joints, b"\0\1\0\0" + bytes(4), START + MS, START + MS)
         tale.joints("arm", START + 2 * MS, swing(1))
-    read = Read(tmp_path / "r.mcap")
+    read = DecodedFile(tmp_path / "r.mcap")
     assert len(read.of(JointState)) == 2
     assert read.refused == ["truncated"]
 
 
-def test_a_stretch_of_log_times_can_be_read_alone(tmp_path: Path):
+def test_interval_of_log_times_can_be_read_alone(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(10):
             tale.joints("arm", START + n * S, swing(n), heard=START + n * S)
-    told = Read(tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S)
-    assert [said.log_time for said in told.said] == [START + 3 * S, START + 4 * S]
+    found = DecodedFile(
+        tmp_path / "r.mcap", streams=("joint_states",), begin=START + 3 * S, end=START + 5 * S
+    )
+    assert [decoded.log_time for decoded in found.decoded] == [START + 3 * S, START + 4 * S]
 
 
-def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path):
+def test_truncated_recording_is_decoded_as_far_as_possible(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(2000):
@@ -175,8 +188,8 @@ def test_a_recording_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path: Path):
     whole = (tmp_path / "r.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: len(whole) // 2])
-    told, all_told = Read(cut), Read(tmp_path / "r.mcap")
-    assert 100 < len(told.said) < len(all_told.said)
-    assert told.said == all_told.said[: len(told.said)]
+    found, all_told = DecodedFile(cut), DecodedFile(tmp_path / "r.mcap")
+    assert 100 < len(found.decoded) < len(all_told.decoded)
+    assert found.decoded == all_told.decoded[: len(found.decoded)]
     recover(cut, tmp_path / "saved.mcap")
-    assert Read(tmp_path / "saved.mcap").said == told.said
+    assert DecodedFile(tmp_path / "saved.mcap").decoded == found.decoded

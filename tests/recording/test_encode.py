@@ -1,4 +1,4 @@
-"""What robots say stands in a recording as a ROS 2 node would have said it."""
+"""Robot messages are recorded as a ROS 2 node would have published them."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def statics(*edges: tuple[str, str], session: int = 1) -> StaticTransforms:
     return StaticTransforms(session, edges, to_block([POSES[1]] * len(edges)))
 
 
-class Desk:
+class EncoderCase:
     """A recording at hand, and who writes it."""
 
     def __init__(self, path: Path, **options: Any) -> None:
@@ -93,14 +93,14 @@ class Desk:
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    return Desk(tmp_path / "run.mcap", alone="cart", programs={1: "driver@host pid 7"})
+def case(tmp_path: Path) -> EncoderCase:
+    return EncoderCase(tmp_path / "run.mcap", alone="cart", programs={1: "driver@host pid 7"})
 
 
-def test_each_number_of_a_joint_state_has_the_name_of_its_coordinate(desk: Desk):
-    desk.encoder.write_message("cart", description(), NOW)
-    desk.encoder.write_message("cart", joints(NOW - 5), NOW)
-    (message,) = desk.read("/joint_states")
+def test_numbers_of_a_joint_state_have_the_names_of_their_coordinates(case: EncoderCase):
+    case.encoder.write_message("cart", description(), NOW)
+    case.encoder.write_message("cart", joints(NOW - 5), NOW)
+    (message,) = case.read("/joint_states")
     free = [f"free.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     assert message.name == [*free, "turn"]
     assert message.position.tolist() == POSITIONS
@@ -110,11 +110,11 @@ def test_each_number_of_a_joint_state_has_the_name_of_its_coordinate(desk: Desk)
     assert message.effort.size == 0
 
 
-def test_moving_and_fixed_edges_stand_under_their_names(desk: Desk):
-    desk.encoder.write_message("cart", description(), NOW)
-    desk.encoder.write_message("cart", transforms(), NOW)
-    desk.encoder.write_message("cart", statics(("arm", "tool"), ("fleet/map", "world")), NOW, MODEL_WRITER)
-    (moving,), (fixed,) = desk.read("/tf"), desk.read("/tf_static")
+def test_moving_and_fixed_edges_are_written_under_their_names(case: EncoderCase):
+    case.encoder.write_message("cart", description(), NOW)
+    case.encoder.write_message("cart", transforms(), NOW)
+    case.encoder.write_message("cart", statics(("arm", "tool"), ("fleet/map", "world")), NOW, MODEL_WRITER)
+    (moving,), (fixed,) = case.read("/tf"), case.read("/tf_static")
     assert [(t.header.frame_id, t.child_frame_id) for t in moving.transforms] == list(MOVING)
     first = moving.transforms[0].transform
     assert [first.translation.x, first.translation.y, first.translation.z] == POSES[0][:3]
@@ -125,11 +125,11 @@ def test_moving_and_fixed_edges_stand_under_their_names(desk: Desk):
     ]
 
 
-def test_a_channel_tells_the_robot_its_writer_and_the_program(desk: Desk):
-    desk.encoder.write_message("cart", description(), NOW)
-    desk.encoder.write_message("cart", joints(seq=2**32 + 7), NOW)
-    desk.encoder.write_message("cart", statics(("arm", "tool"), session=2), NOW, "mount")
-    records = {record.topic: record for record in desk.records()}
+def test_channel_metadata_has_robot_writer_and_program(case: EncoderCase):
+    case.encoder.write_message("cart", description(), NOW)
+    case.encoder.write_message("cart", joints(seq=2**32 + 7), NOW)
+    case.encoder.write_message("cart", statics(("arm", "tool"), session=2), NOW, "mount")
+    records = {record.topic: record for record in case.records()}
     facts = records["/joint_states"].metadata
     assert facts["zstate.robot"] == "cart"
     assert facts["zstate.frame_prefix"] == ""
@@ -143,82 +143,82 @@ def test_a_channel_tells_the_robot_its_writer_and_the_program(desk: Desk):
     assert records["/robot_description"].publish_time == records["/robot_description"].log_time == NOW
 
 
-def test_samples_that_come_before_the_description_are_written_when_it_comes(desk: Desk):
+def test_samples_before_the_description_are_written_after_it(case: EncoderCase):
     for number in range(3):
-        desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
-        desk.encoder.write_message("cart", transforms(NOW + number, number), NOW + number)
-    assert (desk.encoder.messages, desk.encoder.unwritten) == ({}, 6)
-    desk.encoder.write_message("cart", description(), NOW + 10)
-    assert desk.encoder.unwritten == 0
-    assert desk.encoder.messages["cart", "joint_states"] == desk.encoder.messages["cart", "tf"] == 3
-    log_times = [record.log_time for record in desk.records() if record.topic == "/joint_states"]
+        case.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
+        case.encoder.write_message("cart", transforms(NOW + number, number), NOW + number)
+    assert (case.encoder.messages, case.encoder.unwritten) == ({}, 6)
+    case.encoder.write_message("cart", description(), NOW + 10)
+    assert case.encoder.unwritten == 0
+    assert case.encoder.messages["cart", "joint_states"] == case.encoder.messages["cart", "tf"] == 3
+    log_times = [record.log_time for record in case.records() if record.topic == "/joint_states"]
     assert log_times == [NOW, NOW + 1, NOW + 2]
 
 
-def test_of_samples_without_a_description_only_the_newest_are_kept_and_all_are_counted(desk: Desk):
+def test_newest_samples_without_a_description_are_kept_and_all_counted(case: EncoderCase):
     for number in range(MAX_PENDING + 5):
-        desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
-    assert desk.encoder.unwritten == MAX_PENDING + 5
-    desk.encoder.write_message("cart", description(), NOW + S)
-    assert desk.encoder.unwritten == 5
-    assert min(r.log_time for r in desk.records() if r.topic == "/joint_states") == NOW + 5
+        case.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
+    assert case.encoder.unwritten == MAX_PENDING + 5
+    case.encoder.write_message("cart", description(), NOW + S)
+    assert case.encoder.unwritten == 5
+    assert min(r.log_time for r in case.records() if r.topic == "/joint_states") == NOW + 5
 
 
-def test_samples_of_another_model_wait_for_its_description(desk: Desk):
-    desk.encoder.write_message(
+def test_samples_of_another_model_wait_for_its_description(case: EncoderCase):
+    case.encoder.write_message(
         "cart", description(urdf=URDF.replace("turn", "spin"), names=("free", "spin")), NOW
     )
-    desk.encoder.write_message("cart", joints(session=2), NOW)
-    assert desk.encoder.unwritten == 1
-    desk.encoder.write_message("cart", description(session=2), NOW)
-    (message,) = desk.read("/joint_states")
+    case.encoder.write_message("cart", joints(session=2), NOW)
+    assert case.encoder.unwritten == 1
+    case.encoder.write_message("cart", description(session=2), NOW)
+    (message,) = case.read("/joint_states")
     assert message.name[-1] == "turn"
 
 
-def test_a_writer_that_names_its_numbers_needs_no_description(desk: Desk):
+def test_writer_that_names_its_numbers_needs_no_description(case: EncoderCase):
     names = ("b", "a")
     state = JointState(NOW, 0, 1, order_digest(names), to_block([1.0, 2.0]), None, None, names)
     edges = (("map", "odom"),)
     sample = TransformSample(NOW, 0, 1, order_digest(edges), to_block(POSES[:1]), edges)
-    desk.encoder.write_message("cart", state, NOW)
-    desk.encoder.write_message("cart", sample, NOW)
-    assert desk.read("/joint_states")[0].name == ["b", "a"]
-    assert desk.read("/tf")[0].transforms[0].child_frame_id == "odom"
+    case.encoder.write_message("cart", state, NOW)
+    case.encoder.write_message("cart", sample, NOW)
+    assert case.read("/joint_states")[0].name == ["b", "a"]
+    assert case.read("/tf")[0].transforms[0].child_frame_id == "odom"
 
 
-def test_a_model_that_cannot_be_used_is_recorded_and_told_and_the_transforms_are_written(desk: Desk):
-    desk.encoder.write_message("cart", description(urdf="<robot name='cart'/>"), NOW)
-    desk.encoder.write_message("cart", joints(), NOW)
-    desk.encoder.write_message("cart", transforms(), NOW)
-    assert desk.refused == {"unusable model": 1}
-    assert desk.encoder.unwritten == 1
-    assert desk.read("/robot_description")[0].data == "<robot name='cart'/>"
-    assert len(desk.read("/tf")) == 1
+def test_unusable_model_is_recorded_and_reported_and_its_transforms_are_written(case: EncoderCase):
+    case.encoder.write_message("cart", description(urdf="<robot name='cart'/>"), NOW)
+    case.encoder.write_message("cart", joints(), NOW)
+    case.encoder.write_message("cart", transforms(), NOW)
+    assert case.refused == {"unusable model": 1}
+    assert case.encoder.unwritten == 1
+    assert case.read("/robot_description")[0].data == "<robot name='cart'/>"
+    assert len(case.read("/tf")) == 1
 
 
-def test_what_cdr_cannot_say_is_counted_by_reason_and_the_rest_written(desk: Desk):
-    desk.encoder.write_message("cart", description(), NOW)
+def test_messages_that_cdr_cannot_represent_are_counted_by_reason(case: EncoderCase):
+    case.encoder.write_message("cart", description(), NOW)
     for stamp in (0, 2**31 * S, -(2**31) * S - 1, 2**31 * S - 1, -(2**31) * S):
-        desk.encoder.write_message("cart", joints(stamp), NOW)
-        desk.encoder.write_message("cart", transforms(stamp), NOW)
+        case.encoder.write_message("cart", joints(stamp), NOW)
+        case.encoder.write_message("cart", transforms(stamp), NOW)
     short = JointState(NOW, 0, 1, order_digest(CART.joint_names), to_block([1.0]))
-    desk.encoder.write_message("cart", short, NOW)
-    desk.encoder.write_message("cart", statics(("arm", "to\0ol")), NOW, "mount")
-    desk.encoder.write_message("a b", statics(("arm", "tool")), NOW, "mount")
-    assert desk.refused == {"no stamp": 2, "stamp outside 1901 to 2038": 4, "not sayable": 3}
-    assert [message.header.stamp.sec for message in desk.read("/joint_states")] == [2**31 - 1, -(2**31)]
-    published = [record.publish_time for record in desk.records() if record.topic == "/tf"]
+    case.encoder.write_message("cart", short, NOW)
+    case.encoder.write_message("cart", statics(("arm", "to\0ol")), NOW, "mount")
+    case.encoder.write_message("a b", statics(("arm", "tool")), NOW, "mount")
+    assert case.refused == {"no stamp": 2, "stamp outside 1901 to 2038": 4, "not sayable": 3}
+    assert [message.header.stamp.sec for message in case.read("/joint_states")] == [2**31 - 1, -(2**31)]
+    published = [record.publish_time for record in case.records() if record.topic == "/tf"]
     assert published == [2**31 * S - 1, 0]
 
 
-def test_robots_beside_the_one_in_the_root_have_a_namespace_and_a_prefix_that_ros_allows(tmp_path: Path):
-    desk = Desk(tmp_path / "run.mcap", alone="cart")
+def test_robots_outside_the_root_have_a_valid_ros_namespace_and_a_prefix(tmp_path: Path):
+    case = EncoderCase(tmp_path / "run.mcap", alone="cart")
     for robot in ("cart", "arm-1", "arm.1", "2nd"):
-        desk.encoder.write_message(robot, description(), NOW)
-        desk.encoder.write_message(robot, joints(), NOW)
-        desk.encoder.write_message(robot, transforms(), NOW)
+        case.encoder.write_message(robot, description(), NOW)
+        case.encoder.write_message(robot, joints(), NOW)
+        case.encoder.write_message(robot, transforms(), NOW)
     topics = {
-        record.metadata["zstate.robot"]: record.topic for record in desk.records() if "joint" in record.topic
+        record.metadata["zstate.robot"]: record.topic for record in case.records() if "joint" in record.topic
     }
     assert topics == {
         "cart": "/joint_states",
@@ -226,28 +226,28 @@ def test_robots_beside_the_one_in_the_root_have_a_namespace_and_a_prefix_that_ro
         "arm.1": "/arm_1_/joint_states",
         "2nd": "/_2nd/joint_states",
     }
-    frames = [message.transforms[0].child_frame_id for message in desk.read("/tf")]
+    frames = [message.transforms[0].child_frame_id for message in case.read("/tf")]
     assert frames == ["base", "arm-1/base", "arm.1/base", "2nd/base"]
-    assert {record.metadata["zstate.frame_prefix"] for record in desk.records()} == {
+    assert {record.metadata["zstate.frame_prefix"] for record in case.records()} == {
         "", "arm-1/", "arm.1/", "2nd/",
     }  # fmt: skip
 
 
-def test_a_writer_that_starts_again_has_a_channel_of_its_own(desk: Desk):
+def test_restarted_writer_has_its_own_channel(case: EncoderCase):
     for session in (1, 2):
-        desk.encoder.write_message("cart", description(session), NOW + session)
-        desk.encoder.write_message("cart", joints(session=session), NOW + session)
-    sessions = [r.metadata["zstate.session"] for r in desk.records() if r.topic == "/joint_states"]
+        case.encoder.write_message("cart", description(session), NOW + session)
+        case.encoder.write_message("cart", joints(session=session), NOW + session)
+    sessions = [r.metadata["zstate.session"] for r in case.records() if r.topic == "/joint_states"]
     assert sessions == ["1", "2"]
-    with RecordingReader(desk.path) as reader:
+    with RecordingReader(case.path) as reader:
         assert sum(channel.topic == "/joint_states" for channel in reader.channels()) == 2
 
 
-def repeated(desk: Desk) -> list[tuple[str, str, list[str]]]:
+def repeated(case: EncoderCase) -> list[tuple[str, str, list[str]]]:
     """What holds at the beginning of a next file: topic, session, and the children of its edges."""
-    desk.encoder.write_message("cart", ClockMessage(1, 0, 9), NOW + 200 * S)
-    desk.writer.close()
-    with RecordingReader(desk.path.with_name("run_1.mcap")) as reader:
+    case.encoder.write_message("cart", ClockMessage(1, 0, 9), NOW + 200 * S)
+    case.writer.close()
+    with RecordingReader(case.path.with_name("run_1.mcap")) as reader:
         return [
             (
                 record.topic,
@@ -264,110 +264,110 @@ def repeated(desk: Desk) -> list[tuple[str, str, list[str]]]:
         ]
 
 
-def test_what_holds_is_said_again_in_the_next_file_and_what_was_replaced_is_not(desk: Desk):
-    desk.encoder.write_message("cart", description(1), NOW)
-    desk.encoder.write_message("cart", description(2), NOW)
-    desk.encoder.write_message("cart", statics(("arm", "old"), session=1), NOW, "mount")
-    desk.encoder.write_message("cart", statics(("arm", "new"), session=2), NOW, "mount")
-    desk.encoder.write_message("cart", statics(("arm", "other"), session=3), NOW, "another")
-    assert repeated(desk) == [
+def test_latched_values_in_effect_are_repeated_in_the_next_file(case: EncoderCase):
+    case.encoder.write_message("cart", description(1), NOW)
+    case.encoder.write_message("cart", description(2), NOW)
+    case.encoder.write_message("cart", statics(("arm", "old"), session=1), NOW, "mount")
+    case.encoder.write_message("cart", statics(("arm", "new"), session=2), NOW, "mount")
+    case.encoder.write_message("cart", statics(("arm", "other"), session=3), NOW, "another")
+    assert repeated(case) == [
         ("/robot_description", "2", []),
         ("/tf_static", "2", ["new"]),
         ("/tf_static", "3", ["other"]),
     ]
 
 
-def test_statics_that_are_withdrawn_end_with_an_empty_message(desk: Desk):
-    desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
-    desk.encoder.withdraw("cart", "mount", NOW + 1)
-    desk.encoder.withdraw("cart", "mount", NOW + 2)
-    desk.encoder.withdraw("cart", "nobody", NOW + 2)
-    assert repeated(desk) == []
-    assert [len(message.transforms) for message in desk.read("/tf_static")] == [1, 0]
+def test_withdrawn_statics_end_with_an_empty_message(case: EncoderCase):
+    case.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
+    case.encoder.withdraw("cart", "mount", NOW + 1)
+    case.encoder.withdraw("cart", "mount", NOW + 2)
+    case.encoder.withdraw("cart", "nobody", NOW + 2)
+    assert repeated(case) == []
+    assert [len(message.transforms) for message in case.read("/tf_static")] == [1, 0]
 
 
-def test_a_static_writer_that_comes_back_holds_again(desk: Desk):
-    desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
-    desk.encoder.withdraw("cart", "mount", NOW + 1)
-    desk.encoder.write_message("cart", statics(("arm", "tool")), NOW + 2, "mount")
-    assert repeated(desk) == [("/tf_static", "1", ["tool"])]
+def test_static_writer_that_returns_is_latched_again(case: EncoderCase):
+    case.encoder.write_message("cart", statics(("arm", "tool")), NOW, "mount")
+    case.encoder.withdraw("cart", "mount", NOW + 1)
+    case.encoder.write_message("cart", statics(("arm", "tool")), NOW + 2, "mount")
+    assert repeated(case) == [("/tf_static", "1", ["tool"])]
 
 
-def test_statics_without_a_writers_name_add_up_as_in_ros(desk: Desk):
-    desk.encoder.write_message("cart", statics(("arm", "a")), NOW)
-    desk.encoder.write_message("cart", statics(("arm", "b"), ("arm", "c")), NOW)
-    desk.encoder.write_message("cart", statics(("base", "a")), NOW)
-    desk.encoder.write_message("cart", statics(("arm", "d"), session=2), NOW)
-    said = [
+def test_statics_without_a_writer_name_accumulate_as_in_ros(case: EncoderCase):
+    case.encoder.write_message("cart", statics(("arm", "a")), NOW)
+    case.encoder.write_message("cart", statics(("arm", "b"), ("arm", "c")), NOW)
+    case.encoder.write_message("cart", statics(("base", "a")), NOW)
+    case.encoder.write_message("cart", statics(("arm", "d"), session=2), NOW)
+    edges_written = [
         [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
-        for message in desk.read("/tf_static")
+        for message in case.read("/tf_static")
     ]
-    assert said == [
+    assert edges_written == [
         [("arm", "a")],
         [("arm", "a"), ("arm", "b"), ("arm", "c")],
         [("base", "a"), ("arm", "b"), ("arm", "c")],
         [("arm", "d")],
     ]
-    writers = {record.metadata["zstate.writer"] for record in desk.records()}
+    writers = {record.metadata["zstate.writer"] for record in case.records()}
     assert writers == {"ros-1", "ros-2"}
 
 
-def test_simulated_time_is_recorded_from_zero_on(desk: Desk):
+def test_simulated_time_is_recorded_from_zero(case: EncoderCase):
     for number in range(3):
-        desk.encoder.write_message("ros", ClockMessage(number * S, number, 5), NOW + number)
-    assert [message.clock.sec for message in desk.read("/clock")] == [0, 1, 2]
-    assert {record.publish_time for record in desk.records()} == {0, S, 2 * S}
-    assert "zstate.robot" not in desk.records()[0].metadata
+        case.encoder.write_message("ros", ClockMessage(number * S, number, 5), NOW + number)
+    assert [message.clock.sec for message in case.read("/clock")] == [0, 1, 2]
+    assert {record.publish_time for record in case.records()} == {0, S, 2 * S}
+    assert "zstate.robot" not in case.records()[0].metadata
 
 
-def test_a_robot_whose_writer_starts_without_end_takes_no_channels_from_another(desk: Desk):
-    desk.encoder.write_message("cart", description(), NOW)
-    desk.encoder.write_message("flapping", description(), NOW)
+def test_endlessly_restarting_writer_takes_no_channels_from_another_robot(case: EncoderCase):
+    case.encoder.write_message("cart", description(), NOW)
+    case.encoder.write_message("flapping", description(), NOW)
     for number in range(3 * CHANNEL_BURST):
-        assert desk.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
-        is_known = desk.encoder.write_message(
+        assert case.encoder.write_message("cart", joints(NOW + number, number), NOW + number)
+        is_known = case.encoder.write_message(
             "flapping", joints(NOW + number, 0, session=number + 9), NOW + number
         )
         assert is_known == (number < CHANNEL_BURST - 1)
-    assert desk.refused == {"too many writers": 2 * CHANNEL_BURST + 1}
+    assert case.refused == {"too many writers": 2 * CHANNEL_BURST + 1}
     later = NOW + S
     assert (
         sum(
-            desk.encoder.write_message("flapping", joints(later, 0, session=n), later)
+            case.encoder.write_message("flapping", joints(later, 0, session=n), later)
             for n in range(10**6, 10**6 + 100)
         )
         == 10
     )
-    assert desk.encoder.messages["cart", "joint_states"] == 3 * CHANNEL_BURST
-    counts = Counter(record.metadata["zstate.robot"] for record in desk.records())
+    assert case.encoder.messages["cart", "joint_states"] == 3 * CHANNEL_BURST
+    counts = Counter(record.metadata["zstate.robot"] for record in case.records())
     assert counts == {"cart": 3 * CHANNEL_BURST + 1, "flapping": CHANNEL_BURST + 10}
 
 
-def test_channels_of_writers_that_are_gone_are_released_and_those_that_hold_something_are_not(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
+def test_channels_of_departed_writers_are_released_unless_latched(
+    case: EncoderCase, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("zstate.recording.encode.MAX_OPEN_CHANNELS", 10)
-    desk.encoder.write_message("cart", description(), NOW)
+    case.encoder.write_message("cart", description(), NOW)
     for session in range(2, 40):
-        desk.encoder.write_message("cart", joints(session=session), NOW)
-    desk.encoder.write_message("cart", joints(session=2, seq=1), NOW)
-    assert repeated(desk) == [("/robot_description", "1", [])]
-    with RecordingReader(desk.path.with_name("run_1.mcap")) as reader:
+        case.encoder.write_message("cart", joints(session=session), NOW)
+    case.encoder.write_message("cart", joints(session=2, seq=1), NOW)
+    assert repeated(case) == [("/robot_description", "1", [])]
+    with RecordingReader(case.path.with_name("run_1.mcap")) as reader:
         assert len(reader.channels()) <= 11
-    sessions = [r.metadata["zstate.session"] for r in desk.records() if r.topic == "/joint_states"]
+    sessions = [r.metadata["zstate.session"] for r in case.records() if r.topic == "/joint_states"]
     assert sessions == [*map(str, range(2, 40)), "2"]
 
 
-def test_static_writers_without_end_are_refused_and_counted(desk: Desk):
+def test_endless_static_writers_are_refused_and_counted(case: EncoderCase):
     for number in range(MAX_LATCHED + 3):
-        desk.encoder.write_message("cart", statics(("arm", "tool")), NOW, f"writer_{number}")
-    assert desk.refused == {"too many writers": 3}
-    assert desk.encoder.write_message("cart", statics(("arm", "other")), NOW, "writer_0")
-    desk.encoder.withdraw("cart", "writer_0", NOW)
-    assert desk.encoder.write_message("cart", statics(("arm", "other")), NOW, "another")
+        case.encoder.write_message("cart", statics(("arm", "tool")), NOW, f"writer_{number}")
+    assert case.refused == {"too many writers": 3}
+    assert case.encoder.write_message("cart", statics(("arm", "other")), NOW, "writer_0")
+    case.encoder.withdraw("cart", "writer_0", NOW)
+    assert case.encoder.write_message("cart", statics(("arm", "other")), NOW, "another")
 
 
-def test_of_large_samples_without_a_description_fewer_are_kept():
+def test_fewer_large_samples_are_kept_without_a_description():
     early = PendingSamples()
     large = JointState(NOW, 0, 1, order_digest(CART.joint_names), bytes(MAX_PENDING_BYTES // 24 * 8))
     for number in range(5):

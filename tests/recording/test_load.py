@@ -38,7 +38,7 @@ def description(model=RRBOT, session: int = 1) -> RobotDescription:
     return RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
 
 
-def test_answers_are_bit_for_bit_those_of_a_live_buffer(tmp_path: Path):
+def test_lookups_are_bit_identical_to_a_live_buffer(tmp_path: Path):
     live = TransformBuffer()
     ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
     ingest.describe(description())
@@ -59,7 +59,7 @@ def test_answers_are_bit_for_bit_those_of_a_live_buffer(tmp_path: Path):
     assert np.array_equal(twist.linear, live.twist("tool", "world", newest - S).linear)
 
 
-def test_nothing_of_a_long_recording_is_forgotten(tmp_path: Path):
+def test_long_recording_is_kept_entirely(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(200):
@@ -80,7 +80,7 @@ def test_samples_recorded_before_their_description_are_not_lost(tmp_path: Path):
     assert buffer.can_lookup("world", "tool", START - S)
 
 
-def test_a_writer_that_is_restarted_goes_on_in_the_same_history(tmp_path: Path):
+def test_restarted_writer_continues_the_same_history(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(10):
@@ -90,7 +90,7 @@ def test_a_writer_that_is_restarted_goes_on_in_the_same_history(tmp_path: Path):
     assert buffer.can_lookup("world", "tool", START + 9 * S)
 
 
-def test_a_new_writer_whose_clock_is_back_begins_anew(tmp_path: Path):
+def test_new_writer_with_an_earlier_clock_starts_a_new_history(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(10):
@@ -102,7 +102,7 @@ def test_a_new_writer_whose_clock_is_back_begins_anew(tmp_path: Path):
     assert not buffer.can_lookup("world", "tool", 5 * S)
 
 
-def test_a_clock_that_is_set_back_begins_anew_with_the_second_sample_as_live(tmp_path: Path):
+def test_second_sample_of_a_clock_set_back_starts_a_new_history_as_live(tmp_path: Path):
     live = TransformBuffer()
     ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
     ingest.describe(description())
@@ -121,7 +121,7 @@ def test_a_clock_that_is_set_back_begins_anew_with_the_second_sample_as_live(tmp
         ]
 
 
-def test_a_single_sample_of_long_ago_changes_nothing(tmp_path: Path):
+def test_single_old_sample_changes_nothing(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for number, stamp in enumerate([100 * S, 101 * S, 5 * S, 102 * S, 6 * S, 103 * S]):
@@ -131,7 +131,7 @@ def test_a_single_sample_of_long_ago_changes_nothing(tmp_path: Path):
     assert not buffer.can_lookup("world", "tool", 50 * S)
 
 
-def test_a_late_sample_is_sorted_in(tmp_path: Path):
+def test_late_sample_is_sorted_in(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for number, second in enumerate([0, 2, 1, 3]):
@@ -140,7 +140,7 @@ def test_a_late_sample_is_sorted_in(tmp_path: Path):
     assert buffer.lookup("world", "tool", START + S).kind == "exact"
 
 
-def test_edges_beyond_the_model_come_from_tf(tmp_path: Path):
+def test_edges_outside_the_model_come_from_tf(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(10):
@@ -149,12 +149,12 @@ def test_edges_beyond_the_model_come_from_tf(tmp_path: Path):
             tale.edges("arm", stamp, {("odom", "world"): pose(n), ("base", "upper"): IDENTITY})
     buffer = recorded_buffer(tmp_path / "r.mcap")
     assert buffer.lookup("odom", "world", START + 45 * MS).translation[0] == 4.5
-    # The model knows better where its links are than what was said of them on tf.
+    # The model defines its links; transforms on tf do not override it.
     kinds = {frame.name: frame.kind for frame in buffer.frames()}
     assert (kinds["arm/upper"], kinds["arm/world"]) == ("joint", "pose")
 
 
-def test_a_robot_without_a_description_is_known_by_its_tf(tmp_path: Path):
+def test_robot_without_a_description_comes_from_tf(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "cart") as tale:
         for n in range(10):
             tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("base", "mast"): pose(z=n)})
@@ -162,7 +162,7 @@ def test_a_robot_without_a_description_is_known_by_its_tf(tmp_path: Path):
     assert buffer.lookup("odom", "mast", START + 30 * MS).translation.tolist() == [3.0, 0.0, 3.0]
 
 
-def test_joint_states_that_tell_only_a_part_leave_the_robot_to_its_tf(tmp_path: Path, caplog):
+def test_partial_joint_states_leave_the_robot_to_its_tf(tmp_path: Path, caplog):
     with Bag(tmp_path / "bag") as bag:
         bag.describe()
         for n in range(5):
@@ -173,7 +173,7 @@ def test_joint_states_that_tell_only_a_part_leave_the_robot_to_its_tf(tmp_path: 
     assert "no robot_description fits" in caplog.text
 
 
-def test_edges_of_a_clock_that_goes_back_begin_anew_and_others_stay(tmp_path: Path):
+def test_edges_of_a_clock_set_back_restart_and_others_stay(tmp_path: Path):
     with Bag(tmp_path / "bag", StoragePlugin.MCAP) as bag:
         for n, second in enumerate([100, 101, 102, 5, 6, 7]):
             bag.tf(START + n, [Transform("odom", "base", [second, 0, 0], [0, 0, 0, 1], second * S)])
@@ -184,7 +184,7 @@ def test_edges_of_a_clock_that_goes_back_begin_anew_and_others_stay(tmp_path: Pa
     assert buffer.can_lookup("map", "odom", 200 * S)
 
 
-def test_a_new_writer_of_an_edge_goes_on_where_the_old_one_ended(tmp_path: Path):
+def test_new_writer_of_an_edge_continues_its_history(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "cart") as tale:
         for n in range(10):
             edges = {("odom", "base"): pose(n)}
@@ -194,7 +194,7 @@ def test_a_new_writer_of_an_edge_goes_on_where_the_old_one_ended(tmp_path: Path)
     assert buffer.can_lookup("odom", "base", START + 90 * MS)
 
 
-def test_static_edges_of_all_writers_hold(tmp_path: Path):
+def test_static_edges_of_all_writers_are_loaded(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.statics("arm", START, {("tool", "camera"): pose(z=0.1)}, writer="camera")
@@ -205,7 +205,7 @@ def test_static_edges_of_all_writers_hold(tmp_path: Path):
     assert np.allclose(buffer.lookup("camera", "gripper").translation, [0, 0, 0.1])
 
 
-def test_withdrawn_edges_hold_until_something_else_places_the_frame(tmp_path: Path):
+def test_withdrawn_edges_stay_until_the_frame_is_placed_again(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.statics("arm", START, {("table", "cup"): pose(x=1.0), ("table", "plate"): pose(x=2.0)})
         tale.scribe.withdraw("arm", "camera", START + S)
@@ -217,7 +217,7 @@ def test_withdrawn_edges_hold_until_something_else_places_the_frame(tmp_path: Pa
         buffer.lookup("table", "cup")
 
 
-def test_a_repeated_static_value_does_not_come_back(tmp_path: Path):
+def test_repeated_static_value_does_not_return(tmp_path: Path):
     # Latched values are written again every ten seconds, for those who read from the middle.
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.statics("arm", START, {("table", "cup"): pose(x=1.0)})
@@ -237,7 +237,7 @@ def test_static_edges_of_a_bag_add_up(tmp_path: Path):
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_a_bag_of_a_whole_robot_answers(tmp_path: Path, storage: StoragePlugin):
+def test_whole_robot_of_a_bag_is_loaded(tmp_path: Path, storage: StoragePlugin):
     kinematics = Kinematics(RRBOT)
     tool = RRBOT.links.index("tool")
     with Bag(tmp_path / "bag", storage) as bag:
@@ -260,7 +260,7 @@ def test_a_bag_of_a_whole_robot_answers(tmp_path: Path, storage: StoragePlugin):
     assert np.allclose(buffer.lookup("tool", "camera").translation, [0, 0, 0.5])
 
 
-def test_a_robot_is_chosen_by_its_name(tmp_path: Path):
+def test_robot_is_selected_by_name(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         for robot in ("r1", "r2"):
             tale.describe(robot)
@@ -273,20 +273,20 @@ def test_a_robot_is_chosen_by_its_name(tmp_path: Path):
         one.lookup("r1/world", "r1/tool")
 
 
-def test_another_robot_is_refused_with_those_there_are(tmp_path: Path):
+def test_unknown_robot_error_lists_the_recorded_ones(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         tale.describe("arm")
     with pytest.raises(InvalidInput, match="no robot 'leg'; its robots: 'arm'"):
         recorded_buffer(tmp_path / "r.mcap", "leg")
 
 
-def test_what_is_no_recording_is_refused(tmp_path: Path):
+def test_file_that_is_no_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     with pytest.raises(RecordingError, match="not a recording"):
         recorded_buffer(tmp_path / "x.mcap")
 
 
-def test_a_clock_set_back_by_less_than_ten_seconds_begins_anew_in_a_recording_too(tmp_path: Path):
+def test_clock_set_back_by_less_than_ten_seconds_starts_a_new_history(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for number, second in enumerate([10, 11, 12, 6, 7]):

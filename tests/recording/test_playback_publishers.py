@@ -1,4 +1,4 @@
-"""Who replays what somebody writes now is told, whether or not its model is known."""
+"""Playback of a stream with an active writer is refused, with or without a model."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def replay(session, path: Path, **options: object) -> int:
         return replayer.run().samples
 
 
-def test_samples_that_somebody_writes_are_not_replayed_but_with_takeover(sessions, cart: Path):
+def test_samples_of_an_active_writer_are_played_only_with_takeover(sessions, cart: Path):
     with StatePublisher(sessions[0], RRBOT, "cart", streams=["tf"], program="driver"):
         until(lambda: current_tokens(sessions[1], "zstate/cart/@writer/tf/*", 1.0))
         with pytest.raises(SecondWriter) as raised:
@@ -51,7 +51,7 @@ def test_samples_that_somebody_writes_are_not_replayed_but_with_takeover(session
 
 
 @pytest.mark.parametrize(("name", "edge"), [("mount", None), ("room", ("cart/base", "cart/camera"))])
-def test_static_edges_that_somebody_places_are_not_replayed_but_with_takeover(
+def test_static_edges_of_an_active_writer_are_played_only_with_takeover(
     sessions, cart: Path, name: str, edge: tuple[str, str] | None
 ):
     with StaticPublisher(sessions[0], "cart", name, program="calibration") as live:
@@ -62,7 +62,7 @@ def test_static_edges_that_somebody_places_are_not_replayed_but_with_takeover(
         assert replay(sessions[1], cart, takeover=True) == COUNT
 
 
-def test_a_replay_keeps_others_from_writing_the_same(sessions, cart: Path):
+def test_playback_excludes_other_writers_of_its_streams(sessions, cart: Path):
     with Player(sessions[0], cart, rate=0.01) as replayer:
         thread = threading.Thread(target=replayer.run)
         thread.start()
@@ -73,7 +73,7 @@ def test_a_replay_keeps_others_from_writing_the_same(sessions, cart: Path):
         thread.join()
 
 
-def test_passes_of_a_loop_are_not_in_each_others_way(sessions, cart: Path):
+def test_passes_of_a_loop_do_not_conflict(sessions, cart: Path):
     with Player(sessions[0], cart, rate=math.inf, loop=True) as replayer:
         thread = threading.Thread(target=replayer.run)
         thread.start()
@@ -83,7 +83,7 @@ def test_passes_of_a_loop_are_not_in_each_others_way(sessions, cart: Path):
     assert not replayer.report().refused
 
 
-def test_behind_a_router_it_is_the_same(cart: Path, free_port: int):
+def test_ownership_is_the_same_behind_a_router(cart: Path, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     with (
         connect(mode="router", listen=endpoint),

@@ -1,4 +1,4 @@
-"""A recording said again on a real network: the same samples, the same answers, at its own pace."""
+"""Playback on a real network: the same samples and transforms, at the recorded spacing."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def assert_same(one: list[np.ndarray], other: list[np.ndarray]) -> None:
 
 @contextmanager
 def replaying(replayer: Player) -> Iterator[list[PlayerReport]]:
-    """Runs it meanwhile; its report is there afterwards."""
+    """Runs the player during the context; its report is available afterwards."""
     reports: list[PlayerReport] = []
     thread = threading.Thread(target=lambda: reports.append(replayer.run()))
     thread.start()
@@ -98,13 +98,13 @@ def replayed(sessions: tuple[Session, Session], path: Path, **options: object) -
 
 
 @pytest.mark.parametrize("rate", [1.0, 10.0, math.inf])
-def test_a_replay_gives_the_answers_of_the_file(sessions, arm: Path, rate: float):
+def test_playback_gives_the_same_lookups_as_the_file(sessions, arm: Path, rate: float):
     buffer = replayed(sessions, arm, rate=rate)
     stamps = np.random.default_rng(1).integers(START, START + (COUNT - 1) * 10 * MS, 300)
     assert_same(answers(buffer, stamps), answers(recorded_buffer(arm), stamps))
 
 
-def test_live_replayed_and_looked_up_are_the_same(sessions, tmp_path: Path):
+def test_live_played_back_and_recorded_lookups_agree(sessions, tmp_path: Path):
     writer, reader = sessions
     path = tmp_path / "r.mcap"
     with (
@@ -126,7 +126,7 @@ def test_live_replayed_and_looked_up_are_the_same(sessions, tmp_path: Path):
     assert_same(live, answers(recorded_buffer(path), stamps))
     with Recording(path, "arm") as recording:
         assert_same(live, [recording.lookup_many(*frames, stamps)[0] for frames in PATHS])
-    # The publisher of the lens has gone since, which the replay says as well: its edge is withdrawn.
+    # The publisher of the lens has left since; playback withdraws its edge too.
     with TransformListener(reader, "arm", history_s=100.0) as listener:
         settle(writer, "arm")
         with Player(writer, path, ["arm"], rate=10.0) as replayer:
@@ -141,7 +141,7 @@ def joint_states(tap: Tap) -> list[JointState]:
     return [decode(arrival.payload, arrival.encoding, JointState) for arrival in tap.arrivals]
 
 
-def test_stamps_and_numbers_are_those_that_were_recorded(sessions, arm: Path):
+def test_playback_keeps_stamps_and_numbers(sessions, arm: Path):
     writer, reader = sessions
     tap = Tap(reader, "zstate/arm/joint_states")
     await_reader(writer, "zstate/arm/joint_states")
@@ -154,13 +154,13 @@ def test_stamps_and_numbers_are_those_that_were_recorded(sessions, arm: Path):
     assert [from_block(state.positions).tolist() for state in states] == [swing(n / 50) for n in range(COUNT)]
 
 
-def test_samples_are_as_far_apart_as_they_were(sessions, arm: Path):
+def test_playback_keeps_the_spacing_of_samples(sessions, arm: Path):
     clock = Stepping(5)
     with Player(sessions[0], arm, rate=2.0, clock=clock) as replayer:
         report = replayer.run()
-    heard = {(LATENCY + n * 10 * MS + n % 3) // 2 + 5 for n in range(COUNT)}
+    expected = {(LATENCY + n * 10 * MS + n % 3) // 2 + 5 for n in range(COUNT)}
     # Half nanoseconds are rounded to even ones.
-    assert len(heard - {wait + off for wait in clock.waits for off in (-1, 0, 1)}) == 0
+    assert len(expected - {wait + off for wait in clock.waits for off in (-1, 0, 1)}) == 0
     assert clock.waits == sorted(clock.waits)
     assert (report.samples, report.lateness_max, report.delays) == (COUNT, 0, 0)
     assert math.isclose(report.rate, 2.0, rel_tol=1e-6)
@@ -175,7 +175,7 @@ def test_lateness_is_reported(sessions, arm: Path):
     assert report.lateness_p50 == 0
 
 
-def test_a_start_within_has_the_latched_values_of_that_time(sessions, tmp_path: Path):
+def test_start_within_the_recording_has_the_latched_values_of_that_time(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
     with Tale(path, "arm") as tale:
         tale.describe("arm")
@@ -188,13 +188,13 @@ def test_a_start_within_has_the_latched_values_of_that_time(sessions, tmp_path: 
     tap = Tap(reader, "zstate/arm/joint_states")
     heights: list[float] = []
 
-    def hear(arrival: SerializedSample) -> None:
-        said = decode(arrival.payload, arrival.encoding, StaticTransforms)
-        heights.append(from_block(said.poses)[2])
+    def collect(arrival: SerializedSample) -> None:
+        message = decode(arrival.payload, arrival.encoding, StaticTransforms)
+        heights.append(from_block(message.poses)[2])
 
     await_reader(writer, "zstate/arm/joint_states")
     with (
-        LatchedSubscriber(reader, "zstate/arm/tf_static/camera", hear),
+        LatchedSubscriber(reader, "zstate/arm/tf_static/camera", collect),
         Player(writer, path, rate=math.inf, start_s=2.0, duration_s=2.5) as replayer,
     ):
         await_reader(writer, "zstate/arm/tf_static/camera")
@@ -204,7 +204,7 @@ def test_a_start_within_has_the_latched_values_of_that_time(sessions, tmp_path: 
     assert [state.stamp for state in tap.joint_states(3)] == [START + n * S for n in (2, 3, 4)]
 
 
-def test_each_pass_of_a_loop_is_a_new_epoch(sessions, arm: Path):
+def test_each_pass_of_a_loop_starts_a_new_epoch(sessions, arm: Path):
     writer, reader = sessions
     tap, clocks = Tap(reader, "zstate/arm/joint_states"), Tap(reader, "zstate/clock")
     with TransformListener(reader, "arm", history_s=100.0) as listener:
@@ -227,7 +227,7 @@ def test_each_pass_of_a_loop_is_a_new_epoch(sessions, arm: Path):
     )
 
 
-def test_the_time_of_the_recording_is_said(sessions, arm: Path):
+def test_recording_time_is_published_on_the_clock(sessions, arm: Path):
     writer, reader = sessions
     tap = Tap(reader, "zstate/clock")
     await_reader(writer, "zstate/clock")
@@ -240,7 +240,7 @@ def test_the_time_of_the_recording_is_said(sessions, arm: Path):
     assert stamps == expected
 
 
-def test_a_recorded_clock_is_said_as_it_was(sessions, tmp_path: Path):
+def test_recorded_clock_is_published_unchanged(sessions, tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(5):
@@ -255,7 +255,7 @@ def test_a_recorded_clock_is_said_as_it_was(sessions, tmp_path: Path):
     ]
 
 
-def test_it_can_be_paused_and_resumed(sessions, arm: Path):
+def test_player_can_be_paused_and_resumed(sessions, arm: Path):
     tap = Tap(sessions[1], "zstate/arm/joint_states")
     clocks = Tap(sessions[1], "zstate/clock")
     await_reader(sessions[0], "zstate/arm/joint_states")
@@ -271,7 +271,7 @@ def test_it_can_be_paused_and_resumed(sessions, arm: Path):
     assert reports[0].rate > 0.9
 
 
-def test_it_can_be_sent_elsewhere(sessions, arm: Path):
+def test_player_can_seek(sessions, arm: Path):
     tap = Tap(sessions[1], "zstate/arm/joint_states")
     await_reader(sessions[0], "zstate/arm/joint_states")
     replayer = Player(sessions[0], arm)
@@ -285,7 +285,7 @@ def test_it_can_be_sent_elsewhere(sessions, arm: Path):
         other.seek(START - 1)
 
 
-def test_a_seek_while_it_runs_begins_with_new_writers(sessions, arm: Path):
+def test_seek_during_playback_starts_new_writers(sessions, arm: Path):
     tap = Tap(sessions[1], "zstate/arm/joint_states")
     await_reader(sessions[0], "zstate/arm/joint_states")
     replayer = Player(sessions[0], arm)
@@ -297,7 +297,7 @@ def test_a_seek_while_it_runs_begins_with_new_writers(sessions, arm: Path):
     assert len({state.session for state in joint_states(tap)}) == 2
 
 
-def test_it_ends_when_it_is_closed(sessions, arm: Path):
+def test_player_ends_when_it_is_closed(sessions, arm: Path):
     replayer = Player(sessions[0], arm, rate=0.001)
     with replaying(replayer) as reports:
         until(lambda: replayer.report().passes)
@@ -306,7 +306,7 @@ def test_it_ends_when_it_is_closed(sessions, arm: Path):
     assert reports[0].samples < COUNT
 
 
-def test_a_robot_without_a_model_is_said_as_it_was(sessions, tmp_path: Path):
+def test_robot_without_a_model_is_published_unchanged(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
     with Tale(path, "cart") as tale:
         for n in range(20):
@@ -325,7 +325,7 @@ def test_a_robot_without_a_model_is_said_as_it_was(sessions, tmp_path: Path):
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_a_bag_of_ros_is_replayed_natively(sessions, tmp_path: Path, storage: StoragePlugin):
+def test_ros_bag_is_played_back_natively(sessions, tmp_path: Path, storage: StoragePlugin):
     with Bag(tmp_path / "bag", storage) as bag:
         bag.describe()
         bag.tf(START, [Transform("tool", "lens", [0, 0, 0.1], [0, 0, 0, 1], 0)], "/tf_static")
@@ -355,7 +355,7 @@ def test_a_bag_of_ros_is_replayed_natively(sessions, tmp_path: Path, storage: St
         assert np.array_equal(poses, known.lookup_many("map", "world", stamps)[0])
 
 
-def test_a_robot_is_replayed_to_ros(sessions, arm: Path):
+def test_robot_is_played_back_to_ros(sessions, arm: Path):
     wire = "ros2:domain=3,namespace=*,frame_prefix=*/"
     writer, reader = sessions
     with TransformListener(reader, wire=wire, history_s=100.0) as listener:
@@ -368,7 +368,7 @@ def test_a_robot_is_replayed_to_ros(sessions, arm: Path):
         assert_same(answers(listener.buffer, stamps), answers(recorded_buffer(arm), stamps))
 
 
-def test_a_model_that_is_replaced_midway_is_replaced_again(sessions, tmp_path: Path):
+def test_model_replaced_in_the_recording_is_replaced_in_playback(sessions, tmp_path: Path):
     longer = parse_urdf(RRBOT.urdf.replace('"0 0 0.6"', '"0 0 0.9"'), "longer")
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         for second, model in ((0, RRBOT), (1, longer)):
@@ -388,7 +388,7 @@ def test_a_model_that_is_replaced_midway_is_replaced_again(sessions, tmp_path: P
     assert known.lookup("lower", "tool").translation[2] == 0.9
 
 
-def test_what_cannot_be_said_again_is_counted(sessions, tmp_path: Path):
+def test_unpublishable_messages_are_counted(sessions, tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.describe()
         for n, elbow in enumerate([0.5, math.nan, 0.25]):
@@ -399,7 +399,7 @@ def test_what_cannot_be_said_again_is_counted(sessions, tmp_path: Path):
     assert (report.samples, report.refused) == (2, {"not sayable": 1, "missing joints": 1})
 
 
-def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_goes(sessions, tmp_path: Path):
+def test_truncated_recording_is_played_as_far_as_possible(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
     with Tale(path, "arm") as tale:
         tale.describe("arm")
@@ -413,7 +413,7 @@ def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_goes(sessions, tm
     assert 200 < report.samples < 900
 
 
-def test_what_cannot_be_replayed_is_refused(sessions, arm: Path):
+def test_invalid_playback_arguments_are_refused(sessions, arm: Path):
     session = sessions[0]
     with pytest.raises(InvalidInput, match="no robot 'leg'; its robots: 'arm'"):
         Player(session, arm, ["leg"])

@@ -34,7 +34,7 @@ def test_lateness_is_counted_from_the_deadline():
     assert pace.lateness(S) == 3 * MS
 
 
-def test_after_a_long_delay_it_goes_on_from_there():
+def test_playback_continues_after_a_long_delay_without_a_burst():
     clock = Stepping(0, {0: 5 * S})
     pace, stop = PlayerClock(clock, 1.0), threading.Event()
     pace.start(0)
@@ -44,7 +44,7 @@ def test_after_a_long_delay_it_goes_on_from_there():
     assert pace.delays == 1
 
 
-def test_a_clock_that_is_set_back_is_followed():
+def test_clock_that_is_set_back_is_followed():
     clock = Stepping(100 * S)
     pace, stop = PlayerClock(clock, 1.0), threading.Event()
     pace.start(0)
@@ -54,7 +54,7 @@ def test_a_clock_that_is_set_back_is_followed():
     assert clock.waits == [101 * S, 52 * S]
 
 
-def test_without_a_rate_nothing_is_waited_for():
+def test_infinite_rate_never_waits():
     clock = Stepping()
     pace = PlayerClock(clock, math.inf)
     pace.start(0)
@@ -63,7 +63,7 @@ def test_without_a_rate_nothing_is_waited_for():
     assert pace.lateness(3600 * S) == 0
 
 
-def test_what_stops_the_wait_is_told():
+def test_wait_returns_false_when_stopped():
     stop = threading.Event()
     stop.set()
     for rate in (1.0, math.inf):
@@ -72,7 +72,7 @@ def test_what_stops_the_wait_is_told():
         assert not pace.wait(S, stop)
 
 
-def test_a_rest_does_not_count():
+def test_pauses_do_not_count_into_the_achieved_rate():
     clock = Stepping(0)
     pace, stop = PlayerClock(clock, 1.0), threading.Event()
     pace.start(0)
@@ -85,12 +85,12 @@ def test_a_rest_does_not_count():
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, math.nan])
-def test_a_rate_is_above_zero(rate: float):
+def test_rate_must_be_above_zero(rate: float):
     with pytest.raises(InvalidInput, match="rate above 0"):
         PlayerClock(Stepping(), rate)
 
 
-def test_quantiles_are_values_that_so_many_did_not_exceed():
+def test_quantiles_are_recorded_values():
     lateness = Lateness()
     assert lateness.quantile(0.5) == 0
     for nanoseconds in range(1, 101):

@@ -35,7 +35,7 @@ def payloads(path: Path, **choice: object) -> list[bytes]:
         return [record.payload for record in reader.records(**choice)]
 
 
-def test_records_come_by_log_time_across_chunks_and_carry_what_was_written(tmp_path: Path):
+def test_records_come_by_log_time_across_chunks_with_their_contents(tmp_path: Path):
     states = joint_states(100)
     mixed = random.Random(1).sample(states, len(states))
     write_run(tmp_path / "run.mcap", mixed, flush_every=7)
@@ -55,7 +55,7 @@ def test_records_come_by_log_time_across_chunks_and_carry_what_was_written(tmp_p
     assert {r.metadata["zstate.robot"] for r in records} == {"panda"}
 
 
-def test_records_of_one_instant_stay_in_the_order_of_the_file(tmp_path: Path):
+def test_records_of_one_instant_keep_the_order_of_the_file(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap") as writer:
         described, joints = declared(writer)
         for number in range(9):
@@ -67,7 +67,7 @@ def test_records_of_one_instant_stay_in_the_order_of_the_file(tmp_path: Path):
 
 @given(begin=st.integers(-2, 22), end=st.integers(-2, 22))
 @settings(max_examples=40)
-def test_the_interval_is_half_open(whole: Path, begin: int, end: int):
+def test_interval_is_half_open(whole: Path, begin: int, end: int):
     expected = [bytes([number]) for number in range(20) if begin <= number < end]
     assert payloads(whole, begin=START + begin, end=START + end) == expected
 
@@ -85,7 +85,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_topics_are_chosen_by_name(tmp_path: Path):
+def test_topics_are_selected_by_name(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(5))
     assert payloads(tmp_path / "run.mcap", topics=["/robot_description"]) == [DESCRIPTION]
     assert payloads(tmp_path / "run.mcap", topics=["/nobody"]) == []
@@ -103,14 +103,14 @@ def test_chunks_outside_the_interval_are_not_read(whole: Path, tmp_path: Path):
         payloads(path)
 
 
-def test_an_empty_recording_has_no_span(tmp_path: Path):
+def test_empty_recording_has_no_span(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap") as writer:
         declared(writer)
     with RecordingReader(tmp_path / "run.mcap") as reader:
         assert (reader.span, list(reader.records()), reader.complete) == (None, [], True)
 
 
-def test_split_files_are_read_as_one_and_each_alone_too(tmp_path: Path):
+def test_split_files_are_read_as_one_and_separately(tmp_path: Path):
     states = joint_states(500)
     write_run(tmp_path / "run.mcap", states, max_seconds=2.0)
     with RecordingReader(tmp_path / "run.mcap") as reader:
@@ -125,14 +125,14 @@ def test_split_files_are_read_as_one_and_each_alone_too(tmp_path: Path):
     assert alone == [DESCRIPTION, *(payload for _, payload in states[200:400])]
 
 
-def test_what_an_older_recording_of_that_name_left_is_not_taken_in(tmp_path: Path):
+def test_files_of_an_older_recording_of_that_name_are_left_out(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
     write_run(tmp_path / "run.mcap", joint_states(300), max_seconds=2.0, overwrite=True)
     assert (tmp_path / "run_2.mcap").exists()
     assert len(payloads(tmp_path / "run.mcap", topics=["/joint_states"])) == 300
 
 
-def test_a_missing_part_is_named(tmp_path: Path):
+def test_missing_part_is_reported(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
     (tmp_path / "run_1.mcap").unlink()
     with RecordingReader(tmp_path / "run.mcap") as reader:
@@ -155,7 +155,7 @@ def rosbag(path: Path, storage: StoragePlugin, version: int) -> list[tuple[str, 
 
 @pytest.mark.parametrize("version", [8, 9])
 @pytest.mark.parametrize("storage", list(StoragePlugin))
-def test_a_bag_of_ros_2_is_read_as_rosbags_reads_it(tmp_path: Path, storage: StoragePlugin, version: int):
+def test_ros_2_bag_is_read_as_rosbags_reads_it(tmp_path: Path, storage: StoragePlugin, version: int):
     expected = rosbag(tmp_path / "bag", storage, version)
     (file,) = (file for file in (tmp_path / "bag").iterdir() if file.suffix != ".yaml")
     for path in (tmp_path / "bag", file):
@@ -174,7 +174,7 @@ def test_a_bag_of_ros_2_is_read_as_rosbags_reads_it(tmp_path: Path, storage: Sto
         assert window == [START + S // 2 + number * 10 * MS for number in range(50)]
 
 
-def test_a_bag_is_left_as_it_was(tmp_path: Path):
+def test_reading_leaves_a_bag_unchanged(tmp_path: Path):
     rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, 9)
     before = {file.name: file.read_bytes() for file in (tmp_path / "bag").iterdir()}
     (tmp_path / "bag").chmod(0o555)
@@ -184,7 +184,7 @@ def test_a_bag_is_left_as_it_was(tmp_path: Path):
     assert {file.name: file.read_bytes() for file in (tmp_path / "bag").iterdir()} == before
 
 
-def test_what_stands_only_in_the_databases_journal_is_read_too(tmp_path: Path):
+def test_records_in_the_sqlite_journal_are_read(tmp_path: Path):
     rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, 9)
     (database,) = (tmp_path / "bag").glob("*.db3")
     with closing(sqlite3.connect(database)) as connection:
@@ -222,7 +222,7 @@ def test_what_stands_only_in_the_databases_journal_is_read_too(tmp_path: Path):
     ],
     ids=str,
 )
-def test_every_form_that_mcap_writes_is_read(tmp_path: Path, options: dict[str, object]):
+def test_every_variant_that_mcap_writes_is_read(tmp_path: Path, options: dict[str, object]):
     path, states = tmp_path / "run.mcap", joint_states(300)
     mixed = random.Random(3).sample(states, len(states))
     with path.open("wb") as stream:
@@ -241,7 +241,7 @@ def test_every_form_that_mcap_writes_is_read(tmp_path: Path, options: dict[str, 
         assert (reader.complete, reader.losses) == (True, ())
 
 
-def test_channels_that_are_not_cdr_are_skipped_and_named(tmp_path: Path):
+def test_non_cdr_channels_are_skipped_and_listed(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -257,7 +257,7 @@ def test_channels_that_are_not_cdr_are_skipped_and_named(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("beginning", "said"),
+    ("beginning", "reason"),
     [
         (b"", "is empty"),
         (MAGIC[:5], "is cut off within its first 8 bytes"),
@@ -270,19 +270,17 @@ def test_channels_that_are_not_cdr_are_skipped_and_named(tmp_path: Path):
         (b"hello world, hello", "is not a recording: it begins with b'hello world,'"),
     ],
 )
-def test_a_file_that_is_no_recording_is_refused_by_what_it_looks_like(
-    tmp_path: Path, beginning: bytes, said: str
-):
+def test_other_file_is_refused_with_its_recognised_format(tmp_path: Path, beginning: bytes, reason: str):
     path = tmp_path / "run.mcap"
     path.write_bytes(beginning)
     with pytest.raises(RecordingError) as caught:
         RecordingReader(path)
-    assert said in str(caught.value)
+    assert reason in str(caught.value)
     assert str(path) in str(caught.value)
     assert caught.value.path == str(path)
 
 
-def test_a_database_of_something_else_is_refused(tmp_path: Path):
+def test_other_database_is_refused(tmp_path: Path):
     with closing(sqlite3.connect(tmp_path / "other.db3")) as connection:
         connection.execute("CREATE TABLE cats (name TEXT)")
         connection.commit()
@@ -290,12 +288,12 @@ def test_a_database_of_something_else_is_refused(tmp_path: Path):
         RecordingReader(tmp_path / "other.db3")
 
 
-def test_a_missing_file_is_said_to_be_missing(tmp_path: Path):
+def test_missing_file_error_says_so(tmp_path: Path):
     with pytest.raises(RecordingError, match="No such file"):
         RecordingReader(tmp_path / "nothing.mcap")
 
 
-def test_after_close_nothing_is_read(tmp_path: Path):
+def test_closed_reader_reads_nothing(tmp_path: Path):
     write_run(tmp_path / "run.mcap", [])
     reader = RecordingReader(tmp_path / "run.mcap")
     reader.close()
@@ -317,7 +315,7 @@ def read_all(path: Path) -> None:
 
 @given(st.binary(max_size=300), st.sampled_from([b"", MAGIC, b"SQLite format 3\0"]))
 @settings(max_examples=150, deadline=None)
-def test_random_bytes_are_refused_or_read_but_never_crash(scratch: Path, data: bytes, magic: bytes):
+def test_random_bytes_are_refused_or_read_without_crash(scratch: Path, data: bytes, magic: bytes):
     scratch.write_bytes(magic + data)
     read_all(scratch)
 
@@ -353,7 +351,7 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     end=st.floats(0.3, 1),
 )
 @settings(max_examples=300, deadline=None)
-def test_damage_anywhere_is_refused_or_read_but_never_crashes(
+def test_damage_anywhere_is_refused_or_read_without_crash(
     scratch: Path, originals: list[bytes], kind: int, edits: list[tuple[float, int]], end: float
 ):
     data = bytearray(originals[kind])
@@ -364,7 +362,7 @@ def test_damage_anywhere_is_refused_or_read_but_never_crashes(
 
 
 def a_chunk(compression: str, content: bytes, size: int) -> bytes:
-    """An MCAP file that is not closed, with one chunk that says it holds ``size`` bytes."""
+    """An MCAP file that is not closed, with one chunk that states ``size`` bytes."""
     word = compression.encode()
     body = struct.pack("<QQQII", 1, 1, size, 0, len(word)) + word + struct.pack("<Q", len(content)) + content
     header = struct.pack("<I", 0) * 2
@@ -377,13 +375,13 @@ BOMB = (1 << 28) + 1000
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-@pytest.mark.parametrize("says", [1 << 40, 1000])
-def test_a_chunk_that_grows_without_bounds_is_not_decompressed(tmp_path: Path, compression: str, says: int):
+@pytest.mark.parametrize("stated", [1 << 40, 1000])
+def test_chunk_that_decompresses_without_bounds_is_refused(tmp_path: Path, compression: str, stated: int):
     """A quarter of a gigabyte of zeros, whose chunk states a larger or smaller size."""
     zeros = bytes(BOMB)
     packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
-    (tmp_path / "bomb.mcap").write_bytes(a_chunk(compression, packed, says))
-    (tmp_path / "cut.mcap").write_bytes(a_chunk(compression, packed, says)[:-1000])
+    (tmp_path / "bomb.mcap").write_bytes(a_chunk(compression, packed, stated))
+    (tmp_path / "cut.mcap").write_bytes(a_chunk(compression, packed, stated)[:-1000])
     del zeros
     code = """
         import sys
@@ -399,12 +397,12 @@ def test_a_chunk_that_grows_without_bounds_is_not_decompressed(tmp_path: Path, c
     child = Child(code, str(tmp_path))
     bomb, cut, peak_mb = child.line(60.0), child.line(60.0), int(child.line())
     assert child.wait() == 0
-    assert f"states {says} bytes" in bomb or "disagree on their size" in bomb
+    assert f"states {stated} bytes" in bomb or "disagree on their size" in bomb
     assert "longer than its record" in cut or "cut off" in cut
-    assert says > BOMB or peak_mb < 250
+    assert stated > BOMB or peak_mb < 250
 
 
-def test_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path):
+def test_view_instead_of_a_table_is_refused(tmp_path: Path):
     """It may have rows without end."""
     path = tmp_path / "endless.db3"
     with closing(sqlite3.connect(path)) as database:
@@ -417,7 +415,7 @@ def test_a_view_in_the_place_of_a_table_is_refused(tmp_path: Path):
         RecordingReader(path)
 
 
-def test_a_query_that_takes_too_long_for_the_size_of_its_file_is_ended(
+def test_query_that_takes_too_long_for_the_file_size_is_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     path = tmp_path / "bag.db3"

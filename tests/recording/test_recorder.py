@@ -70,7 +70,7 @@ def count(recorder: Recorder, robot: str, stream: str = "joint_states") -> int:
 def publish_paced(
     publisher: StatePublisher, recorder: Recorder, reader: Session, number: int
 ) -> list[np.ndarray]:
-    """So many samples of a sine, as fast as ``reader`` hears those of "r1"; their positions."""
+    """Publishes samples of a sine as fast as ``reader`` receives those of "r1"; their positions."""
     sine = SineSource(publisher.model)
     sent = [sine.read(STAMP + k * PERIOD * 10).positions for k in range(number)]
     with closing(Tap(reader, "zstate/r1/tf")) as tap:
@@ -102,7 +102,7 @@ def ten_thousand(sessions, tmp_path: Path, panda: RobotModel) -> tuple[Path, lis
 
 
 @pytest.mark.robots
-def test_ten_thousand_transforms_are_read_by_others_without_any_difference(ten_thousand, panda: RobotModel):
+def test_other_readers_get_ten_thousand_identical_transforms(ten_thousand, panda: RobotModel):
     path, sent = ten_thousand
     kinematics = Kinematics(panda)
     for reader in OTHERS:
@@ -120,7 +120,7 @@ def test_ten_thousand_transforms_are_read_by_others_without_any_difference(ten_t
 
 
 @pytest.mark.robots
-def test_joint_states_are_read_by_others_bit_for_bit(ten_thousand, panda: RobotModel):
+def test_other_readers_get_joint_states_bit_for_bit(ten_thousand, panda: RobotModel):
     path, sent = ten_thousand
     for reader in OTHERS:
         states = [message for topic, message in reader(path) if topic == "/joint_states"]
@@ -132,7 +132,7 @@ def test_joint_states_are_read_by_others_bit_for_bit(ten_thousand, panda: RobotM
 
 
 @pytest.mark.robots
-def test_the_model_and_its_fixed_edges_are_in_the_recording(ten_thousand, panda: RobotModel):
+def test_recording_has_the_model_and_its_fixed_edges(ten_thousand, panda: RobotModel):
     path, _ = ten_thousand
     for reader in OTHERS:
         described = [message.data for topic, message in reader(path) if topic == "/robot_description"]
@@ -162,19 +162,19 @@ def test_several_robots_have_a_namespace_and_a_prefix_each(sessions, tmp_path: P
         *("/tf", "/tf_static", "/left/joint_states", "/left/robot_description"),
         *("/right/joint_states", "/right/robot_description"),
     }
-    said = {
+    recorded = {
         edge.child_frame_id for message in read(tmp_path / "run.mcap", "/tf") for edge in message.transforms
     }
-    said |= {
+    recorded |= {
         edge.child_frame_id
         for message in read(tmp_path / "run.mcap", "/tf_static")
         for edge in message.transforms
     }
     links = {f"left/{joint.child}" for joint in RRBOT.joints}
-    assert said == links | {f"right/{joint.child}" for joint in GRIPPER.joints}
+    assert recorded == links | {f"right/{joint.child}" for joint in GRIPPER.joints}
 
 
-def test_a_robot_that_comes_later_stands_beside_the_first_one(sessions, tmp_path: Path):
+def test_later_robot_gets_its_own_namespace(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap") as recorder,
@@ -190,7 +190,7 @@ def test_a_robot_that_comes_later_stands_beside_the_first_one(sessions, tmp_path
     assert len(read(tmp_path / "run.mcap", "/second/joint_states")) == 1
 
 
-def test_only_the_chosen_robots_are_recorded_and_one_alone_stands_in_the_root(sessions, tmp_path: Path):
+def test_only_selected_robots_are_recorded_and_a_single_one_in_the_root(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "left") as left,
@@ -210,7 +210,7 @@ def test_only_the_chosen_robots_are_recorded_and_one_alone_stands_in_the_root(se
     assert len(read(tmp_path / "two.mcap", "/left/joint_states")) == 1
 
 
-def test_samples_before_the_description_are_in_the_recording_once_it_came(sessions, tmp_path: Path):
+def test_samples_before_the_description_are_recorded_after_it(sessions, tmp_path: Path):
     writer, reader = sessions
     with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
         settle(writer, "r1")
@@ -224,7 +224,7 @@ def test_samples_before_the_description_are_in_the_recording_once_it_came(sessio
     assert (state.name, state.position.tolist()) == (list(RRBOT.joint_names), [0.25, 0.5])
 
 
-def test_a_writer_that_starts_again_is_another_channel_with_its_own_name(sessions, tmp_path: Path):
+def test_restarted_writer_has_its_own_channel_and_name(sessions, tmp_path: Path):
     writer, reader = sessions
     with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
         for start in (1, 2):
@@ -241,7 +241,7 @@ def test_a_writer_that_starts_again_is_another_channel_with_its_own_name(session
     assert all(abs(record.log_time - time.time_ns()) < 60_000_000_000 for record in records)
 
 
-def test_static_edges_are_recorded_as_they_change_and_are_withdrawn(sessions, tmp_path: Path):
+def test_changed_and_withdrawn_static_edges_are_recorded(sessions, tmp_path: Path):
     writer, reader = sessions
     with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
         with StaticPublisher(writer, "r1", "mount") as statics:
@@ -250,11 +250,11 @@ def test_static_edges_are_recorded_as_they_change_and_are_withdrawn(sessions, tm
             statics.set(Transform("fleet/map", "camera", (1.0, 0.0, 0.0), UPRIGHT))
             until(lambda: count(recorder, "r1", "tf_static") == 2)
         until(lambda: count(recorder, "r1", "tf_static") == 3)
-    said = [
+    recorded = [
         [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
         for message in read(tmp_path / "run.mcap", "/tf_static")
     ]
-    assert said == [[("tool", "hook")], [("tool", "hook"), ("fleet/map", "camera")], []]
+    assert recorded == [[("tool", "hook")], [("tool", "hook"), ("fleet/map", "camera")], []]
 
 
 def put_state(publisher: StreamPublisher, seq: int, stamp: int = STAMP) -> None:
@@ -263,7 +263,7 @@ def put_state(publisher: StreamPublisher, seq: int, stamp: int = STAMP) -> None:
     publisher.put(encode(state))
 
 
-def test_what_did_not_come_and_what_cannot_be_read_or_said_is_counted(sessions, tmp_path: Path):
+def test_missed_undecodable_and_unwritable_messages_are_counted(sessions, tmp_path: Path):
     writer, reader = sessions
     key = "zstate/r1/joint_states"
     with (
@@ -288,7 +288,7 @@ def test_what_did_not_come_and_what_cannot_be_read_or_said_is_counted(sessions, 
         assert [record.sequence for record in recording.records()] == [7, 8, 12, 15]
 
 
-def test_simulated_time_is_recorded_beside_the_robots(sessions, tmp_path: Path):
+def test_simulated_time_is_recorded_with_the_robots(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder,
@@ -301,7 +301,7 @@ def test_simulated_time_is_recorded_beside_the_robots(sessions, tmp_path: Path):
     assert (message.clock.sec, message.clock.nanosec) == (3, 7)
 
 
-def test_what_ros_nodes_say_is_recorded_as_they_say_it(sessions, tmp_path: Path):
+def test_ros_messages_are_recorded_unchanged(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap", wire="ros2:domain=3") as recorder,
@@ -316,14 +316,14 @@ def test_what_ros_nodes_say_is_recorded_as_they_say_it(sessions, tmp_path: Path)
     state = read(tmp_path / "run.mcap", "/joint_states")[-1]
     assert (state.name, state.position.tolist()) == (list(RRBOT.joint_names), positions)
     fixed = {joint.child for joint in RRBOT.joints if joint.type == "fixed"}
-    (said,) = read(tmp_path / "run.mcap", "/tf_static")
-    assert {edge.child_frame_id for edge in said.transforms} == fixed
+    (recorded,) = read(tmp_path / "run.mcap", "/tf_static")
+    assert {edge.child_frame_id for edge in recorded.transforms} == fixed
     with RecordingReader(tmp_path / "run.mcap") as recording:
         programs = {channel.metadata["zstate.program"] for channel in recording.channels()}
     assert len(programs) == 1
 
 
-def test_each_file_of_a_split_recording_can_be_understood_by_itself(sessions, tmp_path: Path):
+def test_each_file_of_a_split_recording_is_readable_alone(sessions, tmp_path: Path):
     writer, reader = sessions
     path = tmp_path / "run.mcap"
     with (
@@ -354,7 +354,7 @@ RECORDER = """
 """
 
 
-def test_of_a_recorder_that_is_killed_all_but_the_last_half_second_is_saved(sessions, spawn, tmp_path: Path):
+def test_killed_recorder_loses_at_most_the_last_half_second(sessions, spawn, tmp_path: Path):
     from zstate.recording.mcap.recover import recover
 
     writer = sessions[0]
@@ -396,7 +396,7 @@ ON_A_SMALL_DISK = """
 """
 
 
-def test_a_full_disk_ends_the_recording_with_a_reason_and_leaves_it_readable(sessions, spawn, tmp_path: Path):
+def test_full_disk_ends_the_recording_with_a_reason_and_leaves_it_readable(sessions, spawn, tmp_path: Path):
     writer = sessions[0]
     child = spawn(ON_A_SMALL_DISK, str(tmp_path / "run.mcap"))
     assert child.line() == "ready"
@@ -420,7 +420,7 @@ def test_a_full_disk_ends_the_recording_with_a_reason_and_leaves_it_readable(ses
         assert 0 < sum(1 for _ in recording.records()) <= written
 
 
-def test_closing_finishes_the_file_within_a_second_and_may_be_repeated(sessions, tmp_path: Path):
+def test_close_finishes_the_file_within_a_second_and_may_be_repeated(sessions, tmp_path: Path):
     writer, reader = sessions
     recorder = Recorder(reader, tmp_path / "run.mcap", ["r1"])
     with StatePublisher(writer, RRBOT, "r1") as publisher:
@@ -440,7 +440,7 @@ def test_closing_finishes_the_file_within_a_second_and_may_be_repeated(sessions,
         assert recording.complete
 
 
-def test_what_was_heard_is_written_even_if_the_recording_ends_at_once(sessions, tmp_path: Path):
+def test_received_samples_are_written_even_if_the_recording_ends_at_once(sessions, tmp_path: Path):
     writer, reader = sessions
     with (
         Recorder(reader, tmp_path / "run.mcap") as recorder,
@@ -457,14 +457,14 @@ def test_what_was_heard_is_written_even_if_the_recording_ends_at_once(sessions, 
     assert recorder.stats.messages == {("r1", "joint_states"): len(sequences)}
 
 
-def test_a_recording_of_nobody_is_a_complete_file(tmp_path: Path):
+def test_recording_without_robots_is_a_complete_file(tmp_path: Path):
     with connect() as session, Recorder(session, tmp_path / "run.mcap") as recorder:
         assert recorder.stats.messages == {}
     with RecordingReader(tmp_path / "run.mcap") as recording:
         assert (recording.complete, recording.span) == (True, None)
 
 
-def test_a_session_that_is_closed_first_leaves_a_complete_file(tmp_path: Path):
+def test_closed_session_leaves_a_complete_file(tmp_path: Path):
     session = connect()
     recorder = Recorder(session, tmp_path / "run.mcap")
     session.close()
@@ -473,7 +473,7 @@ def test_a_session_that_is_closed_first_leaves_a_complete_file(tmp_path: Path):
         assert recording.complete
 
 
-def test_what_cannot_be_recorded_is_refused_and_no_file_made(sessions, tmp_path: Path):
+def test_invalid_recorder_arguments_are_refused_and_create_no_file(sessions, tmp_path: Path):
     session, path = sessions[0], tmp_path / "run.mcap"
     with pytest.raises(InvalidInput, match="robot name 'a/b'"):
         Recorder(session, path, ["a/b"])
@@ -493,7 +493,7 @@ def test_what_cannot_be_recorded_is_refused_and_no_file_made(sessions, tmp_path:
     assert path.read_bytes().startswith(b"\x89MCAP")
 
 
-def test_what_is_latched_is_recorded_whole_beside_the_samples_in_a_thread_of_its_own(
+def test_large_latched_values_are_recorded_entirely_on_their_own_thread(
     sessions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """As if all of it were large: sets of edges in their order, and samples that wait for the description."""

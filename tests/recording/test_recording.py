@@ -15,7 +15,7 @@ from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
 from zstate.transform import Transform
 
 
-def test_it_says_what_it_is(tmp_path: Path):
+def test_repr_has_duration_and_robots(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         tale.describe("r1")
         tale.joints("r1", START + S, swing(0), heard=START + 2 * S)
@@ -26,14 +26,14 @@ def test_it_says_what_it_is(tmp_path: Path):
         assert recording.info.complete
 
 
-def test_a_robot_that_is_not_in_it_is_refused(tmp_path: Path):
+def test_unknown_robot_is_refused(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         tale.describe("r1")
     with pytest.raises(InvalidInput, match="'r1'"):
         Recording(tmp_path / "r.mcap", "r2")
 
 
-def test_a_closed_recording_answers_no_more(tmp_path: Path):
+def test_closed_recording_raises(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
     recording = Recording(tmp_path / "r.mcap")
@@ -66,7 +66,7 @@ def wild(path: Path, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_many_instants_are_answered_as_a_buffer_of_it_all_answers(tmp_path: Path, seed: int, monkeypatch):
+def test_lookup_many_equals_that_of_a_full_buffer(tmp_path: Path, seed: int, monkeypatch):
     monkeypatch.setattr("zstate.recording.load._BATCH", 37)
     wild(tmp_path / "r.mcap", seed)
     dice = np.random.default_rng(seed)
@@ -83,14 +83,14 @@ def test_many_instants_are_answered_as_a_buffer_of_it_all_answers(tmp_path: Path
             assert np.array_equal(told, poses, equal_nan=True)
 
 
-def test_no_instants_have_no_answers(tmp_path: Path):
+def test_lookup_many_of_no_stamps_is_empty(tmp_path: Path):
     wild(tmp_path / "r.mcap", 1)
     with Recording(tmp_path / "r.mcap") as recording:
         poses, valid = recording.lookup_many("map", "tip", [])
     assert (poses.shape, valid.shape) == ((0, 7), (0,))
 
 
-def test_frames_that_are_unknown_or_apart_are_errors(tmp_path: Path):
+def test_unknown_and_disconnected_frames_raise(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.joints("arm", START, swing(0))
@@ -104,7 +104,7 @@ def test_frames_that_are_unknown_or_apart_are_errors(tmp_path: Path):
             recording.lookup_many("world", "tool", [0.5])
 
 
-def test_what_other_robots_and_wrong_edges_say_of_a_robot_counts_as_little_as_it_did_live(tmp_path: Path):
+def test_edges_refused_live_are_refused_from_a_recording(tmp_path: Path):
     with Tale(tmp_path / "r.mcap") as tale:
         tale.statics("thief", START, {("thief/map", "arm/camera"): pose(x=9.0)})
         tale.statics("thief", START, {("arm/base", "arm/laser"): pose(x=9.0)}, writer="laser")
@@ -120,7 +120,7 @@ def test_what_other_robots_and_wrong_edges_say_of_a_robot_counts_as_little_as_it
     assert buffer.can_lookup("world", "camera")
 
 
-def test_a_bag_is_a_recording_too(tmp_path: Path):
+def test_bag_is_a_recording(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         for n in range(20):
             bag.tf(START + n, [Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1], START + n * S)])
@@ -146,7 +146,7 @@ MEMORY = """
 
 
 @pytest.mark.processes
-def test_memory_does_not_grow_with_the_recording(tmp_path: Path, spawn):
+def test_lookup_many_memory_does_not_grow_with_the_recording(tmp_path: Path, spawn):
     # 40 edges of 64 bytes: the large recording would fill a buffer with 50 MB.
     sizes = {"small": 1_000, "large": 20_000}
     for name, count in sizes.items():
@@ -159,7 +159,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path, spawn):
     assert large - small < 20, (small, large)
 
 
-def test_the_buffer_keeps_what_it_is_asked_for():
+def test_buffer_keeps_samples_around_requested_stamps():
     buffer = TransformBuffer(1000.0)
     for n in range(100):
         buffer.insert(Transform("odom", "base", [n, 0, 0], [0, 0, 0, 1], n * S))
@@ -172,7 +172,7 @@ def test_the_buffer_keeps_what_it_is_asked_for():
     assert np.array_equal(buffer.lookup_many("odom", "base", wanted)[0], before)
 
 
-def test_before_a_recording_begins_nobody_is_told_to_start_a_listener(tmp_path: Path):
+def test_lookup_before_the_recording_does_not_suggest_a_listener(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(3):

@@ -27,7 +27,7 @@ def arm(path: Path, count: int = 100, **options: object) -> Path:
     return path
 
 
-def test_readings_are_the_recorded_numbers_moved_to_now(tmp_path: Path):
+def test_readings_are_the_recorded_numbers_shifted_to_the_present(tmp_path: Path):
     with RecordedSource(arm(tmp_path / "r.mcap"), "arm", RRBOT) as source:
         for n in range(100):
             reading = source.read(NOW + n * 10 * MS + n % 3)
@@ -40,7 +40,7 @@ def test_readings_are_the_recorded_numbers_moved_to_now(tmp_path: Path):
         assert source.read(NOW + 10 * S) is None
 
 
-def test_a_slower_reader_gets_the_newest_that_is_due(tmp_path: Path):
+def test_slow_reader_gets_the_newest_due_reading(tmp_path: Path):
     with RecordedSource(arm(tmp_path / "r.mcap"), "arm", RRBOT) as source:
         assert source.read(NOW) is not None
         reading = source.read(NOW + 57 * MS)
@@ -48,19 +48,19 @@ def test_a_slower_reader_gets_the_newest_that_is_due(tmp_path: Path):
         assert reading.positions.tolist() == swing(5)
 
 
-def test_nothing_new_is_none(tmp_path: Path):
+def test_read_returns_none_without_a_new_reading(tmp_path: Path):
     with RecordedSource(arm(tmp_path / "r.mcap"), "arm", RRBOT) as source:
         source.read(NOW)
         assert source.read(NOW + 5 * MS) is None
         assert not source.ended
 
 
-def test_the_only_robot_need_not_be_named(tmp_path: Path):
+def test_only_robot_is_the_default(tmp_path: Path):
     with RecordedSource(arm(tmp_path / "r.mcap"), None, RRBOT) as source:
         assert source.robot == "arm"
 
 
-def test_other_robots_are_refused_with_those_there_are(tmp_path: Path):
+def test_unknown_robot_error_lists_the_robots(tmp_path: Path):
     with pytest.raises(InvalidInput, match="joint_states of 'leg'; it has those of 'arm'"):
         RecordedSource(arm(tmp_path / "r.mcap"), "leg", RRBOT)
     with Bag(tmp_path / "bag") as bag:
@@ -70,7 +70,7 @@ def test_other_robots_are_refused_with_those_there_are(tmp_path: Path):
         RecordedSource(tmp_path / "bag", None, RRBOT)
 
 
-def test_states_that_do_not_fit_the_model_are_counted_and_passed_over(tmp_path: Path):
+def test_states_that_do_not_fit_the_model_are_counted_and_skipped(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"shoulder": 0.5})
         bag.joints(START + 1, {"shoulder": 0.5, "elbow": np.nan})
@@ -82,7 +82,7 @@ def test_states_that_do_not_fit_the_model_are_counted_and_passed_over(tmp_path: 
         assert source.refused == {"missing joints": 1, "bad numbers": 1}
 
 
-def test_a_writer_that_began_anew_follows_as_it_was_heard(tmp_path: Path):
+def test_restarted_writer_continues_at_its_log_times(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         tale.joints("arm", 500 * S, [1, 0], session=1, heard=START)
@@ -94,7 +94,7 @@ def test_a_writer_that_began_anew_follows_as_it_was_heard(tmp_path: Path):
     assert told == [(NOW, 1.0), None, (NOW + 2 * S, 2.0), (NOW + 3 * S, 3.0)]
 
 
-def test_a_late_sample_does_not_take_the_robot_back(tmp_path: Path):
+def test_late_sample_does_not_move_the_robot_back(tmp_path: Path):
     with Tale(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for number, millisecond in enumerate([0, 20, 10, 30]):
@@ -104,7 +104,7 @@ def test_a_late_sample_does_not_take_the_robot_back(tmp_path: Path):
     assert [None if reading is None else reading.positions[0] for reading in seen] == [0.0, None, 1.0, 3.0]
 
 
-def test_a_publisher_runs_with_it(tmp_path: Path):
+def test_publisher_runs_with_a_recorded_source(tmp_path: Path):
     path = arm(tmp_path / "r.mcap", 10)
     with (
         connect() as session,

@@ -22,7 +22,7 @@ def part(number: int, times: list[int], opened: list[int], early: int = 0) -> So
 
 
 @given(st.lists(st.tuples(st.lists(st.integers(0, 30)).map(sorted), st.integers(0, 5))))
-def test_the_merge_is_a_stable_sort(parts: list[tuple[list[int], int]]):
+def test_merge_is_a_stable_sort(parts: list[tuple[list[int], int]]):
     merged = merge_by_log_time([part(n, times, [], early) for n, (times, early) in enumerate(parts)])
     everything = [
         Record(CHANNEL, b"", time, number, place)
@@ -32,7 +32,7 @@ def test_the_merge_is_a_stable_sort(parts: list[tuple[list[int], int]]):
     assert list(merged) == sorted(everything, key=lambda record: record.log_time)
 
 
-def test_a_part_is_opened_when_its_time_has_come():
+def test_part_is_opened_when_its_start_is_reached():
     opened: list[int] = []
     merged = merge_by_log_time([part(0, [5, 6], opened), part(1, [1, 2], opened), part(2, [9], opened)])
     seen = [(record.log_time, list(opened)) for record in merged]

@@ -20,7 +20,7 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import Closed, InvalidInput, MessageError, ZStateError
 from zstate.ingest.counters import Counters
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.static_transforms import StaticTransformIngest
+from zstate.ingest.transforms import StaticTransformIngest
 from zstate.model.robot import RobotModel
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import watch

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.core import BufferCore, Query, check_duration
-from zstate.buffer.message_filter import MessageFilter, frame_of, stamp_of
-from zstate.buffer.path import joints_path
-from zstate.buffer.plan import Plan
+from zstate.buffer.path import Plan, joints_path
 from zstate.buffer.snapshot import (
     FramePoses,
     FrameTable,
@@ -25,7 +23,7 @@ from zstate.buffer.snapshot import (
     joint_history,
 )
 from zstate.buffer.tracks import JointTrack
-from zstate.buffer.waiting import TransformWatch
+from zstate.buffer.waiting import MessageFilter, TransformWatch, frame_of, stamp_of
 from zstate.checks import check_names
 from zstate.clock import Clock, check_stamp, check_stamps, wait_interruptible
 from zstate.errors import Closed, InvalidInput, LookupFailed, NotFinite, as_timeout

@@ -32,9 +32,8 @@ class ClockDomain:
 
         None while no such robot is known; the first of two equally common domains.
         """
-        return self.given or self._most_common()
-
-    def _most_common(self) -> str | None:
+        if self.given:
+            return self.given
         with self._lock:
             counts = Counter(domain for robot in self._present if (domain := self._by_robot.get(robot)))
         return next((domain for domain, _ in counts.most_common(1)), None)

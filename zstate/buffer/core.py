@@ -128,7 +128,10 @@ class BufferCore:
         samples that have velocities by cubic curves. Raises InsertRefused if one of the links has a
         parent already, InvalidInput for a prefix that cannot begin a frame name.
         """
-        prefix = _check_prefix(prefix)
+        if prefix != "":
+            if problem := name_problem(prefix):
+                raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
+            prefix = prefix.removesuffix("/")
         if interpolation not in get_args(Interpolation):
             raise InvalidInput(
                 f"interpolation is one of {', '.join(get_args(Interpolation))}; got {interpolation!r}"
@@ -453,14 +456,9 @@ class BufferCore:
 
     def _check_age(self, path: TransformPath, transform: Transform, max_age_s: float) -> None:
         if path.domain not in ("", self.clock.domain):
-            use = path.uses[0]
-            raise ClockMismatch(
-                path.target,
-                path.source,
-                edges=(use.edge,),
-                robots=(use.track.name,),
-                domains=(path.domain, self.clock.domain),
-            )
+            use, domains = path.uses[0], (path.domain, self.clock.domain)
+            names = (path.target, path.source)
+            raise ClockMismatch(*names, edges=(use.edge,), robots=(use.track.name,), domains=domains)
         age_s = transform.age(self.clock)
         if path.uses and age_s > max_age_s:
             raise path.stale(transform.stamp, age_s, max_age_s)
@@ -491,21 +489,18 @@ class BufferCore:
     def _expect_change(
         self, query: Query, reason: LookupFailed, waiter: Waiter, version: int
     ) -> LookupFailed:
-        condition = self._wake_condition(query, reason)
+        condition = WakeCondition()
+        if isinstance(reason, _NO_PATH):
+            with self._lock:
+                condition = WakeCondition(self._tree.dependencies(query.target, query.source))
+        else:
+            with suppress(LookupFailed):  # the tree has changed since, which its version shows
+                _, path, dependencies = self._cached_path(query.target, query.source)
+                condition = WakeCondition(dependencies, _required_stamps(query, reason, path), query.at)
         waiter.expect(condition, version)
         if _is_final(query, reason, condition):
             raise reason
         return reason
-
-    def _wake_condition(self, query: Query, reason: LookupFailed) -> WakeCondition:
-        if isinstance(reason, _NO_PATH):
-            with self._lock:
-                return WakeCondition(self._tree.dependencies(query.target, query.source))
-        try:
-            cached = self._cached_path(query.target, query.source)
-        except LookupFailed:
-            return WakeCondition()  # the tree has changed since, which its version shows
-        return WakeCondition(cached.dependencies, _required_stamps(query, reason, cached.path), query.at)
 
 
 def _required_stamps(query: Query, reason: LookupFailed, path: TransformPath) -> RequiredStamps:
@@ -543,14 +538,6 @@ def check_duration(name: str, value: float, most: float = 1e300) -> float:
     if value > most:
         raise InvalidInput(f"{name} is at most {most:g} seconds; got {value!r}")
     return value
-
-
-def _check_prefix(prefix: object) -> str:
-    if isinstance(prefix, str) and not prefix:
-        return ""
-    if problem := name_problem(prefix):
-        raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
-    return str(prefix).removesuffix("/")
 
 
 def _not_owned(track: Track) -> InsertRefused:

@@ -6,7 +6,7 @@ It knows no stamps; samples are in the tracks behind the edges.
 from __future__ import annotations
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -155,17 +155,14 @@ class FrameNameIndex:
 
 
 def _near(name: str, names: list[str], count: int) -> list[str]:
-    known = names[:count]
-    return get_close_matches(name, known if "/" in name else _shortest(known), n=3, cutoff=0.7)
-
-
-def _shortest(frames: Sequence[str]) -> list[str]:
-    """The shortest unique name of each frame."""
-    bares = [_bare(frame) for frame in frames]
-    counts: defaultdict[str, int] = defaultdict(int)
-    for bare in bares:
-        counts[bare] += 1
-    return [bare if bare and counts[bare] == 1 else frame for frame, bare in zip(frames, bares, strict=True)]
+    candidates = names[:count]
+    if "/" not in name:
+        bares = [_bare(candidate) for candidate in candidates]
+        counts = Counter(bares)
+        candidates = [
+            bare if bare and counts[bare] == 1 else full for full, bare in zip(candidates, bares, strict=True)
+        ]
+    return get_close_matches(name, candidates, n=3, cutoff=0.7)
 
 
 def _bare(name: str) -> str:
@@ -325,18 +322,9 @@ class FrameTree:
             return FrameInfo(name, None, "root", None, None, None, None, 0)
         if edge.track is None:
             return FrameInfo(name, edge.parent, "static", edge.writer, None, None, None, 0)
-        samples = coverage(edge.track.history.view)
-        return FrameInfo(
-            name,
-            edge.parent,
-            edge.kind,
-            edge.writer,
-            samples.rate_hz,
-            samples.oldest,
-            samples.newest,
-            samples.count,
-            self.domain_of(edge) or None,
-        )
+        oldest, newest, rate_hz, count = coverage(edge.track.history.view)
+        facts = (edge.parent, edge.kind, edge.writer, rate_hz, oldest, newest, count)
+        return FrameInfo(name, *facts, self.domain_of(edge) or None)
 
     def snapshot(self) -> TreeSnapshot:
         """A copy of all frames and robots."""
@@ -358,12 +346,10 @@ class FrameTree:
 
     def resolve(self, name: str, target: str, source: str) -> str:
         """The frame that a name of a lookup means. Raises UnknownFrame or AmbiguousFrame."""
-        if name in self.frames:
-            return name
-        candidates = self.names.with_bare(name)
-        if len(candidates) == 1:
-            return candidates[0]
-        if candidates:
+        frame = self._find(name)
+        if frame is not None:
+            return frame
+        if candidates := self.names.with_bare(name):
             raise AmbiguousFrame(target, source, name=name, candidates=candidates)
         near = self.names.near(name)
         raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=len(self.names))
@@ -377,21 +363,19 @@ class FrameTree:
         source_frame = self.resolve(source, target, source)
         parts = self._split_at_common_ancestor(target_frame, source_frame)
         if parts is None:
-            raise self._disconnected(target, source, (self.root(target_frame), self.root(source_frame)))
+            roots = (self.root(target_frame), self.root(source_frame))
+            failure = Disconnected(target, source, roots=roots)
+            removed = [self._removed[root] for root in roots if root in self._removed]
+            if removed:
+                last = max(removed, key=lambda one: one.at_s)
+                failure.edge, failure.writer = last.edge, last.writer
+                failure.gone_s = time.monotonic() - last.at_s
+            raise failure
         edges = [edge for part in parts for edge in part]
         names = tuple({target: target_frame, source: source_frame}.items())
         placed = tuple((edge.child, edge) for edge in edges)
         dependencies = PathDependencies(names, placed, self._domains(edges))
         return TreePath(*parts, self._common_domain(target, source, edges), dependencies)
-
-    def _disconnected(self, target: str, source: str, roots: tuple[str, str]) -> Disconnected:
-        failure = Disconnected(target, source, roots=roots)
-        removed = [self._removed[root] for root in roots if root in self._removed]
-        if removed:
-            last = max(removed, key=lambda one: one.at_s)
-            failure.edge, failure.writer = last.edge, last.writer
-            failure.gone_s = time.monotonic() - last.at_s
-        return failure
 
     def _split_at_common_ancestor(
         self, target_frame: str, source_frame: str
@@ -418,13 +402,9 @@ class FrameTree:
                 if first is None:
                     first, common = edge, domain
                 elif domain != common:
-                    raise ClockMismatch(
-                        target,
-                        source,
-                        edges=(first.names, edge.names),
-                        robots=(self.robot_of(first), self.robot_of(edge)),
-                        domains=(common, domain),
-                    )
+                    pair, domains = (first.names, edge.names), (common, domain)
+                    robots = (self.robot_of(first), self.robot_of(edge))
+                    raise ClockMismatch(target, source, edges=pair, robots=robots, domains=domains)
         return common
 
     def dependencies(self, target: str, source: str) -> PathDependencies:

@@ -107,7 +107,14 @@ class ReferenceHistory:
         elif not self.reaches(stamp):
             return False
         else:
-            self._splice(stamp, row)
+            stamps, rows = view.kept_stamps(), view.kept_rows()
+            at = int(stamps.searchsorted(stamp))
+            after = at + 1 if stamps[at] == stamp else at
+            new = self._empty(view.size + 1 + view.size // 8)
+            end = at + 1 + len(stamps) - after
+            new.stamps[:at], new.stamps[at], new.stamps[at + 1 : end] = stamps[:at], stamp, stamps[after:]
+            new.rows[:at], new.rows[at], new.rows[at + 1 : end] = rows[:at], row, rows[after:]
+            self.view = new._replace(end=end)
         return True
 
     def _append(self, stamp: int, row: NDArray[np.float64]) -> None:
@@ -125,16 +132,6 @@ class ReferenceHistory:
         if stamps[first] < limit:
             first += int(stamps[first:end].searchsorted(limit))
         self.view = HistoryView(stamps, rows, first, end + 1)
-
-    def _splice(self, stamp: int, row: NDArray[np.float64]) -> None:
-        stamps, rows = self.view.kept_stamps(), self.view.kept_rows()
-        at = int(stamps.searchsorted(stamp))
-        after = at + 1 if stamps[at] == stamp else at
-        fresh = self._empty(self.view.size + 1 + self.view.size // 8)
-        end = at + 1 + len(stamps) - after
-        fresh.stamps[:at], fresh.stamps[at], fresh.stamps[at + 1 : end] = stamps[:at], stamp, stamps[after:]
-        fresh.rows[:at], fresh.rows[at], fresh.rows[at + 1 : end] = rows[:at], row, rows[after:]
-        self.view = fresh._replace(end=end)
 
 
 if TYPE_CHECKING or kernel == "reference":

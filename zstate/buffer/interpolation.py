@@ -201,25 +201,20 @@ class PoseInterpolator:
 
     def rate(self, now: Bracket) -> Rate:
         """Linear and angular velocity: as published, else the constant ones between both rows."""
-        slope = self._slope(now)
-        if self.velocity < 0:
-            return slope
-        columns = range(self.velocity, self.velocity + 6)
-        published = [_published(now.a[k], now.b[k], now) for k in columns]
-        is_known = sum(published) == sum(published)
-        chosen = [
-            now.f.select(is_known, mine, theirs)
-            for mine, theirs in zip(published, (*slope[0], *slope[1]), strict=True)
-        ]
-        return ((chosen[0], chosen[1], chosen[2]), (chosen[3], chosen[4], chosen[5]))
-
-    def _slope(self, now: Bracket) -> Rate:
         a, b = self._pose(now.a), self._pose(now.b)
         is_one_row = now.seconds == 0.0
         per_second = now.f.select(is_one_row, math.nan, 1.0 / now.f.select(is_one_row, 1.0, now.seconds))
         x, y, z = se3.rotation_vector(se3.multiply(b[3:], se3.conjugate(a[3:])), now.f)
         linear = ((b[0] - a[0]) * per_second, (b[1] - a[1]) * per_second, (b[2] - a[2]) * per_second)
-        return linear, (x * per_second, y * per_second, z * per_second)
+        angular = (x * per_second, y * per_second, z * per_second)
+        if self.velocity < 0:
+            return linear, angular
+        columns = range(self.velocity, self.velocity + 6)
+        published = [_published(now.a[k], now.b[k], now) for k in columns]
+        is_known = sum(published) == sum(published)
+        slope = (*linear, *angular)
+        chosen = [now.f.select(is_known, mine, other) for mine, other in zip(published, slope, strict=True)]
+        return ((chosen[0], chosen[1], chosen[2]), (chosen[3], chosen[4], chosen[5]))
 
     def extrapolate(self, row: Row, rate: Rate, seconds: float, f: Backend) -> Pose:
         """The pose ``seconds`` after ``row``, at a constant ``rate``."""
@@ -240,11 +235,9 @@ class StaticStep:
     constant: Pose
 
     def pose(self, values: Values, f: Backend) -> Pose:
-        """parent_from_child."""
         return self.constant
 
     def rate(self, values: Values, rates: Values) -> Rate:
-        """Zero."""
         return _AT_REST
 
 
@@ -257,7 +250,6 @@ class RevoluteStep:
     column: int
 
     def pose(self, values: Values, f: Backend) -> Pose:
-        """parent_from_child."""
         form = self.form
         half = 0.5 * (form.scale * values[self.use][self.column] + form.shift)
         c, s = f.cos(half), f.sin(half)
@@ -266,7 +258,6 @@ class RevoluteStep:
         return (x, y, z, a[0] * c + b[0] * s, a[1] * c + b[1] * s, a[2] * c + b[2] * s, a[3] * c + b[3] * s)
 
     def rate(self, values: Values, rates: Values) -> Rate:
-        """A rotation about the axis."""
         speed = self.form.scale * rates[self.use][self.column]
         x, y, z = se3.rotate(self.form.q_cos, self.form.axis)
         return _AT_REST[0], (x * speed, y * speed, z * speed)
@@ -281,14 +272,12 @@ class PrismaticStep:
     column: int
 
     def pose(self, values: Values, f: Backend) -> Pose:
-        """parent_from_child."""
         form = self.form
         n = form.scale * values[self.use][self.column] + form.shift
         translation = (form.t0[0] + form.t1[0] * n, form.t0[1] + form.t1[1] * n, form.t0[2] + form.t1[2] * n)
         return (*translation, *form.q_cos)
 
     def rate(self, values: Values, rates: Values) -> Rate:
-        """A translation along the axis."""
         speed = self.form.scale * rates[self.use][self.column]
         x, y, z = self.form.t1
         return (x * speed, y * speed, z * speed), _AT_REST[1]
@@ -303,12 +292,10 @@ class PlanarStep:
     column: int
 
     def pose(self, values: Values, f: Backend) -> Pose:
-        """parent_from_child."""
         x, y, yaw = values[self.use][self.column : self.column + 3]
         return se3.compose(self.form.origin, (x, y, 0.0, 0.0, 0.0, f.sin(0.5 * yaw), f.cos(0.5 * yaw)))
 
     def rate(self, values: Values, rates: Values) -> Rate:
-        """A translation in the plane and a rotation about its normal."""
         vx, vy, spin = rates[self.use][self.column : self.column + 3]
         q = self.form.origin[3:]
         return se3.rotate(q, (vx, vy, 0.0)), se3.rotate(q, (0.0, 0.0, spin))
@@ -323,12 +310,10 @@ class PoseStep:
     column: int
 
     def pose(self, values: Values, f: Backend) -> Pose:
-        """parent_from_child."""
         sampled: Pose = values[self.use][self.column]
         return sampled if self.origin == se3.IDENTITY else se3.compose(self.origin, sampled)
 
     def rate(self, values: Values, rates: Values) -> Rate:
-        """The rate of its interpolator."""
         linear, angular = rates[self.use][self.column]
         q = self.origin[3:]
         return se3.rotate(q, linear), se3.rotate(q, angular)

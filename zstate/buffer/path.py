@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from zstate import se3
-from zstate.buffer.frame_tree import Edge, TreePath
+from zstate.buffer.frame_tree import Edge, FrameTree, TreePath
 from zstate.buffer.history import HistoryView
 from zstate.buffer.interpolation import (
     AngleInterpolator,
@@ -37,12 +37,15 @@ from zstate.buffer.interpolation import (
     newest_bracket,
 )
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track, coverage, with_track_info
-from zstate.errors import InFuture, InPast, LookupFailed, NoData, NotFinite, Stale
+from zstate.clock import check_stamp, check_stamps
+from zstate.errors import InFuture, InPast, InvalidInput, LookupFailed, NoData, NotFinite, Stale
 from zstate.extension import kernel
 from zstate.transform import Kind, Transform
 
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
+
+F = TypeVar("F", bound=LookupFailed)
 
 Stamps: TypeAlias = NDArray[np.int64]
 ViewReader: TypeAlias = Callable[[Sequence["TrackUse"]], list[HistoryView]]
@@ -167,7 +170,10 @@ class TransformPath:
             values.append([one.value(now) for one in use.interpolators])
             rates.append([one.rate(now) for one in use.interpolators])
         if any(np.isnan(_flat(numbers)).any() for numbers in rates):
-            raise self._no_rate(views)
+            number = next((number for number, view in enumerate(views) if view.size < 2), 0)
+            failure = self._failure(NoData, number, views, None)
+            failure.note = "a rate of change needs two samples, or published velocities"
+            raise failure
         above_target = chain_motion(self.steps_to_target, values, rates, se3.SCALARS)
         motion = above_target.inverse().then(chain_motion(self.steps_to_source, values, rates, se3.SCALARS))
         if not np.isfinite((*motion.linear, *motion.angular)).all():
@@ -198,40 +204,9 @@ class TransformPath:
 
     def stale(self, stamp: int | None, age_s: float, max_age_s: float) -> Stale:
         """The error for a transform that is too old, naming the edge that is most behind."""
-        use = min(self.uses, key=lambda use: coverage(use.track.history.view).newest or 0)
-        samples = coverage(use.track.history.view)
-        failure = Stale(
-            self.target,
-            self.source,
-            age_s=age_s,
-            max_age_s=max_age_s,
-            edge=use.edge,
-            requested=stamp,
-            oldest=samples.oldest,
-            newest=samples.newest,
-            rate_hz=samples.rate_hz,
-            writer=use.track.writer,
-        )
-        return with_track_info(failure, use.track)
-
-    def _silent(self, views: Sequence[HistoryView]) -> Stale:
-        """The error for an edge whose last sample is older than all that another one keeps."""
-        number = min(range(len(views)), key=lambda n: views[n].newest)
-        other = max(range(len(views)), key=lambda n: views[n].oldest)
-        use, samples = self.uses[number], coverage(views[number])
-        failure = Stale(
-            self.target,
-            self.source,
-            age_s=(views[other].newest - views[number].newest) * 1e-9,
-            other=self.uses[other].edge,
-            other_newest=views[other].newest,
-            edge=use.edge,
-            oldest=samples.oldest,
-            newest=samples.newest,
-            rate_hz=samples.rate_hz,
-            writer=use.track.writer,
-        )
-        return with_track_info(failure, use.track)
+        views = [use.track.history.view for use in self.uses]
+        number = min(range(len(views)), key=lambda n: coverage(views[n]).newest or 0)
+        return self._failure(Stale, number, views, stamp, age_s=age_s, max_age_s=max_age_s)
 
     def failure_at(self, at: int, views: Sequence[HistoryView], predict_ns: int = 0) -> LookupFailed:
         """The error of the limiting track: one that begins later, else an empty one, else one that ends."""
@@ -253,20 +228,21 @@ class TransformPath:
         return failure
 
     def _failure(
-        self, error: type[LookupFailed], number: int, views: Sequence[HistoryView], at: int | None
-    ) -> LookupFailed:
-        samples = coverage(views[number])
-        return self._error(error, number, at, samples.oldest, samples.newest, samples.rate_hz)
+        self, error: type[F], number: int, views: Sequence[HistoryView], at: int | None, **facts: Any
+    ) -> F:
+        """The error of track ``number``; ``facts`` are further ones of its type."""
+        return self._error(error, number, at, *coverage(views[number])[:3], **facts)
 
     def _error(  # noqa: PLR0917 - what a failed lookup in a control loop costs
         self,
-        error: type[LookupFailed],
+        error: type[F],
         number: int,
         requested: int | None,
         oldest: int | None,
         newest: int | None,
         rate_hz: float | None,
-    ) -> LookupFailed:
+        **facts: Any,
+    ) -> F:
         use = self.uses[number]
         failure = error(
             self.target,
@@ -277,22 +253,23 @@ class TransformPath:
             newest=newest,
             rate_hz=rate_hz,
             writer=use.track.writer,
+            **facts,
         )
         return with_track_info(failure, use.track)
-
-    def _no_rate(self, views: Sequence[HistoryView]) -> LookupFailed:
-        short = [number for number, view in enumerate(views) if view.size < 2]
-        failure = self._failure(NoData, short[0] if short else 0, views, None)
-        failure.note = "a rate of change needs two samples, or published velocities"
-        return failure
 
     def _latest(self, views: Sequence[HistoryView]) -> int:
         for number, view in enumerate(views):
             if not view.size:
                 raise self._failure(NoData, number, views, None)
         newest = min(view.newest for view in views)
-        if any(view.oldest > newest for view in views):
-            raise self._silent(views)
+        begins_last = max(range(len(views)), key=lambda n: views[n].oldest)
+        if views[begins_last].oldest > newest:
+            # The last sample of one edge is older than all that another one keeps.
+            number = min(range(len(views)), key=lambda n: views[n].newest)
+            other, other_newest = self.uses[begins_last].edge, views[begins_last].newest
+            age_s = (other_newest - newest) * 1e-9
+            facts = {"age_s": age_s, "other": other, "other_newest": other_newest}
+            raise self._failure(Stale, number, views, None, **facts)
         return newest
 
     def _finite_pose(self, values: Values, at: int | None) -> se3.Pose:
@@ -307,9 +284,7 @@ class TransformPath:
             return NotFinite(self.target, self.source, requested=at)
         sizes = [np.abs(_flat(numbers)).max(initial=0.0) for numbers in values]
         views = [use.track.history.view for use in self.uses[: len(sizes)]]
-        failure = self._failure(NotFinite, int(np.argmax(sizes)), views, at)
-        assert isinstance(failure, NotFinite)
-        return failure
+        return self._failure(NotFinite, int(np.argmax(sizes)), views, at)
 
     def _pose(self, values: Values, f: se3.Backend) -> se3.Pose:
         target_from_top = chain_pose(self.steps_to_target, values, f)
@@ -344,23 +319,15 @@ def _flat(numbers: Sequence[se3.Component]) -> NDArray[np.float64]:
 class CompiledPath(TransformPath):
     """The same results as ``TransformPath``, in a hundredth of the time."""
 
-    def __init__(
-        self,
-        names: tuple[str, str],
-        steps_to_target: Sequence[Step],
-        steps_to_source: Sequence[Step],
-        uses: Sequence[TrackUse],
-        read_views: ViewReader,
-        *,
-        domain: str = "",
-    ) -> None:
-        super().__init__(names, steps_to_target, steps_to_source, uses, read_views, domain=domain)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self._compiled = _kernel.Path(
             Transform,
-            *names,
-            _step_tuples(steps_to_target, self.uses),
-            _step_tuples(steps_to_source, self.uses),
-            tuple(use.track.history for use in uses),
+            self.target,
+            self.source,
+            _step_tuples(self.steps_to_target, self.uses),
+            _step_tuples(self.steps_to_source, self.uses),
+            tuple(use.track.history for use in self.uses),
         )
         # An attribute of the instance: a method in between would cost a third of the whole lookup.
         self.at = self._compiled.at
@@ -410,25 +377,17 @@ class _TrackUseTable:
     """The tracks of a path and the interpolators that read each, in the order of their edges."""
 
     def __init__(self) -> None:
-        self._tracks: list[Track] = []
-        self._edges: list[tuple[str, str]] = []
-        self._interpolators: list[list[Interpolator]] = []
+        self._uses: dict[Track, tuple[list[Interpolator], tuple[str, str]]] = {}
 
     def add(self, edge: Edge, track: Track, interpolators: Sequence[Interpolator]) -> tuple[int, int]:
         """The index of the track, and that of the first of ``interpolators`` among its own."""
-        if track not in self._tracks:
-            self._tracks.append(track)
-            self._edges.append(edge.names)
-            self._interpolators.append([])
-        use = self._tracks.index(track)
-        known = self._interpolators[use]
+        known, _ = self._uses.setdefault(track, ([], edge.names))
         if interpolators[0] not in known:
             known.extend(interpolators)
-        return use, known.index(interpolators[0])
+        return list(self._uses).index(track), known.index(interpolators[0])
 
     def uses(self) -> list[TrackUse]:
-        parts = zip(self._tracks, self._interpolators, self._edges, strict=True)
-        return [TrackUse(track, tuple(interpolators), edge) for track, interpolators, edge in parts]
+        return [TrackUse(track, tuple(known), edge) for track, (known, edge) in self._uses.items()]
 
 
 def _steps(edges: Sequence[Edge], table: _TrackUseTable) -> list[Step]:
@@ -507,3 +466,56 @@ def _step_numbers(
     else:
         axis = se3.rotate(before[3:], form.t1)
     return (form.scale, form.shift, *placed[3:], *placed[:3], *axis)
+
+
+class Plan:
+    """Compiled lookup of ``target_from_source``: ``buffer.lookup`` without the search for names.
+
+    Made by ``TransformBuffer.plan``; follows the buffer when frames are added or withdrawn.
+    """
+
+    def __init__(
+        self, target: str, source: str, tree: FrameTree, current_path: Callable[[], TransformPath]
+    ) -> None:
+        self.target = target
+        self.source = source
+        self._tree = tree
+        self._current_path = current_path
+        self._cached = tree.version, current_path()
+
+    def __repr__(self) -> str:
+        return f"<plan of {self.source!r} in {self.target!r}>"
+
+    def at(self, stamp: int | None = None) -> Transform:
+        """The transform at ``stamp`` [ns], or at the newest common instant. Never predicts.
+
+        Raises LookupFailed as ``TransformBuffer.lookup`` does.
+        """
+        version, path = self._cached
+        if version != self._tree.version:
+            # The version is read first: a path newer than its version is compiled again, never kept.
+            self._cached = self._tree.version, self._current_path()
+            path = self._cached[1]
+        transform = path.at(stamp)
+        if transform is not None:
+            return transform
+        return path.transform(None if stamp is None else check_stamp(stamp))
+
+    def poses(self, stamps: ArrayLike, out: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """pose7 at each of ``stamps``: (T, 7), written into ``out`` if given.
+
+        Raises LookupFailed for the first stamp without a transform; ``out`` is then unchanged.
+        """
+        instants = check_stamps(stamps)
+        if out is not None and (out.shape != (len(instants), 7) or out.dtype != np.float64):
+            raise InvalidInput(f"out must be ({len(instants)}, 7) float64; got {out.shape} {out.dtype}")
+        path = self._current_path()
+        poses, valid = path.poses(instants)
+        while not valid.all():
+            # A lookup of the first missing stamp raises the reason, unless its sample has arrived since.
+            path.result(int(instants[valid.argmin()]))
+            poses, valid = path.poses(instants)
+        if out is None:
+            return poses
+        out[...] = poses
+        return out

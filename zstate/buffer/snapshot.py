@@ -7,11 +7,11 @@ code and data gone from the caches: the number of operations counts, not the siz
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,10 +183,15 @@ class SnapshotReader:
             shown.robots,
         )
         self._version = tree.version
-        self._static = np.array([se3.IDENTITY if edge is None else edge.pose for edge in edges]).reshape(
-            -1, 7
+        static = [se3.IDENTITY if edge is None else edge.pose for edge in edges]
+        self._static = np.array(static).reshape(-1, 7)
+        places: dict[Track, list[tuple[int, int]]] = {}
+        for row, edge in enumerate(edges):
+            if edge is not None and edge.track is not None:
+                places.setdefault(edge.track, []).append((row, edge.index))
+        self._parts = tuple(
+            _TrackPart(track, *np.array(pairs, dtype=np.intp).T) for track, pairs in places.items()
         )
-        self._parts = tuple(_track_parts(edges))
         self._writers = [part.track.writer for part in self._parts]
 
     def is_current(self, version: int) -> bool:
@@ -240,15 +245,6 @@ def _parents_first(edges: Mapping[str, Edge | None]) -> tuple[str, ...]:
         ordered.append(name)
         stack += reversed(children.get(name, ()))
     return tuple(ordered)
-
-
-def _track_parts(edges: Sequence[Edge | None]) -> Iterator[_TrackPart]:
-    places: dict[Track, list[tuple[int, int]]] = {}
-    for row, edge in enumerate(edges):
-        if edge is not None and edge.track is not None:
-            places.setdefault(edge.track, []).append((row, edge.index))
-    for track, pairs in places.items():
-        yield _TrackPart(track, *np.array(pairs, dtype=np.intp).T)
 
 
 def _reason_against(track: Track, view: HistoryView, stamp: int | None, hold_ns: int) -> str | None:
@@ -324,24 +320,10 @@ def _product(first: NDArray[np.float64], second: NDArray[np.float64], form: NDAr
     return (second[:, None] @ matrices)[:, 0]
 
 
-def _quaternion_form() -> NDArray[np.float64]:
-    units: list[se3.Quaternion] = [
-        (1.0, 0.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0, 0.0),
-        (0.0, 0.0, 1.0, 0.0),
-        (0.0, 0.0, 0.0, 1.0),
-    ]
-    return np.array([[se3.multiply(first, second) for second in units] for first in units])
-
-
-def _dual_form(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    form = np.zeros((8, 8, 8))
-    form[:4, :4, :4] = form[:4, 4:, 4:] = form[4:, :4, 4:] = quaternion
-    return form
-
-
-_FORM = _quaternion_form()
-_DUAL = _dual_form(_FORM)
+_UNITS: Any = np.eye(4).tolist()
+_FORM = np.array([[se3.multiply(first, second) for second in _UNITS] for first in _UNITS])
+_DUAL = np.zeros((8, 8, 8))
+_DUAL[:4, :4, :4] = _DUAL[:4, 4:, 4:] = _DUAL[4:, :4, 4:] = _FORM
 _CONJUGATE = np.array((-1.0, -1.0, -1.0, 1.0) * 2)
 _VECTOR_FIRST = np.ascontiguousarray(_FORM[:3])
 """A vector times a quaternion."""

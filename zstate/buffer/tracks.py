@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, TypeAlias, TypeVar
+from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,19 +115,16 @@ class JointTrack:
     ) -> bool:
         """Insert one instant; False if it is older than the history reaches."""
         if velocities is not None and not self.has_velocities:
-            self._add_velocity_columns()
+            old = self.history.view
+            missing = np.full((old.size, self.model.velocity_count), np.nan)
+            wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
+            wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
+            self.history = wider
         if not self.has_velocities:
             return self.history.insert(stamp, positions)
         if velocities is None:
             velocities = np.full(self.model.velocity_count, np.nan)
         return self.history.insert(stamp, np.concatenate((positions, velocities)))
-
-    def _add_velocity_columns(self) -> None:
-        old = self.history.view
-        missing = np.full((old.size, self.model.velocity_count), np.nan)
-        wider = History(self.history.width + self.model.velocity_count, self.history.span_ns)
-        wider.replace(old.kept_stamps(), np.hstack((old.kept_rows(), missing)))
-        self.history = wider
 
 
 class PoseTrack:
@@ -184,14 +180,13 @@ def with_track_info(failure: F, track: Track) -> F:
     return failure
 
 
-@dataclass(frozen=True, slots=True)
-class Coverage:
+class Coverage(NamedTuple):
     """The samples of a track as errors and ``frames()`` describe them: stamps [ns], mean rate, count."""
 
     oldest: int | None
     newest: int | None
     rate_hz: float | None
-    count: int
+    samples: int
 
 
 def coverage(view: HistoryView) -> Coverage:

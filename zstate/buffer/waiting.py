@@ -1,17 +1,28 @@
-"""Waiting for data: an insert wakes exactly the waiters whose samples it brings; nothing polls.
+"""Waiting for data: waiters, watches, and the message filter (tf2_ros ``MessageFilter``). Nothing polls.
 
-A waiter registers with the ``WaiterRegistry`` of the buffer and sets its ``WakeCondition``: the samples or
-the change of the tree after which a failed lookup may succeed.
+An insert wakes exactly the waiters whose samples it brings. A waiter registers with the ``WaiterRegistry`` of
+the buffer and sets its ``WakeCondition``: the samples or the change of the tree after which a failed lookup
+may succeed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import (
+    AsyncIterable,
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Generator,
+    Iterable,
+    Mapping,
+    Sequence,
+)
 from contextlib import ExitStack, contextmanager
 from numbers import Real
 from types import MappingProxyType
-from typing import NamedTuple, TypeAlias
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 from zstate import se3
 from zstate._util.closeable import Closeable
@@ -20,6 +31,8 @@ from zstate.buffer.frame_tree import FrameTree, PathDependencies
 from zstate.buffer.tracks import Track
 from zstate.errors import InvalidInput, LookupFailed
 from zstate.transform import Transform
+
+S = TypeVar("S")
 
 RequiredStamps: TypeAlias = Mapping[Track, int | None]
 """The stamp that each track has to reach [ns]; None is reached by any sample."""
@@ -131,17 +144,14 @@ class WaiterRegistry:
         """Wake the waiters whose condition is met: ``tracks`` have new samples, or the tree has changed."""
         if self._notified_version != self.tree.version:
             self._notified_version = self.tree.version
-            self._notify_tree_change()
+            for waiter in self._waiters:
+                condition = waiter.condition
+                if not self.tree.is_current(condition.dependencies) or condition.is_met():
+                    waiter.wake()
         elif self._by_track:
             for waiter in self._waiting_for(tracks):
                 if waiter.condition.is_met():
                     waiter.wake()
-
-    def _notify_tree_change(self) -> None:
-        for waiter in self._waiters:
-            condition = waiter.condition
-            if not self.tree.is_current(condition.dependencies) or condition.is_met():
-                waiter.wake()
 
     def notify_restart(self, *tracks: Track) -> None:
         """Wake all waiters for ``tracks``: their samples are gone, and newer ones may have older stamps."""
@@ -245,3 +255,68 @@ class TransformWatch(Closeable):
         return (translation_m is not None and math.dist((x, y, z), at) >= translation_m) or (
             rotation_rad is not None and math.hypot(*se3.rotation_vector(turned, se3.SCALARS)) >= rotation_rad
         )
+
+
+Wait: TypeAlias = Callable[[str, str, int, float], Awaitable[Transform]]
+"""``wait_async`` of a buffer: target, source, stamp, timeout_s."""
+
+
+def frame_of(sample: Any) -> str:
+    """The frame of a sample: its attribute ``frame``."""
+    return sample.frame
+
+
+def stamp_of(sample: Any) -> int:
+    """The stamp of a sample [ns]: its attribute ``stamp``."""
+    return sample.stamp
+
+
+class MessageFilter(Generic[S]):
+    """``async for sample, transform in filter``: samples in their order, each with ``target_from_frame``.
+
+    A sample waits up to ``timeout_s`` for the transform at its stamp. One that gets none is left out
+    and counted in ``dropped`` by the name of the error; ``last_reason`` is the last of these errors.
+    """
+
+    def __init__(
+        self,
+        wait: Wait,
+        samples: AsyncIterable[S],
+        target: str,
+        *,
+        frame: Callable[[S], str] = frame_of,
+        stamp: Callable[[S], int] = stamp_of,
+        timeout_s: float = 1.0,
+    ) -> None:
+        self.target = target
+        self.joined = 0
+        self.dropped: Counter[str] = Counter()
+        self.last_reason: LookupFailed | None = None
+        self._wait = wait
+        # One iterator, so that a loop over the filter can be left and continued.
+        self._samples = samples.__aiter__()
+        self._frame = frame
+        self._stamp = stamp
+        self._timeout_s = timeout_s
+
+    def __repr__(self) -> str:
+        reasons = ", ".join(f"{count} {name}" for name, count in self.dropped.items())
+        dropped = f", {self.dropped.total()} dropped ({reasons})" if reasons else ""
+        return f"<MessageFilter for {self.target!r}: {self.joined} joined{dropped}>"
+
+    def __aiter__(self) -> AsyncIterator[tuple[S, Transform]]:
+        return self
+
+    async def __anext__(self) -> tuple[S, Transform]:
+        async for sample in self._samples:
+            frame, stamp = self._frame(sample), self._stamp(sample)
+            try:
+                transform = await self._wait(self.target, frame, stamp, self._timeout_s)
+            except LookupFailed as reason:
+                self.last_reason = reason
+                # A timeout is counted under the error that the lookup ended with.
+                self.dropped[type(reason).__name__.removesuffix("Timeout")] += 1
+            else:
+                self.joined += 1
+                return sample, transform
+        raise StopAsyncIteration

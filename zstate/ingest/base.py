@@ -12,8 +12,8 @@ from zstate._util.bounded_queue import BoundedQueue
 from zstate._util.fork_safe import fork_safe
 from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput, MessageError, format_duration
+from zstate.ingest.counters import MissingSamples
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.ingest.sequence import MissingSamples
 from zstate.wire.messages import RobotDescription, Sample, message_size
 
 # Bounds on the samples that wait for the robot's description, which takes milliseconds.
@@ -92,14 +92,19 @@ class StreamIngest(ABC):
                     "second writer", f"{self.robot!r} has another, newer writer than {sample.session}"
                 )
                 return
-            is_in_order = True
-            if sample.seq == self._next_seq:
-                self._next_seq = sample.seq + 1
+            is_in_order, seq, expected = True, sample.seq, self._next_seq
+            if seq == expected:
+                self._next_seq = seq + 1
             else:
                 # The network reorders only samples after a larger number. The samples of one ROS message
                 # have the same number.
-                is_in_order = sample.seq >= (self._next_seq or 0) - 1
-                self._count_gap(sample.seq, overflowed)
+                is_in_order = seq >= (expected or 0) - 1
+                if expected is None:
+                    self._missing.stop_at(seq)
+                elif seq > expected:
+                    self._missing.add(expected, seq)
+                    self._counters.count("dropped" if overflowed else "missed", seq - expected)
+                self._next_seq = max(seq + 1, expected or 0)
             if not self._insert_counted(sample, is_in_order=is_in_order):
                 for _ in range(self._early.append(sample, message_size(sample))):
                     self._refuse_undescribed()
@@ -263,14 +268,6 @@ class StreamIngest(ABC):
     def _replace_session(self, sample: Sample) -> None:
         """Handle the first sample of another writer, which begins a new epoch."""
         self._drop_history()
-
-    def _count_gap(self, seq: int, overflowed: bool) -> None:
-        if self._next_seq is None:
-            self._missing.stop_at(seq)
-        elif seq > self._next_seq:
-            self._missing.add(self._next_seq, seq)
-            self._counters.count("dropped" if overflowed else "missed", seq - self._next_seq)
-        self._next_seq = max(seq + 1, self._next_seq or 0)
 
     @abstractmethod
     def describe(self, description: RobotDescription) -> None:

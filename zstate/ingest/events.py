@@ -176,10 +176,9 @@ class EventLog(Closeable):
 
     def _check_deadlines(self, now_s: float) -> float:
         stale, next_s = self._deadlines.expired(now_s)
-        if stale:
-            with self._lock:
-                for (robot, session), silent_s in stale.items():
-                    self._add_silence("stale", robot, session, silent_s)
+        with self._lock:
+            for (robot, session), silent_s in stale.items():
+                self._add_silence("stale", robot, session, silent_s)
         return next_s
 
     def _on_joined(self, announced: Announcement) -> None:
@@ -215,15 +214,14 @@ class EventLog(Closeable):
             del self._alive[place]
             self._owners.replace((announced.robot, announced.name), frozenset())
         was_stale = self._deadlines.unregister((announced.robot, writer.session))
-        who = f"{announced.robot!r}: {writer} "
         what = _what(announced)
         if kind == "cut off":
-            text = f"{who}is cut off: the router that carried its {what} is lost"
+            text = f"is cut off: the router that carried its {what} is lost"
         elif was_stale:
-            kind, text = "cut off", f"{who}fell silent and is gone: it froze, or was cut off from the network"
+            kind, text = "cut off", "fell silent and is gone: it froze, or was cut off from the network"
         else:
-            text = f"{who}has left: it does not write {what} any more"
-        self._add(kind, announced.robot, announced.stream, writer, text)
+            text = f"has left: it does not write {what} any more"
+        self._add(kind, announced.robot, announced.stream, writer, f"{announced.robot!r}: {writer} {text}")
 
     def _add_silence(
         self, kind: Literal["stale", "resumed"], robot: str, session: int, silent_s: float

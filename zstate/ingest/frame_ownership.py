@@ -21,7 +21,7 @@ on what is published, not on the order of arrival.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import count
 from typing import NamedTuple
 
@@ -32,13 +32,7 @@ from zstate.buffer.frame_tree import Edge
 from zstate.buffer.tracks import JointTrack
 from zstate.errors import InsertRefused
 from zstate.ingest.counters import Counters
-from zstate.ingest.edge_claims import (
-    CONTESTED,
-    Admitted,
-    EdgeClaim,
-    EdgeSource,
-    is_same_pose,
-)
+from zstate.ingest.edge_claims import CONTESTED, Admitted, EdgeClaim, EdgeSource, is_same_pose
 from zstate.model.robot import RobotModel
 from zstate.transform import Transform
 from zstate.wire.keys import FOREIGN_FRAME, EdgeNames, foreign_edge_problem, frame_owner
@@ -152,7 +146,9 @@ class FrameOwnership:
                 text = f"{frame.writer or 'hand'!r} placed {frame.name!r}, a link of the model"
                 self.counters.count_refusal("second writer", text)
         root = f"{robot}/{model.root}"
-        top = self._root_above(root)
+        top = root
+        while (above := self.buffer.frames((top,))) and above[0].parent is not None:
+            top = above[0].parent
         if top in links and top != root:
             # The edges between are valid children of the model; the one that places its root closes the loop.
             (frame,) = self.buffer.frames((root,))
@@ -162,14 +158,6 @@ class FrameOwnership:
                 self.counters.count_refusal("loop", text)
             return True
         return bool(taken)
-
-    def _root_above(self, frame: str) -> str:
-        """The frame above ``frame`` that has no parent."""
-        known = self.buffer.frames((frame,))
-        while known and known[0].parent is not None:
-            frame = known[0].parent
-            known = self.buffer.frames((frame,))
-        return frame
 
     def set_statics(
         self, source: EdgeSource, edges: Mapping[EdgeNames, Transform], *, adds: bool = False
@@ -307,9 +295,8 @@ class FrameOwnership:
 
     def _is_in_buffer(self, claim: EdgeClaim) -> bool:
         """Whether it places its child there: the caller may have changed the buffer, too."""
-        if claim.pose is not None and self._placed.get(claim.child) is not claim:
-            return False
-        if not claim.is_accepted:
+        is_placed = claim.pose is None or self._placed.get(claim.child) is claim
+        if not is_placed or not claim.is_accepted:
             return False
         kind = "pose" if claim.pose is None else "static"
         for frame in self.buffer.frames((claim.child,)):
@@ -349,7 +336,15 @@ class FrameOwnership:
         with self._lock:
             accepted, roots = self._caller_edges()
             claims = [claim for claims in self._claims.values() for claim in claims]
-            claims.sort(key=lambda claim: self._precedence(claim, roots))
+            claims.sort(
+                key=lambda claim: (
+                    self._rank(claim),
+                    claim.child in roots,
+                    self._is_departed(claim),
+                    claim.pose is not None,
+                    claim.order,
+                )
+            )
             refusals: dict[EdgeClaim, InsertRefused] = {}
             for claim in claims:
                 error = self._refusal(claim, accepted)
@@ -358,12 +353,19 @@ class FrameOwnership:
                 elif self._prevails(claim, accepted.get(claim.child)):
                     accepted[claim.child] = _AcceptedEdge(claim.parent, claim.source.name, claim, claim.pose)
             before = [claim for claim in claims if claim.is_accepted]
-            self._withdraw_refused(refusals)
+            for claim in refusals:
+                if self._is_in_buffer(claim):
+                    self.buffer.withdraw(claim.child)
+                if self._placed.get(claim.child) is claim:
+                    del self._placed[claim.child]
             for claim in claims:
                 self.version += claim.pose is None and claim.is_accepted == (claim in refusals)
                 claim.is_accepted, claim.refusal = claim not in refusals, refusals.get(claim)
             self._refused, self._is_resolved = dict.fromkeys(refusals), True
-            self._insert_accepted(accepted.values(), published)
+            for edge in accepted.values():
+                claim = edge.claim
+                if claim is not None and (claim in published or not self._is_in_buffer(claim)):
+                    self._insert_accepted(claim)
             for claim in {*before, *published}.intersection(refusals):
                 if claim.pose is not None:
                     self._report(claim.source, refusals[claim])
@@ -388,18 +390,10 @@ class FrameOwnership:
     def _is_claimed(self, edge: Edge) -> bool:
         placed = self._placed.get(edge.child)
         if edge.kind == "static":
-            return (
-                placed is not None
-                and placed.parent == edge.parent
-                and edge.static_writer == placed.source.name
-            )
+            found = (edge.parent, edge.static_writer)
+            return placed is not None and found == (placed.parent, placed.source.name)
         claims = self._claims.get(edge.child, ())
         return any(claim.pose is None and claim.parent == edge.parent for claim in claims)
-
-    def _precedence(self, claim: EdgeClaim, roots: Collection[str]) -> tuple[int, bool, bool, bool, int]:
-        """The sort key of a claim; the smallest is accepted first."""
-        rank, is_root = self._rank(claim), claim.child in roots
-        return rank, is_root, self._is_departed(claim), claim.pose is not None, claim.order
 
     def _is_departed(self, claim: EdgeClaim) -> bool:
         return (claim.source.robot, claim.source.session) in self._departed
@@ -446,25 +440,14 @@ class FrameOwnership:
             return self._is_departed(there.claim)
         return claim.published > there.claim.published
 
-    def _withdraw_refused(self, refused: Collection[EdgeClaim]) -> None:
-        for claim in refused:
-            if self._is_in_buffer(claim):
-                self.buffer.withdraw(claim.child)
-            if self._placed.get(claim.child) is claim:
-                del self._placed[claim.child]
-
-    def _insert_accepted(self, accepted: Iterable[_AcceptedEdge], published: Collection[EdgeClaim]) -> None:
-        for one in accepted:
-            claim = one.claim
-            if claim is None or claim.pose is None:
-                continue
-            if claim in published or not self._is_in_buffer(claim):
-                try:
-                    self._insert(claim)
-                except InsertRefused as error:  # the caller changed the buffer in the meantime
-                    claim.is_accepted, claim.refusal = False, error
-                    self._refused[claim] = None
-                    self._report(claim.source, error)
+    def _insert_accepted(self, claim: EdgeClaim) -> None:
+        if claim.pose is not None:
+            try:
+                self._insert(claim)
+            except InsertRefused as error:  # the caller has changed the buffer since
+                claim.is_accepted, claim.refusal = False, error
+                self._refused[claim] = None
+                self._report(claim.source, error)
 
     def _report(self, source: EdgeSource, error: InsertRefused) -> None:
         self.counters.count_refusal(error.reason, f"static edge of {source.name!r}: {error}")
@@ -475,16 +458,16 @@ class FrameOwnership:
 def _loop(names: EdgeNames, by: str, accepted: Mapping[str, _AcceptedEdge]) -> InsertRefused | None:
     """The refusal of an edge that would close a loop."""
     parent, child = names
-    ring = [parent]
+    ring, below, writer = [parent], child, by
     while ring[-1] != child:
         above = accepted.get(ring[-1])
         if above is None:
             return None
+        below, writer = ring[-1], above.writer
         ring.append(above.parent)
-    way = " -> ".join(map(repr, reversed(ring)))
-    writer = accepted[ring[-2]].writer if len(ring) > 1 else by
+    path = " -> ".join(map(repr, reversed(ring)))
     text = (
-        f"{parent!r} -> {child!r} by {by} would close the loop {way} -> {child!r}; "
-        f"{child!r} -> {ring[-2] if len(ring) > 1 else child!r} is written by {writer}"
+        f"{parent!r} -> {child!r} by {by} would close the loop {path} -> {child!r}; "
+        f"{child!r} -> {below!r} is written by {writer}"
     )
     return InsertRefused(text, reason="loop", edge=names)

@@ -50,7 +50,13 @@ class StampCheck:
 
     def check(self, robot: str, writer: str | None, sample: Sample) -> None:
         """Check a sample outside the accepted range."""
-        if not self._is_on_system_clock(robot, sample):
+        domain = self._buffer.domain.domain_of(robot)
+        if domain is None and self._is_described:
+            # The description names the clock, and may not have arrived yet.
+            is_on_system_clock = isinstance(sample, TransformSample) and sample.edges is not None
+        else:
+            is_on_system_clock = domain in (None, "", SYSTEM)
+        if not is_on_system_clock:
             return
         now = self._buffer.clock.now()
         if abs(sample.stamp - now) <= FAR_NS:
@@ -68,13 +74,6 @@ class StampCheck:
                 f"{'after' if offset > 0 else 'before'} this machine's time ({format_stamp(sample.stamp)}): "
                 f"{likely_cause(sample.stamp, now)}; they are used and counted in off_clock",
             )
-
-    def _is_on_system_clock(self, robot: str, sample: Sample) -> bool:
-        domain = self._buffer.domain.domain_of(robot)
-        if domain is None and self._is_described:
-            # The description names the clock, and may not have arrived yet.
-            return isinstance(sample, TransformSample) and sample.edges is not None
-        return domain in (None, "", SYSTEM)
 
 
 @dataclass(slots=True)

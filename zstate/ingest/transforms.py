@@ -1,6 +1,8 @@
-"""Ingest of transforms that publishers computed, into a buffer."""
+"""Ingest of transforms that publishers computed: moving ones, static ones, and a filter for known models."""
 
 from __future__ import annotations
+
+from contextlib import suppress
 
 from zstate._util.bounded_dict import BoundedDict
 from zstate.clock import SET_BACK_NS
@@ -8,11 +10,15 @@ from zstate.errors import InsertRefused, InvalidInput
 from zstate.ingest.base import ClockSetBack, StreamIngest
 from zstate.ingest.edge_claims import CONTESTED, Admitted, EdgeSource
 from zstate.ingest.frame_ownership import FrameOwnership
-from zstate.wire.keys import full_name
+from zstate.model.robot import RobotModel
+from zstate.transform import Transform
+from zstate.wire.keys import EdgeNames, full_name
 from zstate.wire.messages import (
+    POSE_BYTES,
     Edges,
     RobotDescription,
     Sample,
+    StaticTransforms,
     TransformSample,
     order_digest,
     poses_from_block,
@@ -146,3 +152,97 @@ class TransformIngest(StreamIngest):
 
     def _on_writer_changed(self) -> None:
         pass  # each sample is inserted under its writer's name
+
+
+class StaticTransformIngest:
+    """Keeps exactly the static edges that one writer publishes now in a buffer.
+
+    ``children`` are the child frames of these edges, refused ones included. ``is_model`` marks the edges of
+    the robot's model.
+    """
+
+    def __init__(self, robot: str, writer: str, ownership: FrameOwnership, *, is_model: bool = False) -> None:
+        self.children: frozenset[str] = frozenset()
+        self._ownership = ownership
+        self._source = EdgeSource(robot, writer, is_model=is_model)
+
+    def name_writer(self, writer: str) -> None:
+        """Set the printed name of the writer, if it is announced later than its edges."""
+        self._ownership.rename(self._source, writer)
+
+    def replace(self, statics: StaticTransforms) -> None:
+        """Insert these edges; withdraw earlier ones that are missing or have another parent."""
+        self._source.session = statics.session
+        edges = self._edges(statics)
+        self.children = frozenset(child for _, child in edges)
+        self._ownership.set_statics(self._source, edges)
+
+    def add(self, statics: StaticTransforms) -> None:
+        """Insert these edges and keep the earlier ones: in ROS no static edge is ever withdrawn."""
+        self._source.session = statics.session
+        self._ownership.set_statics(self._source, self._edges(statics), adds=True)
+
+    def withdraw(self) -> None:
+        """Withdraw all of this writer's edges."""
+        self.children = frozenset()
+        self._ownership.release(self._source)
+
+    def _edges(self, statics: StaticTransforms) -> dict[EdgeNames, Transform]:
+        edges: dict[EdgeNames, Transform] = {}
+        robot = self._source.robot
+        for names, pose in zip(statics.edges, poses_from_block(statics.poses), strict=True):
+            reason = "frame name"
+            try:
+                parent, child = (full_name(robot, frame) for frame in names)
+                reason = "bad numbers"
+                edges[parent, child] = Transform.from_pose7(parent, child, pose)
+            except InvalidInput as error:
+                text = f"static edge of {self._source.name!r}: {error}"
+                self._ownership.counters.for_robot(robot).count_refusal(reason, text)
+        return edges
+
+
+class ModelEdgeFilter:
+    """Removes the edges of known models from messages that name edges; the models define them exactly."""
+
+    def __init__(self) -> None:
+        self._links: dict[str, frozenset[str]] = {}
+        self._rows: dict[tuple[str, Edges], list[int]] = {}
+
+    def set_model(self, robot: str, model: RobotModel) -> None:
+        """Remove the links of ``robot`` from now on."""
+        self._links[robot] = frozenset(f"{robot}/{joint.child}" for joint in model.joints)
+        self._rows.clear()
+
+    def filter_sample(self, robot: str, sample: TransformSample) -> TransformSample | None:
+        """The rest of a sample that names its edges; None if nothing is left."""
+        named = sample.edges or ()
+        rows = self._kept(robot, named)
+        if len(rows) == len(named):
+            return sample if named else None
+        edges = tuple(named[row] for row in rows)
+        head = (sample.stamp, sample.seq, sample.session, order_digest(edges))
+        return TransformSample(*head, _rows_of(sample.poses, rows), edges) if rows else None
+
+    def filter_statics(self, robot: str, statics: StaticTransforms) -> StaticTransforms:
+        """The rest of a message of static edges."""
+        rows = self._kept(robot, statics.edges)
+        edges = tuple(statics.edges[row] for row in rows)
+        return StaticTransforms(statics.session, edges, _rows_of(statics.poses, rows))
+
+    def _kept(self, robot: str, edges: Edges) -> list[int]:
+        rows = self._rows.get((robot, edges))
+        if rows is None:
+            rows = list[int]()
+            for row, (_, child) in enumerate(edges):
+                name = ""  # an invalid name is refused and counted when it is inserted
+                with suppress(InvalidInput):
+                    name = full_name(robot, child)
+                if not any(name in links for links in self._links.values()):
+                    rows.append(row)
+            self._rows[robot, edges] = rows
+        return rows
+
+
+def _rows_of(block: bytes, rows: list[int]) -> bytes:
+    return b"".join(block[row * POSE_BYTES : (row + 1) * POSE_BYTES] for row in rows)

@@ -108,11 +108,8 @@ class SimulatedClock(Closeable):
     def wait(self, timeout_s: float | None = None) -> int:
         """The newest stamp [ns], waiting for the first; None waits for ever. Raises NoClock and Closed."""
         if not wait_interruptible(self._has_time, timeout_s):
-            raise NoClock(
-                f"no time was received on {self.key!r} for {timeout_s:g} s; start the simulation or "
-                "`zstate replay`",
-                waited_s=timeout_s or 0.0,
-            )
+            text = f"no time was received on {self.key!r} for {timeout_s:g} s"
+            raise NoClock(f"{text}; start the simulation or `zstate replay`", waited_s=timeout_s or 0.0)
         if self._now is None:
             raise Closed("the simulated clock was closed before it received a time")
         return self._now
@@ -156,9 +153,8 @@ class SimulatedClock(Closeable):
             if self._follows(message.session):
                 self._set(message.stamp)
             else:
-                self._refuse(
-                    "second clock", f"another publisher of the time is active: {message.session:08x}"
-                )
+                text = f"another publisher of the time is active: {message.session:08x}"
+                self._refuse("second clock", text)
 
     def _follows(self, session: int) -> bool:
         """Whether ``session`` is the one to follow: the newest to appear, while it is active."""

@@ -18,8 +18,7 @@ from zstate.ingest.events import EventLog, WriterEvent
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
 from zstate.ingest.stamp_checks import StampCheck
-from zstate.ingest.static_transforms import StaticTransformIngest
-from zstate.ingest.transforms import TransformIngest
+from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch
@@ -119,13 +118,12 @@ class TransformListener(Closeable):
             self._capacity = capacity_for(key)
             opening.enter_context(StreamSubscriber(session, key, self._on_samples))
             if history_on_join and self._wire.name == "native":
-                self._history = HistoryReader(
-                    session, self._observed(self._on_history), self._count_undecodable
+                on_history = self._observed(self._on_history)
+                self._history = opening.enter_context(
+                    HistoryReader(session, on_history, self._count_undecodable)
                 )
-                opening.enter_context(self._history)
             if not self._wire.shared:
-                self._clock_offsets = _WriterClockOffsets(session, self.buffer)
-                opening.enter_context(self._clock_offsets)
+                self._clock_offsets = opening.enter_context(_WriterClockOffsets(session, self.buffer))
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
             opening.enter_context(watch(session, robot, on_writer, wire, on_cut_off))
@@ -235,12 +233,8 @@ class TransformListener(Closeable):
 
     def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
         robot = self._robot_from_key(arrivals[0].key)  # the key of the request
-        samples = [
-            sample
-            for arrival in arrivals
-            for sample in self._decode(self._follow, arrival, robot)
-            if isinstance(sample, Sample)
-        ]
+        messages = (message for one in arrivals for message in self._decode(self._follow, one, robot))
+        samples = [message for message in messages if isinstance(message, Sample)]
         if any(sample.session != writer for sample in samples):
             text = f"{robot!r}: samples of another session than {writer}, whose history was requested"
             self._counters.count_refusal("foreign answer", text)
@@ -308,15 +302,12 @@ class TransformListener(Closeable):
     def _count_foreign(self, key: str, error: InvalidInput) -> None:
         self._counters.count_refusal("foreign", f"{shortened(key)}: {error}")
 
-    def _on_writer(self, announced: Announcement, alive: bool) -> None:
-        self._events.on_writer(announced, alive)
-        self._set_writer(announced, alive=alive)
-
     def _on_cut_off(self, announced: Announcement) -> None:
         self._events.on_cut_off(announced)
-        self._set_writer(announced, alive=False)
+        self._on_writer(announced, alive=False)  # adds no second event
 
-    def _set_writer(self, announced: Announcement, *, alive: bool) -> None:
+    def _on_writer(self, announced: Announcement, alive: bool) -> None:
+        self._events.on_writer(announced, alive)
         robot, session, stream = announced.robot, announced.writer.session, announced.stream
         name = str(announced.writer)
         if alive:
@@ -379,11 +370,4 @@ class _WriterClockOffsets(Closeable):
 
 
 _LISTENERS: weakref.WeakSet[TransformListener] = weakref.WeakSet()
-
-
-def _end_after_fork() -> None:
-    for listener in tuple(_LISTENERS):
-        listener.end_after_fork()
-
-
-os.register_at_fork(after_in_child=_end_after_fork)
+os.register_at_fork(after_in_child=lambda: [listener.end_after_fork() for listener in tuple(_LISTENERS)])

@@ -13,7 +13,6 @@ from zstate.model.robot import RobotModel
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.sample_history import SampleCache
 from zstate.net.session import Session
-from zstate.transform import Transform
 from zstate.wire.keys import full_name, lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_to_json, to_json
 from zstate.wire.messages import from_block
@@ -48,17 +47,15 @@ class LookupService(Closeable):
 
     def _answer(self, parameters: Mapping[str, str]) -> Reply:
         try:
-            return Reply(to_json(self._lookup(LookupRequest.parse(parameters))), _JSON)
+            request, buffer = LookupRequest.parse(parameters), self._get_buffer()
+            try:
+                transform = buffer.lookup(request.target, request.source, request.at)
+            except AmbiguousFrame:
+                target, source = (full_name(self._robot, name) for name in (request.target, request.source))
+                transform = buffer.lookup(target, source, request.at)
+            return Reply(to_json(transform), _JSON)
         except ZStateError as error:
             return Reply(error_to_json(error), _JSON, is_error=True)
-
-    def _lookup(self, question: LookupRequest) -> Transform:
-        buffer = self._get_buffer()
-        try:
-            return buffer.lookup(question.target, question.source, question.at)
-        except AmbiguousFrame:
-            names = [full_name(self._robot, frame) for frame in (question.target, question.source)]
-            return buffer.lookup(names[0], names[1], question.at)
 
     def close(self) -> None:
         """Stop answering. A second call does nothing."""

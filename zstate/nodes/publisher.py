@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from typing import TYPE_CHECKING, TypeAlias
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.extension import kernel
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.model.urdf_joint import JointLimits
 from zstate.net.clock_offset import ClockService
@@ -24,20 +28,31 @@ from zstate.net.status import StatusPublisher
 from zstate.net.writer import SampleWriter, WireWriter, write_all
 from zstate.nodes.lookup_service import LookupService, RecentBuffer
 from zstate.nodes.publisher_status import LimitWatch, PublisherStats, StatusReporter, StreamStats
-from zstate.nodes.robot_encoder import Positions, RobotEncoder
 from zstate.rate import Rate, RateReport
 from zstate.sources.joint_source import JointSource
 from zstate.wire.identity import Announcement
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import MODEL_WRITER, Stream, check_robot
+from zstate.wire.keys import MODEL_WRITER, Stream, check_robot, wire_name
 from zstate.wire.messages import (
     JointState,
     RobotDescription,
     StaticTransforms,
+    TransformSample,
+    from_block,
     order_digest,
     to_block,
 )
 from zstate.wire.registry import as_wire_names, get_wire
+
+if TYPE_CHECKING or kernel == "c":
+    from zstate._kernel import block_of
+else:
+
+    def block_of(numbers: object, count: int) -> None:
+        """None: the caller checks them with numpy."""
+
+
+Positions: TypeAlias = ArrayLike | Mapping[str, float | Sequence[float]]
 
 STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 """The streams of a robot's state."""
@@ -46,6 +61,47 @@ _SAMPLED: tuple[Stream, ...] = ("joint_states", "tf")
 
 _NEWEST_ONLY_S = 1e-9
 """Span of the cache that serves lookups when there is no cache for joining listeners."""
+
+
+class RobotEncoder:
+    """Checks and encodes the samples of a model published under the name ``robot``.
+
+    ``names`` are the moving edges (parent, child) in the order of a transform sample's poses, with the
+    frame names of the wire; ``order`` is their digest.
+    """
+
+    def __init__(self, model: RobotModel, robot: str) -> None:
+        self._model = model
+        self._count = model.position_count
+        self._table = JointTransforms(model)
+        forms = self._table.forms
+        names = [(wire_name(robot, form.parent), wire_name(robot, form.child)) for form in forms]
+        fixed = [form.kind == "fixed" for form in forms]
+        self._rows = np.flatnonzero(~np.array(fixed, dtype=np.bool_))
+        self.names = tuple(names[row] for row in self._rows)
+        self.order = order_digest(self.names)
+        self._fixed_names = tuple(name for name, is_fixed in zip(names, fixed, strict=True) if is_fixed)
+        self._fixed_poses = [form.origin for form in forms if form.kind == "fixed"]
+
+    def encode_positions(self, positions: Positions) -> bytes:
+        """``positions`` as a block. Raises InvalidInput unless they are a configuration of the robot."""
+        block = block_of(positions, self._count)
+        if block is None:
+            model = self._model
+            is_named = isinstance(positions, Mapping)
+            block = to_block(model.positions(positions) if is_named else model.check_positions(positions))
+        if self._table.has_floats:
+            self._table.normalised(from_block(block))
+        return block
+
+    def transform_sample(self, state: JointState) -> TransformSample:
+        """The pose of each moving edge, ``parent_from_child``, in ``state``."""
+        poses = self._table.poses(from_block(state.positions)).take(self._rows, axis=0)
+        return TransformSample(state.stamp, state.seq, state.session, self.order, to_block(poses))
+
+    def statics(self, session: int) -> StaticTransforms:
+        """The fixed edges of the model."""
+        return StaticTransforms(session, self._fixed_names, to_block(self._fixed_poses))
 
 
 class StatePublisher(Closeable):
@@ -95,7 +151,9 @@ class StatePublisher(Closeable):
         self._rate: Rate | None = None
         self._wires = wires = as_wire_names(wires)
         self._joint_order = order_digest(model.joint_names)
-        _check_streams(streams)
+        for stream in streams:
+            if stream not in STREAMS:
+                raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")
         limits = JointLimits(model)
         self._limits = LimitWatch(limits, self.robot) if limits and wires else None
         sample_names = SampleLayout(
@@ -267,9 +325,3 @@ class StatePublisher(Closeable):
         self._stop.set()
         with self._lock:
             self._opened.close()
-
-
-def _check_streams(streams: Sequence[Stream]) -> None:
-    for stream in streams:
-        if stream not in STREAMS:
-            raise InvalidInput(f"{stream!r} is not one of the streams {', '.join(map(repr, STREAMS))}")

@@ -127,17 +127,14 @@ def assess_health(before: PublisherStats, now: PublisherStats, *, quiet_ns: int)
     if refused:
         text = f"{refused} of {sent + refused} samples cannot be published: {now.last_refusal}"
         return Health("warn" if sent else "error", text)
-    if quiet_ns > _longest_pause_ns(now.rate):
+    longest_ns = _QUIET_NS if now.rate is None else max(_QUIET_NS, 2e9 / now.rate.commanded_hz)
+    if quiet_ns > longest_ns:
         what = "since this publisher opened" if not now.sent else f"for {format_duration(quiet_ns)}"
         return Health("stale", f"nothing was published {what}")
     outside = now.outside_limits - before.outside_limits
     if outside:
         return Health("warn", f"{outside} {ARE_OUTSIDE}: {now.last_excess}")
     return _punctuality(before.rate, now.rate)
-
-
-def _longest_pause_ns(rate: RateReport | None) -> float:
-    return _QUIET_NS if rate is None else max(_QUIET_NS, 2e9 / rate.commanded_hz)
 
 
 def _punctuality(before: RateReport | None, now: RateReport | None) -> Health:
@@ -147,11 +144,10 @@ def _punctuality(before: RateReport | None, now: RateReport | None) -> Health:
     skipped = now.skipped - (before.skipped if before else 0)
     if late <= 0 and skipped <= 0:
         return Health("ok")
-    return Health(
-        "warn",
-        f"{late} ticks late and {skipped} skipped: {now.commanded_hz:g} Hz are more than this process keeps; "
-        "its source or its machine is slow",
+    text = (
+        f"{late} ticks late and {skipped} skipped: {now.commanded_hz:g} Hz are more than this process keeps"
     )
+    return Health("warn", f"{text}; its source or its machine is slow")
 
 
 def _values(stats: PublisherStats) -> dict[str, str]:

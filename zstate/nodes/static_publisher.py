@@ -17,7 +17,7 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import WireWriter, write_all
 from zstate.transform import Transform
-from zstate.wire.identity import Announcement, WriterId
+from zstate.wire.identity import Announcement
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
 from zstate.wire.registry import as_wire_names, get_wire
@@ -50,7 +50,10 @@ class StaticPublisher(Closeable):
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
         self.robot = check_robot(robot)
-        self.writer = check_writer(_default_writer(identity) if writer is None else writer)
+        if writer is None:
+            # A script name may have blanks, which a key cannot.
+            writer = f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"
+        self.writer = check_writer(writer)
         if self.writer == MODEL_WRITER:
             raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
         self._session_id = identity.session
@@ -140,8 +143,3 @@ class StaticPublisher(Closeable):
             for latched in self._latched:
                 latched.withdraw()
             self._opened.close()
-
-
-def _default_writer(identity: WriterId) -> str:
-    # A script name may have blanks, which a key cannot.
-    return f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"

@@ -63,11 +63,12 @@ class RecordedWriter:
             return None
         facts = channel.metadata
         foreign = _SESSION not in facts
+        digest = blake2b(channel.topic.encode(), digest_size=4).digest()
         robot = robot_from_topic(channel.topic) if foreign else facts.get(ROBOT, "")
         return cls(
             robot="" if stream == "clock" else robot,
             stream=stream,
-            session=_session_of(channel.topic) if foreign else int(facts[_SESSION]),
+            session=int.from_bytes(digest, "little") if foreign else int(facts[_SESSION]),
             static_writer=facts.get("zstate.writer"),
             program=facts.get("zstate.program"),
             foreign=foreign,
@@ -119,7 +120,14 @@ class DecodedRecording:
 
         The clock belongs to every robot, and so do the transforms that are in no namespace of a bag.
         """
-        return {writer for writer in self.writers if robots is None or _belongs_to(writer, robots)}
+        return {
+            writer
+            for writer in self.writers
+            if robots is None
+            or writer.stream == "clock"
+            or writer.robot in robots
+            or (writer.foreign and writer.robot == SHARED and writer.stream in ("tf", "tf_static"))
+        }
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -148,9 +156,7 @@ class DecodedRecording:
         writer = decoder.writer
         seq = count if writer.foreign else record.sequence
         try:
-            messages = decoder.hearing.messages(
-                writer.stream, record.payload, writer.session, seq, decoder.names
-            )
+            messages = decoder.ros.messages(writer.stream, record.payload, writer.session, seq, decoder.names)
         except MessageError as error:
             self._refuse(error.reason, f"{record.topic}: {error}")
             return
@@ -173,7 +179,7 @@ class _ChannelDecoder(NamedTuple):
 
     writer: RecordedWriter
     names: FrameNames
-    hearing: RosDecoder
+    ros: RosDecoder
 
 
 class LatchedState:
@@ -270,12 +276,3 @@ def recorded_model(
             continue
         return model
     return None
-
-
-def _belongs_to(writer: RecordedWriter, robots: Collection[str]) -> bool:
-    is_shared = writer.foreign and writer.robot == SHARED and writer.stream in ("tf", "tf_static")
-    return writer.stream == "clock" or is_shared or writer.robot in robots
-
-
-def _session_of(topic: str) -> int:
-    return int.from_bytes(blake2b(topic.encode(), digest_size=4).digest(), "little")

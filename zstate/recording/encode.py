@@ -127,7 +127,12 @@ class RecordingEncoder:
             self._refuse("too many writers", f"{robot!r}: {error}")
             return False
         except InvalidInput as error:
-            self._refuse(_reason(message), f"{robot!r}: {error}")
+            reason, stamp = "not sayable", message.stamp if isinstance(message, Sample | ClockMessage) else 1
+            try:
+                to_time(stamp)
+            except InvalidInput:
+                reason = "stamp outside 1901 to 2038"
+            self._refuse(reason if stamp else "no stamp", f"{robot!r}: {error}")
         return True
 
     def withdraw(self, robot: str, static_writer: str, log_time: int) -> None:
@@ -334,7 +339,12 @@ class PendingSamples:
     def append(self, robot: str, sample: Sample | ClockMessage, log_time: int) -> None:
         """Hold a sample received at ``log_time``, unless it alone exceeds the limit."""
         pending = self._robots.setdefault(robot, BoundedQueue(MAX_PENDING, MAX_PENDING_BYTES))
-        self.dropped += pending.append((sample, log_time), _size(sample))
+        blocks: tuple[bytes | None, ...] = ()
+        if isinstance(sample, JointState):
+            blocks = (sample.positions, sample.velocities, sample.efforts)
+        elif isinstance(sample, TransformSample):
+            blocks = (sample.poses,)
+        self.dropped += pending.append((sample, log_time), sum(len(block or b"") for block in blocks))
 
     def pop(self, robot: str) -> Iterable[tuple[Sample | ClockMessage, int]]:
         """Remove the samples of ``robot``, and return them with their log times."""
@@ -382,20 +392,3 @@ class StaticAccumulator:
 
 class _TooManyWriters(InvalidInput):
     """The robot has used up its channels."""
-
-
-def _reason(message: Message) -> str:
-    stamp = message.stamp if isinstance(message, Sample | ClockMessage) else 1
-    if not stamp:
-        return "no stamp"
-    try:
-        to_time(stamp)
-    except InvalidInput:
-        return "stamp outside 1901 to 2038"
-    return "not sayable"
-
-
-def _size(sample: Sample | ClockMessage) -> int:
-    if isinstance(sample, JointState):
-        return sum(len(block or b"") for block in (sample.positions, sample.velocities, sample.efforts))
-    return len(sample.poses) if isinstance(sample, TransformSample) else 0

@@ -1,12 +1,9 @@
-"""Facts of a recording, without reading its messages.
-
-What is in a recording, robot by robot.
-"""
+"""Facts of a recording, in total and robot by robot, without reading its messages."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,7 +81,7 @@ def _unique(words: Iterable[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RecordedStream:
-    """What one writer said. ``rate_hz`` is the mean over the whole recording, None of latched values."""
+    """One writer's messages on one stream. ``rate_hz`` is the mean rate; None for latched values."""
 
     stream: Stream
     topic: str
@@ -96,7 +93,7 @@ class RecordedStream:
 
 @dataclass(frozen=True)
 class RecordedRobot:
-    """One robot of a recording; ``model`` is None where there is none, ``fault`` says if it is of no use."""
+    """One robot of a recording; ``model`` is None without a usable one, ``fault`` is then the reason."""
 
     name: str
     model: RobotModel | None
@@ -105,59 +102,46 @@ class RecordedRobot:
 
     def facts(self) -> dict[str, Any]:
         """The same as JSON has it."""
-        model = self.model
-        return {
-            "robot": self.name,
-            "model": None
-            if model is None
-            else {"name": model.name, "links": list(model.links), "joints": list(model.joint_names)},
-            "streams": [vars(stream) for stream in self.streams],
-        }
+        model, facts = self.model, None
+        if model is not None:
+            facts = {"name": model.name, "links": list(model.links), "joints": list(model.joint_names)}
+        return {"robot": self.name, "model": facts, "streams": [vars(stream) for stream in self.streams]}
 
 
 def recorded_robots(info: RecordingInfo) -> list[RecordedRobot]:
-    """The robots by name. RecordingError when a description's chunk turns out to be damaged."""
+    """The robots by name. Raises RecordingError if the chunk of a description is damaged."""
     by_name: dict[str, list[tuple[RecordedWriter, Channel]]] = {}
     for channel in info.channels:
-        speaker = RecordedWriter.from_channel(channel)
-        if speaker is not None and speaker.robot:
-            by_name.setdefault(speaker.robot, []).append((speaker, channel))
+        writer = RecordedWriter.from_channel(channel)
+        if writer is not None and writer.robot:
+            by_name.setdefault(writer.robot, []).append((writer, channel))
+    robots: list[RecordedRobot] = []
     with RecordingReader(info.path) as reader:
-        return [_robot(name, reader, said, info.duration_s) for name, said in sorted(by_name.items())]
+        for name, written in sorted(by_name.items()):
+            topics = {channel.topic for writer, channel in written if writer.stream == "robot_description"}
+            model, fault = None, ""
+            record = next(reader.records(topics), None) if topics else None
+            if record is not None:
+                try:
+                    model = parse_urdf(decode_string(record.payload), f"the model of {name!r}")
+                except (MessageError, ModelError) as error:
+                    fault = str(error)
+            streams: list[RecordedStream] = []
+            for writer, channel in written:
+                rate = None if writer.stream in LATCHED else mean_rate(channel, info.duration_s)
+                names = ", ".join(filter(None, (writer.static_writer, writer.program)))
+                facts = (channel.topic, channel.type_name, channel.count, rate, names)
+                streams.append(RecordedStream(writer.stream, *facts))
+            robots.append(RecordedRobot(name, model, fault, tuple(streams)))
+    return robots
 
 
 def other_channels(info: RecordingInfo) -> list[Channel]:
-    """The clock, and what says nothing of a robot's state."""
-    speakers = ((RecordedWriter.from_channel(channel), channel) for channel in info.channels)
-    return [channel for speaker, channel in speakers if speaker is None or not speaker.robot]
+    """The channels of no robot: the clock and other topics."""
+    writers = ((RecordedWriter.from_channel(channel), channel) for channel in info.channels)
+    return [channel for writer, channel in writers if writer is None or not writer.robot]
 
 
 def mean_rate(channel: Channel, duration_s: float) -> float | None:
     """The messages of a channel a second, over the whole recording."""
     return (channel.count - 1) / duration_s if channel.count > 1 and duration_s > 0.0 else None
-
-
-def _robot(
-    name: str, reader: RecordingReader, said: Sequence[tuple[RecordedWriter, Channel]], duration_s: float
-) -> RecordedRobot:
-    described = {channel.topic for speaker, channel in said if speaker.stream == "robot_description"}
-    model, fault = _model(reader, described, name)
-    streams = (_stream(speaker, channel, duration_s) for speaker, channel in said)
-    return RecordedRobot(name, model, fault, tuple(streams))
-
-
-def _model(reader: RecordingReader, topics: set[str], name: str) -> tuple[RobotModel | None, str]:
-    """The first model that was recorded."""
-    record = next(reader.records(topics), None) if topics else None
-    if record is None:
-        return None, ""
-    try:
-        return parse_urdf(decode_string(record.payload), f"the model of {name!r}"), ""
-    except (MessageError, ModelError) as error:
-        return None, str(error)
-
-
-def _stream(speaker: RecordedWriter, channel: Channel, duration_s: float) -> RecordedStream:
-    rate = None if speaker.stream in LATCHED else mean_rate(channel, duration_s)
-    writer = ", ".join(filter(None, (speaker.static_writer, speaker.program)))
-    return RecordedStream(speaker.stream, channel.topic, channel.type_name, channel.count, rate, writer)

@@ -28,9 +28,7 @@ from zstate.ingest.base import StreamIngest
 from zstate.ingest.counters import Counters, ListenerStats
 from zstate.ingest.frame_ownership import FrameOwnership
 from zstate.ingest.joint_states import JointStateIngest
-from zstate.ingest.model_filter import ModelEdgeFilter
-from zstate.ingest.static_transforms import StaticTransformIngest
-from zstate.ingest.transforms import TransformIngest
+from zstate.ingest.transforms import ModelEdgeFilter, StaticTransformIngest, TransformIngest
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import (
     DecodedMessage,
@@ -76,31 +74,31 @@ def load_into(
     """
     counters = Counters()
     buffer.is_recording = True
-    transcript = DecodedRecording(reader, counters.count_refusal)
-    robots = None if robot is None else (check_has_robot(transcript, robot),)
+    recording = DecodedRecording(reader, counters.count_refusal)
+    robots = None if robot is None else (check_has_robot(recording, robot),)
     shares_frames = any(
         writer.foreign or (writer.stream == "tf_static" and writer.static_writer is None)  # of ROS
-        for writer in transcript.writers
+        for writer in recording.writers
     )
-    loader = RecordingLoader(buffer, counters, () if shares_frames else transcript.robots)
-    for description in first_descriptions(transcript, robots).values():
-        model = recorded_model(transcript, description, counters.count_refusal)
+    loader = RecordingLoader(buffer, counters, () if shares_frames else recording.robots)
+    for description in first_descriptions(recording, robots).values():
+        model = recorded_model(recording, description, counters.count_refusal)
         if model is not None:
             loader.add_model(description, model)
     stamps = None if around is None else np.unique(around)
     batch = _BATCH if stamps is None else max(_BATCH, len(stamps))
-    for count, decoded in enumerate(transcript.messages(robots), 1):
+    for count, decoded in enumerate(recording.messages(robots), 1):
         loader.insert(decoded)
         if stamps is not None and not count % batch:
             buffer.keep_only_around(stamps)
     return counters.stats()
 
 
-def check_has_robot(transcript: DecodedRecording, robot: str) -> str:
+def check_has_robot(recording: DecodedRecording, robot: str) -> str:
     """``robot``, if the recording has it. Raises InvalidInput, which names the robots it has."""
-    if robot not in transcript.robots:
-        there = ", ".join(map(repr, transcript.robots)) or "none"
-        raise InvalidInput(f"the recording has no robot {robot!r}; its robots: {there}")
+    if robot not in recording.robots:
+        names = ", ".join(map(repr, recording.robots)) or "none"
+        raise InvalidInput(f"the recording has no robot {robot!r}; its robots: {names}")
     return robot
 
 

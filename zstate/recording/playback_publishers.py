@@ -11,7 +11,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
-from zstate.ingest.model_filter import ModelEdgeFilter
+from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.ownership import Edge, WriterClaim, claim_edges, named_edges
@@ -22,13 +22,7 @@ from zstate.nodes.publisher import StatePublisher
 from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, joint_order, static_key
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import MODEL_WRITER, Stream
-from zstate.wire.messages import (
-    JointState,
-    Message,
-    RobotDescription,
-    StaticTransforms,
-    TransformSample,
-)
+from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.registry import get_wire
 
 
@@ -62,7 +56,7 @@ class PlaybackPublishers(Closeable):
         self._robots: dict[str, _RobotPublisher] = {}
         self._others: dict[str, PassthroughPublisher] = {}
         with ExitStack() as opening:
-            opening.callback(self._close_robots)
+            opening.callback(lambda: [robot.close() for robot in self._robots.values()])
             for robot, model in models.items():
                 self._robots[robot] = self._open(robot, model, _is_computed(robot, writers))
             for robot, streams in self._other_streams(writers).items():
@@ -114,10 +108,19 @@ class PlaybackPublishers(Closeable):
     def _publish(self, writer: RecordedWriter, message: Message) -> bool:
         robot = self._robots.get(writer.robot)
         if isinstance(message, StaticTransforms):
-            return self._set_statics(writer, message)
-        if isinstance(message, RobotDescription):
-            return self._describe(writer, message)
-        if isinstance(message, JointState) and robot is not None:
+            if writer.static_writer == MODEL_WRITER and robot is not None:
+                return False
+            edges = self._modelled.filter_statics(writer.robot, message)
+            self._others[writer.robot].set_statics(edges, static_key(writer)[1])
+        elif isinstance(message, RobotDescription) and robot is None:
+            self._others[writer.robot].describe(message, MODEL_WRITER)
+        elif isinstance(message, RobotDescription):
+            assert robot is not None
+            if robot.model.urdf != message.urdf:
+                model = parse_urdf(message.urdf, f"the URDF of {writer.robot!r}")
+                robot.close()
+                self._robots[writer.robot] = self._open(writer.robot, model, "tf" in robot.streams)
+        elif isinstance(message, JointState) and robot is not None:
             robot.publish(message)
         elif isinstance(message, TransformSample):
             rest = self._computed.filter_sample(writer.robot, message)
@@ -128,30 +131,9 @@ class PlaybackPublishers(Closeable):
             self._others[writer.robot].publish(message)
         return True
 
-    def _describe(self, writer: RecordedWriter, description: RobotDescription) -> bool:
-        robot = self._robots.get(writer.robot)
-        if robot is None:
-            self._others[writer.robot].describe(description, MODEL_WRITER)
-        elif robot.model.urdf != description.urdf:
-            model = parse_urdf(description.urdf, f"the URDF of {writer.robot!r}")
-            robot.close()
-            self._robots[writer.robot] = self._open(writer.robot, model, "tf" in robot.streams)
-        return True
-
-    def _set_statics(self, writer: RecordedWriter, statics: StaticTransforms) -> bool:
-        if writer.static_writer == MODEL_WRITER and writer.robot in self._robots:
-            return False
-        rest = self._modelled.filter_statics(writer.robot, statics)
-        self._others[writer.robot].set_statics(rest, static_key(writer)[1])
-        return True
-
     def close(self) -> None:
         """Close all publishers. A second call does nothing."""
         self._opened.close()
-
-    def _close_robots(self) -> None:
-        for robot in self._robots.values():
-            robot.close()
 
 
 class _RobotPublisher(Closeable):
@@ -243,23 +225,17 @@ class PassthroughPublisher(Closeable):
         head = (message.stamp, self._seqs[stream], self._session_id, message.order)
         if isinstance(message, JointState):
             numbers = (message.positions, message.velocities, message.efforts)
-            again = JointState(*head, *numbers, message.names)
+            sample = JointState(*head, *numbers, message.names)
         else:
-            again = TransformSample(*head, message.poses, message.edges)
-        write_all(self._streams[stream], again)
+            sample = TransformSample(*head, message.poses, message.edges)
+        write_all(self._streams[stream], sample)
         self._seqs[stream] += 1
 
     def describe(self, description: RobotDescription, writer: str) -> None:
         """Publish the robot's description (latched)."""
-        again = RobotDescription(
-            self._session_id,
-            description.urdf,
-            description.digest,
-            description.joint_names,
-            description.moving_edges,
-            SIMULATED,
-        )
-        write_all(self._latch("robot_description", writer), again)
+        orders = (description.joint_names, description.moving_edges)
+        message = RobotDescription(self._session_id, description.urdf, description.digest, *orders, SIMULATED)
+        write_all(self._latch("robot_description", writer), message)
 
     def set_statics(self, statics: StaticTransforms, writer: str) -> None:
         """Publish all static edges of one ``writer``; an empty set withdraws the previous ones."""
@@ -288,10 +264,10 @@ class PassthroughPublisher(Closeable):
     def _announced(self, stream: Stream, writer: str) -> Announcement:
         return Announcement(self._robot, stream, self._writer, writer if stream == "tf_static" else "")
 
-    def _claimed(self, opening: ExitStack, wanted: Sequence[Announcement]) -> WriterClaim | None:
-        return (
-            opening.enter_context(WriterClaim(self._session, wanted)) if self._is_alone and wanted else None
-        )
+    def _claimed(self, opening: ExitStack, streams: Sequence[Announcement]) -> WriterClaim | None:
+        if not self._is_alone or not streams:
+            return None
+        return opening.enter_context(WriterClaim(self._session, streams))
 
     @contextmanager
     def _placing(self, statics: StaticTransforms, writer: str) -> Generator[None]:

@@ -17,7 +17,6 @@ from zstate.net.session import Session
 from zstate.nodes.clock import ClockPublisher
 from zstate.recording.decode import (
     LATCHED,
-    DecodedMessage,
     DecodedRecording,
     LatchedState,
     first_descriptions,
@@ -215,19 +214,21 @@ class Player(Closeable):
             has_clock = any(writer.stream == "clock" for writer in writers)
             ticks = None if has_clock else _ClockTicks(clock, begin, self._player_clock.rate)
             for decoded in self._recording.messages(self.robots, begin=begin, end=self._end):
-                if not self._wait(decoded.log_time, ticks):
-                    break
-                self._publish(decoded, publishers, clock)
-
-    def _wait(self, log_time: int, ticks: _ClockTicks | None) -> bool:
-        """Wait until ``log_time``, publishing the clock; False when this pass is over."""
-        while ticks is not None and ticks.next <= log_time:
-            if not self._reach(ticks.next, ticks):
-                return False
-            ticks.publish(log_time)
-        return self._reach(log_time, ticks)
+                while ticks is not None and ticks.next <= decoded.log_time:
+                    if not self._reach(ticks.next, ticks):
+                        return
+                    ticks.publish(decoded.log_time)
+                if not self._reach(decoded.log_time, ticks):
+                    return
+                lateness = self._player_clock.lateness(decoded.log_time)
+                if isinstance(decoded.message, ClockMessage):
+                    clock.publish(decoded.message.stamp)
+                elif publishers.publish(decoded) and isinstance(decoded.message, Sample):
+                    self._samples += 1
+                    self._lateness.add(lateness)
 
     def _reach(self, log_time: int, ticks: _ClockTicks | None) -> bool:
+        """Wait until ``log_time``; False when this pass is over."""
         while True:
             # Cleared first: a request after these checks wakes the wait.
             self._wake.clear()
@@ -242,16 +243,6 @@ class Player(Closeable):
             elif self._player_clock.wait(log_time, self._wake):
                 self._position = log_time
                 return True
-
-    def _publish(
-        self, decoded: DecodedMessage, publishers: PlaybackPublishers, clock: ClockPublisher
-    ) -> None:
-        lateness = self._player_clock.lateness(decoded.log_time)
-        if isinstance(decoded.message, ClockMessage):
-            clock.publish(decoded.message.stamp)
-        elif publishers.publish(decoded) and isinstance(decoded.message, Sample):
-            self._samples += 1
-            self._lateness.add(lateness)
 
 
 class _ClockTicks:

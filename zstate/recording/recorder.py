@@ -19,8 +19,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SystemClock, wait_interruptible
 from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
-from zstate.ingest.counters import Counters
-from zstate.ingest.sequence import GapCounter
+from zstate.ingest.counters import Counters, GapCounter
 from zstate.net.at_exit import forked_text
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import announce_reader, watch

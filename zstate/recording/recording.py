@@ -28,11 +28,11 @@ class Recording(Closeable):
         self.info: RecordingInfo = read_info(path)
         self.robot = robot
         self._reader = RecordingReader(path)
-        transcript = DecodedRecording(self._reader, Refusals().count)
-        self.robots = transcript.robots
+        recording = DecodedRecording(self._reader, Refusals().count)
+        self.robots = recording.robots
         try:
             if robot is not None:
-                check_has_robot(transcript, robot)
+                check_has_robot(recording, robot)
         except BaseException:
             self.close()
             raise

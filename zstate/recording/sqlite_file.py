@@ -35,11 +35,23 @@ class SqliteFile:
         self.size = self._steps = 0
         with self._errors():
             self.size = path.stat().st_size
-            self._database = sqlite3.connect(_uri(path), uri=True, check_same_thread=False)
+            uri = f"file:{quote(str(path.resolve()))}?mode=ro"
+            journals = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
+            if not any(journal.exists() for journal in journals):
+                # SQLite then creates no files of its own, which would need a writable folder. It would also
+                # ignore the journal in which a killed recorder left the newest messages.
+                uri += "&immutable=1"
+            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
             self._database.set_progress_handler(self._is_over_limit, _STEPS_BETWEEN)
         try:
             with self._errors():
-                self._check_tables()
+                found = self._rows(
+                    "SELECT name, type, rootpage FROM sqlite_master WHERE name IN ('topics', 'messages')"
+                )
+                for name, kind, page in found:  # views may have rows without end
+                    if kind != "table" or not page:
+                        found_kind = kind if page else "view or virtual table"
+                        raise ValueError(f"{name!r} is a {found_kind}, not a table")
                 self._channels = dict(self._read_channels())
                 ((first, last),) = self._rows("SELECT min(timestamp), max(timestamp) FROM messages")
                 self.span = None if first is None else (int(first), int(last))
@@ -68,15 +80,6 @@ class SqliteFile:
             "`sqlite3 FILE .recover` may save a part of it"
         )
         return RecordingError(text, path=str(self.path))
-
-    def _check_tables(self) -> None:
-        """Raise ValueError for views instead of tables: they may have rows without end."""
-        found = self._rows(
-            "SELECT name, type, rootpage FROM sqlite_master WHERE name IN ('topics', 'messages')"
-        )
-        for name, kind, page in found:
-            if kind != "table" or not page:
-                raise ValueError(f"{name!r} is a {kind if page else 'view or virtual table'}, not a table")
 
     @property
     def _max_steps(self) -> int:
@@ -125,11 +128,3 @@ class SqliteFile:
 
     def close(self) -> None:
         self._database.close()
-
-
-def _uri(path: Path) -> str:
-    uri = f"file:{quote(str(path.resolve()))}?mode=ro"
-    # Immutable: SQLite creates no files of its own, which would need a writable folder. It would also
-    # ignore the journal in which a killed recorder left the newest messages.
-    journals = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
-    return uri if any(journal.exists() for journal in journals) else f"{uri}&immutable=1"

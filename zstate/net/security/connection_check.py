@@ -224,7 +224,8 @@ def _alert_reason(error: ssl.SSLError, credentials: Credentials | None) -> Refus
     if alert == "CERTIFICATE_EXPIRED":
         return RefusalReason(
             "our certificate expired",
-            f"{local} has expired, or is not valid yet by the router's clock; renew it, and check both clocks",
+            f"{local} has expired, or is not valid yet by the router's clock; "
+            "renew it, and check both clocks",
         )
     return RefusalReason(
         "our certificate refused",

@@ -1,19 +1,38 @@
-"""One MCAP file, read by its index, or by a scan if it has none."""
+"""One MCAP file, read by its index or a scan, and the files of a split recording.
+
+A split recording is run.mcap, run_1.mcap, run_2.mcap ... Each file carries the recording's identity in a
+metadata record behind its header. Names alone do not suffice: an older recording of the same name may have
+left files behind.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 from mcap.opcode import Opcode
+from mcap.records import Metadata
 
 from zstate.errors import RecordingError
-from zstate.recording.mcap.index import DataRange, Index, Summary, read_header
-from zstate.recording.mcap.records import MESSAGE, BoundedFile, CorruptData, iter_records
+from zstate.recording.mcap.index import DataRange, Summary, read_header
+from zstate.recording.mcap.records import MAGIC, MESSAGE, BoundedFile, CorruptData, iter_records, parse_record
 from zstate.recording.mcap.scan import Scan
 from zstate.recording.storage import Channel, Format, ReadFilter, Record, SortedPart
+
+IDENTITY = "zstate.recording"
+"""Name of the metadata record; its keys are "id", and "part" (0, 1, ...)."""
+
+_SIGNATURES = {
+    b"#ROSBAG V": "a bag of ROS 1: `rosbags-convert` makes a ROS 2 one of it",
+    b"\x28\xb5\x2f\xfd": "compressed: `zstd -d` unpacks it",
+    b"\x1f\x8b": "compressed: `gunzip` unpacks it",
+    b"\x04\x22\x4d\x18": "compressed: `lz4 -d` unpacks it",
+    b"PK\x03\x04": "a ZIP archive: unpack it",
+    b"rosbag2_bagfile_information": "a bag's metadata.yaml: name its folder",
+}
 
 
 @contextmanager
@@ -38,21 +57,21 @@ class McapFile:
         self.path = path
         with open_errors(path) as file:
             self.size = file.size
-            self._index = index = _read_index(file)
+            try:
+                self._index = index = Summary(file).index(read_header(file)[0])
+            except CorruptData:
+                self._index = index = Scan(file).index()
         self.profile, self.library = index.header.profile, index.header.library
-        self._channels = {number: self._channel(number) for number in index.channels}
+        self._channels: dict[int, Channel] = {}
+        for number, channel in index.channels.items():
+            schema = index.schemas.get(channel.schema_id)
+            facts = ("" if schema is None else schema.name, channel.message_encoding, channel.metadata)
+            self._channels[number] = Channel(channel.topic, *facts, index.counts.get(number, 0))
         self.channels = tuple(self._channels.values())
         self.span = index.span
         self.compressions = tuple(sorted({one.compression for one in index.ranges} - {""}))
         self.complete = index.complete
         self.losses = tuple(map(str, index.losses))
-
-    def _channel(self, number: int) -> Channel:
-        channel = self._index.channels[number]
-        schema = self._index.schemas.get(channel.schema_id)
-        type_name = "" if schema is None else schema.name
-        count = self._index.counts.get(number, 0)
-        return Channel(channel.topic, type_name, channel.message_encoding, channel.metadata, count)
 
     def parts(self, read_filter: ReadFilter) -> list[SortedPart]:
         selected = {
@@ -92,9 +111,60 @@ class McapFile:
         """Do nothing: the file is open only during reads."""
 
 
-def _read_index(file: BoundedFile) -> Index:
-    header, _ = read_header(file)
+def explain_unreadable(path: Path, beginning: bytes) -> str:
+    """Why the file at ``path`` with these first bytes cannot be read, and what to do."""
+    if not beginning:
+        return f"{str(path)!r} is empty: its recorder ended before it wrote anything"
+    if MAGIC.startswith(beginning):
+        return f"{str(path)!r} is cut off within its first {len(MAGIC)} bytes; nothing of it can be saved"
+    for magic, what in _SIGNATURES.items():
+        if beginning.startswith(magic):
+            return f"{str(path)!r} is {what}"
+    return (
+        f"{str(path)!r} is not a recording: it begins with {beginning[:12]!r}, and neither as an MCAP file "
+        "nor as the SQLite file of a bag"
+    )
+
+
+def split_path(first: Path, part: int) -> Path:
+    """The file of a recording's part, numbered as by rosbag2."""
+    return first if part == 0 else first.with_name(f"{first.stem}_{part}{first.suffix}")
+
+
+def later_splits(first: Path) -> list[tuple[int, Path]]:
+    """The files in the folder of ``first`` that are named as its later parts, by number."""
+    pattern = re.compile(rf"{re.escape(first.stem)}_([1-9]\d*){re.escape(first.suffix)}")
+    found = ((pattern.fullmatch(path.name), path) for path in first.parent.iterdir())
+    return sorted((int(match[1]), path) for match, path in found if match)
+
+
+def split_files(first: Path) -> tuple[list[Path], list[str]]:
+    """The files of the recording that begins with ``first``, and the names of missing ones.
+
+    ``first`` alone if it is not the first part of a recording by zstate.
+    """
+    identity = _identity(first)
+    if identity is None or identity[1] != "0":
+        return [first], []
+    later = [
+        (part, path) for part, path in later_splits(first) if _identity(path) == (identity[0], str(part))
+    ]
+    present = {part for part, _ in later}
+    missing = [
+        split_path(first, part).name for part in range(1, max(present, default=0)) if part not in present
+    ]
+    return [first, *(path for _, path in later)], missing
+
+
+def _identity(path: Path) -> tuple[str, str] | None:
     try:
-        return Summary(file).index(header)
-    except CorruptData:
-        return Scan(file).index()
+        with BoundedFile(path) as file:
+            if not file.has_mcap_magic:
+                return None
+            opcode, body = file.record(read_header(file)[1])
+            if opcode != Opcode.METADATA:
+                return None
+            found = parse_record(Metadata, body)
+    except (CorruptData, OSError):
+        return None
+    return (found.metadata.get("id", ""), found.metadata.get("part", "")) if found.name == IDENTITY else None

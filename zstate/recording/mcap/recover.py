@@ -11,8 +11,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from zstate.errors import RecordingError
-from zstate.recording.file_signatures import explain_unreadable
-from zstate.recording.mcap.file import open_errors
+from zstate.recording.mcap.file import explain_unreadable, open_errors
 from zstate.recording.mcap.index import DataLoss
 from zstate.recording.mcap.records import MESSAGE, BoundedFile, iter_records
 from zstate.recording.mcap.scan import Scan
@@ -85,10 +84,7 @@ def _copy(file: BoundedFile, scan: Scan, output: McapOutput) -> Counter[str]:
     }
     copied = {
         number: writer.register_channel(
-            channel.topic,
-            channel.message_encoding,
-            schemas.get(channel.schema_id, 0),
-            dict(channel.metadata),
+            channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), dict(channel.metadata)
         )
         for number, channel in index.channels.items()
     }

@@ -82,7 +82,13 @@ class Scan:
         while at < self._end and not self._has_data_end:
             at = self._step(at)
         self._add_bare_range(at)
-        self._describe_lost_channels()
+        if self._summary is not None:  # its copy describes the channels whose chunk is lost
+            self._schemas = {**self._summary.schemas, **self._schemas}
+            self._channels = {**self._summary.channels, **self._channels}
+        for number, count in self._counts.items():
+            if number not in self._channels:
+                reason = f"{count} messages of channel {number}, whose description is lost"
+                self._losses.append(DataLoss(self._ranges[0].offset, 0, reason))
 
     def index(self) -> Index:
         """The rebuilt index."""
@@ -163,28 +169,15 @@ class Scan:
         """The offset to continue at after damage at ``at``, in a record that ends at ``end`` if known."""
         found = _next_chunk(self._file, at + 1, self._end if end is None else end) or end
         if found is None and opcode == Opcode.CHUNK:
-            reason = f"{reason}, but for {self._add_cut_chunk(at)} messages"
-        going_on = self._end if found is None else found
-        self._losses.append(DataLoss(at, going_on - at, reason))
-        return going_on
-
-    def _add_cut_chunk(self, at: int) -> int:
-        """Add the readable part of the chunk that the file ends in; its number of messages."""
-        before = self._counts.total()
-        cut = DataRange("cut chunk", at, self._end, 0, 0, None, "")
-        with suppress(CorruptData):
-            self._add(cut, cut.content(self._file))
-        return self._counts.total() - before
-
-    def _describe_lost_channels(self) -> None:
-        """Use the summary's copy of channels and schemas whose chunk is lost."""
-        if self._summary is not None:
-            self._schemas = {**self._summary.schemas, **self._schemas}
-            self._channels = {**self._summary.channels, **self._channels}
-        for number, count in self._counts.items():
-            if number not in self._channels:
-                reason = f"{count} messages of channel {number}, whose description is lost"
-                self._losses.append(DataLoss(self._ranges[0].offset, 0, reason))
+            # The file ends within this chunk; its beginning may be readable.
+            before = self._counts.total()
+            cut = DataRange("cut chunk", at, self._end, 0, 0, None, "")
+            with suppress(CorruptData):
+                self._add(cut, cut.content(self._file))
+            reason = f"{reason}, but for {self._counts.total() - before} messages"
+        next_at = self._end if found is None else found
+        self._losses.append(DataLoss(at, next_at - at, reason))
+        return next_at
 
 
 def _next_chunk(file: BoundedFile, start: int, stop: int) -> int | None:
@@ -194,17 +187,11 @@ def _next_chunk(file: BoundedFile, start: int, stop: int) -> int | None:
         window = file.read(at, min(_WINDOW, file.size - at))
         for match in _SIGNATURE.finditer(window):
             candidate = at + match.start() - _BEFORE_SIGNATURE
-            if start <= candidate < stop and _is_chunk(file, candidate):
-                return candidate
+            if start <= candidate < stop:
+                with suppress(CorruptData):
+                    opcode, body = file.record(candidate)
+                    if opcode == Opcode.CHUNK:
+                        decompress(parse_chunk(body))
+                        return candidate
         at += _WINDOW - _OVERLAP
     return None
-
-
-def _is_chunk(file: BoundedFile, offset: int) -> bool:
-    try:
-        opcode, body = file.record(offset)
-        if opcode == Opcode.CHUNK:
-            decompress(parse_chunk(body))
-    except CorruptData:
-        return False
-    return opcode == Opcode.CHUNK

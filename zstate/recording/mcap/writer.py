@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, RecordingError
-from zstate.recording.mcap.split_files import IDENTITY, later_splits, split_path
+from zstate.recording.mcap.file import IDENTITY, later_splits, split_path
 from zstate.recording.storage import CDR
 from zstate.wire.ros2.qos import Qos
 from zstate.wire.ros2.types import RosType

@@ -1,0 +1,127 @@
+"""Insertion of cached samples into a buffer that also receives live ones."""
+
+from __future__ import annotations
+
+from helpers.robots import RRBOT, STAMP
+
+from zstate.buffer.buffer import TransformBuffer
+from zstate.ingest.counters import Counters
+from zstate.ingest.frame_ownership import FrameOwnership
+from zstate.ingest.joint_states import JointStateIngest
+from zstate.wire.messages import JointState, RobotDescription, order_digest, to_block
+
+PERIOD = 10_000_000
+ORDER = order_digest(RRBOT.joint_names)
+DESCRIPTION = RobotDescription(7, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ())
+
+
+def states(first: int, end: int, session: int = 7) -> list[JointState]:
+    """Samples ``first`` up to ``end``; the shoulder position identifies it."""
+    return [
+        JointState(STAMP + seq * PERIOD, seq, session, ORDER, to_block([0.01 * seq, 0.0]))
+        for seq in range(first, end)
+    ]
+
+
+class HistoryIngest:
+    """A ingest, and what has become of the samples."""
+
+    def __init__(self, *, described: bool = True, history_s: float = 10.0) -> None:
+        self.buffer = TransformBuffer(history_s)
+        self.counters = Counters()
+        self.ingest = JointStateIngest("r1", FrameOwnership(self.buffer, self.counters))
+        if described:
+            self.ingest.describe(DESCRIPTION)
+
+    def receive(self, *samples: JointState) -> None:
+        for sample in samples:
+            self.ingest.insert_sample(sample, overflowed=False)
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Received, missed and recalled."""
+        stats = self.counters.stats()
+        return stats.received, stats.missed, stats.recalled
+
+    @property
+    def stamps_known(self) -> list[int]:
+        """The numbers of the samples in the buffer."""
+        stamps = [STAMP + number * PERIOD for number in range(-1, 60)]
+        looked = [self.buffer.explain("world", "tool", stamp) for stamp in stamps]
+        return [
+            (stamp - STAMP) // PERIOD
+            for stamp, reason in zip(stamps, looked, strict=True)
+            if reason is None and self.buffer.lookup("world", "tool", stamp).kind == "exact"
+        ]
+
+
+def test_received_samples_are_not_inserted_again_from_history():
+    history = HistoryIngest()
+    history.receive(*states(5, 10))
+    assert history.ingest.insert_history(states(3, 10))
+    assert (history.counts, history.stamps_known) == ((5, 0, 2), list(range(3, 10)))
+    assert not history.ingest.insert_history(states(0, 3))
+    assert (history.counts, history.stamps_known) == ((5, 0, 5), list(range(10)))
+
+
+def test_no_older_history_is_requested_when_all_samples_were_received():
+    history = HistoryIngest()
+    history.receive(*states(0, 5))
+    assert not history.ingest.insert_history(states(2, 5))
+    assert history.counts == (5, 0, 0)
+
+
+def test_history_may_arrive_before_the_first_live_sample():
+    history = HistoryIngest()
+    assert history.ingest.insert_history(states(5, 10))
+    history.receive(*states(10, 12))
+    assert not history.ingest.insert_history(states(0, 5))
+    assert (history.counts, history.stamps_known) == ((2, 0, 10), list(range(12)))
+
+
+def test_gap_is_filled_whether_or_not_it_was_detected_before():
+    for shows_first in (True, False):
+        history = HistoryIngest()
+        history.receive(*states(0, 5))
+        if shows_first:
+            history.receive(*states(20, 21))
+        assert history.ingest.insert_history(states(10, 20))
+        assert not history.ingest.insert_history(states(3, 10))
+        if not shows_first:
+            history.receive(*states(20, 21))
+        assert history.stamps_known == list(range(21))
+        # It was missed all the same: a reader in a control loop did not have it in time.
+        assert history.counts == (6, 15, 15)
+
+
+def test_history_waits_for_the_description():
+    history = HistoryIngest(described=False)
+    assert history.ingest.insert_history(states(5, 10))
+    assert history.ingest.insert_history(states(0, 5)) is False
+    history.receive(*states(10, 12))
+    assert history.counts == (0, 0, 0)
+    history.ingest.describe(DESCRIPTION)
+    assert (history.counts, history.stamps_known) == ((2, 0, 10), list(range(12)))
+
+
+def test_history_of_a_writer_that_has_left_is_refused():
+    history = HistoryIngest()
+    history.receive(*states(0, 5))
+    history.receive(*states(20, 21, session=8))
+    assert not history.ingest.insert_history(states(0, 5))
+    assert (history.counts, history.stamps_known) == ((6, 0, 0), [20])
+
+
+def test_no_history_older_than_the_buffer_keeps_is_requested():
+    history = HistoryIngest(history_s=0.1)
+    history.receive(*states(30, 31))
+    assert not history.ingest.insert_history(states(0, 30))
+    assert history.stamps_known == list(range(20, 31))
+
+
+def test_unusable_history_is_counted_once_per_page():
+    history = HistoryIngest()
+    history.receive(*states(30, 31))
+    bad = [JointState(STAMP + seq * PERIOD, seq, 7, ORDER, to_block([0.0])) for seq in range(30)]
+    assert not history.ingest.insert_history(bad)
+    assert (history.counters.stats().refused, history.counts) == ({"bad numbers": 1}, (1, 0, 0))

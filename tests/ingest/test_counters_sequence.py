@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+from zstate.ingest.counters import Counters, GapCounter, MissingSamples
+
+
+def test_every_sample_of_a_new_session_is_missing():
+    missing = MissingSamples()
+    assert missing
+    assert all(seq in missing for seq in (0, 1, 10**12))
+
+
+def test_samples_before_the_first_live_one_are_missing():
+    missing = MissingSamples()
+    missing.stop_at(5)
+    assert [seq for seq in range(10) if seq in missing] == [0, 1, 2, 3, 4]
+
+
+def test_gap_is_missing_until_later_samples_are_inserted():
+    missing = MissingSamples()
+    missing.stop_at(2)
+    missing.add(7, 9)
+    assert [seq for seq in range(12) if seq in missing] == [0, 1, 7, 8]
+    missing.stop_at(8)
+    assert [seq for seq in range(12) if seq in missing] == [0, 1, 7]
+    missing.stop_at(7)
+    assert [seq for seq in range(12) if seq in missing] == [0, 1]
+
+
+def test_nothing_is_missing_after_the_first_sample_of_all():
+    missing = MissingSamples()
+    missing.stop_at(0)
+    assert not missing
+    assert 0 not in missing
+
+
+def test_newest_of_many_gaps_are_kept():
+    missing = MissingSamples()
+    missing.stop_at(0)
+    for first in range(0, 1000, 10):
+        missing.add(first, first + 1)
+    assert 990 in missing
+    assert 0 not in missing
+
+
+def counted(counters: Counters) -> tuple[int, int]:
+    stats = counters.stats()
+    return stats.missed, stats.dropped
+
+
+def test_gaps_between_the_samples_of_each_writer_are_counted():
+    gap_counter = GapCounter(counters := Counters())
+    for writer, seq in (("a", 5), ("b", 100), ("a", 6), ("b", 101), ("a", 9)):
+        gap_counter.add(writer, seq)
+    assert counted(counters) == (2, 0)
+
+
+def test_first_late_and_repeated_samples_are_no_gap():
+    gap_counter = GapCounter(counters := Counters())
+    for seq in (5, 6, 6, 4, 7):
+        gap_counter.add("a", seq)
+    assert counted(counters) == (0, 0)
+
+
+def test_gaps_of_an_overflowed_batch_count_as_dropped_for_all_writers():
+    gap_counter = GapCounter(counters := Counters())
+    for writer in ("a", "b", "c"):
+        gap_counter.add(writer, 0)
+    gap_counter.start_batch(overflowed=True)
+    for writer, seq in (("a", 3), ("b", 1), ("a", 5)):
+        gap_counter.add(writer, seq)
+    assert counted(counters) == (0, 3)
+    gap_counter.start_batch(overflowed=False)
+    for writer, seq in (("a", 7), ("b", 3), ("c", 2), ("c", 4), ("d", 7), ("d", 9)):
+        gap_counter.add(writer, seq)
+    assert counted(counters) == (4, 4)

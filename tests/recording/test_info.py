@@ -1,0 +1,52 @@
+"""The summary of a recording, compared with its contents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.recording_files import START, S, joint_states, write_run
+
+from zstate.errors import RecordingError
+from zstate.recording.info import read_info
+
+
+def test_info_has_the_facts_of_the_writer(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    write_run(path, joint_states(101))
+    info = read_info(path)
+    assert (info.path, info.files, info.size) == (path, (path,), path.stat().st_size)
+    assert (info.formats, info.profiles, info.compressions) == (("mcap",), ("ros2",), ("zstd",))
+    assert info.libraries[0].startswith("zstate ")
+    assert (info.first, info.last, info.duration_s) == (START, START + S, 1.0)
+    assert {c.topic: (c.type_name, c.count) for c in info.channels} == {
+        "/robot_description": ("std_msgs/msg/String", 1),
+        "/joint_states": ("sensor_msgs/msg/JointState", 101),
+    }
+    assert (info.message_count, info.robots, info.skipped) == (102, ("panda",), ())
+    assert (info.complete, info.losses) == (True, ())
+
+
+def test_info_covers_all_files_of_a_split_recording(tmp_path: Path):
+    write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
+    info = read_info(tmp_path / "run.mcap")
+    assert [file.name for file in info.files] == ["run.mcap", "run_1.mcap", "run_2.mcap"]
+    assert info.size == sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert info.message_count == 500 + 3
+    assert info.duration_s == 4.99
+
+
+def test_info_of_a_truncated_recording_is_incomplete(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    write_run(path, joint_states(100))
+    path.write_bytes(path.read_bytes()[:5000])
+    info = read_info(path)
+    assert not info.complete
+    (loss,) = info.losses
+    assert loss.startswith("run.mcap: ")
+    assert "cut off" in loss
+
+
+def test_file_that_is_no_recording_is_refused(tmp_path: Path):
+    with pytest.raises(RecordingError):
+        read_info(tmp_path / "nothing.mcap")

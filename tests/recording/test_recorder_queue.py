@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import time
+from contextlib import closing
+
+from helpers.processes import SOON_S, until
+from helpers.robots import Tap, await_reader
+
+from zstate.net.latched import LatchedPublisher
+from zstate.net.streams import CAPACITY, StreamPublisher
+from zstate.recording.recorder import QUEUE_LENGTH, Batch, MessageQueue
+
+
+def payloads(batches: list[Batch]) -> list[bytes]:
+    return [arrival.payload for one in batches for arrival in one.arrivals]
+
+
+def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
+    writer, reader = sessions
+    batches: list[Batch] = []
+    with (
+        MessageQueue(reader) as inbox,
+        StreamPublisher(writer, "a/samples", "") as samples,
+        LatchedPublisher(writer, "a/value", "") as value,
+    ):
+        value.set(b"holds")
+        inbox.subscribe("joint_states", "a/samples", "r1")
+        inbox.subscribe_latched("robot_description", "a/*", None)
+        until(lambda: samples.has_readers)
+        await_reader(writer, "a/value")
+        before = time.time_ns()
+        for number in range(5):
+            samples.put(b"%d" % number)
+        until(lambda: batches.extend(inbox.pop_all()) or len(payloads(batches)) >= 11)
+        assert inbox.pop_all() == []
+    ours = [one for one in batches if one.robot == "r1"]
+    assert payloads(ours) == [b"0", b"1", b"2", b"3", b"4"]
+    assert all(before <= one.stamp <= time.time_ns() and not one.overflowed for one in ours)
+    assert {one.stream for one in ours} == {"joint_states"}
+    assert b"holds" in payloads([one for one in batches if one.stream == "robot_description"])
+
+
+def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
+    writer, reader = sessions
+    sent = QUEUE_LENGTH + 3 * CAPACITY
+    with (
+        MessageQueue(reader) as inbox,
+        StreamPublisher(writer, "a/samples", "") as samples,
+        closing(Tap(reader, "a/samples")) as tap,
+    ):
+        inbox.subscribe("joint_states", "a/samples", "r1")
+        until(lambda: samples.has_readers)
+        for number in range(sent):
+            samples.put(b"%d" % number)
+            if number % 50 == 49:  # what comes too fast is lost on the way
+                tap.payloads(number + 1)
+        batches: list[Batch] = []
+        until(lambda: batches.extend(inbox.pop_all()) or any(one.overflowed for one in batches))
+        samples.put(b"last")
+        until(lambda: batches.extend(inbox.pop_all()) or payloads(batches)[-1] == b"last")
+    assert QUEUE_LENGTH <= len(payloads(batches)) <= QUEUE_LENGTH + 3 * CAPACITY
+    assert len(payloads(batches)) < sent
+
+
+def test_close_is_fast_without_a_reader_and_keeps_waiting_batches(sessions):
+    writer, reader = sessions
+    inbox = MessageQueue(reader)
+    with StreamPublisher(writer, "a/samples", "") as samples:
+        inbox.subscribe("joint_states", "a/samples", "r1")
+        until(lambda: samples.has_readers)
+        for number in range(QUEUE_LENGTH + 2 * CAPACITY):
+            samples.put(b"%d" % number)
+    began = time.monotonic()
+    inbox.close()
+    inbox.close()
+    assert time.monotonic() - began < SOON_S
+    # How many its ring lost before them is the machine's business.
+    waiting = [int(payload) for payload in payloads(inbox.pop_all())]
+    assert waiting
+    assert waiting == sorted(waiting)
