@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from zstate.metrics.collectors import Paces
+from zstate.metrics.collectors import CounterRates
 
 
 class Hands:
@@ -13,7 +13,7 @@ class Hands:
         return self.time_s
 
 
-def noted(paces: Paces, clock: Hands, seconds: int, rate_hz: float, count: float = 0.0) -> float:
+def noted(paces: CounterRates, clock: Hands, seconds: int, rate_hz: float, count: float = 0.0) -> float:
     """What it has come to after ``seconds``, noted each second."""
     for _ in range(seconds):
         paces.note("a", count)
@@ -24,14 +24,14 @@ def noted(paces: Paces, clock: Hands, seconds: int, rate_hz: float, count: float
 
 def test_the_first_reading_has_the_rate_of_the_window_before_it():
     clock = Hands()
-    paces = Paces(clock)
+    paces = CounterRates(clock)
     count = noted(paces, clock, 35, 100.0)
     assert paces.rate_hz("a", count) == 100.0
 
 
 def test_two_who_read_do_not_disturb_each_other():
     clock = Hands()
-    paces = Paces(clock)
+    paces = CounterRates(clock)
     count = noted(paces, clock, 20, 50.0)
     for _ in range(100):
         assert paces.rate_hz("a", count) == pytest.approx(50.0)
@@ -41,7 +41,7 @@ def test_two_who_read_do_not_disturb_each_other():
 
 def test_a_rate_is_that_of_the_last_ten_seconds():
     clock = Hands()
-    paces = Paces(clock)
+    paces = CounterRates(clock)
     count = noted(paces, clock, 30, 100.0)
     count = noted(paces, clock, 5, 0.0, count)
     assert paces.rate_hz("a", count) == 50.0
@@ -51,7 +51,7 @@ def test_a_rate_is_that_of_the_last_ten_seconds():
 
 def test_what_is_only_read_has_the_rate_since_the_reading_before():
     clock = Hands()
-    paces = Paces(clock)
+    paces = CounterRates(clock)
     assert paces.rate_hz("a", 40) == 0.0
     clock.time_s += 20.0
     assert paces.rate_hz("a", 240) == (240 - 40) / 20.0
@@ -61,7 +61,7 @@ def test_what_is_only_read_has_the_rate_since_the_reading_before():
 
 def test_what_begins_anew_has_no_negative_rate():
     clock = Hands()
-    paces = Paces(clock)
+    paces = CounterRates(clock)
     paces.rate_hz("a", 1000)
     clock.time_s += 1.0
     assert paces.rate_hz("a", 3) == 0.0

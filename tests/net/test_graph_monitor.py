@@ -7,7 +7,7 @@ import os
 from helpers.processes import until
 from helpers.robots import RRBOT
 
-from zstate.net.graph import GraphMonitor, StreamUse, graph_of
+from zstate.net.graph import GraphMonitor, StreamUse, build_graph
 from zstate.net.presence import RobotInfo
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -52,7 +52,7 @@ def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_
     statics = (("left", MOUNT), ("right", MOUNT))
     arm = RobotInfo("arm", (("joint_states", DRIVER), ("tf_static", MOUNT)), statics)
     readers = [Announcement(ANY, "joint_states", VIEWER), Announcement("base", "tf", VIEWER)]
-    graph = graph_of([arm], readers, lambda robot, stream, writer: 500.0 if writer == DRIVER else None)
+    graph = build_graph([arm], readers, lambda robot, stream, writer: 500.0 if writer == DRIVER else None)
     assert graph.streams == (
         StreamUse("arm", "joint_states", ("driver",), ("view",), 500.0),
         StreamUse("arm", "tf_static/left", ("mount",), ()),
@@ -63,7 +63,7 @@ def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_
 
 
 def test_without_writers_a_reader_of_all_robots_is_in_the_graph():
-    graph = graph_of([], [Announcement(ANY, "tf", VIEWER)])
+    graph = build_graph([], [Announcement(ANY, "tf", VIEWER)])
     assert graph.streams == (StreamUse(ANY, "tf", (), ("view",)),)
 
 

@@ -10,7 +10,7 @@ import pytest
 from helpers.processes import until
 
 from zstate.errors import Closed, SecondWriter
-from zstate.net.ownership import GONE_WITHIN_S, WriterClaim, check_edges
+from zstate.net.ownership import TOKEN_EXPIRY_S, WriterClaim, check_edges
 from zstate.net.presence import announce, current_tokens
 from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher
@@ -89,7 +89,7 @@ def test_a_writer_that_is_leaving_is_waited_for(sessions):
     ours, theirs = sessions
     leaving = told(theirs, said(FIRST))
     await_tokens(ours, 1)
-    timer = threading.Timer(GONE_WITHIN_S / 5, leaving.close)
+    timer = threading.Timer(TOKEN_EXPIRY_S / 5, leaving.close)
     timer.start()
     WriterClaim(ours, [said(SECOND)]).close()
     timer.join()

@@ -111,7 +111,7 @@ def test_closing_the_session_ends_a_query_that_waits(sessions: tuple[Session, Se
 def test_replies_beyond_the_bound_are_counted_in_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    monkeypatch.setattr(queryable, "MOST_REPLIES", 10)
+    monkeypatch.setattr(queryable, "MAX_REPLIES", 10)
     with connect() as session, many_tokens(session, 30), caplog.at_level(logging.WARNING, "zstate"):
         assert len(list(query_tokens(session.zenoh, "zstate/*/@writer/*/*", 1.0))) == 10
     (record,) = caplog.records

@@ -12,8 +12,8 @@ from helpers.robots import SECOND, STAMP
 from zstate.errors import InvalidInput, MessageError
 from zstate.net.queryable import Queryable, Reply
 from zstate.net.sample_history import (
-    MOST_BYTES,
-    MOST_PAGE_BYTES,
+    MAX_CACHE_BYTES,
+    MAX_PAGE_BYTES,
     PAGE_BYTES,
     PAGE_SAMPLES,
     HistoryReader,
@@ -98,7 +98,7 @@ def test_memory_is_bounded_whatever_the_stamps_say():
         memory.append(state(seq, STAMP, numbers=1))
     kept = seqs(memory.since(0))
     assert kept == list(range(100 - len(kept), 100))
-    assert 1 <= len(kept) <= MOST_BYTES // 800_000
+    assert 1 <= len(kept) <= MAX_CACHE_BYTES // 800_000
 
 
 @pytest.mark.parametrize("span_s", [-1.0, 0.0, float("nan"), float("inf")])
@@ -344,7 +344,7 @@ def test_of_many_replies_the_first_on_the_right_key_is_the_page(sessions):
 
 def test_a_page_that_is_too_large_is_refused(sessions):
     writer, reader = sessions
-    page = encode(HistoryPage(ENCODINGS[JointState], (bytes(MOST_PAGE_BYTES),)))
+    page = encode(HistoryPage(ENCODINGS[JointState], (bytes(MAX_PAGE_BYTES),)))
     heard = Heard(reader)
     with Queryable(writer, KEY, lambda _: Reply(page, ENCODINGS[HistoryPage])), heard.reader:
         await_answers(reader)

@@ -2,7 +2,7 @@
 
 Each reads counters that exist anyway, at each scrape.
 
-Paces: rates of what is only counted.
+CounterRates: rates of what is only counted.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ EVERY_S = 1.0
 _Marks = deque[tuple[float, float]]
 
 
-class Paces:
+class CounterRates:
     """Rates [Hz] of counts over the last ten seconds, independent of when and how often they are read.
 
     ``note`` is to be called about once a second; without that a rate is the one since the last reading that
@@ -131,7 +131,7 @@ class PublisherMetrics:
 
     def __init__(self, publishers: Sequence[StatePublisher]) -> None:
         self._publishers = publishers
-        self._paces = Paces()
+        self._paces = CounterRates()
         self.sample()
 
     def sample(self) -> None:
@@ -191,7 +191,7 @@ class ListenerMetrics:
 
     def __init__(self, listeners: Callable[[], Sequence[Listened]]) -> None:
         self._listeners = listeners
-        self._paces = Paces()
+        self._paces = CounterRates()
         self.sample()
 
     def sample(self) -> None:

@@ -31,7 +31,7 @@ from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
 from zstate.wire.messages import ClockMessage as Time
 from zstate.wire.native import ENCODINGS, decode, encode
 
-AGAIN_S = 30.0
+REFRESH_S = 30.0
 """So old a measurement is repeated when it is asked for; sooner while there was no answer."""
 
 _UNANSWERED_AGAIN_S = 5.0
@@ -200,7 +200,7 @@ class _Measured:
         self.offset: ClockOffset | None = None
         self._unanswered = 0
         self._meter = meter
-        self._wanted_s = -AGAIN_S
+        self._wanted_s = -REFRESH_S
 
     @property
     def timeout_s(self) -> float:
@@ -216,7 +216,7 @@ class _Measured:
 
     def __call__(self) -> ClockOffset | None:
         now_s = time.monotonic()
-        if now_s - self._wanted_s >= (_UNANSWERED_AGAIN_S if self.offset is None else AGAIN_S):
+        if now_s - self._wanted_s >= (_UNANSWERED_AGAIN_S if self.offset is None else REFRESH_S):
             self._wanted_s = now_s
             self._meter.want(self)
         return self.offset

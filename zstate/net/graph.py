@@ -90,12 +90,12 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-RateOf = Callable[[str, Stream, WriterId], float | None]
+RateLookup = Callable[[str, Stream, WriterId], float | None]
 """The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
 
 
-def graph_of(
-    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateOf | None = None
+def build_graph(
+    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateLookup | None = None
 ) -> Graph:
     """The graph of discovered writers and readers.
 
@@ -106,7 +106,7 @@ def graph_of(
 
 
 def _stream_uses(
-    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateOf | None
+    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateLookup | None
 ) -> Iterator[StreamUse]:
     written: set[tuple[str, Stream]] = {
         (robot.name, stream) for robot in robots for stream, _ in robot.writers
@@ -193,7 +193,7 @@ class GraphMonitor(Closeable):
 
     def _update(self) -> None:
         robots = discover(self._session, _DISCOVERY_TIMEOUT_S)
-        graph = graph_of(robots, discover_readers(self._session, _DISCOVERY_TIMEOUT_S))
+        graph = build_graph(robots, discover_readers(self._session, _DISCOVERY_TIMEOUT_S))
         # The process of this monitor may itself read all robots, which is no stream of a robot.
         self._graph = Graph(tuple(stream for stream in graph.streams if stream.robot != ANY))
         alive = {(robot.name, writer.session) for robot in robots for _, writer in robot.writers}

@@ -20,7 +20,7 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InsertRefused, InvalidInput, MessageError, SecondWriter, format_duration
-from zstate.net.presence import ANSWER_WITHIN_S, announce, tokens_there
+from zstate.net.presence import ANSWER_WITHIN_S, announce, confirmed_tokens
 from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.streams import Ring, to_serialized
@@ -43,7 +43,7 @@ from zstate.wire.native import NativeWire
 from zstate.wire.protocol import SerializedSample
 
 CAPACITY = 1024
-GONE_WITHIN_S = 0.5
+TOKEN_EXPIRY_S = 0.5
 """So long after a writer was killed its token may still be seen; measured: 2 to 33 ms."""
 
 ROUND_S = 0.005
@@ -104,7 +104,7 @@ class WriterClaim(Closeable):
         For those who say something once and are silent then. Raises SecondWriter.
         """
         _wait_for_propagation(self._session)
-        deadline = time.monotonic() + GONE_WITHIN_S
+        deadline = time.monotonic() + TOKEN_EXPIRY_S
         while rivals := self._rivals_now():
             earlier = [rival for rival in rivals if self._is_before_us(rival)]
             if earlier or time.monotonic() > deadline:
@@ -162,7 +162,7 @@ class WriterClaim(Closeable):
 
     def _await_the_leaving(self) -> None:
         wait_for_discovery(self._session)
-        deadline = time.monotonic() + GONE_WITHIN_S
+        deadline = time.monotonic() + TOKEN_EXPIRY_S
         while rivals := self._rivals_now():
             if time.monotonic() > deadline:
                 raise _second_writer(self._oldest(rivals))
@@ -205,7 +205,7 @@ class WriterClaim(Closeable):
         return self._session.zenoh.liveliness().declare_subscriber(self._expression, ring, history=True)
 
     def _rivals_now(self) -> list[Announcement]:
-        return self._rivals_of(tokens_there(self._session, self._expression))
+        return self._rivals_of(confirmed_tokens(self._session, self._expression))
 
     def _rivals_of(self, tokens: Iterable[str]) -> list[Announcement]:
         said = (_WIRE.announced(token, ANY) for token in tokens)
@@ -297,7 +297,7 @@ def claim_edges(
 
 
 def _await_the_later(session: Session, writer: Announcement, edge: Edge, beside: Container[int]) -> None:
-    deadline = time.monotonic() + GONE_WITHIN_S
+    deadline = time.monotonic() + TOKEN_EXPIRY_S
     while rivals := list(_about_to_place(session, writer, edge[1], beside)):
         first, theirs = min(rivals, key=lambda rival: seniority(rival[0]))
         if seniority(first) < seniority(writer) or time.monotonic() > deadline:
@@ -308,7 +308,7 @@ def _await_the_later(session: Session, writer: Announcement, edge: Edge, beside:
 def _about_to_place(
     session: Session, writer: Announcement, child: str, beside: Container[int]
 ) -> Iterator[tuple[Announcement, Edge]]:
-    for token in tokens_there(session, edge_expression(child)):
+    for token in confirmed_tokens(session, edge_expression(child)):
         with suppress(InvalidInput):  # not ours
             robot, edge, identity = parse_edge_key(token)
             said = Announcement.parse(robot, "tf_static", identity)
@@ -360,7 +360,7 @@ def check_readers(session: Session, writer: Announcement, edges: Sequence[Edge])
 
 def _is_announced(session: Session, robot: str) -> bool:
     try:
-        return bool(tokens_there(session, _WIRE.writers_expression(robot)))
+        return bool(confirmed_tokens(session, _WIRE.writers_expression(robot)))
     except InvalidInput:  # what cannot be a robot's name is that of none
         return False
 
@@ -471,7 +471,7 @@ def _unknown(name: str, said: StaticTransforms) -> WriterId:
 
 def _with_identity(session: Session, placed: Announcement) -> Announcement:
     """The same with who it is, if that is announced."""
-    for token in tokens_there(session, _WIRE.writers_expression(placed.robot)):
+    for token in confirmed_tokens(session, _WIRE.writers_expression(placed.robot)):
         said = _WIRE.announced(token, placed.robot)
         if said is not None and said.stream == "tf_static" and said.writer.session == placed.writer.session:
             return Announcement(placed.robot, "tf_static", said.writer, placed.name)

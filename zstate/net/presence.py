@@ -27,7 +27,7 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput
-from zstate.net.queryable import MOST_REPLIES, query_tokens
+from zstate.net.queryable import MAX_REPLIES, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, Ring, call_for_each
 from zstate.wire.identity import Announcement, WriterId
@@ -204,7 +204,7 @@ def current_tokens(session: Session, expression: str, timeout_s: float) -> froze
     return frozenset(query_tokens(session.zenoh, expression, timeout_s))
 
 
-def tokens_there(session: Session, expression: str) -> frozenset[str]:
+def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:
     """The liveliness tokens there are, asked for twice before there are said to be none."""
     # Of a router's answers to a session that follows the same tokens, one in 1500 was empty.
     found = current_tokens(session, expression, ANSWER_WITHIN_S)
@@ -276,14 +276,14 @@ class WriterWatch(Closeable):
 
     def _changes(self) -> list[tuple[str, bool]]:
         """What has come and gone since the last batch; later changes are still in the ring."""
-        there = tokens_there(self._session, self._expression)
+        there = confirmed_tokens(self._session, self._expression)
         gone, come = self._known.keys() - there, there - self._known.keys()
         return [*((token, False) for token in gone), *((token, True) for token in come)]
 
     def _on_change(self, token: str, alive: bool, *, cut_off: bool) -> None:
         if alive == (token in self._known):
             return
-        if alive and len(self._known) >= MOST_REPLIES:
+        if alive and len(self._known) >= MAX_REPLIES:
             self.ignored += 1
             return
         announced = self._wire.announced(token, self._robot) if alive else self._known.pop(token)

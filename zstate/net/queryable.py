@@ -30,7 +30,7 @@ from zstate.transform import Transform
 from zstate.wire.keys import lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_from_json, from_json
 
-MOST_REPLIES = 100_000
+MAX_REPLIES = 100_000
 """At most so many replies to one query are kept. The rest are counted, and logged as a warning."""
 
 _NEVER_FULL = 2**24
@@ -76,18 +76,18 @@ def query_tokens(session: zenoh.Session, expression: str, timeout_s: float) -> I
 def _bounded(replies: Iterable[zenoh.Reply], selector: str) -> Iterator[zenoh.Reply]:
     count = 0
     for count, reply in enumerate(replies, 1):
-        if count <= MOST_REPLIES:
+        if count <= MAX_REPLIES:
             yield reply
-    if count > MOST_REPLIES:
+    if count > MAX_REPLIES:
         facts = {"event": "too many replies", "selector": selector, "replies": count}
         text = "%r has %d replies; only the first %d are used"
-        _LOG.warning(text, selector, count, MOST_REPLIES, extra=facts)
+        _LOG.warning(text, selector, count, MAX_REPLIES, extra=facts)
 
 
 CAPACITY = 64
 """So many questions wait. When more come the oldest are lost, and who asked is told that nobody answers."""
 
-LONGEST_REST_S = 0.2
+MAX_PAUSE_S = 0.2
 
 Queries: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Query]"
 
@@ -141,7 +141,7 @@ class Queryable(Closeable):
             call_for_each(queries, self._answer_one)
         finally:
             if len(queries) >= self._capacity:
-                time.sleep(min(3.0 * (time.monotonic() - began), LONGEST_REST_S))
+                time.sleep(min(3.0 * (time.monotonic() - began), MAX_PAUSE_S))
 
     def _answer_one(self, asked: zenoh.Query) -> None:
         with asked:  # leaving tells the one who asks that this was all

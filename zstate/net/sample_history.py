@@ -102,15 +102,15 @@ PAGE_BYTES = 32_000
 PAGE_SAMPLES = 256
 """So many make a page where samples are small: then a page takes well below a millisecond to make."""
 
-MOST_BYTES = 8_000_000
+MAX_CACHE_BYTES = 8_000_000
 TIMEOUTS_S = (0.25, 0.5, 1.0)
 """So long a writer may take for its page; one that takes longer three times in a row is not asked again."""
 
-FIRST_REST_S = 0.05
-TRIES = 5
+RETRY_DELAY_S = 0.05
+MAX_ATTEMPTS = 5
 """So often a page is asked for where nothing answers yet, with longer and longer rests: 1.5 s in all."""
 
-MOST_PAGE_BYTES = 524_288
+MAX_PAGE_BYTES = 524_288
 """A longer page is refused: one has at most 32 kB, or a single sample."""
 
 _OVERHEAD = 300
@@ -133,7 +133,7 @@ class SampleCache:
         self.span_s = span_s
         self.writer = writer
         self._span_ns = round(span_s * 1e9)
-        self._states: deque[JointState] = deque(maxlen=MOST_BYTES // (8 * numbers + _OVERHEAD))
+        self._states: deque[JointState] = deque(maxlen=MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD))
         self._newest = 0
 
     def append(self, state: JointState) -> None:
@@ -198,8 +198,8 @@ def _page(states: Sequence[JointState], say: Callable[[JointState], bytes]) -> t
 
 
 def _history_request(page: SerializedSample) -> HistoryPage:
-    if len(page.payload) > MOST_PAGE_BYTES:
-        text = f"a page of {len(page.payload)} bytes, more than {MOST_PAGE_BYTES}"
+    if len(page.payload) > MAX_PAGE_BYTES:
+        text = f"a page of {len(page.payload)} bytes, more than {MAX_PAGE_BYTES}"
         raise MessageError(text, reason="too large")
     return decode(page.payload, page.encoding, HistoryPage)
 
@@ -345,9 +345,9 @@ class HistoryReader(Closeable):
         now_s = time.monotonic()
         asked.tries += 1
         asked.timeouts += now_s - asked.sent_s > 0.9 * TIMEOUTS_S[asked.timeouts]
-        if asked.tries >= TRIES or asked.timeouts >= len(TIMEOUTS_S):
+        if asked.tries >= MAX_ATTEMPTS or asked.timeouts >= len(TIMEOUTS_S):
             return None
-        return now_s + FIRST_REST_S * 2**asked.tries
+        return now_s + RETRY_DELAY_S * 2**asked.tries
 
     def close(self) -> None:
         """Stop asking, within a second. A second call does nothing."""

@@ -23,7 +23,7 @@ from zstate.wire.protocol import SerializedSample
 
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
-MOST_BYTES = 65_536
+MAX_STATUS_BYTES = 65_536
 """A longer status is refused."""
 
 
@@ -65,7 +65,7 @@ class StatusPublisher(Closeable):
             self._publisher.put(encode(status))
 
 
-class StatusWatch(Closeable):
+class StatusSubscriber(Closeable):
     """Hears every status of ``robot`` ("*": of all robots); ``refused`` counts what was none, by reason."""
 
     def __init__(self, session: Session, robot: str, callback: Callable[[str, Status], None]) -> None:
@@ -91,8 +91,8 @@ class StatusWatch(Closeable):
 
 def _status_in(arrival: SerializedSample) -> tuple[str, Status]:
     """The robot and its writer's status. Raises MessageError, or InvalidInput for a key of no writer."""
-    if len(arrival.payload) > MOST_BYTES:
-        text = f"a Status of {len(arrival.payload)} bytes, more than {MOST_BYTES}"
+    if len(arrival.payload) > MAX_STATUS_BYTES:
+        text = f"a Status of {len(arrival.payload)} bytes, more than {MAX_STATUS_BYTES}"
         raise MessageError(text, reason="too large")
     robot, identity = parse_status_key(arrival.key)
     status = decode(arrival.payload, arrival.encoding, Status)
@@ -103,11 +103,11 @@ def _status_in(arrival: SerializedSample) -> tuple[str, Status]:
     return robot, status
 
 
-def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusWatch:
+def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusSubscriber:
     """Call ``callback(robot, status)`` with what each publisher of ``robot`` says of itself, once a second.
 
     They begin within a second. It is called from one thread. A process that is frozen or gone says
     nothing: look at the age of what it said last. Said on the native wire alone; ROS's diagnostics are
     not among the messages that zstate speaks.
     """
-    return StatusWatch(session, robot, callback)
+    return StatusSubscriber(session, robot, callback)

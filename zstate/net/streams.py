@@ -110,7 +110,7 @@ class Receiver(Generic[T]):
 CAPACITY = 1024
 """So many samples of one key wait for a reader that is held up: a second at 1 kHz."""
 
-CAPACITY_OF_MANY = 4096
+WILDCARD_CAPACITY = 4096
 """And so many of an expression that hears many keys: 0.8 s of 100 robots at 50 Hz.
 
 Not more, because a sample that waits holds the memory it was received in, 10 to 20 kB.
@@ -123,17 +123,17 @@ _Statuses: TypeAlias = "zenoh.handlers.Handler[zenoh.MatchingStatus]"
 
 def capacity_for(keyexpr: str) -> int:
     """How many samples of ``keyexpr`` wait for who reads them; of more the oldest are lost."""
-    return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
+    return WILDCARD_CAPACITY if "*" in keyexpr else CAPACITY
 
 
-def to_serialized(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> SerializedSample:
+def to_serialized(sample: zenoh.Sample, key: str = "", max_bytes: int = LATCHED_BYTES) -> SerializedSample:
     """What came, as the wires read it; ``key`` is on which, where that is known.
 
-    A payload of more than ``most_bytes`` is not copied: of such a one only the size is given.
+    A payload of more than ``max_bytes`` is not copied: of such a one only the size is given.
     """
     payload, beside = sample.payload, sample.attachment
     key = key or str(sample.key_expr)
-    if len(payload) > most_bytes or (beside is not None and len(beside) > ATTACHMENT_BYTES):
+    if len(payload) > max_bytes or (beside is not None and len(beside) > ATTACHMENT_BYTES):
         return SerializedSample(key, b"\0", str(sample.encoding), None, max(len(payload), LATCHED_BYTES + 1))
     return SerializedSample(
         key, payload.to_bytes(), str(sample.encoding), None if beside is None else beside.to_bytes()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 WINDOW = 10_000
 """Ten seconds at 1 kHz."""
-FEW = 200
+FLEET_WINDOW = 200
 """Enough for a rate, and few enough for a large fleet."""
 _MEASURABLE_NS = 200_000_000
 _PUBLISHED_NS = 2_000_000_000
