@@ -68,8 +68,14 @@ def test_empty_variables_say_nothing(monkeypatch: pytest.MonkeyPatch):
         ),
         ({"ZSTATE_LISTEN": "localhost:1"}, "ZSTATE_LISTEN in the environment: 'localhost:1' is not .* 'tcp/"),
         ({"ZSTATE_MODE": "loopback", "ZSTATE_LISTEN": "tcp/0.0.0.0:1"}, "ZSTATE_LISTEN .* leaves this host"),
-        ({"ZSTATE_CONNECT": "tls/here:1", "ZSTATE_CERTS": "x"}, "ZSTATE_CERTS is set but ZSTATE_IDENTITY is not"),
-        ({"ZSTATE_CONNECT": "tls/here:1", "ZSTATE_IDENTITY": "x"}, "ZSTATE_IDENTITY is set but ZSTATE_CERTS is not"),
+        (
+            {"ZSTATE_CONNECT": "tls/here:1", "ZSTATE_CERTS": "x"},
+            "ZSTATE_CERTS is set but ZSTATE_IDENTITY is not",
+        ),
+        (
+            {"ZSTATE_CONNECT": "tls/here:1", "ZSTATE_IDENTITY": "x"},
+            "ZSTATE_IDENTITY is set but ZSTATE_CERTS is not",
+        ),
         (
             {"ZSTATE_CONNECT": "tcp/here:1", "ZSTATE_USER": "eve"},
             "'eve' .*ZSTATE_USER.* into ZSTATE_PASSWORD,",

@@ -46,7 +46,7 @@ def test_who_comes_second_is_told_who_writes_already_and_what_to_do(sessions):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="joint_states of 'r1'") as raised:
             WriterClaim(ours, [said(SECOND)])
-    assert "'driver@jetson pid 412', there since 1970-01-01" in str(raised.value)
+    assert "'driver@jetson pid 412', started 1970-01-01" in str(raised.value)
     assert "takeover=True" in str(raised.value)
     error = pickle.loads(pickle.dumps(raised.value))
     assert (error.robot, error.stream, error.first, error.edge) == ("r1", "joint_states", FIRST, None)

@@ -63,7 +63,10 @@ def test_a_client_whose_router_does_not_answer_is_told_within_its_timeout(free_p
 
 def test_a_busy_port_is_named(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
-    with connect(mode="router", listen=endpoint), pytest.raises(PortBusy, match="another program listens") as caught:
+    with (
+        connect(mode="router", listen=endpoint),
+        pytest.raises(PortBusy, match="another program listens") as caught,
+    ):
         connect(listen=endpoint)
     assert caught.value.endpoint == endpoint
 

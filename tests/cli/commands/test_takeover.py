@@ -15,7 +15,7 @@ def test_what_somebody_writes_already_is_written_with_takeover_only(spawn: Spawn
     with standing():
         message = failure(*command)
         assert f"pid {os.getpid()}'" in message
-        assert "joint_states of 'rrbot' already" in message
+        assert "already writes joint_states of 'rrbot'" in message
         assert "rrbot" in started(spawn, *command, "--takeover").line()
 
 
