@@ -180,7 +180,7 @@ def test_a_measurement_is_made_once_however_often_it_is_asked_for(sessions):
     ):
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
-        ask = meter.follow("r1", known.writer)
+        ask = meter.watch("r1", known.writer)
         until(lambda: ask() is not None)
         first = ask()
         assert all(ask() is first for _ in range(1000))
@@ -192,7 +192,7 @@ def test_a_meter_whose_session_is_gone_falls_silent(sessions):
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         reader.close()
-        assert meter.follow("r1", known.writer)() is None
+        assert meter.watch("r1", known.writer)() is None
 
 
 def test_many_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions):
@@ -207,9 +207,9 @@ def test_many_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(ses
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         for one in silent:
-            meter.follow("r2", one)
+            meter.watch("r2", one)
         until(queryable.handler.try_recv)
-        ask = meter.follow("r1", known.writer)
+        ask = meter.watch("r1", known.writer)
         until(lambda: ask() is not None, timeout_s=SOON_S)
 
 

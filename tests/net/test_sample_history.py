@@ -136,7 +136,7 @@ def test_a_reader_gets_every_sample_as_it_was_sent_the_newest_page_first(session
     heard = Heard(reader)
     with serve_history(writer, "r1", "joint_states", memory, encode), heard.reader:
         await_answers(reader)
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         until(lambda: len(heard.pages) == 2)
     assert heard.seqs() == [list(range(3, PAGE_SAMPLES + 3)), [0, 1, 2]]
     assert heard.pages[1] == [
@@ -151,7 +151,7 @@ def test_a_page_is_small_and_has_at_least_one_sample(sessions: tuple[Session, Se
         heard = Heard(reader, most=3)
         with serve_history(writer, "r1", "joint_states", memory, encode), heard.reader:
             await_answers(reader)
-            heard.reader.ask(KEY, 7)
+            heard.reader.request(KEY, 7)
             until(lambda heard=heard: len(heard.pages) == 3)
         sizes = [sum(len(one.payload) for one in page) for page in heard.pages]
         assert all(size <= PAGE_BYTES for size in sizes) if numbers == 100 else sizes[0] > PAGE_BYTES
@@ -167,7 +167,7 @@ def test_a_writer_that_has_said_nothing_says_so_and_is_not_asked_again(sessions)
         before = service.answered
         heard = Heard(reader)
         with heard.reader:
-            heard.reader.ask(KEY, 7)
+            heard.reader.request(KEY, 7)
             until(lambda: service.answered == before + 1)
     assert (heard.pages, heard.errors) == ([], [])
 
@@ -188,7 +188,7 @@ def test_an_answer_on_another_key_than_was_asked_is_none(sessions: tuple[Session
         pass
     heard = Heard(reader)
     with heard.reader:
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         assert all(asked.acquire(timeout=5.0) for _ in range(2)), "no answer is asked for again"
     assert (heard.pages, heard.errors) == ([], [])
     forged.undeclare()
@@ -205,7 +205,7 @@ def test_each_writer_of_a_key_is_asked_for_itself(sessions: tuple[Session, Sessi
     ):
         await_answers(reader)
         for session in (7, 8, 9):
-            heard.reader.ask(KEY, session)
+            heard.reader.request(KEY, session)
         until(lambda: len(heard.pages) == 2)
     assert sorted(heard.seqs()) == [[0, 1, 2], [0, 1, 2, 3, 4]]
 
@@ -217,7 +217,7 @@ def test_more_writers_than_are_asked_at_once_all_have_their_turn(sessions: tuple
     with serve_history(writer, "r1", "joint_states", memory, encode), heard.reader:
         await_answers(reader)
         for _ in range(30):
-            heard.reader.ask(KEY, 7)
+            heard.reader.request(KEY, 7)
         until(lambda: len(heard.pages) == 30)
 
 
@@ -233,7 +233,7 @@ def test_an_answer_that_is_none_is_told_and_ends_the_asking(sessions, answer: Re
     heard = Heard(reader)
     with Queryable(writer, KEY, lambda _: answer), heard.reader:
         await_answers(reader)
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         until(lambda: len(heard.errors) == 1)
     assert (heard.errors[0].reason, heard.pages) == (reason, [])
 
@@ -251,9 +251,9 @@ def test_a_writer_that_always_names_the_same_older_page_is_not_asked_for_ever(se
     with Queryable(writer, KEY, answer), heard.reader:
         await_answers(reader)
         asked.clear()
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         until(lambda: len(heard.pages) == 2)
-        heard.reader.ask(KEY, 8)
+        heard.reader.request(KEY, 8)
         until(lambda: len(heard.pages) == 4)
     assert asked == ["", "5", "", "5"]
 
@@ -262,7 +262,7 @@ def test_who_answers_only_later_is_heard_all_the_same(sessions: tuple[Session, S
     writer, reader = sessions
     heard = Heard(reader)
     with heard.reader:
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         asked = threading.Event()
 
         def answer(parameters):
@@ -283,7 +283,7 @@ def test_who_does_not_answer_costs_no_thread_and_closing_does_not_wait_for_it(se
     writer, reader = sessions
     queryable = writer.zenoh.declare_queryable(KEY)
     heard = Heard(reader)
-    heard.reader.ask(KEY, 7)
+    heard.reader.request(KEY, 7)
     heard.reader.close()
     heard.reader.close()
     assert (heard.pages, heard.errors) == ([], [])
@@ -298,9 +298,9 @@ def test_many_silent_writers_of_one_robot_do_not_delay_the_history_of_another(se
     with serve_history(writer, "r1", "joint_states", remembering(PAGE_SAMPLES + 3), encode), heard.reader:
         await_answers(reader)
         for session in range(500):
-            heard.reader.ask("zstate/r2/joint_states", session)
+            heard.reader.request("zstate/r2/joint_states", session)
         until(silent.handler.try_recv)
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         until(lambda: len(heard.pages) == 2)
     assert not heard.errors
 
@@ -311,7 +311,7 @@ def test_a_writer_that_keeps_silent_is_asked_three_times(sessions):
     silent = writer.zenoh.declare_queryable(KEY, zenoh.handlers.RingChannel(100))
     heard, kept = Heard(reader), list[zenoh.Query]()
     with heard.reader:
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
 
         def is_asked_in_all() -> bool:
             while (query := silent.handler.try_recv()) is not None:
@@ -336,7 +336,7 @@ def test_of_many_replies_the_first_on_the_right_key_is_the_page(sessions):
     queryable = writer.zenoh.declare_queryable(KEY, answer)
     heard = Heard(reader)
     with heard.reader:
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         until(lambda: heard.pages)
     assert [[one.payload for one in page] for page in heard.pages] == [[b"right"]]
     queryable.undeclare()
@@ -348,7 +348,7 @@ def test_a_page_that_is_too_large_is_refused(sessions):
     heard = Heard(reader)
     with Queryable(writer, KEY, lambda _: Reply(page, ENCODINGS[HistoryPage])), heard.reader:
         await_answers(reader)
-        heard.reader.ask(KEY, 7)
+        heard.reader.request(KEY, 7)
         until(lambda: heard.errors)
     assert (heard.errors[0].reason, heard.pages) == ("too large", [])
 
@@ -368,7 +368,7 @@ def test_a_page_that_cannot_be_taken_does_not_end_the_asking_of_others(sessions,
     past = HistoryReader(reader, take, lambda *_: None)
     with serve_history(writer, "r1", "joint_states", remembering(3), encode), past:
         await_answers(reader)
-        past.ask(KEY, 7)
-        past.ask(KEY, 7)
+        past.request(KEY, 7)
+        past.request(KEY, 7)
         until(lambda: len(pages) == 2)
     assert len(raised) == 1

@@ -340,7 +340,7 @@ def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Sessi
         said = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
         with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
-            past.ask(JOINTS, publisher.cache.since(0)[0].session)
+            past.request(JOINTS, publisher.cache.since(0)[0].session)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == said
     assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}
