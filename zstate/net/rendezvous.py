@@ -21,7 +21,7 @@ import socket
 import threading
 import time
 import weakref
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import zenoh
 
@@ -196,7 +196,7 @@ class _Address:
         self.endpoint = f"tcp/{address[0]}:{address[1]}"
         self.address = address
         self._key = key
-        self._peer: tuple[zenoh.Session, zenoh.Subscriber[object]] | None = None
+        self._peer: ExitStack | None = None
         self._lock = fork_safe_lock()
         self._registration: RendezvousRegistration | None = None
 
@@ -228,16 +228,20 @@ class _Address:
         """Run the rendezvous peer, if no process has the port."""
         if self._peer is not None or not self.is_free:
             return
+        peer = ExitStack()
         try:
             session = open_zenoh(default_config("peer", (), [self.endpoint]))
-            peer = session, session.declare_subscriber(self._key, zenoh.handlers.RingChannel(1))
+            peer.callback(session.close)
+            # Closing undeclares nothing: a session that connects at that moment would see the subscription
+            # for ever. So it is undeclared first.
+            peer.callback(session.declare_subscriber(self._key, zenoh.handlers.RingChannel(1)).undeclare)
         except zenoh.ZError:
             return  # another process was quicker
         with self._lock:
             if not stop.is_set():
                 self._peer = peer
                 return
-        _close_peer(*peer)
+        peer.close()
 
     def join(self, session: zenoh.Session, endpoint: str) -> RendezvousRegistration:
         """The registration of ``session`` there."""
@@ -253,13 +257,7 @@ class _Address:
             peer, self._peer = self._peer, None
         self._registration = None
         if peer is not None:
-            _close_peer(*peer)
-
-
-def _close_peer(session: zenoh.Session, subscriber: zenoh.Subscriber[object]) -> None:
-    # Closing undeclares nothing: a session that connects at that moment would see the subscription for ever.
-    subscriber.undeclare()
-    session.close()
+            peer.close()
 
 
 def free_endpoint() -> str:

@@ -243,9 +243,9 @@ class HistoryReader(Closeable):
         while not self._closed:
             now_s = time.monotonic()
             next_s = self._waiting.next_s(now_s)
-            is_idle = next_s is None or self._in_flight >= _MAX_IN_FLIGHT
+            pause_s = None if next_s is None or self._in_flight >= _MAX_IN_FLIGHT else next_s - now_s
             with suppress(queue.Empty):
-                event = self._events.get(timeout=None if is_idle else next_s - now_s)
+                event = self._events.get(timeout=pause_s)
                 if event is not None:
                     self._on_event(*event)
             now_s = time.monotonic()
