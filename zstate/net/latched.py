@@ -48,7 +48,7 @@ class LatchedPublisher(Closeable):
 
     def withdraw(self) -> None:
         """Withdraw the value from all subscribers. Raises Closed."""
-        self._send(lambda: self._publisher.delete())
+        self._send(self._publisher.delete)  # pyright: ignore[reportUnknownArgumentType]
 
     def _send(self, action: Callable[[], object]) -> None:
         self._session.check()

@@ -88,7 +88,7 @@ def open_with_retry(
 
 
 def _attempt(config: zenoh.Config) -> zenoh.Session | None:
-    """A session, or None without a link. Zenoh has one error for everything; its text tells them apart."""
+    """A session, or None without a link. Zenoh has one error for everything; its text distinguishes them."""
     try:
         return open_zenoh(config)
     except zenoh.ZError as error:

@@ -308,7 +308,7 @@ def check_edges(
 ) -> None:
     """Raise SecondWriter if a live static writer of any robot places a child of ``edges`` already.
 
-    Frames are full names; ``writer`` is the one that asks. Takes one round trip.
+    Frames are full names; ``writer`` publishes ``edges``. Takes one round trip.
     """
     wait_for_discovery(session)
     children = {child for _, child in edges}

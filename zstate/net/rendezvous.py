@@ -49,7 +49,7 @@ _DISCOVERY_POLL_S = 0.002
 
 
 def rendezvous_key(number: int) -> str:
-    """The key of the peer at the rendezvous address ``number``, which tells it from the others."""
+    """The key of the peer at the rendezvous address ``number``, which distinguishes it from the others."""
     return f"{PEER_KEY}/{number}" if number else PEER_KEY
 
 
@@ -106,7 +106,7 @@ class RendezvousRegistration:
     @property
     def is_registered(self) -> bool:
         """Whether the session sees a rendezvous peer there now."""
-        # the stub says bool, but it is an object and always true
+        # bool in the stub, but it is an object and always true
         return bool(self._publisher.matching_status.matching)  # pyright: ignore
 
     def _register(self, stop: threading.Event) -> None:
