@@ -15,7 +15,7 @@ from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
 
 
-def test_writers_and_readers_of_a_stream_are_seen_and_how_the_writers_do(sessions):
+def test_monitor_shows_writers_readers_and_the_status_of_writers(sessions):
     with (
         GraphMonitor(sessions[1]) as watch,
         StatePublisher(sessions[0], RRBOT, "r1", program="driver") as publisher,
@@ -36,7 +36,7 @@ def test_writers_and_readers_of_a_stream_are_seen_and_how_the_writers_do(session
     watch.close()
 
 
-def test_a_publisher_that_is_gone_says_nothing_any_more(sessions):
+def test_status_of_a_closed_publisher_disappears(sessions):
     with GraphMonitor(sessions[1]) as watch:
         with StatePublisher(sessions[0], RRBOT, "r1"):
             until(lambda: watch.graph().streams and watch.states())
