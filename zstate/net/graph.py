@@ -112,13 +112,17 @@ def build_graph(
             for name in names if stream == "tf_static" and names else ("",):
                 by_name.setdefault(name, []).append(writer)
     # A reader of all robots does not miss a stream that one of them lacks.
-    read = {(one.robot, one.stream) for one in readers if one.robot != ANY or not written}
+    used: set[tuple[str, Stream]] = {
+        *written,
+        *((one.robot, one.stream) for one in readers if one.robot != ANY or not written),
+    }
+    unwritten: dict[str, list[WriterId]] = {"": []}
     uses: list[StreamUse] = []
-    for robot, stream in sorted(written.keys() | read):
+    for robot, stream in sorted(used):
         reading = programs(
             one.writer for one in readers if one.stream == stream and one.robot in (robot, ANY)
         )
-        for name, writers in written.get((robot, stream), {"": []}).items():
+        for name, writers in written.get((robot, stream), unwritten).items():
             rates = (rate_of(robot, stream, writer) for writer in writers) if rate_of else ()
             rate_hz = next((rate for rate in rates if rate is not None), None)
             label = f"{stream}/{name}" if name else stream

@@ -1,6 +1,6 @@
 """Latched values (ROS 1; transient local in DDS): late joiners receive the current value of each key."""
 
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownLambdaType=false
 # zenoh's stubs leave the return types of some methods out
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class LatchedPublisher(Closeable):
 
     def withdraw(self) -> None:
         """Withdraw the value from all subscribers. Raises Closed."""
-        self._send(self._publisher.delete)  # pyright: ignore[reportUnknownArgumentType]
+        self._send(self._publisher.delete)
 
     def _send(self, action: Callable[[], object]) -> None:
         self._session.check()
