@@ -15,7 +15,7 @@ import zenoh
 from bench.soak.roles import Report, paced, until_told
 from bench.soak.task import Task
 from zstate import connect, load_model
-from zstate.net.streams import CAPACITY_OF_MANY
+from zstate.net.streams import WILDCARD_CAPACITY
 
 
 def publish(task: Task) -> Report:
@@ -78,12 +78,12 @@ def join_fresh(task: Task) -> Report:
 
 def _subscribe(session: zenoh.Session) -> list[Any]:
     samples = session.declare_subscriber(
-        "zstate/*/joint_states", zenoh.handlers.RingChannel(CAPACITY_OF_MANY)
+        "zstate/*/joint_states", zenoh.handlers.RingChannel(WILDCARD_CAPACITY)
     )
     marks = zenoh.ext.declare_advanced_subscriber(
         session,
         "zstate/*/tf_static/*",
-        zenoh.handlers.RingChannel(CAPACITY_OF_MANY),
+        zenoh.handlers.RingChannel(WILDCARD_CAPACITY),
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
         recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
     )

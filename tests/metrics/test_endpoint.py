@@ -13,29 +13,29 @@ from prometheus_client.registry import Collector
 
 import zstate
 from zstate.errors import InvalidInput, PortBusy
-from zstate.metrics.endpoint import MetricsEndpoint
+from zstate.metrics.endpoint import BindAddress, MetricsEndpoint
 
 
 class Counting(Collector):
-    """How often it was asked."""
+    """Counts its scrapes."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.scrapes = 0
 
     def collect(self):
-        self.asked += 1
-        yield GaugeMetricFamily("asked", "How often.", self.asked)
+        self.scrapes += 1
+        yield GaugeMetricFamily("scrapes", "How often.", self.scrapes)
 
 
-def test_it_asks_its_collectors_at_each_scrape():
+def test_collectors_are_called_at_each_scrape():
     counting = Counting()
     with MetricsEndpoint([counting]) as endpoint:
-        before = counting.asked
-        first, second = (scraped(endpoint.url)[row("asked")] for _ in range(2))
+        before = counting.scrapes
+        first, second = (scraped(endpoint.url)[row("scrapes")] for _ in range(2))
     assert (first, second) == (before + 1, before + 2)
 
 
-def test_it_tells_the_version_and_what_the_process_uses():
+def test_version_and_process_resources_are_reported():
     with MetricsEndpoint([]) as endpoint:
         metrics = scraped(endpoint.url)
     assert metrics[row("zstate_build_info", version=zstate.__version__, kernel=str(zstate.kernel))] == 1.0
@@ -43,13 +43,13 @@ def test_it_tells_the_version_and_what_the_process_uses():
     assert metrics[row("process_resident_memory_bytes")] > 1e6
 
 
-def test_two_of_one_process_do_not_mix():
+def test_two_endpoints_of_one_process_are_separate():
     with MetricsEndpoint([Counting()]) as one, MetricsEndpoint([]) as other:
-        assert row("asked") in scraped(one.url)
-        assert row("asked") not in scraped(other.url)
+        assert row("scrapes") in scraped(one.url)
+        assert row("scrapes") not in scraped(other.url)
 
 
-def test_it_is_reached_at_this_host_alone_unless_told_otherwise():
+def test_only_this_host_reaches_the_endpoint_by_default():
     with MetricsEndpoint([]) as endpoint:
         assert endpoint.url.startswith("http://127.0.0.1:")
     with MetricsEndpoint([], "::1") as endpoint:
@@ -57,7 +57,7 @@ def test_it_is_reached_at_this_host_alone_unless_told_otherwise():
         assert scraped(endpoint.url)
 
 
-def test_nothing_is_left_when_it_has_closed():
+def test_close_ends_threads_connections_and_the_port():
     before = threading.active_count()
     endpoint = MetricsEndpoint([])
     port = int(endpoint.url.split(":")[2].split("/")[0])
@@ -71,7 +71,7 @@ def test_nothing_is_left_when_it_has_closed():
         socket.create_connection(("127.0.0.1", port))
 
 
-def test_a_port_that_is_taken_and_a_host_elsewhere_are_told():
+def test_a_used_port_and_a_remote_host_are_refused():
     with MetricsEndpoint([]) as endpoint:
         port = int(endpoint.url.split(":")[2].split("/")[0])
         with pytest.raises(PortBusy, match=f"'127.0.0.1:{port}'.*or 0 for a free one") as busy:
@@ -81,7 +81,7 @@ def test_a_port_that_is_taken_and_a_host_elsewhere_are_told():
         MetricsEndpoint([], "192.0.2.1")
 
 
-def test_without_the_library_one_is_told_what_to_install():
+def test_a_missing_library_error_names_the_package():
     code = (
         "import sys; sys.modules['prometheus_client'] = None\n"
         "import zstate.metrics.buffer, zstate.metrics.collectors\n"
@@ -92,5 +92,25 @@ def test_without_the_library_one_is_told_what_to_install():
         "except LibraryMissing as error:\n"
         "    print(error)"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "pip install 'zstate[metrics]'" in said
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "pip install 'zstate[metrics]'" in printed
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("9100", ("127.0.0.1", 9100)),
+        ("0", ("127.0.0.1", 0)),
+        ("0.0.0.0:9100", ("0.0.0.0", 9100)),
+        ("robot.local:65535", ("robot.local", 65535)),
+        ("[::1]:9100", ("::1", 9100)),
+    ],
+)
+def test_a_port_without_host_is_on_this_host(text: str, address: tuple[str, int]):
+    assert BindAddress.parse(text) == address
+
+
+@pytest.mark.parametrize("text", ["", "65536", "-1", "host:", "::1:9100", "tcp/1.2.3.4:5", "a b:1", "\u0661"])
+def test_an_invalid_address_error_shows_the_correct_form(text: str):
+    with pytest.raises(InvalidInput, match=r"for instance 9100, or 0\.0\.0\.0:9100"):
+        BindAddress.parse(text)

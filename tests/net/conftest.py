@@ -1,4 +1,4 @@
-"""What the tests of the network have: routers that let some in and others not."""
+"""Fixtures of the network tests: routers that accept some sessions and refuse others."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ import pytest
 from helpers.processes import DEADLINE_S, SOON_S, Child
 
 from zstate import Recording, SineSource, StatePublisher, connect, load_model
-from zstate.net.at_exit import WITHIN_S
+from zstate.net.at_exit import TIMEOUT_S
 
 PROGRAMS = {
     "listener": """
@@ -92,7 +92,7 @@ if __name__ == "__main__":
     sys.exit(child.exitcode)
 """
 
-BESIDE_A_FROZEN_READER = """
+WITH_A_FROZEN_READER = """
     import os, sys, time, zenoh, zstate
     session = zstate.connect()
     publisher = session.zenoh.declare_publisher("k", congestion_control=zenoh.CongestionControl.DROP)
@@ -108,7 +108,7 @@ BESIDE_A_FROZEN_READER = """
 
 @pytest.fixture
 def rrbot(rendezvous: str) -> Iterator[None]:
-    """A robot that is published at every moment of a program's end."""
+    """A robot that is published during the whole exit of a program."""
     model = load_model("rrbot")
     with connect() as session, StatePublisher(session, model) as publisher:
         running = threading.Thread(target=publisher.run, args=(SineSource(model), 500.0))
@@ -119,7 +119,7 @@ def rrbot(rendezvous: str) -> Iterator[None]:
 
 
 def program(body: str, ending: str, *, in_function: bool) -> str:
-    """What a function has opened may be freed before the program ends."""
+    """The source of a program. Objects opened in a function may be freed before the program ends."""
     body = textwrap.dedent(body)
     if in_function:
         body = f"def main():\n{textwrap.indent(body, '    ')}\nmain()\n"
@@ -128,7 +128,7 @@ def program(body: str, ending: str, *, in_function: bool) -> str:
 
 @pytest.mark.usefixtures("rrbot")
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_a_program_that_closes_nothing_ends_with_its_own_exit_code(spawn, name: str):
+def test_program_that_closes_nothing_keeps_its_exit_code(spawn, name: str):
     children: list[tuple[Child, int]] = [
         (spawn(program(PROGRAMS[name], ending, in_function=number % 2 == 0)), code)
         for number, (ending, code) in enumerate(ENDINGS.items())
@@ -139,7 +139,7 @@ def test_a_program_that_closes_nothing_ends_with_its_own_exit_code(spawn, name: 
 
 @pytest.mark.usefixtures("rrbot")
 @pytest.mark.parametrize("method", ["spawn", "forkserver", "fork"])
-def test_a_child_of_multiprocessing_ends_with_its_own_exit_code(tmp_path: Path, method: str):
+def test_multiprocessing_child_keeps_its_exit_code(tmp_path: Path, method: str):
     script = tmp_path / "listening.py"
     script.write_text(IN_A_CHILD)
     done = subprocess.run(
@@ -149,7 +149,7 @@ def test_a_child_of_multiprocessing_ends_with_its_own_exit_code(tmp_path: Path, 
 
 
 @pytest.mark.usefixtures("rrbot")
-def test_a_recording_that_nobody_closes_is_finished_at_the_end(spawn, tmp_path: Path):
+def test_unclosed_recording_is_complete_after_exit(spawn, tmp_path: Path):
     body = """
         from zstate.recording.recorder import Recorder
         recorder = Recorder(zstate.connect(), sys.argv[1], "rrbot")
@@ -162,13 +162,13 @@ def test_a_recording_that_nobody_closes_is_finished_at_the_end(spawn, tmp_path: 
 
 
 @pytest.mark.usefixtures("rrbot")
-def test_nothing_is_printed_at_the_end_of_a_program_that_closes_nothing(spawn):
+def test_program_that_closes_nothing_prints_nothing_at_exit(spawn):
     child: Child = spawn(program(PROGRAMS["publishers in daemon threads"], "", in_function=False))
     assert (child.wait(4 * DEADLINE_S), child.stderr) == (0, "")
 
 
 @pytest.mark.usefixtures("rrbot")
-def test_a_program_goes_on_while_python_waits_for_its_threads_and_in_its_atexit_functions(spawn):
+def test_listener_works_while_python_joins_threads_and_in_atexit_functions(spawn):
     body = """
         import atexit
         listener = zstate.TransformListener(zstate.connect(), "rrbot")
@@ -191,7 +191,7 @@ def test_a_program_goes_on_while_python_waits_for_its_threads_and_in_its_atexit_
     assert [child.line(), child.line()] == ["worked", "looked again"]
 
 
-def test_an_atexit_function_may_close_the_session(spawn):
+def test_atexit_function_may_close_the_session(spawn):
     child: Child = spawn("""
         import atexit, zstate
         session = zstate.connect()
@@ -200,7 +200,7 @@ def test_an_atexit_function_may_close_the_session(spawn):
     assert (child.wait(4 * DEADLINE_S), child.stderr) == (0, "")
 
 
-def test_no_session_is_opened_once_the_process_ends(spawn):
+def test_connect_raises_while_the_process_ends(spawn):
     child: Child = spawn("""
         import atexit
         @atexit.register
@@ -216,7 +216,7 @@ def test_no_session_is_opened_once_the_process_ends(spawn):
     assert "this process is ending" in child.line()
 
 
-def test_a_frozen_reader_holds_the_end_of_a_program_up_for_two_seconds_at_most(spawn):
+def test_frozen_reader_delays_exit_by_at_most_two_seconds(spawn):
     reader: Child = spawn("""
         import sys, zenoh, zstate
         with zstate.connect() as session:
@@ -225,11 +225,11 @@ def test_a_frozen_reader_holds_the_end_of_a_program_up_for_two_seconds_at_most(s
             sys.stdin.readline()
     """)
     reader.line()
-    child: Child = spawn(BESIDE_A_FROZEN_READER)
+    child: Child = spawn(WITH_A_FROZEN_READER)
     assert child.line() == "matched"
     os.kill(reader.process.pid, signal.SIGSTOP)
     child.tell()
     assert child.line() == "ending"
     began = time.monotonic()
     assert child.wait() == 3
-    assert time.monotonic() - began < SOON_S + WITHIN_S
+    assert time.monotonic() - began < SOON_S + TIMEOUT_S

@@ -1,4 +1,4 @@
-"""How far the clocks of writers are ahead, asked over real sessions."""
+"""Clock offsets of writers, measured over real sessions."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ MS = 1_000_000
 SECOND = 1_000_000_000
 
 
-class Ahead:
-    """The system's clock, and so much more."""
+class OffsetClock:
+    """The system clock plus a constant offset."""
 
     domain = "system"
 
@@ -41,40 +41,40 @@ class Ahead:
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 1_200 * MS, -3_600 * SECOND])
-def test_the_offset_is_known_to_half_of_a_round_trip(sessions, ahead_ns):
+def test_offset_error_is_at_most_half_the_round_trip(sessions, ahead_ns):
     writer, reader = sessions
-    with StatePublisher(writer, RRBOT, "r1", clock=Ahead(ahead_ns), program="driver"):
+    with StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(ahead_ns), program="driver"):
         (found,) = measure_offsets(reader, "r1", timeout_s=5.0)
     assert abs(found.offset_ns - ahead_ns) <= found.uncertainty_ns
     assert found.uncertainty_ns == found.round_trip_ns // 2
     assert (found.robot, found.writer.program) == ("r1", "driver")
 
 
-def test_it_is_known_as_well_through_a_router():
+def test_offset_is_measured_through_a_router():
     endpoint = f"tcp/127.0.0.1:{a_free_port()}"
     with (
         connect(mode="router", listen=endpoint),
         connect(mode="client", endpoints=endpoint) as writer,
         connect(mode="client", endpoints=endpoint) as reader,
-        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
+        StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(SECOND)),
     ):
         (found,) = measure_offsets(reader, "*", timeout_s=5.0)
         assert abs(found.offset_ns - SECOND) <= found.uncertainty_ns
 
 
-def test_it_is_measured_by_the_clock_that_was_given(sessions):
+def test_offset_is_relative_to_the_clock_argument(sessions):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1", clock=ManualClock(10 * SECOND)):
         (found,) = measure_offsets(reader, "r1", clock=ManualClock(4 * SECOND), timeout_s=5.0)
-    # Neither of the two moves: the middle of the round trip is all that is added to the question.
+    # Neither clock moves: the difference is half of the round trip.
     assert found.offset_ns == 6 * SECOND - found.uncertainty_ns
 
 
-def test_each_writer_of_each_robot_answers_for_itself(sessions):
+def test_each_writer_of_each_robot_has_its_own_offset(sessions):
     writer, reader = sessions
     with (
-        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
-        StatePublisher(writer, RRBOT, "r2", clock=Ahead(2 * SECOND)),
+        StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(SECOND)),
+        StatePublisher(writer, RRBOT, "r2", clock=OffsetClock(2 * SECOND)),
         StatePublisher(writer, RRBOT, "r3", clock=ManualClock(0, "sim")),
     ):
         until(lambda: len(measure_offsets(reader, "*")) == 2)
@@ -83,7 +83,7 @@ def test_each_writer_of_each_robot_answers_for_itself(sessions):
     assert first.offset_ns < 1_500 * MS < second.offset_ns
 
 
-def test_who_answers_nonsense_or_not_at_all_is_passed_over(sessions):
+def test_invalid_and_missing_replies_are_ignored(sessions):
     writer, reader = sessions
     key = "zstate/r1/@clock/somebody"
     queryable = writer.zenoh.declare_queryable(key, lambda query: query.reply(key, b"noon"))
@@ -93,18 +93,18 @@ def test_who_answers_nonsense_or_not_at_all_is_passed_over(sessions):
 
 
 @pytest.mark.parametrize("session", [5, 6])
-def test_an_answer_counts_on_the_key_and_with_the_session_of_the_writer_that_was_asked(sessions, session):
+def test_reply_needs_the_key_and_the_session_of_its_writer(sessions, session):
     ours = WriterId("driver", "nuc", 3, 1, 5)
     key = clock_key("r1", ours.identity)
-    said = encode(ClockMessage(time.time_ns(), 0, session))
-    answer = lambda query: query.reply(key, said, encoding=ENCODINGS[ClockMessage])  # noqa: E731
+    payload = encode(ClockMessage(time.time_ns(), 0, session))
+    answer = lambda query: query.reply(key, payload, encoding=ENCODINGS[ClockMessage])  # noqa: E731
     queryable = sessions[0].zenoh.declare_queryable(key, answer)
     found = measure_offsets(sessions[1], "r1", timeout_s=0.5)
     assert [one.writer for one in found] == ([ours] if session == 5 else [])
     queryable.undeclare()
 
 
-def test_what_cannot_be_asked_is_refused(sessions):
+def test_invalid_arguments_and_a_closed_session_are_refused(sessions):
     for wrong in ({"rounds": 0}, {"timeout_s": 0.0}):
         with pytest.raises(InvalidInput, match="rounds is 1 or more"):
             measure_offsets(sessions[0], "r1", **wrong)
@@ -113,7 +113,7 @@ def test_what_cannot_be_asked_is_refused(sessions):
         measure_offsets(sessions[0], "r1")
 
 
-def test_the_key_of_a_clock_says_whose_it_is():
+def test_clock_key_contains_robot_and_identity():
     assert clock_expression("*") == "zstate/*/@clock/*"
     assert parse_clock_key(clock_key("r1", "driver,host,1,2,3")) == ("r1", "driver,host,1,2,3")
     for other in ("zstate/r1/@writer/clock", "zstate/r1/tf", "r1/x/@clock/y"):
@@ -121,9 +121,9 @@ def test_the_key_of_a_clock_says_whose_it_is():
             parse_clock_key(other)
 
 
-def test_a_failed_lookup_tells_of_the_writers_clock_when_that_is_off(sessions):
+def test_failed_lookup_mentions_a_wrong_writer_clock(sessions):
     writer, reader = sessions
-    clock = Ahead(1_200 * MS)
+    clock = OffsetClock(1_200 * MS)
     with (
         TransformListener(reader, "r1") as listener,
         StatePublisher(writer, RRBOT, "r1", clock=clock, program="driver") as publisher,
@@ -152,7 +152,7 @@ def test_a_failed_lookup_tells_of_the_writers_clock_when_that_is_off(sessions):
 
 
 @pytest.mark.parametrize("follow", ["joint_states", "tf"])
-def test_a_clock_that_agrees_is_known_and_not_worth_a_word(sessions, follow):
+def test_failed_lookup_does_not_mention_a_correct_clock(sessions, follow):
     writer, reader = sessions
     with (
         TransformListener(reader, "r1", follow=follow) as listener,
@@ -172,48 +172,48 @@ def test_a_clock_that_agrees_is_known_and_not_worth_a_word(sessions, follow):
         assert "the clock of" not in str(reason)
 
 
-def test_a_measurement_is_made_once_however_often_it_is_asked_for(sessions):
+def test_reading_an_offset_often_measures_it_once(sessions):
     writer, reader = sessions
     with (
-        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
-        ClockOffsetMonitor(reader, Ahead(0)) as meter,
+        StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(SECOND)),
+        ClockOffsetMonitor(reader, OffsetClock(0)) as monitor,
     ):
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
-        ask = meter.follow("r1", known.writer)
+        ask = monitor.watch("r1", known.writer)
         until(lambda: ask() is not None)
         first = ask()
         assert all(ask() is first for _ in range(1000))
 
 
-def test_a_meter_whose_session_is_gone_falls_silent(sessions):
+def test_monitor_of_a_closed_session_returns_none(sessions):
     writer, reader = sessions
-    with StatePublisher(writer, RRBOT, "r1"), ClockOffsetMonitor(reader, Ahead(0)) as meter:
+    with StatePublisher(writer, RRBOT, "r1"), ClockOffsetMonitor(reader, OffsetClock(0)) as monitor:
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         reader.close()
-        assert meter.follow("r1", known.writer)() is None
+        assert monitor.watch("r1", known.writer)() is None
 
 
-def test_many_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions):
+def test_silent_writers_of_one_robot_do_not_delay_the_offset_of_another(sessions):
     writer, reader = sessions
     silent = [WriterId("p", "h", 1, 1, session) for session in range(100)]
     kept: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(10_000)
     queryable = writer.zenoh.declare_queryable("zstate/r2/@clock/*", kept)
     with (
-        StatePublisher(writer, RRBOT, "r1", clock=Ahead(SECOND)),
-        ClockOffsetMonitor(reader, Ahead(0)) as meter,
+        StatePublisher(writer, RRBOT, "r1", clock=OffsetClock(SECOND)),
+        ClockOffsetMonitor(reader, OffsetClock(0)) as monitor,
     ):
         until(lambda: measure_offsets(reader, "r1"))
         (known,) = measure_offsets(reader, "r1")
         for one in silent:
-            meter.follow("r2", one)
+            monitor.watch("r2", one)
         until(queryable.handler.try_recv)
-        ask = meter.follow("r1", known.writer)
+        ask = monitor.watch("r1", known.writer)
         until(lambda: ask() is not None, timeout_s=SOON_S)
 
 
-def test_an_answer_counts_only_from_the_writer_whose_clock_was_asked(sessions):
+def test_reply_of_another_writer_does_not_count(sessions):
     writer, reader = sessions
     asked, other = (WriterId("p", "h", 1, 1, session) for session in (7, 8))
     key = clock_key("r1", asked.identity)

@@ -1,4 +1,4 @@
-"""How open each mode is: what it refuses, whom it finds."""
+"""Connection modes: refused endpoints and discovery."""
 
 from __future__ import annotations
 
@@ -41,25 +41,25 @@ LAN_PEER = """
         "tcp/10.0.0.1:7447#iface=lo",
     ],
 )
-def test_loopback_refuses_what_leaves_this_host(endpoint: str):
+def test_loopback_refuses_endpoints_that_leave_this_host(endpoint: str):
     for use in ({"endpoints": ["tcp/127.0.0.1:1", endpoint]}, {"listen": endpoint}):
         with pytest.raises(InvalidInput) as caught:
             connect(mode="loopback", **use)
         assert f"{endpoint!r} leaves this host" in str(caught.value)
 
 
-def test_loopback_takes_what_stays_here(free_port: int, tmp_path):
+def test_loopback_accepts_endpoints_of_this_host(free_port: int, tmp_path):
     here = [f"tcp/127.0.3.4:{free_port}", f"tcp/localhost:{free_port}", f"unixsock-stream/{tmp_path}/s"]
     with connect(mode="loopback", endpoints=[*here, f"tcp/[::1]:{free_port}"], listen=here[0]):
         pass
 
 
-def test_loopback_meets_the_programs_of_this_host():
+def test_loopback_discovers_processes_of_this_host():
     with connect(mode="loopback") as one, connect() as other:
         until(lambda: other.zid in [str(zid) for zid in one.zenoh.info.peers_zid()])
 
 
-def test_loopback_takes_neither_a_configuration_nor_a_rendezvous_elsewhere(monkeypatch: pytest.MonkeyPatch):
+def test_loopback_refuses_a_configuration_and_a_remote_rendezvous(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(ConfigError, match="'loopback' stays on this host"):
         connect({}, mode="loopback")
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", "10.0.0.1:7450")
@@ -67,7 +67,7 @@ def test_loopback_takes_neither_a_configuration_nor_a_rendezvous_elsewhere(monke
         connect(mode="loopback")
 
 
-def test_a_client_that_loses_its_router_goes_on_with_another(spawn, free_port: int):
+def test_client_that_loses_its_router_uses_another(spawn, free_port: int):
     router = """
         import sys
         from zstate.net.session import connect
@@ -113,7 +113,7 @@ def machines() -> Iterator[Callable[..., Child]]:
 
 
 def _wire_up(names: list[str]) -> None:
-    """A switch in the first, and a cable from it to each."""
+    """Creates a switch in the first namespace, with a cable to each of the others."""
     try:
         for name in names:
             _ip("netns", "add", name)
@@ -136,22 +136,22 @@ def _ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True, capture_output=True)
 
 
-def knows(child: Child, zid: str) -> bool:
+def discovers(child: Child, zid: str) -> bool:
     child.tell()
     return zid in child.line().split()
 
 
 @pytest.mark.netns
-def test_machines_of_a_lan_find_each_other_by_multicast(machines):
+def test_lan_machines_discover_each_other_by_multicast(machines):
     children = [machines(number, LAN_PEER, "", "") for number in range(3)]
     zids = [child.line() for child in children]
     for child, own in zip(children, zids, strict=True):
         for zid in zids:
-            until(lambda child=child, own=own, zid=zid: zid == own or knows(child, zid))
+            until(lambda child=child, own=own, zid=zid: zid == own or discovers(child, zid))
 
 
 @pytest.mark.netns
-def test_where_multicast_is_blocked_they_meet_through_one_that_all_connect_to(machines):
+def test_without_multicast_lan_machines_meet_through_a_common_peer(machines):
     for number, link in ((1, "lan"), (2, "lan"), (0, "switch")):
         turn_off = f"import os; os.execvp('ip', 'ip link set {link} multicast off'.split())"
         assert machines(number, turn_off).wait() == 0
@@ -159,8 +159,8 @@ def test_where_multicast_is_blocked_they_meet_through_one_that_all_connect_to(ma
     hub.line()
     one, other = (machines(number, LAN_PEER, "tcp/10.98.0.1:7448", "") for number in (1, 2))
     zids = one.line(), other.line()
-    until(lambda: knows(one, zids[1]))
-    until(lambda: knows(other, zids[0]))
+    until(lambda: discovers(one, zids[1]))
+    until(lambda: discovers(other, zids[0]))
 
 
 SECURED = """
@@ -188,11 +188,11 @@ def folders(tmp_path: Path) -> tuple[str, str]:
 
 
 @pytest.mark.netns
-def test_machines_of_a_lan_with_certificates_of_one_authority_meet(machines, folders: tuple[str, str]):
+def test_lan_machines_with_certificates_of_one_authority_connect(machines, folders: tuple[str, str]):
     one, other = (machines(number, SECURED, folders[0], f"r{number + 1}") for number in (0, 1))
     zids = one.line(), other.line()
-    until(lambda: knows(one, zids[1]))
-    until(lambda: knows(other, zids[0]))
+    until(lambda: discovers(one, zids[1]))
+    until(lambda: discovers(other, zids[0]))
 
 
 @pytest.mark.netns
@@ -203,7 +203,7 @@ def test_machines_of_a_lan_with_certificates_of_one_authority_meet(machines, fol
         (False, "it does not use TLS", "and this session was given no other to trust"),
     ],
 )
-def test_strangers_in_a_lan_are_not_spoken_to_and_both_are_told_why(
+def test_lan_machines_of_different_authorities_are_refused_with_the_reason(
     machines, folders: tuple[str, str], has_certificate: bool, told_us: str, told_them: str
 ):
     ours = machines(0, SECURED, folders[0], "r1")
@@ -211,5 +211,5 @@ def test_strangers_in_a_lan_are_not_spoken_to_and_both_are_told_why(
     zids = ours.line(), theirs.line()
     until(lambda: told_us in ours.stderr and "/10.98.0.2:" in ours.stderr)
     until(lambda: told_them in theirs.stderr and "tls/10.98.0.1:" in theirs.stderr)
-    assert not knows(ours, zids[1])
-    assert not knows(theirs, zids[0])
+    assert not discovers(ours, zids[1])
+    assert not discovers(theirs, zids[0])

@@ -7,7 +7,7 @@ import os
 from helpers.processes import until
 from helpers.robots import RRBOT
 
-from zstate.net.graph import GraphMonitor, StreamUse, graph_of
+from zstate.net.graph import GraphMonitor, StreamUse, build_graph
 from zstate.net.presence import RobotInfo
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -15,7 +15,7 @@ from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import ANY
 
 
-def test_writers_and_readers_of_a_stream_are_seen_and_how_the_writers_do(sessions):
+def test_monitor_shows_writers_readers_and_the_status_of_writers(sessions):
     with (
         GraphMonitor(sessions[1]) as watch,
         StatePublisher(sessions[0], RRBOT, "r1", program="driver") as publisher,
@@ -36,7 +36,7 @@ def test_writers_and_readers_of_a_stream_are_seen_and_how_the_writers_do(session
     watch.close()
 
 
-def test_a_publisher_that_is_gone_says_nothing_any_more(sessions):
+def test_status_of_a_closed_publisher_disappears(sessions):
     with GraphMonitor(sessions[1]) as watch:
         with StatePublisher(sessions[0], RRBOT, "r1"):
             until(lambda: watch.graph().streams and watch.states())
@@ -52,7 +52,7 @@ def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_
     statics = (("left", MOUNT), ("right", MOUNT))
     arm = RobotInfo("arm", (("joint_states", DRIVER), ("tf_static", MOUNT)), statics)
     readers = [Announcement(ANY, "joint_states", VIEWER), Announcement("base", "tf", VIEWER)]
-    graph = graph_of([arm], readers, lambda robot, stream, writer: 500.0 if writer == DRIVER else None)
+    graph = build_graph([arm], readers, lambda robot, stream, writer: 500.0 if writer == DRIVER else None)
     assert graph.streams == (
         StreamUse("arm", "joint_states", ("driver",), ("view",), 500.0),
         StreamUse("arm", "tf_static/left", ("mount",), ()),
@@ -63,7 +63,7 @@ def test_readers_of_all_robots_read_each_stream_and_static_edges_have_the_names_
 
 
 def test_without_writers_a_reader_of_all_robots_is_in_the_graph():
-    graph = graph_of([], [Announcement(ANY, "tf", VIEWER)])
+    graph = build_graph([], [Announcement(ANY, "tf", VIEWER)])
     assert graph.streams == (StreamUse(ANY, "tf", (), ("view",)),)
 
 

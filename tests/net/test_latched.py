@@ -26,46 +26,46 @@ def key(writer: str) -> str:
     return f"zstate/r/tf_static/{writer}"
 
 
-class Inbox:
-    """The present values by key, and everything that was heard."""
+class Values:
+    """The current values by key, and every received sample."""
 
     def __init__(self, session) -> None:
         self.values: dict[str, bytes] = {}
-        self.heard: list[tuple[str, bytes, str]] = []
-        self.subscriber = LatchedSubscriber(session, ALL, self._hear)
+        self.received: list[tuple[str, bytes, str]] = []
+        self.subscriber = LatchedSubscriber(session, ALL, self._on_value)
 
-    def _hear(self, arrival: SerializedSample) -> None:
+    def _on_value(self, arrival: SerializedSample) -> None:
         if arrival.payload:
             self.values[arrival.key] = arrival.payload
         else:
             self.values.pop(arrival.key, None)
-        self.heard.append((arrival.key, arrival.payload, arrival.encoding))
+        self.received.append((arrival.key, arrival.payload, arrival.encoding))
 
 
-def test_who_joins_late_receives_the_present_value_once():
+def test_late_joiner_receives_the_current_value_once():
     with connect() as writer, LatchedPublisher(writer, key("a"), ENCODING) as value:
         value.set(b"old")
         value.set(b"new")
         with connect() as reader:
-            inbox = Inbox(reader)
-            until(lambda: inbox.values)
-            assert inbox.heard == [(key("a"), b"new", ENCODING)]
+            values = Values(reader)
+            until(lambda: values.values)
+            assert values.received == [(key("a"), b"new", ENCODING)]
 
 
-def test_a_change_reaches_everybody():
+def test_change_reaches_all_subscribers():
     with connect() as writer, connect() as reader, connect() as other:
-        early = Inbox(reader)
+        early = Values(reader)
         with LatchedPublisher(writer, key("a"), ENCODING) as value:
             value.set(b"1")
             until(lambda: early.values == {key("a"): b"1"})
-            late = Inbox(other)
+            late = Values(other)
             until(lambda: late.values == {key("a"): b"1"})
             value.set(b"2")
-            for inbox in (early, late):
-                until(lambda inbox=inbox: inbox.values == {key("a"): b"2"})
+            for values in (early, late):
+                until(lambda values=values: values.values == {key("a"): b"2"})
 
 
-def test_every_writer_under_one_expression_is_remembered():
+def test_late_joiner_receives_the_value_of_every_matching_writer():
     with connect() as first, connect() as second, connect() as reader:
         writers = [
             LatchedPublisher(session, key(f"{session.zid}_{index}"), ENCODING)
@@ -74,11 +74,11 @@ def test_every_writer_under_one_expression_is_remembered():
         ]
         for number, writer in enumerate(writers):
             writer.set(b"%d" % number)
-        inbox = Inbox(reader)
-        until(lambda: sorted(inbox.values.values()) == [b"%d" % number for number in range(10)])
+        values = Values(reader)
+        until(lambda: sorted(values.values.values()) == [b"%d" % number for number in range(10)])
 
 
-def test_a_withdrawn_value_is_taken_back_and_not_live_for_who_joins_late():
+def test_withdrawn_value_is_removed_and_not_sent_to_late_joiners():
     with (
         connect() as writer,
         connect() as reader,
@@ -86,29 +86,29 @@ def test_a_withdrawn_value_is_taken_back_and_not_live_for_who_joins_late():
         LatchedPublisher(writer, key("a"), ENCODING) as value,
         LatchedPublisher(writer, key("b"), ENCODING) as witness,
     ):
-        early = Inbox(reader)
+        early = Values(reader)
         value.set(b"1")
         until(lambda: early.values)
         value.withdraw()
         until(lambda: not early.values)
         witness.set(b"2")
-        late = Inbox(other)
+        late = Values(other)
         until(lambda: late.values)
         assert late.values == {key("b"): b"2"}
-        assert (key("a"), b"1", ENCODING) not in late.heard
+        assert (key("a"), b"1", ENCODING) not in late.received
         value.set(b"3")
         until(lambda: late.values.get(key("a")) == b"3")
 
 
-def test_a_killed_writers_value_is_gone_for_later_joiners_and_stays_with_those_who_have_it(spawn):
+def test_killed_writers_value_stays_with_subscribers_and_is_not_sent_to_late_joiners(spawn):
     with connect() as reader, connect() as other:
         killed: Child = spawn(WRITER, "killed", "{}")
         alive: Child = spawn(WRITER, "alive", "{}")
-        early = Inbox(reader)
+        early = Values(reader)
         until(lambda: len(early.values) == 2)
         killed.kill()
-        until(lambda: len(list(other.zenoh.info.peers_zid())) <= 3)  # lobby, reader, alive
-        late = Inbox(other)
+        until(lambda: len(list(other.zenoh.info.peers_zid())) <= 3)  # rendezvous peer, reader, alive
+        late = Values(other)
         until(lambda: late.values)
         assert late.values == {key("alive"): b"alive"}
         assert set(early.values) == {key("alive"), key("killed")}
@@ -117,15 +117,15 @@ def test_a_killed_writers_value_is_gone_for_later_joiners_and_stays_with_those_w
         assert alive.stderr == ""
 
 
-def test_a_restarted_writers_value_is_heard_again(spawn):
+def test_restarted_writers_value_is_received_again(spawn):
     with connect() as reader:
-        inbox = Inbox(reader)
+        values = Values(reader)
         first: Child = spawn(WRITER, "a", "{}")
-        until(lambda: len(inbox.heard) == 1)
+        until(lambda: len(values.received) == 1)
         first.kill()
         spawn(WRITER, "a", "{}")
-        until(lambda: len(inbox.heard) == 2)
-        assert inbox.heard[0] == inbox.heard[1] == (key("a"), b"a", ENCODING)
+        until(lambda: len(values.received) == 2)
+        assert values.received[0] == values.received[1] == (key("a"), b"a", ENCODING)
 
 
 def test_late_join_works_through_a_router(spawn, free_port: int):
@@ -134,11 +134,11 @@ def test_late_join_works_through_a_router(spawn, free_port: int):
         writer: Child = spawn(WRITER, "a", repr({"mode": "client", "endpoints": endpoint}))
         writer.line()
         with connect(mode="client", endpoints=endpoint) as reader:
-            inbox = Inbox(reader)
-            until(lambda: inbox.values == {key("a"): b"a"})
+            values = Values(reader)
+            until(lambda: values.values == {key("a"): b"a"})
 
 
-def test_setting_after_close_says_so():
+def test_set_after_close_raises_closed():
     with connect() as session:
         value = LatchedPublisher(session, key("a"), ENCODING)
         value.close()
@@ -148,7 +148,7 @@ def test_setting_after_close_says_so():
                 use()
 
 
-def test_an_empty_value_is_refused_because_it_means_withdrawn():
+def test_empty_value_is_refused_because_it_means_withdrawn():
     with (
         connect() as session,
         LatchedPublisher(session, key("a"), ENCODING) as value,

@@ -1,4 +1,4 @@
-"""How long a client waits for its router, and for which of several."""
+"""Connection retries of clients with one or several routers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STRANGER = Credentials(user="eve", password="wonder")
 
 @pytest.fixture
 def router(spawn: Callable[..., Child], free_port: int) -> str:
-    """Where one listens that knows no users, and so refuses whoever names one."""
+    """Endpoint of a router without users, which refuses every user name."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = spawn(ROUTER, endpoint)
     child.tell()
@@ -43,12 +43,12 @@ def nowhere() -> str:
 
 
 def client(endpoints: list[str], **connecting: object) -> dict[str, object]:
-    """A configuration of Zenoh's own."""
+    """A Zenoh configuration."""
     multicast = {"multicast": {"enabled": False}}
     return {"mode": "client", "connect": {"endpoints": endpoints, **connecting}, "scouting": multicast}
 
 
-def test_whom_all_refuse_is_told_so_long_before_the_time_is_over(router: str):
+def test_refusal_by_all_endpoints_raises_before_the_timeout(router: str):
     began = time.monotonic()
     for arguments in (
         {"mode": "client", "endpoints": router, "timeout_s": LONG_S},
@@ -60,13 +60,13 @@ def test_whom_all_refuse_is_told_so_long_before_the_time_is_over(router: str):
     assert time.monotonic() - began < LONG_S
 
 
-def test_one_that_is_not_there_yet_may_still_let_in_whom_another_refuses(router: str):
+def test_endpoint_that_is_not_up_yet_may_accept_after_a_refusal(router: str):
     with pytest.raises(AccessDenied, match="nothing answers at") as caught:
         connect(mode="client", endpoints=[nowhere(), router], credentials=STRANGER, timeout_s=0.2)
     assert caught.value.endpoint == router
 
 
-def test_a_router_that_starts_later_is_waited_for(spawn: Callable[..., Child], free_port: int):
+def test_connect_waits_for_a_router_that_starts_later(spawn: Callable[..., Child], free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = spawn(ROUTER, endpoint)
     with pytest.raises(Unreachable):
@@ -77,26 +77,24 @@ def test_a_router_that_starts_later_is_waited_for(spawn: Callable[..., Child], f
 
 
 @pytest.mark.parametrize("waiting", [{}, {"timeout_ms": 60_000}, {"timeout_ms": {"client": -1}}])
-def test_of_several_endpoints_in_a_configuration_of_zenoh_a_dead_one_holds_nobody_up(
-    router: str, waiting: dict[str, object]
-):
+def test_dead_endpoint_in_a_zenoh_configuration_causes_no_delay(router: str, waiting: dict[str, object]):
     began = time.monotonic()
     with connect(client([nowhere(), router], **waiting)) as session:
         assert session.zenoh.info.routers_zid()
     assert time.monotonic() - began < LONG_S
 
 
-def test_a_configuration_says_how_long_to_wait():
-    def patience(**connecting: object) -> float:
+def test_connect_timeout_is_read_from_the_configuration():
+    def timeout_of(**connecting: object) -> float:
         return connect_timeout(zenoh.Config.from_json5(json.dumps(client([nowhere()], **connecting))))
 
-    assert patience() == 0.0
-    assert patience(timeout_ms=2500) == 2.5
-    assert patience(timeout_ms=-1) == float("inf")
-    assert patience(timeout_ms={"client": 500, "peer": -1}) == 0.5
-    assert patience(timeout_ms=2500, exit_on_failure=False) == 0.0
+    assert timeout_of() == 0.0
+    assert timeout_of(timeout_ms=2500) == 2.5
+    assert timeout_of(timeout_ms=-1) == float("inf")
+    assert timeout_of(timeout_ms={"client": 500, "peer": -1}) == 0.5
+    assert timeout_of(timeout_ms=2500, exit_on_failure=False) == 0.0
 
 
-def test_a_busy_port_is_not_waited_for(router: str):
+def test_busy_port_raises_at_once(router: str):
     with pytest.raises(PortBusy):
         connect(mode="router", listen=router)

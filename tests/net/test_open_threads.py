@@ -20,7 +20,7 @@ OPENING = """
 
 
 def threads_of(pid: int) -> dict[str, int]:
-    """How many threads each of Zenoh's pools has."""
+    """The number of threads in each of Zenoh's pools."""
     names = [(task / "comm").read_text() for task in Path(f"/proc/{pid}/task").iterdir()]
     return {pool: sum(name.startswith(f"{pool}-") for name in names) for pool in ("net", "tx", "rx", "acc")}
 
@@ -35,23 +35,21 @@ def opened(spawn, *arguments: str) -> tuple[dict[str, int], str | None]:
     return threads, left_behind
 
 
-def test_a_router_has_threads_for_many_who_vanish_and_the_environment_stays_as_it_was(spawn, free_port: int):
+def test_router_has_many_threads_and_the_environment_is_unchanged(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     threads, left_behind = opened(spawn, json.dumps({"mode": "router", "listen": endpoint}), endpoint)
     assert threads["net"] >= 128
     assert left_behind is None
 
 
-def test_whoever_has_few_neighbours_has_few_threads_more(spawn, free_port: int):
+def test_peer_has_few_additional_threads(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     threads, _ = opened(spawn, json.dumps({"mode": "peer", "listen": endpoint}), endpoint)
-    assert 4 <= threads.pop("net") < 20  # where one waits for another it is replaced meanwhile
+    assert 4 <= threads.pop("net") < 20  # a thread that waits for another is replaced for that time
     assert threads == {"tx": 1, "rx": 0, "acc": 0}
 
 
-def test_what_the_environment_says_of_zenohs_threads_is_kept(
-    spawn, free_port: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_zenoh_runtime_in_the_environment_is_used(spawn, free_port: int, monkeypatch: pytest.MonkeyPatch):
     endpoint, chosen = f"tcp/127.0.0.1:{free_port}", "(rx: (worker_threads: 3))"
     monkeypatch.setenv("ZENOH_RUNTIME", chosen)
     threads, left_behind = opened(spawn, json.dumps({"mode": "router", "listen": endpoint}), endpoint)

@@ -1,4 +1,4 @@
-"""Two who say the same static edges at the same moment: one of them is told, whatever the network."""
+"""Two writers of the same static edges at the same time: one gets SecondWriter, on any network."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def edge(parent: str, x: float) -> Transform:
 def pair(
     request: pytest.FixtureRequest, spawn: Callable[..., Child], free_port: int
 ) -> Iterator[tuple[Session, Session]]:
-    """Two sessions, or twice the same, directly or behind a router."""
+    """Two sessions, or the same one twice, directly or behind a router."""
     how: dict[str, Any] = {}
     if "client" in request.param:
         how = {"mode": "client", "endpoints": f"tcp/127.0.0.1:{free_port}"}
@@ -50,8 +50,8 @@ def pair(
         yield one, one if "one" in request.param else other
 
 
-def at_once(*actions: Callable[[], object]) -> list[SecondWriter | None]:
-    """What each of them raised, all begun at the same moment."""
+def run_together(*actions: Callable[[], object]) -> list[SecondWriter | None]:
+    """What each action raised; all start at the same time."""
     barrier = Barrier(len(actions))
 
     def run(action: Callable[[], object]) -> SecondWriter | None:
@@ -66,12 +66,12 @@ def at_once(*actions: Callable[[], object]) -> list[SecondWriter | None]:
         return list(pool.map(run, actions))
 
 
-def the_one_told(errors: Sequence[SecondWriter | None]) -> tuple[int, SecondWriter]:
+def only_error(errors: Sequence[SecondWriter | None]) -> tuple[int, SecondWriter]:
     ((place, error),) = [(place, error) for place, error in enumerate(errors) if error is not None]
     return place, error
 
 
-def test_of_two_who_place_a_frame_at_once_one_is_told_of_the_other_whose_edge_holds(pair):
+def test_simultaneous_static_writers_of_a_frame_one_gets_second_writer_and_the_other_edge_holds(pair):
     for _ in range(ROUNDS):
         with (
             TransformListener(pair[1], "*", history_on_join=False) as listener,
@@ -80,38 +80,38 @@ def test_of_two_who_place_a_frame_at_once_one_is_told_of_the_other_whose_edge_ho
         ):
             for session in pair:
                 until(lambda s=session: len(current_tokens(s, "zstate/*/@writer/tf_static/*", 1.0)) == 2)
-            errors = at_once(
+            errors = run_together(
                 lambda mount=mount: mount.set(edge("fleet/base", 1.0)),
                 lambda room=room: room.set(edge("fleet/base", 2.0)),
             )
-            place, error = the_one_told(errors)
+            place, error = only_error(errors)
             assert error.first.program == ("room", "mount")[place]
             assert error.edge == ("fleet/base", "fleet/camera")
             listener.buffer.wait("fleet/base", "fleet/camera", timeout_s=5.0)
             assert listener.buffer.lookup("fleet/base", "fleet/camera").translation[0] == (2.0, 1.0)[place]
 
 
-# Peers do not wait for an answer that may never come: of a hundred times they miss each other once.
+# Peers do not wait for a reply that may never come: they miss each other once in a hundred times.
 @pytest.mark.parametrize("pair", ["clients", "one peer", "one client"], indirect=True)
-def test_of_two_who_open_under_one_name_at_once_one_is_told_of_the_other(pair):
+def test_simultaneous_static_writers_of_a_name_one_gets_second_writer(pair):
     for _ in range(ROUNDS):
         with ExitStack() as opened:
 
             def open_on(session: Session, opened: ExitStack = opened) -> None:
                 opened.enter_context(StaticPublisher(session, "r1", "mount")).set(edge("fleet/base", 1.0))
 
-            _, error = the_one_told(at_once(*(partial(open_on, session) for session in pair)))
+            _, error = only_error(run_together(*(partial(open_on, session) for session in pair)))
         assert (error.stream, error.edge) == ("tf_static", None)
 
 
 @pytest.mark.parametrize("pair", ["one peer", "one client"], indirect=True)
-def test_who_comes_second_in_a_session_is_told_always(pair):
+def test_second_writer_in_one_session_is_always_refused(pair):
     for _ in range(3 * ROUNDS):
         with StatePublisher(pair[0], RRBOT, "r1"), pytest.raises(SecondWriter):
             StatePublisher(pair[1], RRBOT, "r1")
 
 
-def test_what_somebody_was_about_to_place_who_left_may_be_placed(sessions):
+def test_frame_is_free_after_a_claiming_writer_has_left(sessions):
     ours, theirs = sessions
     early = Announcement("r2", "tf_static", WriterId("room", "laptop", 9, 1, 8), "room")
     with StaticPublisher(ours, "r1", "mount") as mount:

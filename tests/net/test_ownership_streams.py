@@ -1,4 +1,4 @@
-"""Who may write, asked over real sessions on loopback."""
+"""Ownership of streams, over real sessions on loopback."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from helpers.processes import until
 
 from zstate.errors import Closed, SecondWriter
-from zstate.net.ownership import GONE_WITHIN_S, WriterClaim, check_edges
+from zstate.net.ownership import TOKEN_EXPIRY_S, WriterClaim, check_edges
 from zstate.net.presence import announce, current_tokens
 from zstate.net.session import Session, connect
 from zstate.nodes.static_publisher import StaticPublisher
@@ -22,14 +22,14 @@ FIRST = WriterId("driver", "jetson", 412, 1_000_000_000, 7)
 SECOND = WriterId("simulator", "laptop", 9, 2_000_000_000, 8)
 
 
-def said(
+def announcement(
     writer: WriterId, stream: Stream = "joint_states", name: str = "", robot: str = "r1"
 ) -> Announcement:
     return Announcement(robot, stream, writer, name)
 
 
-def told(session: Session, announced: Announcement):
-    return announce(session, writer_key(announced.robot, announced.stream, announced.identity))
+def announced(session: Session, content: Announcement):
+    return announce(session, writer_key(content.robot, content.stream, content.identity))
 
 
 def await_tokens(session: Session, count: int) -> None:
@@ -40,66 +40,66 @@ def edge(parent: str, child: str) -> Transform:
     return Transform(parent, child, [1, 0, 0], [0, 0, 0, 1])
 
 
-def test_who_comes_second_is_told_who_writes_already_and_what_to_do(sessions):
+def test_second_writer_error_names_the_first_writer_and_takeover(sessions):
     ours, theirs = sessions
-    with told(theirs, said(FIRST)):
+    with announced(theirs, announcement(FIRST)):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="joint_states of 'r1'") as raised:
-            WriterClaim(ours, [said(SECOND)])
-    assert "'driver@jetson pid 412', there since 1970-01-01" in str(raised.value)
+            WriterClaim(ours, [announcement(SECOND)])
+    assert "'driver@jetson pid 412', started 1970-01-01" in str(raised.value)
     assert "takeover=True" in str(raised.value)
     error = pickle.loads(pickle.dumps(raised.value))
     assert (error.robot, error.stream, error.first, error.edge) == ("r1", "joint_states", FIRST, None)
 
 
-def test_it_is_the_second_however_early_its_clock_says_it_began(sessions):
+def test_second_writer_is_refused_even_with_an_earlier_start_time(sessions):
     ours, theirs = sessions
-    with told(theirs, said(SECOND)):
+    with announced(theirs, announcement(SECOND)):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter):
-            WriterClaim(ours, [said(FIRST)])
+            WriterClaim(ours, [announcement(FIRST)])
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        said(FIRST, "tf"),
-        said(FIRST, robot="r2"),
-        said(FIRST, "tf_static", "mount"),
-        said(FIRST, "tf_static"),  # as zstate said it before it had names
+        announcement(FIRST, "tf"),
+        announcement(FIRST, robot="r2"),
+        announcement(FIRST, "tf_static", "mount"),
+        announcement(FIRST, "tf_static"),  # the form before static writers had names
     ],
 )
-def test_who_writes_something_else_is_in_nobodys_way(sessions, other):
+def test_writers_of_other_streams_do_not_conflict(sessions, other):
     ours, theirs = sessions
-    with told(theirs, other):
+    with announced(theirs, other):
         await_tokens(ours, 1)
-        with WriterClaim(ours, [said(SECOND), said(SECOND, "tf_static", "room")]) as claim:
+        with WriterClaim(ours, [announcement(SECOND), announcement(SECOND, "tf_static", "room")]) as claim:
             claim.check()
 
 
 def test_static_edges_under_one_name_have_one_writer(sessions):
     ours, theirs = sessions
-    with told(theirs, said(FIRST, "tf_static", "mount")):
+    with announced(theirs, announcement(FIRST, "tf_static", "mount")):
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="static edges of 'r1' under the name 'mount'"):
-            WriterClaim(ours, [said(SECOND, "tf_static", "mount")])
+            WriterClaim(ours, [announcement(SECOND, "tf_static", "mount")])
 
 
-def test_a_writer_that_is_leaving_is_waited_for(sessions):
+def test_claim_waits_for_a_leaving_writer(sessions):
     ours, theirs = sessions
-    leaving = told(theirs, said(FIRST))
+    leaving = announced(theirs, announcement(FIRST))
     await_tokens(ours, 1)
-    timer = threading.Timer(GONE_WITHIN_S / 5, leaving.close)
+    timer = threading.Timer(TOKEN_EXPIRY_S / 5, leaving.close)
     timer.start()
-    WriterClaim(ours, [said(SECOND)]).close()
+    WriterClaim(ours, [announcement(SECOND)]).close()
     timer.join()
 
 
 @pytest.mark.parametrize("asks_first", [True, False])
-def test_of_two_that_open_at_once_only_the_later_one_is_told_and_ever_after(sessions, asks_first):
+def test_simultaneous_writers_only_the_later_one_is_refused_and_stays_refused(sessions, asks_first):
     ours, theirs = sessions
-    first, second = WriterClaim(ours, [said(FIRST)]), WriterClaim(theirs, [said(SECOND)])
-    with told(ours, said(FIRST)), told(theirs, said(SECOND)):
+    first, second = WriterClaim(ours, [announcement(FIRST)]), WriterClaim(theirs, [announcement(SECOND)])
+    with announced(ours, announcement(FIRST)), announced(theirs, announcement(SECOND)):
         for session in sessions:
             await_tokens(session, 2)
         for claim in (first, second) if asks_first else (second, first):
@@ -117,18 +117,18 @@ def test_of_two_that_open_at_once_only_the_later_one_is_told_and_ever_after(sess
     second.close()
 
 
-def test_a_session_that_has_just_connected_sees_who_is_there():
-    with connect() as theirs, told(theirs, said(FIRST)):
+def test_new_session_sees_existing_writers():
+    with connect() as theirs, announced(theirs, announcement(FIRST)):
         for _ in range(3):
             with connect() as ours, pytest.raises(SecondWriter):
-                WriterClaim(ours, [said(SECOND)])
+                WriterClaim(ours, [announcement(SECOND)])
 
 
-def test_a_claim_needs_no_thread_and_a_check_is_not_another_opening(sessions):
+def test_claim_needs_no_thread_and_a_check_is_cheaper_than_a_claim(sessions):
     before = threading.active_count()
     until(lambda: time.monotonic() - sessions[0].opened_at > 0.05)
     began = time.perf_counter()
-    claims = [WriterClaim(sessions[0], [said(SECOND, robot=f"r{number}")]) for number in range(100)]
+    claims = [WriterClaim(sessions[0], [announcement(SECOND, robot=f"r{number}")]) for number in range(100)]
     opened = time.perf_counter()
     for claim in claims:
         claim.check()
@@ -139,8 +139,8 @@ def test_a_claim_needs_no_thread_and_a_check_is_not_another_opening(sessions):
         claim.close()
 
 
-def test_a_closed_session_is_said_to_be_closed(sessions):
-    claim = WriterClaim(sessions[0], [said(FIRST)])
+def test_check_on_a_closed_session_raises_closed(sessions):
+    claim = WriterClaim(sessions[0], [announcement(FIRST)])
     sessions[0].close()
     with pytest.raises(Closed):
         claim.check()
@@ -148,31 +148,31 @@ def test_a_closed_session_is_said_to_be_closed(sessions):
 
 
 @pytest.mark.parametrize("robot", ["r1", "r2"])
-def test_a_frame_that_another_static_writer_places_is_refused_with_its_edge_and_writer(sessions, robot):
+def test_frame_conflict_error_has_the_edge_and_its_writer(sessions, robot):
     ours, theirs = sessions
     with StaticPublisher(theirs, robot, "mount", program="calibration") as mount:
         mount.set(edge("hall/tool", "hall/camera"))
         await_tokens(ours, 1)
         with pytest.raises(SecondWriter, match="'hall/camera' on 'hall/tool' already, as 'mount'") as raised:
-            check_edges(ours, said(SECOND, "tf_static", "room"), [("hall/table", "hall/camera")])
+            check_edges(ours, announcement(SECOND, "tf_static", "room"), [("hall/table", "hall/camera")])
         assert raised.value.edge == ("hall/tool", "hall/camera")
         assert raised.value.first.program == "calibration"
-        check_edges(ours, said(SECOND, "tf_static", "room"), [("hall/tool", "hall/laser")])
+        check_edges(ours, announcement(SECOND, "tf_static", "room"), [("hall/tool", "hall/laser")])
         mount.withdraw("hall/camera")
         until(lambda: not is_placed(ours))
 
 
 def is_placed(session: Session) -> bool:
     try:
-        check_edges(session, said(SECOND, "tf_static", "room"), [("hall/table", "hall/camera")])
+        check_edges(session, announcement(SECOND, "tf_static", "room"), [("hall/table", "hall/camera")])
     except SecondWriter:
         return True
     return False
 
 
-def test_a_robots_own_writer_is_not_refused_for_another_robots_claim_on_its_frame(sessions):
+def test_writer_of_the_frames_robot_overrides_another_robots_claim(sessions):
     ours, theirs = sessions
     with StaticPublisher(theirs, "r2", "mount") as mount:
         mount.set(edge("r1/tool", "r1/camera"))
         await_tokens(ours, 1)
-        check_edges(ours, said(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])
+        check_edges(ours, announcement(SECOND, "tf_static", "room"), [("r1/table", "r1/camera")])

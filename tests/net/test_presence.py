@@ -38,11 +38,11 @@ WRITER = """
 """
 
 
-def said(session: Session, robot: str, stream: Stream, writer: WriterId) -> LivelinessToken:
+def announced(session: Session, robot: str, stream: Stream, writer: WriterId) -> LivelinessToken:
     return announce(session, writer_key(robot, stream, writer.identity))
 
 
-def test_a_writer_is_said_as_program_host_and_pid():
+def test_writer_text_is_program_host_and_pid():
     assert str(WriterId("zstate-publish", "jetson", 412, 0, 0)) == "zstate-publish@jetson pid 412"
 
 
@@ -51,7 +51,7 @@ WRITERS = st.builds(WriterId, *[NAMES] * 2, *[st.integers(0, 2**63 - 1)] * 2, st
 
 
 @given(WRITERS)
-def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: WriterId):
+def test_every_identity_is_one_key_chunk_and_round_trips(writer: WriterId):
     assert check_writer(writer.identity) == writer.identity
     assert WriterId.parse(writer.identity) == writer
 
@@ -67,30 +67,30 @@ def test_every_writer_fits_one_chunk_of_a_key_and_comes_back(writer: WriterId):
         *("*,b,1,1,1", "a%,b,1,1,1", "a%ff,b,1,1,1"),
     ],
 )
-def test_an_identity_that_is_not_ours_is_refused(identity: str):
+def test_invalid_identity_is_refused(identity: str):
     with pytest.raises(InvalidInput):
         WriterId.parse(identity)
 
 
 @given(st.from_regex(r"[\w.,-]{0,6}", fullmatch=True))
-def test_the_name_of_static_edges_stands_in_the_token_and_without_one_it_is_as_before(name: str):
+def test_token_contains_the_name_of_static_edges_if_there_is_one(name: str):
     announced = Announcement("r1", "tf_static", DRIVER, name)
     assert Announcement.parse("r1", "tf_static", check_writer(announced.identity)) == announced
     assert Announcement.parse("r1", "tf_static", DRIVER.identity).name == ""
 
 
 @pytest.mark.parametrize("name", ["a/b", "line\nend", "\x1b[2J", "@writer", " "])
-def test_a_token_whose_static_name_cannot_be_one_is_foreign(name: str):
+def test_token_with_an_invalid_static_name_is_foreign(name: str):
     with pytest.raises(InvalidInput):
         Announcement.parse("r1", "tf_static", Announcement("r1", "tf_static", DRIVER, name).identity)
 
 
-def test_a_name_stands_nowhere_else():
+def test_tokens_of_other_streams_have_no_name():
     with pytest.raises(InvalidInput):
         Announcement.parse("r1", "joint_states", f"{DRIVER.identity},mount")
 
 
-def test_a_writer_here_tells_this_process():
+def test_local_writer_has_program_host_and_pid_of_this_process():
     before = time.time_ns()
     writer = local_writer(7)
     assert (writer.pid, writer.session) == (os.getpid(), 7)
@@ -99,13 +99,13 @@ def test_a_writer_here_tells_this_process():
     assert local_writer(7, "driver").program == "driver"
 
 
-def test_discover_names_every_robot_with_its_writers_sorted():
+def test_discover_returns_every_robot_with_its_writers_sorted():
     with (
         connect() as one,
         connect() as two,
-        said(one, "r2", "tf_static", CAMERA),
-        said(one, "r1", "tf_static", CAMERA),
-        said(two, "r1", "joint_states", DRIVER),
+        announced(one, "r2", "tf_static", CAMERA),
+        announced(one, "r1", "tf_static", CAMERA),
+        announced(two, "r1", "joint_states", DRIVER),
         connect() as asker,
     ):
         assert discover(asker) == (
@@ -114,14 +114,14 @@ def test_discover_names_every_robot_with_its_writers_sorted():
         )
 
 
-def test_discover_finds_processes_that_the_session_has_not_met_yet(spawn):
+def test_discover_in_a_new_session_finds_other_processes(spawn):
     for robot in ("r1", "r2", "r3"):
         assert spawn(WRITER, robot).line() == "announced"
     with connect() as asker:
         assert [robot.name for robot in discover(asker)] == ["r1", "r2", "r3"]
 
 
-def test_discover_of_nobody_takes_its_time_and_no_more():
+def test_discover_without_robots_takes_its_timeout():
     with connect() as session:
         started = time.monotonic()
         assert discover(session, timeout_s=0.3) == ()
@@ -131,58 +131,58 @@ def test_discover_of_nobody_takes_its_time_and_no_more():
                 discover(session, timeout_s=timeout_s)
 
 
-def test_readers_are_announced_apart_from_writers_each_by_itself():
+def test_readers_are_announced_separately_from_writers():
     with connect() as one, connect() as asker, ExitStack() as reading:
         wire = get_wire("native")
         for robot, streams in (("r1", ("tf", "tf_static")), ("*", ("tf",)), ("*", ("tf",))):
             for announcement in announce_reader(one, wire, robot, streams):
                 reading.enter_context(announcement)
         readers = discover_readers(asker)
-        assert [(said.robot, said.stream) for said in readers] == [
+        assert [(reader.robot, reader.stream) for reader in readers] == [
             ("*", "tf"),
             ("*", "tf"),
             ("r1", "tf"),
             ("r1", "tf_static"),
         ]
-        assert {said.writer.pid for said in readers} == {os.getpid()}
+        assert {reader.writer.pid for reader in readers} == {os.getpid()}
         assert discover(asker, timeout_s=0.1) == ()
         reading.close()
         until(lambda: not discover_readers(asker, timeout_s=0.1))
 
 
-def test_tokens_that_are_not_ours_are_passed_over_and_counted():
+def test_foreign_tokens_are_ignored_and_counted():
     with connect() as stranger, connect() as session:
         tokens = [
             stranger.zenoh.liveliness().declare_token(f"zstate/r1/@writer/{rest}")
             for rest in ("joint_states/nonsense", "unknown_stream/a,b,1,2,3", "tf/a,b,1,2,x")
         ]
-        with said(stranger, "r1", "tf", DRIVER), watch(session, "*", lambda *event: None) as follower:
+        with announced(stranger, "r1", "tf", DRIVER), watch(session, "*", lambda *event: None) as follower:
             until(lambda: follower.foreign == 3)
             assert discover(session) == (RobotInfo("r1", (("tf", DRIVER),)),)
         for token in tokens:
             token.undeclare()
 
 
-def test_a_watch_hears_who_is_there_who_comes_and_who_goes():
+def test_watch_reports_current_new_and_leaving_writers():
     events: list[tuple[Announcement, bool]] = []
     camera, driver = Announcement("r1", "tf", CAMERA), Announcement("r1", "joint_states", DRIVER)
     with (
         connect() as writer,
         connect() as reader,
-        said(writer, "r1", "tf", CAMERA),
+        announced(writer, "r1", "tf", CAMERA),
         watch(reader, "r1", lambda *event: events.append(event)),
     ):
         until(lambda: (camera, True) in events)
-        token = said(writer, "r1", "joint_states", DRIVER)
+        token = announced(writer, "r1", "joint_states", DRIVER)
         until(lambda: (driver, True) in events)
-        with said(writer, "r2", "tf", DRIVER):
+        with announced(writer, "r2", "tf", DRIVER):
             token.close()
             token.close()
             until(lambda: (driver, False) in events)
     assert {announced.robot for announced, _ in events} == {"r1"}
 
 
-def test_a_killed_writer_is_heard_to_go(spawn):
+def test_watch_reports_a_killed_writer(spawn):
     events: list[tuple[Announcement, bool]] = []
     with connect() as reader, watch(reader, "*", lambda *event: events.append(event)):
         child: Child = spawn(WRITER, "r1")

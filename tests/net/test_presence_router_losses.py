@@ -1,4 +1,4 @@
-"""A lost router, told from writers that left it."""
+"""Lost routers, distinguished from writers that left."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ ROUTER = """
 """
 
 
-def test_a_writer_that_leaves_is_told_from_a_router_that_is_lost(spawn, free_port):
+def test_leaving_writer_is_distinguished_from_a_lost_router(spawn, free_port):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     router = spawn(ROUTER, endpoint)
     router.line()
-    heard: list[str] = []
+    changes: list[str] = []
     with (
         connect(mode="client", endpoints=endpoint) as theirs,
         connect(mode="client", endpoints=endpoint) as ours,
         watch(
             ours,
             "*",
-            lambda _, alive: heard.append("there" if alive else "gone"),
-            on_cut_off=lambda _: heard.append("cut off"),
+            lambda _, alive: changes.append("there" if alive else "gone"),
+            on_cut_off=lambda _: changes.append("cut off"),
         ),
     ):
         with announce(theirs, TOKEN):
-            until(lambda: heard == ["there"])
-        until(lambda: heard == ["there", "gone"])
+            until(lambda: changes == ["there"])
+        until(lambda: changes == ["there", "gone"])
         with announce(theirs, TOKEN):
-            until(lambda: heard == ["there", "gone", "there"])
+            until(lambda: changes == ["there", "gone", "there"])
             router.kill()
-            until(lambda: len(heard) == 4)
-    assert heard[-1] == "cut off"
+            until(lambda: len(changes) == 4)
+    assert changes[-1] == "cut off"
 
 
-def test_among_peers_no_router_is_lost(sessions):
+def test_peers_lose_no_router(sessions):
     ours, theirs = sessions
     with RouterLossDetector(ours) as losses:
         theirs.close()

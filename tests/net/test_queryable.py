@@ -1,4 +1,4 @@
-"""Questions on one key, and one thread that answers."""
+"""Queryables on one key, with one thread that replies."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ KEY = "zstate/r1/lookup"
 
 
 def replies(session: Session, selector: str, timeout_s: float = 5.0) -> list[tuple[bool, bytes, str]]:
-    """What is answered: whether it is no error, the payload and its encoding."""
+    """The replies: whether it is no error, the payload and its encoding."""
     found = []
     for reply in session.zenoh.get(selector, timeout=timeout_s):
-        said = reply.ok or reply.err
-        assert said is not None
-        found.append((reply.ok is not None, said.payload.to_bytes(), str(said.encoding)))
+        value = reply.ok or reply.err
+        assert value is not None
+        found.append((reply.ok is not None, value.payload.to_bytes(), str(value.encoding)))
     return found
 
 
 def answered(session: Session, selector: str) -> list[tuple[bool, bytes, str]]:
-    """The same, once the question finds its way."""
+    """The same, once the query reaches the queryable."""
     found: list[tuple[bool, bytes, str]] = []
 
     def is_answered() -> bool:
@@ -37,19 +37,19 @@ def answered(session: Session, selector: str) -> list[tuple[bool, bytes, str]]:
     return found
 
 
-def test_a_question_has_its_answer_and_an_error_is_one_to_zenoh(sessions: tuple[Session, Session]):
+def test_query_gets_its_reply_and_errors_are_zenoh_error_replies(sessions: tuple[Session, Session]):
     def answer(parameters):
         return Reply(repr(parameters).encode(), "text/plain", is_error="wrong" in parameters)
 
     with Queryable(sessions[0], KEY, answer) as service:
-        said = answered(sessions[1], f"{KEY}?a=1;b=x=y")
-        assert said == [(True, b"{'a': '1', 'b': 'x=y'}", "text/plain")]
+        value = answered(sessions[1], f"{KEY}?a=1;b=x=y")
+        assert value == [(True, b"{'a': '1', 'b': 'x=y'}", "text/plain")]
         assert replies(sessions[1], f"{KEY}?wrong") == [(False, b"{'wrong': ''}", "text/plain")]
         until(lambda: service.answered == 2)
     assert replies(sessions[1], KEY) == []
 
 
-def test_no_answer_is_said_at_once(sessions: tuple[Session, Session]):
+def test_query_without_a_reply_ends_at_once(sessions: tuple[Session, Session]):
     with Queryable(sessions[0], KEY, lambda parameters: Reply(b"x", "") if parameters else None):
         answered(sessions[1], f"{KEY}?a=1")
         start = time.monotonic()
@@ -57,7 +57,7 @@ def test_no_answer_is_said_at_once(sessions: tuple[Session, Session]):
         assert time.monotonic() - start < 15.0
 
 
-def test_an_answer_that_fails_is_counted_and_reported_once_and_the_next_is_given(
+def test_failing_answer_is_counted_and_reported_once_and_the_next_query_is_answered(
     sessions: tuple[Session, Session], monkeypatch: pytest.MonkeyPatch
 ):
     reported: list[threading.ExceptHookArgs] = []
@@ -75,7 +75,7 @@ def test_an_answer_that_fails_is_counted_and_reported_once_and_the_next_is_given
     assert [args.exc_type for args in reported] == [ZeroDivisionError]
 
 
-def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
+def test_slow_answer_delays_no_subscription_and_overflows_are_counted(
     sessions: tuple[Session, Session],
 ):
     writer, reader = sessions
@@ -87,11 +87,11 @@ def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
             may_answer.wait(30.0)
         return Reply(b"x", "")
 
-    heard: list[bytes] = []
+    received: list[bytes] = []
     with (
         StreamPublisher(reader, "zstate/r1/tf", "") as stream,
         StreamSubscriber(
-            writer, "zstate/r1/tf", lambda arrivals: heard.extend(one.payload for one in arrivals)
+            writer, "zstate/r1/tf", lambda arrivals: received.extend(one.payload for one in arrivals)
         ),
         Queryable(writer, KEY, answer, capacity=4) as service,
     ):
@@ -103,7 +103,7 @@ def test_a_slow_answer_delays_no_subscription_and_a_flood_is_lost_and_counted(
         # Those that found no room are over before anything was answered.
         until(lambda: sum(not next_reply(get) for get in flood[:36]) == 36)
         stream.put(b"live")
-        until(lambda: heard == [b"live"])
+        until(lambda: received == [b"live"])
         may_answer.set()
         assert len(list(slow)) == 1
         assert [len(list(get)) for get in flood[36:]] == [1, 1, 1, 1]
@@ -114,7 +114,7 @@ def next_reply(get) -> bool:
     return bool(list(get))
 
 
-def test_closing_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):
+def test_close_is_quick_and_may_be_repeated(sessions: tuple[Session, Session]):
     service = Queryable(sessions[0], KEY, lambda _: None)
     start = time.monotonic()
     service.close()

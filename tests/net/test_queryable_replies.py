@@ -50,19 +50,21 @@ def many_tokens(session: Session, count: int) -> Iterator[list[str]]:
 
 
 def test_more_tokens_than_the_default_channel_holds_are_discovered_in_the_session_that_announces_them():
-    heard: list[Announcement] = []
+    received: list[Announcement] = []
     with (
         connect() as session,
         many_tokens(session, MORE_THAN_THE_DEFAULT),
-        watch(session, "*", lambda announced, _: heard.append(announced)),
+        watch(session, "*", lambda announced, _: received.append(announced)),
     ):
         assert len(discover(session)) == MORE_THAN_THE_DEFAULT
         assert len(discover_readers(session)) == MORE_THAN_THE_DEFAULT
         session.zenoh.put("zstate/r1/joint_states", b"")
-        until(lambda: len(heard) == MORE_THAN_THE_DEFAULT)
+        until(lambda: len(received) == MORE_THAN_THE_DEFAULT)
 
 
-def test_they_are_discovered_in_a_session_that_follows_them(sessions: tuple[Session, Session]):
+def test_more_tokens_than_the_default_channel_holds_are_discovered_in_a_watching_session(
+    sessions: tuple[Session, Session],
+):
     ours, theirs = sessions
     with many_tokens(theirs, MORE_THAN_THE_DEFAULT), watch(ours, "*", lambda *_: None):
         until(lambda: len(current_tokens(ours, "zstate/*/@writer/*/*", 1.0)) == MORE_THAN_THE_DEFAULT)
@@ -108,17 +110,17 @@ def test_closing_the_session_ends_a_query_that_waits(sessions: tuple[Session, Se
     assert not waiting.is_alive()
 
 
-def test_replies_beyond_the_bound_are_counted_in_a_warning(
+def test_replies_beyond_the_limit_are_counted_in_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    monkeypatch.setattr(queryable, "MOST_REPLIES", 10)
+    monkeypatch.setattr(queryable, "MAX_REPLIES", 10)
     with connect() as session, many_tokens(session, 30), caplog.at_level(logging.WARNING, "zstate"):
         assert len(list(query_tokens(session.zenoh, "zstate/*/@writer/*/*", 1.0))) == 10
     (record,) = caplog.records
     assert "has 30 replies; only the first 10 are used" in record.getMessage()
 
 
-def test_a_watch_loses_no_token_in_a_burst_that_overflows_its_ring(monkeypatch: pytest.MonkeyPatch):
+def test_watch_loses_no_token_if_a_burst_overflows_its_ring(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zstate.net.presence.CAPACITY", 64)
     alive: set[Announcement] = set()
     may_go_on = threading.Event()
@@ -135,18 +137,18 @@ def test_a_watch_loses_no_token_in_a_burst_that_overflows_its_ring(monkeypatch: 
         until(lambda: not alive)
 
 
-def test_a_callback_that_raises_costs_no_other_token_its_call(monkeypatch: pytest.MonkeyPatch):
-    heard: list[str] = []
+def test_failing_callback_does_not_affect_other_tokens(monkeypatch: pytest.MonkeyPatch):
+    received: list[str] = []
 
     def note(announced: Announcement, is_alive: bool) -> None:
         if announced.robot == "r3":
             raise InvalidInput("r3")
-        heard.append(announced.robot)
+        received.append(announced.robot)
 
     raised: list[object] = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
     with connect() as session, many_tokens(session, 9), watch(session, "*", note) as follower:
-        until(lambda: len(heard) == 8 and follower.failures)
+        until(lambda: len(received) == 8 and follower.failures)
     assert len(raised) == 1
 
 

@@ -11,63 +11,63 @@ from zstate.errors import ConfigError
 from zstate.net.rendezvous import RENDEZVOUS, rendezvous_addresses, silent_addresses
 from zstate.net.session import Session, connect
 
-# Says its zid, then puts its name on k/<name> until it is told to stop; says every name it hears.
+# Publishes its name on k/<name> until a line arrives on stdin; prints every name it receives.
 NODE = """
     import sys, threading
     from zstate.net.session import connect
     from zstate.net.streams import StreamPublisher, StreamSubscriber
     name = sys.argv[1]
-    heard = set()
+    received = set()
 
-    def hear(samples):
-        for said in {sample.payload.decode() for sample in samples} - heard:
-            heard.add(said)
-            print(said)
+    def on_samples(samples):
+        for name_ in {sample.payload.decode() for sample in samples} - received:
+            received.add(name_)
+            print(name_)
 
     stop = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.readline(), stop.set()), daemon=True).start()
-    with connect() as session, StreamSubscriber(session, "k/*", hear):
+    with connect() as session, StreamSubscriber(session, "k/*", on_samples):
         with StreamPublisher(session, "k/" + name, "text/plain") as out:
             while not stop.wait(0.01):
                 out.put(name.encode())
 """
 
 
-def hears(child: Child, *names: str) -> None:
+def receives(child: Child, *names: str) -> None:
     waiting = set(names)
     while waiting:
         waiting.discard(child.line())
 
 
-def test_two_processes_find_each_other_and_data_flows_both_ways(spawn):
+def test_two_processes_discover_each_other_and_exchange_data(spawn):
     first, second = spawn(NODE, "first"), spawn(NODE, "second")
-    hears(first, "second")
-    hears(second, "first")
+    receives(first, "second")
+    receives(second, "first")
     for child in (first, second):
         child.tell()
         assert child.wait() == 0
         assert child.stderr == ""
 
 
-def test_a_newcomer_meets_the_old_ones_after_the_owner_was_killed(spawn):
+def test_new_process_discovers_the_others_after_the_owner_was_killed(spawn):
     owner = spawn(NODE, "owner")
-    hears(owner, "owner")  # it alone has the port before the second comes
+    receives(owner, "owner")  # it alone has the port before the second comes
     second = spawn(NODE, "second")
-    hears(second, "owner")
+    receives(second, "owner")
     owner.kill()
     third = spawn(NODE, "third")
-    hears(third, "second")
-    hears(second, "third")
+    receives(third, "second")
+    receives(second, "third")
 
 
-def test_many_that_start_at_once_all_meet(spawn):
+def test_processes_that_start_together_all_discover_each_other(spawn):
     names = [f"n{index}" for index in range(5)]
     children = [spawn(NODE, name) for name in names]
     for child in children:
-        hears(child, *names)
+        receives(child, *names)
 
 
-def test_the_lobby_passes_on_when_its_session_closes():
+def test_rendezvous_port_is_taken_over_when_its_session_closes():
     owner, heir = connect(), connect()
     owner.close()
     with connect() as newcomer:
@@ -80,7 +80,7 @@ def have_met(one: Session, other: Session) -> bool:
 
 
 def connect_while_closing(owner: Session, delay_s: float) -> Session:
-    """A session that opens while ``owner`` closes, which it begins ``delay_s`` later."""
+    """A session that opens while ``owner`` closes, which starts ``delay_s`` later."""
     closing = threading.Timer(delay_s, owner.close)
     closing.start()
     newcomer = connect()
@@ -88,7 +88,7 @@ def connect_while_closing(owner: Session, delay_s: float) -> Session:
     return newcomer
 
 
-def test_who_connects_while_the_lobby_closes_still_meets_who_comes_later():
+def test_session_opened_while_the_rendezvous_peer_closes_discovers_later_sessions():
     connect().close()
     started = time.monotonic()
     connect().close()
@@ -103,46 +103,46 @@ def test_who_connects_while_the_lobby_closes_still_meets_who_comes_later():
 
 
 @pytest.fixture
-def two_places(rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where this test meets, with a second address for while the first is silent."""
+def two_addresses(rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two rendezvous addresses for this test."""
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
 
 
-@pytest.mark.usefixtures("two_places")
-def test_sessions_meet_at_the_next_address_while_the_keeper_of_the_first_is_stopped(spawn):
-    keeper = spawn(NODE, "keeper")
-    hears(keeper, "keeper")  # it alone has the port before the others come
+@pytest.mark.usefixtures("two_addresses")
+def test_sessions_meet_at_the_next_address_while_the_owner_of_the_first_is_stopped(spawn):
+    owner = spawn(NODE, "owner")
+    receives(owner, "owner")  # it alone has the port before the others come
     early = spawn(NODE, "early")
-    hears(early, "keeper")
-    os.kill(keeper.process.pid, signal.SIGSTOP)
+    receives(early, "owner")
+    os.kill(owner.process.pid, signal.SIGSTOP)
     try:
         late, _ = spawn(NODE, "late"), spawn(NODE, "last")
-        hears(late, "early", "last")
-        hears(early, "late")
+        receives(late, "early", "last")
+        receives(early, "late")
     finally:
-        os.kill(keeper.process.pid, signal.SIGCONT)
-    hears(keeper, "late", "last")
-    hears(late, "keeper")
+        os.kill(owner.process.pid, signal.SIGCONT)
+    receives(owner, "late", "last")
+    receives(late, "owner")
     with connect() as newcomer:
         until(lambda: len(list(newcomer.zenoh.info.peers_zid())) >= 4)
 
 
-@pytest.mark.usefixtures("two_places")
-def test_a_session_that_opens_beside_a_stopped_keeper_has_met_the_others_when_it_is_open(spawn):
-    keeper = spawn(NODE, "keeper")
-    hears(keeper, "keeper")
+@pytest.mark.usefixtures("two_addresses")
+def test_session_opened_while_the_owner_is_stopped_has_discovered_the_others(spawn):
+    owner = spawn(NODE, "owner")
+    receives(owner, "owner")
     with connect() as other:
-        until(lambda: len(list(other.zenoh.info.peers_zid())) >= 2)  # the keeper and its lobby
-        os.kill(keeper.process.pid, signal.SIGSTOP)
+        until(lambda: len(list(other.zenoh.info.peers_zid())) >= 2)  # the owner and its rendezvous peer
+        os.kill(owner.process.pid, signal.SIGSTOP)
         until(silent_addresses)
         with connect() as newcomer:
             until(lambda: have_met(newcomer, other), SOON_S)
             assert len(silent_addresses()) == 1
-        os.kill(keeper.process.pid, signal.SIGCONT)
+        os.kill(owner.process.pid, signal.SIGCONT)
         until(lambda: not silent_addresses())
 
 
-def test_the_second_address_is_left_alone_while_the_first_answers(
+def test_second_address_is_unused_while_the_first_answers(
     rendezvous: str, free_port: int, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
@@ -151,7 +151,7 @@ def test_the_second_address_is_left_alone_while_the_first_answers(
         probe.bind(("127.0.0.1", free_port))
 
 
-def test_a_session_that_is_told_where_to_go_leaves_the_rendezvous_alone(rendezvous: str, free_port: int):
+def test_session_with_endpoints_does_not_use_the_rendezvous(rendezvous: str, free_port: int):
     host, port = rendezvous.split(":")
     endpoint = f"tcp/127.0.0.1:{free_port}"
     with (
@@ -163,7 +163,7 @@ def test_a_session_that_is_told_where_to_go_leaves_the_rendezvous_alone(rendezvo
         probe.connect((host, int(port)))
 
 
-def test_the_rendezvous_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch):
+def test_rendezvous_addresses_are_read_from_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", "box.local:1234")
     assert rendezvous_addresses() == (("box.local", 1234),)
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", "127.0.0.1:1 127.0.0.1:2")
@@ -177,7 +177,7 @@ def test_the_rendezvous_is_where_the_environment_says(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     "text", ["7450", "box:", "box:0", "box:70000", "tcp/box:1", ":1", " ", "box:1 box", "box:1,box:2"]
 )
-def test_a_rendezvous_that_is_no_address_is_refused(text: str, monkeypatch: pytest.MonkeyPatch):
+def test_invalid_rendezvous_address_is_refused(text: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", text)
     with pytest.raises(ConfigError, match="host:port") as caught:
         connect()

@@ -11,8 +11,8 @@ from zstate.net.session import connect
 
 
 @pytest.fixture
-def lobby(rendezvous: str) -> str:
-    """Where the lobby of this test is to be."""
+def peer(rendezvous: str) -> str:
+    """The endpoint of the rendezvous peer of this test."""
     return f"tcp/{rendezvous}"
 
 
@@ -20,60 +20,60 @@ def are_linked(one: zenoh.Session, other: zenoh.Session) -> bool:
     return str(other.zid()) in [str(zid) for zid in one.info.peers_zid()]
 
 
-def test_a_session_that_the_lobby_does_not_know_is_introduced_and_meets_everybody(lobby: str):
+def test_unregistered_session_registers_and_discovers_all_sessions(peer: str):
     endpoint, stop = free_endpoint(), threading.Event()
     with (
-        connect() as keeper,
-        connect() as guest,
-        open_zenoh(default_config("peer", (), [endpoint])) as stranger,
+        connect() as owner,
+        connect() as other,
+        open_zenoh(default_config("peer", (), [endpoint])) as session,
     ):
-        membership = RendezvousRegistration(stranger, endpoint, lobby)
+        registration = RendezvousRegistration(session, endpoint, peer)
 
         def has_met_both() -> bool:
-            membership.refresh(stop)
-            return are_linked(stranger, keeper.zenoh) and are_linked(stranger, guest.zenoh)
+            registration.refresh(stop)
+            return are_linked(session, owner.zenoh) and are_linked(session, other.zenoh)
 
-        assert not are_linked(stranger, guest.zenoh)
+        assert not are_linked(session, other.zenoh)
         until(has_met_both)
 
 
-def test_a_link_to_somebody_who_keeps_no_lobby_does_not_count(lobby: str):
+def test_link_to_a_process_without_a_rendezvous_peer_is_no_registration(peer: str):
     elsewhere, endpoint, stop = free_endpoint(), free_endpoint(), threading.Event()
     with (
         open_zenoh(default_config("peer", (), [elsewhere])) as ghost,
         open_zenoh(default_config("peer", [elsewhere], [endpoint])) as haunted,
     ):
         until(lambda: are_linked(haunted, ghost))
-        membership = RendezvousRegistration(haunted, endpoint, lobby)
-        with connect() as guest:
+        registration = RendezvousRegistration(haunted, endpoint, peer)
+        with connect() as other:
 
             def has_met() -> bool:
-                membership.refresh(stop)
-                return are_linked(haunted, guest.zenoh)
+                registration.refresh(stop)
+                return are_linked(haunted, other.zenoh)
 
             until(has_met)
 
 
-def test_an_introduction_ends_as_soon_as_it_is_told_to(lobby: str):
+def test_registration_ends_when_stop_is_set(peer: str):
     endpoint, stop = free_endpoint(), threading.Event()
-    with open_zenoh(default_config("peer", (), [endpoint])) as stranger:
-        membership = RendezvousRegistration(stranger, endpoint, lobby)  # of a lobby that nobody keeps
+    with open_zenoh(default_config("peer", (), [endpoint])) as session:
+        registration = RendezvousRegistration(session, endpoint, peer)  # no process runs the peer
 
-        def renew() -> None:
+        def refresh_until_stop() -> None:
             while not stop.is_set():
-                membership.refresh(stop)
+                registration.refresh(stop)
 
-        renewing = threading.Thread(target=renew)
-        renewing.start()
-        until(lambda: list(stranger.info.peers_zid()))
+        refreshing = threading.Thread(target=refresh_until_stop)
+        refreshing.start()
+        until(lambda: list(session.info.peers_zid()))
         stop.set()
-        until(lambda: not renewing.is_alive())
+        until(lambda: not refreshing.is_alive())
 
 
-def test_a_session_that_is_closed_has_no_membership_any_more(lobby: str):
+def test_refresh_of_a_closed_session_raises(peer: str):
     endpoint = free_endpoint()
-    stranger = open_zenoh(default_config("peer", (), [endpoint]))
-    membership = RendezvousRegistration(stranger, endpoint, lobby)
-    stranger.close()
+    session = open_zenoh(default_config("peer", (), [endpoint]))
+    registration = RendezvousRegistration(session, endpoint, peer)
+    session.close()
     with pytest.raises(zenoh.ZError, match="closed"):
-        until(lambda: membership.refresh(threading.Event()))
+        until(lambda: registration.refresh(threading.Event()))

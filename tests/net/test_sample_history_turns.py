@@ -1,4 +1,4 @@
-"""The order in which many writers are asked."""
+"""The order of requests to many writers."""
 
 from __future__ import annotations
 
@@ -8,56 +8,56 @@ from hypothesis import strategies as st
 from zstate.net.sample_history import RoundRobinQueue
 
 
-def taken(turns: RoundRobinQueue[str], now_s: float) -> list[str]:
+def popped(queue: RoundRobinQueue[str], now_s: float) -> list[str]:
     items: list[str] = []
-    while (item := turns.pop(now_s)) is not None:
+    while (item := queue.pop(now_s)) is not None:
         items.append(item)
     return items
 
 
-def test_each_source_has_its_turn_and_keeps_its_own_order():
-    turns: RoundRobinQueue[str] = RoundRobinQueue()
+def test_sources_take_turns_and_keep_their_own_order():
+    queue: RoundRobinQueue[str] = RoundRobinQueue()
     for item in ("a1", "a2", "a3", "b1", "c1", "c2"):
-        turns.add(item[0], item)
-    assert taken(turns, 0.0) == ["a1", "b1", "c1", "a2", "c2", "a3"]
-    assert len(turns) == 0
+        queue.add(item[0], item)
+    assert popped(queue, 0.0) == ["a1", "b1", "c1", "a2", "c2", "a3"]
+    assert len(queue) == 0
 
 
 def test_a_source_with_many_items_delays_another_by_one():
-    turns: RoundRobinQueue[str] = RoundRobinQueue()
+    queue: RoundRobinQueue[str] = RoundRobinQueue()
     for number in range(1000):
-        turns.add("a", f"a{number}")
-    turns.pop(0.0)
-    turns.add("b", "b")
-    assert "b" in (turns.pop(0.0), turns.pop(0.0))
+        queue.add("a", f"a{number}")
+    queue.pop(0.0)
+    queue.add("b", "b")
+    assert "b" in (queue.pop(0.0), queue.pop(0.0))
 
 
-def test_nothing_is_taken_before_it_is_due():
-    turns: RoundRobinQueue[str] = RoundRobinQueue()
-    turns.add("a", "late", 2.0)
-    turns.add("b", "soon", 1.0)
-    assert (turns.pop(0.5), turns.next_s(0.5)) == (None, 1.0)
-    assert (taken(turns, 1.5), turns.next_s(1.5)) == (["soon"], 2.0)
-    assert turns.next_s(3.0) == 3.0
-    assert taken(turns, 3.0) == ["late"]
-    assert turns.next_s(3.0) is None
+def test_item_is_not_popped_before_it_is_due():
+    queue: RoundRobinQueue[str] = RoundRobinQueue()
+    queue.add("a", "late", 2.0)
+    queue.add("b", "soon", 1.0)
+    assert (queue.pop(0.5), queue.next_s(0.5)) == (None, 1.0)
+    assert (popped(queue, 1.5), queue.next_s(1.5)) == (["soon"], 2.0)
+    assert queue.next_s(3.0) == 3.0
+    assert popped(queue, 3.0) == ["late"]
+    assert queue.next_s(3.0) is None
 
 
-def test_what_is_cleared_is_not_taken():
-    turns: RoundRobinQueue[str] = RoundRobinQueue()
-    turns.add("a", "a1")
-    turns.add("a", "a2")
-    turns.add("b", "later", 5.0)
-    turns.pop(0.0)
-    turns.clear()
-    assert (len(turns), taken(turns, 9.0)) == (0, [])
+def test_cleared_items_are_not_popped():
+    queue: RoundRobinQueue[str] = RoundRobinQueue()
+    queue.add("a", "a1")
+    queue.add("a", "a2")
+    queue.add("b", "later", 5.0)
+    queue.pop(0.0)
+    queue.clear()
+    assert (len(queue), popped(queue, 9.0)) == (0, [])
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.floats(0.0, 10.0))), st.floats(0.0, 10.0))
-def test_all_that_is_due_is_taken_once(added: list[tuple[str, float]], now_s: float):
-    turns: RoundRobinQueue[str] = RoundRobinQueue()
+def test_each_due_item_is_popped_once(added: list[tuple[str, float]], now_s: float):
+    queue: RoundRobinQueue[str] = RoundRobinQueue()
     for number, (source, due_s) in enumerate(added):
-        turns.add(source, f"{source}{number}", due_s)
+        queue.add(source, f"{source}{number}", due_s)
     due = [f"{source}{number}" for number, (source, due_s) in enumerate(added) if due_s <= now_s]
-    assert sorted(taken(turns, now_s)) == sorted(due)
-    assert len(turns) == len(added) - len(due)
+    assert sorted(popped(queue, now_s)) == sorted(due)
+    assert len(queue) == len(added) - len(due)

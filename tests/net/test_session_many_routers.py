@@ -1,4 +1,4 @@
-"""Several routers: one that dies, and a robot's that joins its fleet's. Each is a process of its own."""
+"""Several router processes: one that dies, and a robot's router that joins the fleet's."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def client(*endpoints: str) -> Session:
     return connect(mode="client", endpoints=endpoints)
 
 
-def publish_and_look(publisher: StatePublisher, listener: TransformListener, after: int = 0) -> bool:
+def publish_and_check(publisher: StatePublisher, listener: TransformListener, after: int = 0) -> bool:
     """Whether the listener has a sample stamped later than ``after``."""
     publisher.publish([0.1, 0.2])
     if not listener.buffer.can_lookup("base", "lower"):
@@ -39,7 +39,7 @@ def publish_and_look(publisher: StatePublisher, listener: TransformListener, aft
     return listener.buffer.latest("base", "lower") > after
 
 
-def test_clients_go_to_the_next_router_when_theirs_is_killed(spawn: Spawn):
+def test_clients_use_the_next_router_when_theirs_is_killed(spawn: Spawn):
     first, second = endpoint(), endpoint()
     dying = router(spawn, first)
     router(spawn, second, "--connect", first)
@@ -49,17 +49,17 @@ def test_clients_go_to_the_next_router_when_theirs_is_killed(spawn: Spawn):
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1") as listener,
     ):
-        until(lambda: publish_and_look(publisher, listener))
+        until(lambda: publish_and_check(publisher, listener))
         dying.kill()
         killed_at = time.time_ns()
-        until(lambda: publish_and_look(publisher, listener, after=killed_at))
-        # Somebody who comes now finds it all behind the second one.
+        until(lambda: publish_and_check(publisher, listener, after=killed_at))
+        # A new session finds everything behind the second router.
         with client(first, second) as late, TransformListener(late, "r1") as newcomer:
             assert [info.name for info in discover(late)] == ["r1"]
-            until(lambda: publish_and_look(publisher, newcomer))
+            until(lambda: publish_and_check(publisher, newcomer))
 
 
-def test_readers_and_writers_at_different_routers_meet_again_when_one_is_killed(spawn: Spawn):
+def test_readers_and_writers_at_different_routers_reconnect_when_one_is_killed(spawn: Spawn):
     first, second = endpoint(), endpoint()
     dying = router(spawn, first)
     router(spawn, second, "--connect", first)
@@ -69,13 +69,13 @@ def test_readers_and_writers_at_different_routers_meet_again_when_one_is_killed(
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1") as listener,
     ):
-        until(lambda: publish_and_look(publisher, listener))
+        until(lambda: publish_and_check(publisher, listener))
         dying.kill()
         killed_at = time.time_ns()
-        until(lambda: publish_and_look(publisher, listener, after=killed_at))
+        until(lambda: publish_and_check(publisher, listener, after=killed_at))
 
 
-def test_a_robots_router_and_its_fleets_pass_everything_on_both_ways(spawn: Spawn):
+def test_robot_router_and_fleet_router_forward_both_ways(spawn: Spawn):
     fleet, site = endpoint(), endpoint()
     # The robot starts before its fleet can be reached.
     router(spawn, site, "--connect", fleet)
@@ -93,22 +93,22 @@ def test_a_robots_router_and_its_fleets_pass_everything_on_both_ways(spawn: Spaw
             TransformListener(robot, "*", follow="tf") as below,
         ):
             places.set(Transform("map", "dock", (1.0, 2.0, 0.0), UPRIGHT))
-            until(lambda: publish_and_look(publisher, above))
+            until(lambda: publish_and_check(publisher, above))
             assert above.buffer.wait("base", "camera", timeout_s=5.0).kind == "static"
             assert below.buffer.wait("map", "dock", timeout_s=5.0).kind == "static"
             for session in (hall, robot):
                 until(lambda there=session: [info.name for info in discover(there)] == ["fleet", "r1"])
 
 
-def test_what_a_site_misses_while_its_fleet_is_gone_comes_back(spawn: Spawn):
+def test_streams_resume_when_the_fleet_router_returns(spawn: Spawn):
     fleet, site = endpoint(), endpoint()
     dying = router(spawn, fleet)
     router(spawn, site, "--connect", fleet)
     with client(site) as robot, StatePublisher(robot, RRBOT, "r1") as publisher:
         dying.kill()
-        # The robot's own programs do not notice.
+        # The robot's own programs are not affected.
         with client(site) as beside, TransformListener(beside, "r1") as listener:
-            until(lambda: publish_and_look(publisher, listener))
+            until(lambda: publish_and_check(publisher, listener))
         router(spawn, fleet)
         with client(fleet) as hall, TransformListener(hall, "r1") as listener:
-            until(lambda: publish_and_look(publisher, listener))
+            until(lambda: publish_and_check(publisher, listener))

@@ -1,4 +1,4 @@
-"""How publishers do, as others hear it."""
+"""Status of publishers, as subscribers receive it."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ OK = Status(1, 2, "ok", "driver", "nuc", 3, 100.0, 4, 0)
 ME = WriterId("driver", "nuc", 3, 1, OK.session).identity
 
 
-class Heard:
-    """Every status of ``robot``, and when it came [s]."""
+class Statuses:
+    """Every status of ``robot``, and its arrival [s]."""
 
     def __init__(self, session: Session, robot: str = "*") -> None:
         self.statuses: list[tuple[str, Status]] = []
         self.times: list[float] = []
-        self.watch = watch_status(session, robot, self._note)
+        self.watch = watch_status(session, robot, self._on_status)
 
-    def _note(self, robot: str, status: Status) -> None:
+    def _on_status(self, robot: str, status: Status) -> None:
         self.times.append(time.monotonic())
         self.statuses.append((robot, status))
 
@@ -52,39 +52,39 @@ def status_threads() -> int:
     return sum(thread.name == "zstate status" for thread in threading.enumerate())
 
 
-def test_a_publisher_says_once_a_second_how_it_does(sessions):
-    heard = Heard(sessions[1])
+def test_publisher_sends_its_status_once_a_second(sessions):
+    received = Statuses(sessions[1])
     with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as publisher:
         running = threading.Thread(target=publisher.run, args=(SineSource(RRBOT), 50.0))
         running.start()
-        until(lambda: len(heard.statuses) >= 3)
+        until(lambda: len(received.statuses) >= 3)
         (writer,) = {said for robot in discover(sessions[1]) for _, said in robot.writers}
     running.join()
-    robot, status = heard.statuses[-1]
+    robot, status = received.statuses[-1]
     assert robot == "r1"
     assert (status.program, status.pid, status.session) == ("driver", writer.pid, writer.session)
     assert status.sent > 0
     assert status.values["commanded"] == "50 Hz"
-    periods = np.diff(heard.times)
-    # The medium may hold one up; it does not catch up in a burst, nor fall behind for long.
+    periods = np.diff(received.times)
+    # The network may delay one; it neither catches up in a burst nor falls behind for long.
     assert 0.5 < np.mean(periods) < 2.0
 
 
-def test_it_ends_with_its_publisher_and_leaves_no_thread(sessions):
+def test_status_ends_with_its_publisher_and_leaves_no_thread(sessions):
     before = status_threads()
-    heard = Heard(sessions[1])
+    received = Statuses(sessions[1])
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         publisher.publish([0.0, 0.0])
-        until(lambda: heard.statuses)
+        until(lambda: received.statuses)
         assert status_threads() == before + 1
     assert status_threads() == before
     with StatePublisher(sessions[0], RRBOT, "r2"):
-        until(lambda: heard.statuses[-1][0] == "r2")
-    names = [robot for robot, _ in heard.statuses]
+        until(lambda: received.statuses[-1][0] == "r2")
+    names = [robot for robot, _ in received.statuses]
     assert names == sorted(names), "r1 spoke after its publisher was closed"
 
 
-def test_who_comes_later_hears_of_the_last_second_alone(sessions):
+def test_late_subscriber_receives_only_the_status_of_the_last_second(sessions):
     asked = threading.Semaphore(0)
 
     def status() -> Status:
@@ -93,19 +93,19 @@ def test_who_comes_later_hears_of_the_last_second_alone(sessions):
 
     with StatusPublisher(sessions[0], "r1", ME, status):
         assert asked.acquire(timeout=5.0)
-        heard = Heard(sessions[1], "r1")
+        received = Statuses(sessions[1], "r1")
         assert asked.acquire(timeout=5.0)
-        until(lambda: heard.statuses)
-        assert len(heard.statuses) == 1
+        until(lambda: received.statuses)
+        assert len(received.statuses) == 1
 
 
-def test_a_publisher_that_stands_still_is_stale(sessions):
-    heard = Heard(sessions[1], "r1")
+def test_publisher_that_stands_still_is_stale(sessions):
+    received = Statuses(sessions[1], "r1")
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         publisher.publish([0.0, 0.0])
-        until(lambda: "stale" in heard.levels)
-        assert "nothing was published for" in heard.last().text
-        until(lambda: publisher.publish([0.0, 0.0]) or heard.last().level == "ok")
+        until(lambda: "stale" in received.levels)
+        assert "nothing was published for" in received.last().text
+        until(lambda: publisher.publish([0.0, 0.0]) or received.last().level == "ok")
 
 
 class Slow:
@@ -119,29 +119,29 @@ class Slow:
         return JointReading(np.zeros(2))
 
 
-def test_a_publisher_that_cannot_keep_its_rate_warns(sessions):
-    heard = Heard(sessions[1], "r1")
+def test_publisher_below_its_rate_warns(sessions):
+    received = Statuses(sessions[1], "r1")
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         running = threading.Thread(target=publisher.run, args=(Slow(), 100.0))
         running.start()
-        until(lambda: "warn" in heard.levels)
+        until(lambda: "warn" in received.levels)
     running.join()
-    warning = next(status for _, status in heard.statuses if status.level == "warn")
+    warning = next(status for _, status in received.statuses if status.level == "warn")
     assert "100 Hz are more than this process keeps" in warning.text
     assert warning.late > 0
 
 
-def test_a_publisher_whose_samples_are_refused_tells_the_reason(sessions):
-    heard = Heard(sessions[1], "r1")
+def test_status_contains_the_reason_of_refused_samples(sessions):
+    received = Statuses(sessions[1], "r1")
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
 
         def is_in_error() -> bool:
             with suppress(InvalidInput):
                 publisher.publish([0.0, float("nan")])
-            return "error" in heard.levels
+            return "error" in received.levels
 
         until(is_in_error)
-    assert "nan" in heard.last().text
+    assert "nan" in received.last().text
 
 
 WRITER = """
@@ -153,22 +153,22 @@ WRITER = """
 """
 
 
-def test_a_process_that_is_gone_says_nothing_more(spawn):
+def test_ended_process_sends_no_status(spawn):
     with connect() as session:
-        heard = Heard(session)
+        received = Statuses(session)
         child: Child = spawn(WRITER)
         child.line()
-        until(lambda: heard.statuses)
+        until(lambda: received.statuses)
         child.kill()
         until(lambda: not discover(session, 0.2))
         with StatePublisher(session, RRBOT, "r2"):
-            until(lambda: len([robot for robot, _ in heard.statuses if robot == "r2"]) == 2)
-    names = [robot for robot, _ in heard.statuses]
+            until(lambda: len([robot for robot, _ in received.statuses if robot == "r2"]) == 2)
+    names = [robot for robot, _ in received.statuses]
     assert names == sorted(names), "r1 spoke after its process was killed"
 
 
-def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
-    heard = Heard(sessions[1], "r1")
+def test_invalid_status_is_counted_and_ignored(sessions):
+    received = Statuses(sessions[1], "r1")
     key = status_key("r1", ME)
     with ExitStack() as opened:
         said = {
@@ -178,13 +178,13 @@ def test_what_is_no_status_is_counted_and_does_no_harm(sessions):
         await_reader(sessions[0], key)
         for stream in said.values():
             stream.put(b"\xff\x00 noise")
-        until(lambda: sum(heard.watch.refused.values()) == 2)
-    assert heard.watch.refused == {"foreign": 1, "malformed": 1}
-    assert not heard.statuses
+        until(lambda: sum(received.watch.refused.values()) == 2)
+    assert received.watch.refused == {"foreign": 1, "malformed": 1}
+    assert not received.statuses
 
 
 def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
-    heard = Heard(sessions[1])
+    received = Statuses(sessions[1])
     await_reader(sessions[0], status_key("r1", ME))
     theirs = WriterId("driver", "nuc", 3, 1, 99).identity
     wrong = [("r1", theirs, OK), ("*", ME, OK), ("r1", ME, replace(OK, rate_hz=float("nan")))]
@@ -192,12 +192,12 @@ def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     for robot, identity, status in wrong:
         key = f"zstate/{robot}/status/{identity}"
         sessions[0].zenoh.put(key, encode(status), encoding=ENCODINGS[Status])
-    until(lambda: sum(heard.watch.refused.values()) == len(wrong))
-    assert heard.watch.refused == {"foreign": 3, "malformed": 1, "too large": 1}
-    assert not heard.statuses
+    until(lambda: sum(received.watch.refused.values()) == len(wrong))
+    assert received.watch.refused == {"foreign": 3, "malformed": 1, "too large": 1}
+    assert not received.statuses
 
 
-def test_after_its_session_is_gone_it_ends_by_itself():
+def test_status_thread_ends_with_the_session():
     before = status_threads()
     with connect() as session:
         publisher = StatusPublisher(session, "r1", ME, lambda: OK)
@@ -206,20 +206,20 @@ def test_after_its_session_is_gone_it_ends_by_itself():
 
 
 @pytest.mark.parametrize("streams", [("robot_description",), ("tf_static",)])
-def test_a_publisher_of_what_does_not_change_has_no_status(sessions, streams):
+def test_publisher_of_latched_streams_only_has_no_status(sessions, streams):
     before = status_threads()
     with StatePublisher(sessions[0], RRBOT, "r1", streams=streams):
         assert status_threads() == before
 
 
-def test_a_ros_wire_carries_none(sessions, monkeypatch: pytest.MonkeyPatch):
+def test_ros_wire_carries_no_status(sessions, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     before = status_threads()
     with StatePublisher(sessions[0], RRBOT, "r1", ("ros2",)):
         assert status_threads() == before
 
 
-def test_a_closed_publisher_counts_what_it_refused_before(sessions):
+def test_closed_publisher_keeps_its_refusal_counts(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         publisher.publish([0.0, 0.0])
         with pytest.raises(InvalidInput):

@@ -27,7 +27,7 @@ def test_samples_arrive_in_order_with_key_and_encoding(sessions):
     assert (subscriber.full_batches, subscriber.failures) == (0, 0)
 
 
-def test_readers_of_many_keys_and_writers_of_a_session_go_on_when_one_of_its_readers_closes(sessions):
+def test_other_readers_and_writers_of_a_session_continue_when_one_reader_closes(sessions):
     here, there = sessions
     ours, theirs = "zstate/ours/joint_states", "zstate/theirs/joint_states"
     gone: list[SerializedSample] = []
@@ -40,20 +40,20 @@ def test_readers_of_many_keys_and_writers_of_a_session_go_on_when_one_of_its_rea
         StreamSubscriber(there, many, heard["there"].extend),
     ):
 
-        def all_say(payload: bytes) -> bool:
+        def all_receive(payload: bytes) -> bool:
             mine.put(payload)
             other.put(payload)
             said = {(ours, payload), (theirs, payload)}
             return all(said <= {(arrival.key, arrival.payload) for arrival in ear} for ear in heard.values())
 
         with StreamSubscriber(here, many, gone.extend):
-            until(lambda: all_say(b"while both are there"))  # the sessions may just be meeting
+            until(lambda: all_receive(b"while both are there"))  # discovery may take a moment
             until(lambda: {arrival.key for arrival in gone} == {ours, theirs})
-        until(lambda: all_say(b"afterwards"))
+        until(lambda: all_receive(b"afterwards"))
     assert {arrival.payload for arrival in gone} == {b"while both are there"}
 
 
-def test_what_goes_beside_a_sample_arrives_with_it(sessions):
+def test_attachment_arrives_with_its_sample(sessions):
     got: list[SerializedSample] = []
     with (
         StreamPublisher(sessions[0], KEY, "") as publisher,
@@ -65,7 +65,7 @@ def test_what_goes_beside_a_sample_arrives_with_it(sessions):
     assert (got[0].payload, got[0].attachment) == (b"payload", b"beside")
 
 
-def test_a_writer_knows_whether_anybody_reads(sessions):
+def test_has_readers_follows_the_subscribers(sessions):
     with StreamPublisher(sessions[0], KEY, ENCODING) as publisher:
         assert not publisher.has_readers
         with StreamSubscriber(sessions[1], KEY, lambda samples: None):
@@ -73,7 +73,7 @@ def test_a_writer_knows_whether_anybody_reads(sessions):
         until(lambda: not publisher.has_readers)
 
 
-def test_a_slow_reader_gets_the_newest_samples_and_is_told_that_its_ring_was_full(sessions):
+def test_slow_reader_receives_the_newest_samples_and_full_batches_are_counted(sessions):
     batches: list[list[int]] = []
     seen: list[SerializedSample] = []
     busy, go_on = threading.Event(), threading.Event()
@@ -93,7 +93,7 @@ def test_a_slow_reader_gets_the_newest_samples_and_is_told_that_its_ring_was_ful
         assert busy.wait(10)
         for number in range(1, 101):
             publisher.put(str(number).encode())
-        until(lambda: len(seen) == 101)  # the other reader of the session is not held up
+        until(lambda: len(seen) == 101)  # the other reader of the session is not delayed
         assert subscriber.full_batches == 0
         go_on.set()
         until(lambda: len(batches) == 2)
@@ -102,7 +102,9 @@ def test_a_slow_reader_gets_the_newest_samples_and_is_told_that_its_ring_was_ful
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_reader_that_raises_is_counted_reported_once_and_goes_on(sessions, monkeypatch: pytest.MonkeyPatch):
+def test_failing_callback_is_counted_reported_once_and_called_again(
+    sessions, monkeypatch: pytest.MonkeyPatch
+):
     reported: list[object] = []
     monkeypatch.setattr(threading, "excepthook", lambda arguments: reported.append(arguments.exc_value))
 
@@ -165,7 +167,7 @@ def test_a_closed_session_ends_the_threads_of_its_subscribers():
     subscriber.close()
 
 
-def test_putting_after_close_says_so(sessions):
+def test_put_after_close_raises_closed(sessions):
     publisher = StreamPublisher(sessions[0], KEY, ENCODING)
     publisher.close()
     publisher.close()

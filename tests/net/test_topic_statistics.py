@@ -24,8 +24,8 @@ def added(*received: tuple[int, int, int, int]) -> IntervalStatistics:
     return statistics
 
 
-def test_a_burst_changes_the_rate_of_arrivals_and_not_that_of_stamps():
-    # Stamped every 20 ms, one of them lost, all but the first held up until 100 ms.
+def test_burst_changes_the_arrival_rate_but_not_the_stamp_rate():
+    # Stamped every 20 ms, one of them lost, all but the first delayed until 100 ms.
     window = added((20, 0, 1, 20), (100, 20, 2, 80), (100, 60, 4, 40)).window()
     assert window is not None
     assert window.rate_hz == pytest.approx(2 / 0.08)
@@ -39,7 +39,7 @@ def test_delays_are_from_stamp_to_arrival():
     assert window.delays == (3 * MS, 7 * MS)
 
 
-def test_a_window_has_the_samples_after_its_begin():
+def test_window_has_the_samples_after_its_start():
     statistics = added(*((10 * number, 0, number, 0) for number in range(10)))
     window = statistics.window(60 * MS)
     assert window is not None
@@ -57,7 +57,7 @@ def test_one_sample_has_no_rate():
     assert IntervalStatistics().window() is None
 
 
-def test_gaps_are_counted_for_each_session_and_late_samples_fill_none_twice():
+def test_gaps_are_counted_per_session_and_late_samples_change_nothing():
     gaps = SequenceGaps()
     for session, seq in ((1, 5), (2, 9), (1, 6), (1, 9), (1, 8), (1, 10), (2, 10)):
         assert gaps.add(session, seq)
@@ -65,7 +65,7 @@ def test_gaps_are_counted_for_each_session_and_late_samples_fill_none_twice():
     assert (gaps.missed(1), gaps.missed(2), gaps.missed(), gaps.missed(3)) == (2, 0, 2, 0)
 
 
-def test_samples_of_one_message_are_one_for_each_source():
+def test_samples_of_one_message_count_once_per_source():
     with connect() as session, TopicStatistics(session, get_wire("native")) as topic:
         for seq in (1, 1, 2):
             topic.add("r1", "joint_states", JointState(0, seq, 7, order_digest(()), b""), seq, 0)

@@ -35,7 +35,7 @@ def opened(session, wire: str) -> WireWriter:
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_what_is_open_is_announced_and_is_heard_until_it_closes(sessions, wire: str):
+def test_open_streams_are_announced_and_received_until_close(sessions, wire: str):
     writer, reader = sessions
     joints, described = KEYS[wire]
     ear = Ear(reader, joints)
@@ -55,7 +55,7 @@ def test_what_is_open_is_announced_and_is_heard_until_it_closes(sessions, wire: 
 
 
 @pytest.mark.parametrize(("wire", "kinds"), [("native", ["PUT", "DELETE"]), ("ros2", ["PUT", "PUT"])])
-def test_a_value_is_withdrawn_only_where_that_can_be_said(sessions, wire: str, kinds: list[str]):
+def test_value_is_withdrawn_only_if_the_wire_can(sessions, wire: str, kinds: list[str]):
     writer, reader = sessions
     ear = Ear(reader, KEYS[wire][1])
     await_reader(writer, KEYS[wire][1])
@@ -69,7 +69,7 @@ def test_a_value_is_withdrawn_only_where_that_can_be_said(sessions, wire: str, k
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_readers_are_known(sessions, wire: str):
+def test_has_readers_is_true_with_a_subscriber(sessions, wire: str):
     writer, reader = sessions
     with opened(writer, wire) as out:
         stream = out.open_stream("joint_states")
@@ -80,7 +80,7 @@ def test_readers_are_known(sessions, wire: str):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_after_close_nothing_is_put_and_closing_again_does_nothing(wire: str):
+def test_write_after_close_raises_and_a_second_close_does_nothing(wire: str):
     with connect() as session:
         out = opened(session, wire)
         stream, latched = out.open_stream("joint_states"), out.open_latched("robot_description")
@@ -93,7 +93,7 @@ def test_after_close_nothing_is_put_and_closing_again_does_nothing(wire: str):
     latched.withdraw()
 
 
-def test_each_has_a_number_of_its_own_in_its_session(sessions):
+def test_each_stream_has_a_unique_number_in_its_session(sessions):
     writer, reader = sessions
     with opened(writer, "ros2") as one, opened(writer, "ros2") as other:
         for out in (one, other):
@@ -117,6 +117,6 @@ def test_a_message_that_one_wire_cannot_represent_is_sent_on_none(sessions):
     assert [(writer.samples, writer.bytes) for writer in writers] == [(1, size) for size in sizes]
 
 
-def test_what_ros_has_no_topic_for_is_refused(sessions):
+def test_stream_without_a_ros_topic_is_refused(sessions):
     with opened(sessions[0], "ros2") as out, pytest.raises(InvalidInput, match="'joint_commands'"):
         out.open_stream("joint_commands")

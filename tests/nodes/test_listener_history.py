@@ -336,7 +336,7 @@ def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Sess
         expected = tap.payloads(2)
         pages: list[list[SerializedSample]] = []
         with HistoryReader(reader, lambda page, _: bool(pages.append(page)), lambda *_: None) as past:
-            past.ask(JOINTS, publisher.cache.since(0)[0].session)
+            past.request(JOINTS, publisher.cache.since(0)[0].session)
             until(lambda: pages)
     assert [one.payload for one in pages[0]] == expected
     assert {one.encoding for one in pages[0]} == {ENCODINGS[JointState]}

@@ -71,7 +71,7 @@ def test_second_process_is_refused_with_the_name_of_the_first_which_continues(sp
         assert second.wait() == 1
         assert "driver@" in second.stderr
         assert f"pid {first.process.pid}'" in second.stderr
-        assert "'r1' already" in second.stderr
+        assert "already writes joint_states of 'r1'" in second.stderr
         received = listener.stats.received
         until(lambda: listener.stats.received > received)
         assert listener.stats.refused == {}
@@ -139,7 +139,7 @@ def test_later_publisher_ends_when_two_networks_are_joined(later_publishes_first
 def test_token_of_an_earlier_start_ends_no_running_publisher_until_its_holder_publishes(
     sessions, monkeypatch: pytest.MonkeyPatch, stream
 ):
-    monkeypatch.setattr("zstate.net.ownership._AT_ONCE_S", 0.0)
+    monkeypatch.setattr("zstate.net.ownership._STARTUP_S", 0.0)
     ours, theirs = sessions
     stranger = WriterId("stranger", "laptop", 9, 1, 99)
     with StatePublisher(ours, RRBOT, "r1") as publisher:

@@ -1,1 +1,1 @@
-"""Metrics for Prometheus: what publishers, listeners and routers count, read when it is asked for."""
+"""Prometheus metrics: collectors that read existing counters at a scrape, and their HTTP endpoint."""

@@ -1,7 +1,4 @@
-"""Transform buffer that counts its lookups and measures the latency of its samples.
-
-A buffer that measures how samples come in.
-"""
+"""Transform buffers that count lookups and measure the rate and latency of samples."""
 
 from __future__ import annotations
 
@@ -121,8 +118,12 @@ class InstrumentedBuffer(TransformBuffer):
 
     def _on_sample(self, robot: str, stamp: int) -> None:
         """Called when a sample of ``robot`` with this stamp [ns] can be looked up."""
-        if (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain:
+        if self._is_comparable(robot):
             self.latency.add((self.clock.now() - stamp) * 1e-9)
+
+    def _is_comparable(self, robot: str) -> bool:
+        """Whether the samples of ``robot`` are stamped in the clock domain of this buffer's clock."""
+        return (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain
 
 
 _WINDOW_NS = 5_000_000_000
@@ -134,7 +135,7 @@ class RobotMeasure:
 
     ``rate_hz`` is 0 if they have missed their deadline, or are fewer than two. ``latency_s`` is the median
     time from a sample's stamp until it could be looked up, by the clocks of both machines; ``age_s`` is that
-    of the newest sample. None without samples, and where the clock here does not tell their time.
+    of the newest sample. Both are None without samples, and with stamps of another clock domain.
     """
 
     rate_hz: float
@@ -143,7 +144,7 @@ class RobotMeasure:
 
 
 class MeteredBuffer(InstrumentedBuffer):
-    """A InstrumentedBuffer that also measures, robot by robot, when each sample can be looked up.
+    """An InstrumentedBuffer that also measures, for each robot, when each sample can be looked up.
 
     ``has_samples`` is set at the first one.
     """
@@ -176,10 +177,6 @@ class MeteredBuffer(InstrumentedBuffer):
         statistics.add(Received(time.monotonic_ns(), stamp, statistics.count, delay))
         if statistics.count == 1:
             self.has_samples.set()
-
-    def _is_comparable(self, robot: str) -> bool:
-        """Whether the clock here tells the time that stamps the samples of ``robot``."""
-        return (self.domain.domain_of(robot) or self.clock.domain) == self.clock.domain
 
     def measure(self, robot: str, within_ns: int = _WINDOW_NS) -> RobotMeasure:
         """How the samples of ``robot`` arrived."""

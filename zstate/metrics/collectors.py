@@ -1,8 +1,6 @@
-"""Collectors of metrics: publishers, listeners, writers, connections, recorders and bridges.
+"""Prometheus collectors of publishers, listeners, writers, connections, recorders and bridges.
 
-Each reads counters that exist anyway, at each scrape.
-
-Paces: rates of what is only counted.
+Each reads existing counters at a scrape. ``CounterRates`` computes rates from them.
 """
 
 from __future__ import annotations
@@ -33,50 +31,39 @@ if TYPE_CHECKING:
 WINDOW_S = 10.0
 EVERY_S = 1.0
 
-_Marks = deque[tuple[float, float]]
 
+class CounterRates:
+    """Rates [Hz] of counters over the last ten seconds, independent of when and how often they are read.
 
-class Paces:
-    """Rates [Hz] of counts over the last ten seconds, independent of when and how often they are read.
-
-    ``note`` is to be called about once a second; without that a rate is the one since the last reading that
-    is at least ten seconds old, or since the first. Any thread may call.
+    ``update`` is called about once a second; otherwise a rate is the one since the last reading that is at
+    least ten seconds old, or since the first. Thread-safe.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._marks: BoundedDict[Hashable, _Marks] = BoundedDict()
+        self._readings: BoundedDict[Hashable, deque[tuple[float, float]]] = BoundedDict()
+        """Times [s] and counts, at most one a second."""
         self._lock = threading.Lock()
 
-    def note(self, key: Hashable, count: float) -> None:
-        """What ``key`` counts has come to ``count``."""
-        with self._lock:
-            self._note(key, count, self._clock())
-
-    def rate_hz(self, key: Hashable, count: float) -> float:
-        """The rate of what ``key`` counts, which has come to ``count``; 0 at the first reading."""
+    def update(self, key: Hashable, count: float) -> float:
+        """Add a reading of the counter ``key``. Returns its rate; 0 at the first reading."""
         with self._lock:
             now = self._clock()
-            time_s, before = self._note(key, count, now)
-        return (count - before) / (now - time_s) if now > time_s else 0.0
-
-    def _note(self, key: Hashable, count: float, now: float) -> tuple[float, float]:
-        """Keep this reading if the last one is a second old. Returns the one at the window's beginning."""
-        marks = self._marks.get(key)
-        if marks is None:
-            marks = _Marks()
-            self._marks[key] = marks
-        if marks and count < marks[-1][1]:
-            marks.clear()  # it counts from the beginning again
-        if not marks or now - marks[-1][0] >= EVERY_S:
-            marks.append((now, count))
-        while len(marks) > 1 and now - marks[1][0] >= WINDOW_S:
-            marks.popleft()
-        return marks[0]
+            readings = self._readings.get(key)
+            if readings is None:
+                readings = self._readings[key] = deque[tuple[float, float]]()
+            if readings and count < readings[-1][1]:
+                readings.clear()  # the counter has restarted
+            if not readings or now - readings[-1][0] >= EVERY_S:
+                readings.append((now, count))
+            while len(readings) > 1 and now - readings[1][0] >= WINDOW_S:
+                readings.popleft()
+            first_s, first = readings[0]
+        return (count - first) / (now - first_s) if now > first_s else 0.0
 
 
 MAX_ROBOTS = 500
-"""Robots with rows of their own. Names come from the network, so further robots are only counted."""
+"""Robots with their own rows. Names come from the network, so further robots are only counted."""
 _MAX_STREAMS = 5 * MAX_ROBOTS
 
 
@@ -131,43 +118,39 @@ class PublisherMetrics:
 
     def __init__(self, publishers: Sequence[StatePublisher]) -> None:
         self._publishers = publishers
-        self._paces = Paces()
+        self._rates = CounterRates()
         self.sample()
 
     def sample(self) -> None:
-        """Read the counters, from which rates are computed; called once a second."""
+        """Read the counters for their rates; called once a second."""
         for publisher in self._publishers:
             for (wire, stream), counts in publisher.stats.streams.items():
-                self._paces.note((id(publisher), wire, stream), counts.samples)
+                self._rates.update((id(publisher), wire, stream), counts.samples)
 
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
         for publisher in self._publishers:
             if publisher.stats.streams:
                 self._add(families, publisher)
-        yield from families
+        return families
 
     def _add(self, families: MetricFamilies, publisher: StatePublisher) -> None:
         robot, stats = publisher.robot, publisher.stats
         count, gauge = families.count, families.gauge
         for (wire, stream), counts in stats.streams.items():
             labels = {"robot": robot, "wire": wire, "stream": stream}
-            count("zstate_publisher_samples", "Samples put on the network.", counts.samples, **labels)
+            count("zstate_publisher_samples", "Samples published.", counts.samples, **labels)
             count("zstate_publisher_bytes", "Their payloads [bytes].", counts.bytes, **labels)
-            text = "Samples not said, since nobody reads the stream."
+            text = "Samples not published because the stream has no reader."
             count("zstate_publisher_suppressed", text, counts.suppressed, **labels)
-            key: Hashable = id(publisher), wire, stream
-            rate_hz = self._paces.rate_hz(key, counts.samples)
-            gauge("zstate_publisher_rate_hertz", "Samples put a second.", rate_hz, **labels)
+            rate_hz = self._rates.update((id(publisher), wire, stream), counts.samples)
+            gauge("zstate_publisher_rate_hertz", "Samples published per second.", rate_hz, **labels)
         count("zstate_publisher_refused", "Samples that could not be published.", stats.refused, robot=robot)
-        if stats.rate is not None:
-            rate = stats.rate
-            text = "The rate that the publisher is to keep."
-            gauge("zstate_publisher_commanded_hertz", text, rate.commanded_hz, robot=robot)
+        if (rate := stats.rate) is not None:
+            gauge("zstate_publisher_commanded_hertz", "The commanded rate.", rate.commanded_hz, robot=robot)
             count("zstate_publisher_ticks", "Ticks of that rate.", rate.ticks, robot=robot)
-            text = "Ticks more than a period late."
-            count("zstate_publisher_late_ticks", text, rate.late, robot=robot)
-            text = "Ticks given up after a long delay."
+            count("zstate_publisher_late_ticks", "Ticks over a period late.", rate.late, robot=robot)
+            text = "Ticks skipped after a long delay."
             count("zstate_publisher_skipped_ticks", text, rate.skipped, robot=robot)
 
 
@@ -191,13 +174,13 @@ class ListenerMetrics:
 
     def __init__(self, listeners: Callable[[], Sequence[Listened]]) -> None:
         self._listeners = listeners
-        self._paces = Paces()
+        self._rates = CounterRates()
         self.sample()
 
     def sample(self) -> None:
-        """Read the counters, from which rates are computed; called once a second."""
+        """Read the counters for their rates; called once a second."""
         for listener in self._listeners():
-            self._paces.note(id(listener), listener.stats.received)
+            self._rates.update(id(listener), listener.stats.received)
 
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
@@ -208,45 +191,40 @@ class ListenerMetrics:
             if isinstance(listener.buffer, InstrumentedBuffer):
                 _add_lookups(families, listener.robot, listener.buffer)
         left_out = max(0, len(listeners) - MAX_ROBOTS)
-        families.gauge("zstate_listener_robots_left_out", "Robots without rows of their own.", left_out)
-        yield from families
+        families.gauge("zstate_listener_robots_left_out", "Robots without their own rows.", left_out)
+        return families
 
     def _add_counts(self, families: MetricFamilies, listener: Listened) -> None:
         robot, counts = listener.robot, asdict(listener.stats)
+        text = "Messages that could not be used."
         for reason, count in counts.pop("refused").items():
-            text = "Messages that could not be used."
             families.count("zstate_listener_refused", text, count, robot=robot, reason=reason)
         for name, count in counts.items():
             text = f"Samples {name.replace('_', ' ')}, as TransformListener.stats counts them."
             families.count(f"zstate_listener_{name}", text, count, robot=robot)
-        rate_hz = self._paces.rate_hz(id(listener), counts["received"])
-        families.gauge("zstate_listener_rate_hertz", "Samples received a second.", rate_hz, robot=robot)
+        rate_hz = self._rates.update(id(listener), counts["received"])
+        families.gauge("zstate_listener_rate_hertz", "Samples received per second.", rate_hz, robot=robot)
 
 
 def _add_ages(families: MetricFamilies, listener: Listened) -> None:
-    text = "How old the newest sample of a robot is, by the clocks of both machines."
-    buffer = listener.buffer
-    for robot, stamp in sorted(_newest_stamps(listener).items())[:MAX_ROBOTS]:
+    buffer, newest = listener.buffer, dict[str, int]()
+    for frame in buffer.frames():
+        robot = frame.name.partition("/")[0]
+        stamp = frame.newest_in(buffer.clock.domain)
+        if stamp is not None and listener.robot in (ANY, robot):
+            newest[robot] = max(newest.get(robot, stamp), stamp)
+    text = "The age of a robot's newest sample, by the clocks of both machines."
+    for robot, stamp in sorted(newest.items())[:MAX_ROBOTS]:
         age_s = (buffer.clock.now() - stamp) * 1e-9
         families.gauge("zstate_listener_age_seconds", text, age_s, robot=robot)
 
 
-def _newest_stamps(listener: Listened) -> dict[str, int]:
-    newest: dict[str, int] = {}
-    for frame in listener.buffer.frames():
-        robot = frame.name.partition("/")[0]
-        stamp = frame.newest_in(listener.buffer.clock.domain)
-        if stamp is not None and listener.robot in (ANY, robot):
-            newest[robot] = max(newest.get(robot, stamp), stamp)
-    return newest
-
-
 def _add_lookups(families: MetricFamilies, robot: str, buffer: InstrumentedBuffer) -> None:
-    text = "From a sample's stamp until it could be looked up."
+    text = "Time from a sample's stamp until it could be looked up."
     families.histogram("zstate_listener_latency_seconds", text, buffer.latency_of(robot), robot=robot)
     families.count("zstate_listener_lookups", "Lookups in the buffer.", buffer.lookups, robot=robot)
     for kind, count in buffer.failures.items():
-        text = "Lookups without an answer, by the kind of the error."
+        text = "Failed lookups by the kind of the error."
         families.count("zstate_listener_lookup_errors", text, count, robot=robot, kind=kind)
 
 
@@ -258,12 +236,11 @@ class WriterMetrics:
 
     def collect(self) -> Iterable[Metric]:
         families, robots = MetricFamilies(), self._robots()
-        families.gauge("zstate_robots", "Robots that somebody writes for.", len(robots))
+        families.gauge("zstate_robots", "Robots with a writer.", len(robots))
         for robot in robots[:MAX_ROBOTS]:
             for stream, _ in robot.writers:
-                text = "Writers that are alive."
-                families.gauge("zstate_writers", text, 1, robot=robot.name, stream=stream)
-        yield from families
+                families.gauge("zstate_writers", "Live writers.", 1, robot=robot.name, stream=stream)
+        return families
 
 
 class ConnectionMetrics:
@@ -273,12 +250,12 @@ class ConnectionMetrics:
         self._session = session
 
     def collect(self) -> Iterable[Metric]:
-        families, known = MetricFamilies(), connections(self._session)
-        for mode, count in known.sessions.items():
+        families, current = MetricFamilies(), connections(self._session)
+        for mode, count in current.sessions.items():
             families.gauge("zstate_router_sessions", "Connected sessions.", count, mode=mode)
-        for protocol, count in known.links.items():
+        for protocol, count in current.links.items():
             families.gauge("zstate_router_links", "Links to them.", count, protocol=protocol)
-        yield from families
+        return families
 
 
 class RecorderMetrics:
@@ -289,19 +266,17 @@ class RecorderMetrics:
 
     def collect(self) -> Iterable[Metric]:
         families, stats = MetricFamilies(), self._recorder.stats
-        for (robot, stream), count in sorted(stats.messages.items())[:_MAX_STREAMS]:
-            text = "Messages written."
-            families.count("zstate_recorder_messages", text, count, robot=robot, stream=stream)
+        count = families.count
+        for (robot, stream), number in sorted(stats.messages.items())[:_MAX_STREAMS]:
+            count("zstate_recorder_messages", "Messages written.", number, robot=robot, stream=stream)
         families.gauge("zstate_recorder_size_bytes", "Size of all files.", stats.bytes)
         families.gauge("zstate_recorder_files", "Files of the recording.", len(stats.files))
         for name in ("dropped", "missed", "unwritten"):
             text = f"Samples {name}, as Recorder.stats counts them."
-            families.count(f"zstate_recorder_{name}", text, getattr(stats, name))
-        for reason, count in stats.refused.items():
-            families.count(
-                "zstate_recorder_refused", "Messages that cannot be written.", count, reason=reason
-            )
-        yield from families
+            count(f"zstate_recorder_{name}", text, getattr(stats, name))
+        for reason, number in stats.refused.items():
+            count("zstate_recorder_refused", "Messages that cannot be written.", number, reason=reason)
+        return families
 
 
 class BridgeMetrics:
@@ -313,15 +288,9 @@ class BridgeMetrics:
     def collect(self) -> Iterable[Metric]:
         families = MetricFamilies()
         for carrier in sorted(self._bridge.carriers, key=lambda carrier: carrier.robot)[:MAX_ROBOTS]:
-            text = "Robots that are carried, by way."
-            families.gauge(
-                "zstate_bridge_carried",
-                text,
-                carrier.has_begun,
-                robot=carrier.robot,
-                way=carrier.source.direction,
-            )
+            robot, way, text = carrier.robot, carrier.source.direction, "Bridged robots by direction."
+            families.gauge("zstate_bridge_carried", text, carrier.has_begun, robot=robot, way=way)
             for reason, count in carrier.refused.items():
-                text = "What could not be carried."
-                families.count("zstate_bridge_refused", text, count, robot=carrier.robot, reason=reason)
-        yield from families
+                text = "Messages that could not be bridged."
+                families.count("zstate_bridge_refused", text, count, robot=robot, reason=reason)
+        return families

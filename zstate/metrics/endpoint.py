@@ -66,8 +66,8 @@ def check_library() -> None:
 class MetricsEndpoint(Closeable):
     """Serves the metrics of ``collectors`` at ``url``; a context manager.
 
-    It also serves CPU, memory and open files of this process, and the version of zstate. ``port`` 0 is a free
-    one. It adds no counting: it reads counters that exist anyway. Raises PortBusy, LibraryMissing without
+    Includes CPU, memory and open files of this process, and the version of zstate. Collectors read existing
+    counters; nothing is counted for it. ``port`` 0 is a free one. Raises PortBusy, LibraryMissing without
     prometheus-client, and InvalidInput if ``host`` is not an address of this host.
     """
 
@@ -76,10 +76,21 @@ class MetricsEndpoint(Closeable):
         from prometheus_client import CollectorRegistry, ProcessCollector, exposition  # noqa: PLC0415
 
         registry = CollectorRegistry()
-        for collector in (*collectors, _Build()):
+        for collector in (*collectors, _BuildMetrics()):
             registry.register(cast("Collector", collector))
         ProcessCollector(registry=registry)
-        self._server = _bound(host, port)
+        try:
+            self._server = (_Server6 if ":" in host else _Server)((host, port), _Handler)
+        except OSError as error:
+            endpoint = f"{host}:{port}"
+            if error.errno == errno.EADDRINUSE:
+                raise PortBusy(
+                    f"metrics cannot be served at {endpoint!r}: another program listens there; choose "
+                    "another port, or 0 for a free one",
+                    endpoint=endpoint,
+                ) from None
+            text = f"metrics cannot be served at {endpoint!r}: {error.strerror}; give an address of this host"
+            raise InvalidInput(text) from None
         samplers = [getattr(collector, "sample", None) for collector in collectors]
         self._server.samplers = [sampler for sampler in samplers if sampler is not None]
         # The library's types leave out the arguments of the application.
@@ -125,25 +136,9 @@ class _Handler(WSGIRequestHandler):
         """Log nothing: scrapes are frequent."""
 
 
-class _Build:
+class _BuildMetrics:
     def collect(self) -> Iterable[Metric]:
         from prometheus_client.core import InfoMetricFamily  # noqa: PLC0415
 
         facts = {"version": __version__, "kernel": str(kernel)}
-        yield InfoMetricFamily("zstate_build", "Which zstate this is.", facts)
-
-
-def _bound(host: str, port: int) -> _Server:
-    try:
-        return (_Server6 if ":" in host else _Server)((host, port), _Handler)
-    except OSError as error:
-        where = f"{host}:{port}"
-        if error.errno == errno.EADDRINUSE:
-            raise PortBusy(
-                f"metrics cannot be served at {where!r}: somebody listens there already; choose another "
-                "port, or 0 for a free one",
-                endpoint=where,
-            ) from None
-        raise InvalidInput(
-            f"metrics cannot be served at {where!r}: {error.strerror}; give an address of this host"
-        ) from None
+        yield InfoMetricFamily("zstate_build", "Version and kernel of zstate.", facts)

@@ -1,9 +1,8 @@
-"""Clock offsets: how far the clock of a writer is ahead of the one here, measured over the network.
+"""Clock offsets: how far the clock of a writer is ahead of the local clock, measured over the network.
 
-A writer answers whoever asks on ``zstate/<robot>/@clock/<identity>`` with the time by which it stamps.
-The answer was given somewhere between the question and its arrival here; taken for the middle, it is wrong
-by at most half of that round trip, and the shortest of several is the one to believe (as NTP does). Writers
-on simulated time do not answer: that is everybody's.
+A writer replies to queries on ``zstate/<robot>/@clock/<identity>`` with the time of its stamps. It replied
+at some time during the round trip; with the middle of it the error is at most half the round trip, and the
+shortest of several is used (as in NTP). Writers on simulated time do not reply: they share one clock.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -13,7 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import zenoh
@@ -28,25 +27,25 @@ from zstate.net.sample_history import RoundRobinQueue
 from zstate.net.session import Session
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import clock_expression, clock_key, parse_clock_key
-from zstate.wire.messages import ClockMessage as Time
+from zstate.wire.messages import ClockMessage
 from zstate.wire.native import ENCODINGS, decode, encode
 
-AGAIN_S = 30.0
-"""So old a measurement is repeated when it is asked for; sooner while there was no answer."""
+REFRESH_S = 30.0
+"""A measurement older than this is repeated when it is read; sooner while there was no reply."""
 
-_UNANSWERED_AGAIN_S = 5.0
+_UNANSWERED_REFRESH_S = 5.0
 
 _TIMEOUTS_S = (0.1, 0.2, 0.5)
-"""Of three attempts, the later two in their turn; then not before it is asked for again."""
+"""Of three attempts, the later two after those of other robots; then none until the offset is read again."""
 
-_MEETING_S = 0.05
+_DISCOVERY_S = 0.05
 
 
 @dataclass(frozen=True, order=True, slots=True)
 class MeasuredOffset:
-    """The clock of ``writer`` is ``offset_ns`` ahead of the one here, plus or minus ``uncertainty_ns``.
+    """The clock of ``writer`` is ``offset_ns`` ahead of the local one, plus or minus ``uncertainty_ns``.
 
-    ``round_trip_ns`` is the shortest there was, from the question to the answer.
+    ``round_trip_ns`` is the shortest one, from query to reply.
     """
 
     robot: str
@@ -57,11 +56,12 @@ class MeasuredOffset:
 
 
 class ClockService(Queryable):
-    """Tells whoever asks what time it is by the ``clock`` of one writer of ``robot``."""
+    """Replies with the time of ``clock``, which stamps what one writer of ``robot`` publishes."""
 
     def __init__(self, session: Session, robot: str, writer: WriterId, clock: Clock) -> None:
         def answer(_: object) -> Reply:
-            return Reply(encode(Time(clock.now(), self.answered, writer.session)), ENCODINGS[Time])
+            message = ClockMessage(clock.now(), self.answered, writer.session)
+            return Reply(encode(message), ENCODINGS[ClockMessage])
 
         super().__init__(session, clock_key(robot, writer.identity), answer)
 
@@ -76,92 +76,91 @@ def measure_offsets(
 ) -> tuple[MeasuredOffset, ...]:
     """How far the clock of each writer of ``robot`` ("*": of all robots) is ahead of ``clock``, sorted.
 
-    ``clock`` is this machine's unless given. The best of so many ``rounds`` counts. None is there when
-    nobody answers within ``timeout_s``. Raises InvalidInput and Closed.
+    ``clock`` is this machine's by default. The shortest round trip of ``rounds`` counts. Empty without a
+    reply within ``timeout_s``. Raises InvalidInput and Closed.
     """
     if rounds < 1 or not timeout_s > 0.0:
         raise InvalidInput(f"rounds is 1 or more and timeout_s is positive; got {rounds} and {timeout_s}")
-    expression = clock_expression(robot)
-    return tuple(sorted(_best(session, expression, rounds, clock or SystemClock(), timeout_s)))
+    return tuple(
+        sorted(_measure(session, clock_expression(robot), rounds, clock or SystemClock(), timeout_s))
+    )
 
 
-def _best(
+def _measure(
     session: Session, expression: str, rounds: int, clock: Clock, timeout_s: float
-) -> Iterator[MeasuredOffset]:
+) -> Collection[MeasuredOffset]:
     best: dict[str, MeasuredOffset] = {}
     deadline = time.monotonic() + timeout_s
     while rounds:
-        heard = list(_round(session, expression, clock, timeout_s))
-        if heard:
+        has_reply = False
+        sent_ns, now = time.monotonic_ns(), clock.now()
+        replies = query(
+            session.zenoh,
+            expression,
+            timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        for reply in replies:
+            round_trip_ns = time.monotonic_ns() - sent_ns
+            decoded = _decode_reply(reply)
+            if decoded is not None:
+                has_reply = True
+                robot, writer, stamp = decoded
+                half = round_trip_ns // 2
+                measured = MeasuredOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
+                key = clock_key(robot, writer.identity)
+                if key not in best or round_trip_ns < best[key].round_trip_ns:
+                    best[key] = measured
+        if has_reply:
             rounds -= 1
         elif best or time.monotonic() > deadline:
             break
         else:
-            time.sleep(_MEETING_S)  # a session that has just connected has not met everybody yet
-        for one in heard:
-            key = clock_key(one.robot, one.writer.identity)
-            if key not in best or one.round_trip_ns < best[key].round_trip_ns:
-                best[key] = one
-    yield from best.values()
+            time.sleep(_DISCOVERY_S)  # a session that has just connected has not discovered all others yet
+    return best.values()
 
 
-def _round(session: Session, expression: str, clock: Clock, timeout_s: float) -> Iterator[MeasuredOffset]:
-    asked_ns, now = time.monotonic_ns(), clock.now()
-    replies = query(
-        session.zenoh,
-        expression,
-        timeout_s,
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-    )
-    for reply in replies:
-        round_trip_ns = time.monotonic_ns() - asked_ns
-        if reply.ok is not None:
-            told = _parse_reply(reply.ok)
-            if told is not None:
-                robot, writer, stamp = told
-                half = round_trip_ns // 2
-                yield MeasuredOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
-
-
-def _parse_reply(sample: zenoh.Sample) -> tuple[str, WriterId, int] | None:
-    """Who says what time it is; None for what is no answer of ours."""
+def _decode_reply(reply: zenoh.Reply) -> tuple[str, WriterId, int] | None:
+    """Robot, writer and the time of its clock; None for other replies."""
+    if reply.ok is None:
+        return None
     try:
-        robot, identity = parse_clock_key(str(sample.key_expr))
+        robot, identity = parse_clock_key(str(reply.ok.key_expr))
         writer = WriterId.parse(identity)
-        time_there = decode(sample.payload.to_bytes(), str(sample.encoding), Time)
+        message = decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), ClockMessage)
     except (InvalidInput, MessageError):
         return None
-    return (robot, writer, time_there.stamp) if time_there.session == writer.session else None
+    return (robot, writer, message.stamp) if message.session == writer.session else None
 
 
 class ClockOffsetMonitor(Closeable):
-    """Measures the clocks of writers as often as somebody wants to know, in a thread of its own.
+    """Measures the clock offsets of writers when they are read, in its own thread.
 
-    The thread lives no longer than there is something to measure. Each robot has its turn: silent writers
-    of one robot do not delay those of another for long.
+    The thread lives only while there is something to measure. Robots take turns: silent writers of one robot
+    do not delay those of another for long.
     """
 
     def __init__(self, session: Session, clock: Clock) -> None:
         self._session = session
         self._clock = clock
-        self._wanted: RoundRobinQueue[_Measured] = RoundRobinQueue()
+        self._requests: RoundRobinQueue[_WriterOffset] = RoundRobinQueue()
         self._lock = fork_safe_lock()
         self._is_running = False
         self._is_open = True
 
-    def follow(self, robot: str, writer: WriterId) -> Callable[[], ClockOffset | None]:
-        """What tells how far the clock of ``writer`` is ahead: measured now, and when asked after 30 s."""
-        measured = _Measured(self, robot, clock_key(robot, writer.identity))
-        measured()
-        return measured
+    def watch(self, robot: str, writer: WriterId) -> Callable[[], ClockOffset | None]:
+        """A function that returns the clock offset of ``writer``; measured now, and again after 30 s."""
+        offset = _WriterOffset(self, robot, clock_key(robot, writer.identity))
+        offset()
+        return offset
 
-    def want(self, measured: _Measured) -> None:
-        """Measure, as soon as what was wanted before is done."""
+    def request(self, offset: _WriterOffset) -> None:
+        """Measure ``offset`` after the ones that were requested before."""
         with self._lock:
             if not self._is_open:
                 return
-            self._wanted.add(measured.robot, measured)
+            self._requests.add(offset.robot, offset)
             if not self._is_running:
                 self._is_running = True
                 thread = threading.Thread(target=self._run, name="zstate clock offsets", daemon=True)
@@ -171,52 +170,51 @@ class ClockOffsetMonitor(Closeable):
                     self._is_open = False
 
     def close(self) -> None:
-        """Measure no more. A second call does nothing."""
+        """Stop measuring. A second call does nothing."""
         with self._lock:
             self._is_open = False
-            self._wanted.clear()
+            self._requests.clear()
 
     def _run(self) -> None:
         while True:
             with self._lock:
-                measured = self._wanted.pop(0.0)
-                if measured is None:
+                offset = self._requests.pop(0.0)
+                if offset is None:
                     self._is_running = False
                     return
             try:
-                found = list(_best(self._session, measured.key, 8, self._clock, measured.timeout_s))
-                if measured.add_reply(found):
-                    self.want(measured)
+                if offset.update(_measure(self._session, offset.key, 8, self._clock, offset.timeout_s)):
+                    self.request(offset)
             except (Closed, zenoh.ZError):
-                self.close()  # the session is gone
+                self.close()  # with the session
 
 
-class _Measured:
-    """The offset of one writer's clock, as far as it is known."""
+class _WriterOffset:
+    """The offset of one writer's clock, if it is known."""
 
-    def __init__(self, meter: ClockOffsetMonitor, robot: str, key: str) -> None:
+    def __init__(self, monitor: ClockOffsetMonitor, robot: str, key: str) -> None:
         self.robot = robot
         self.key = key
         self.offset: ClockOffset | None = None
         self._unanswered = 0
-        self._meter = meter
-        self._wanted_s = -AGAIN_S
+        self._monitor = monitor
+        self._requested_s = -REFRESH_S
 
     @property
     def timeout_s(self) -> float:
-        """How long it may take the writer to answer: longer, when it has not answered before."""
+        """The time for the next reply: longer if the writer did not reply before."""
         return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
 
-    def add_reply(self, found: Sequence[MeasuredOffset]) -> bool:
-        """Keep what was measured; whether to try again, where the writer did not answer."""
-        self._unanswered = 0 if found else self._unanswered + 1
-        for one in found:
+    def update(self, measured: Collection[MeasuredOffset]) -> bool:
+        """Store a measurement. Returns whether to try again, without a reply."""
+        self._unanswered = 0 if measured else self._unanswered + 1
+        for one in measured:
             self.offset = ClockOffset(one.offset_ns, one.uncertainty_ns)
         return 0 < self._unanswered < len(_TIMEOUTS_S)
 
     def __call__(self) -> ClockOffset | None:
         now_s = time.monotonic()
-        if now_s - self._wanted_s >= (_UNANSWERED_AGAIN_S if self.offset is None else AGAIN_S):
-            self._wanted_s = now_s
-            self._meter.want(self)
+        if now_s - self._requested_s >= (_UNANSWERED_REFRESH_S if self.offset is None else REFRESH_S):
+            self._requested_s = now_s
+            self._monitor.request(self)
         return self.offset

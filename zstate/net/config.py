@@ -1,9 +1,4 @@
-"""What a session is told: endpoints checked, settings chosen, one zenoh.Config out.
-
-The ways to join the network, and how open each of them is.
-
-What the environment says about joining the network: what zstate's commands go by, for other programs.
-"""
+"""Session settings: modes, checked endpoints, ``ZSTATE_*`` variables, and the zenoh.Config they make."""
 
 # pyright: reportUnknownMemberType=false
 # zenoh's stubs leave the return types of some methods out
@@ -37,15 +32,15 @@ ROUTER_ENDPOINT = "tcp/127.0.0.1:7447"
 SETTINGS: dict[str, object] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": True,
-    # How long opening waits for those it is told of. Who has just gone is told of, too, and never answers.
+    # How long opening waits for peers known from gossip. Gossip includes peers that have just left.
     "scouting/delay": 20,
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
     "transport/link/tx/lease": 3000,
-    # A connection that was cut comes back within a second of the heal: TCP asks again after one second,
-    # then a new attempt follows. Two round trips and those of TLS must fit into one.
+    # A connection that was cut is back within a second of the repair: TCP retries after one second, then a
+    # new attempt follows. Two round trips and those of TLS must fit into one attempt.
     "transport/unicast/open_timeout": 1800,
-    # By default 100 connections that send nothing keep everybody else out for 10 s each time.
+    # By default 100 connections that send nothing keep all others out for 10 s each time.
     "transport/unicast/accept_timeout": 3000,
     "transport/unicast/accept_pending": 1000,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 200, "period_increase_factor": 2},
@@ -69,10 +64,10 @@ ROS_ROUTER: dict[str, object] = {
         "shared_memory": {"enabled": False},
     },
 }
-"""What rmw_zenohd sets, but for where it listens: tcp/[::]:7447, which is open to the network.
+"""The settings of rmw_zenohd, except that it listens at tcp/[::]:7447, which is open to the network.
 
-ROS nodes are peers. They find each other through the router's gossip, and data goes between them
-directly; the router passes on what is said between peers and clients.
+ROS nodes are peers. They find each other through the router's gossip and exchange data directly; the router
+forwards between peers and clients.
 """
 
 _ADDRESSED = {"tcp", "udp", "tls", "quic", "ws"}
@@ -80,19 +75,18 @@ _LOCAL = {"unixsock-stream", "unixpipe", "vsock", "serial"}
 
 
 def endpoint_list(endpoints: str | Sequence[str]) -> tuple[str, ...]:
-    """Checked endpoints, from one or several. Raises InvalidInput saying the right form."""
-    given = [endpoints] if isinstance(endpoints, str) else endpoints
-    return tuple(_check_endpoint(endpoint) for endpoint in given)
+    """Checked endpoints, from one or several. Raises InvalidInput with the correct form."""
+    return tuple(map(_check_endpoint, [endpoints] if isinstance(endpoints, str) else endpoints))
 
 
 def _check_endpoint(endpoint: str) -> str:
-    protocol, slash, rest = endpoint.partition("/")
+    protocol, slash, location = endpoint.partition("/")
     if not slash or not protocol.isascii() or protocol not in _ADDRESSED | _LOCAL:
         raise InvalidInput(f"{endpoint!r} is not an endpoint; {_advice(endpoint)}")
-    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    address = re.split(r"[?#]", location, maxsplit=1)[0]
     if protocol in _ADDRESSED:
         if parse_endpoint(endpoint) is None:
-            raise InvalidInput(f"{endpoint!r} does not say host and port; {_advice(address, protocol)}")
+            raise InvalidInput(f"{endpoint!r} has no host and port; {_advice(address, protocol)}")
     elif not address:
         raise InvalidInput(f"{endpoint!r} has no address after {protocol + '/'!r}")
     return endpoint
@@ -113,20 +107,17 @@ def default_config(
     timeout_s: float | None = None,
     credentials: Credentials | None = None,
 ) -> zenoh.Config:
-    """Our settings. Without ``timeout_s`` connecting is tried for ever and opening never fails."""
-    return _apply(
-        zenoh.Config(),
-        {
-            **SETTINGS,
-            **_mode(mode),
-            **_secured(credentials),
-            **_is_config_section(mode, credentials),
-            "connect/endpoints": list(endpoints),
-            "listen/endpoints": list(listen),
-            "connect/timeout_ms": -1 if timeout_s is None else round(timeout_s * 1000),
-            "connect/exit_on_failure": timeout_s is not None,
-        },
-    )
+    """The default settings. Without ``timeout_s`` connecting is retried for ever and opening never fails."""
+    settings = {**SETTINGS, **_mode_settings(mode), **(credentials.settings() if credentials else {})}
+    # A peer found by multicast or gossip may accept plain TCP: with certificates only these are used.
+    # Routers search for no peers, and may serve the programs of their host without certificates.
+    if mode != "router" and credentials is not None and credentials.ca is not None:
+        settings["transport/link/protocols"] = ["tls", "quic"]
+    settings["connect/endpoints"] = list(endpoints)
+    settings["listen/endpoints"] = list(listen)
+    settings["connect/timeout_ms"] = -1 if timeout_s is None else round(timeout_s * 1000)
+    settings["connect/exit_on_failure"] = timeout_s is not None
+    return _apply(zenoh.Config(), settings)
 
 
 def user_config(
@@ -136,36 +127,27 @@ def user_config(
     listen: Sequence[str],
     credentials: Credentials | None = None,
 ) -> zenoh.Config:
-    """The user's configuration; credentials, endpoints and a mode other than "peer" replace what it says."""
-    told = {**({} if mode == "peer" else _mode(mode)), **_secured(credentials)}
+    """The user's configuration, with credentials, endpoints and a mode other than "peer" replaced."""
+    settings = {
+        **({} if mode == "peer" else _mode_settings(mode)),
+        **(credentials.settings() if credentials else {}),
+    }
     if endpoints:
-        told["connect/endpoints"] = list(endpoints)
+        settings["connect/endpoints"] = list(endpoints)
     if listen:
-        told["listen/endpoints"] = list(listen)
-    return _apply(_load(source), told)
+        settings["listen/endpoints"] = list(listen)
+    return _apply(_load(source), settings)
 
 
-def _mode(mode: Mode) -> dict[str, object]:
+def _mode_settings(mode: Mode) -> dict[str, object]:
     if mode == "lan":
         return {
             "mode": "peer",
             "scouting/multicast/enabled": True,
             "scouting/gossip/enabled": True,
-            "scouting/delay": 200,  # to be found takes a while
+            "scouting/delay": 200,  # multicast discovery takes a while
         }
     return {"mode": "peer" if mode == "loopback" else mode}
-
-
-def _secured(credentials: Credentials | None) -> dict[str, object]:
-    return {} if credentials is None else credentials.settings()
-
-
-def _is_config_section(mode: Mode, credentials: Credentials | None) -> dict[str, object]:
-    # Whoever is found by multicast or gossip and speaks plain TCP would be spoken to, certificates or not.
-    # Routers look for nobody, and may serve the programs of their host without.
-    if mode == "router" or credentials is None or credentials.ca is None:
-        return {}
-    return {"transport/link/protocols": ["tls", "quic"]}
 
 
 def _apply(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config:
@@ -175,13 +157,13 @@ def _apply(config: zenoh.Config, settings: Mapping[str, object]) -> zenoh.Config
 
 
 def endpoints_in(config: zenoh.Config) -> tuple[str, ...]:
-    """Where it says to connect, as far as that is a plain list."""
+    """The endpoints that ``config`` connects to; empty unless they are a plain list."""
     found = json.loads(config.get_json("connect/endpoints"))
     return tuple(e for e in found if isinstance(e, str)) if isinstance(found, list) else ()  # pyright: ignore[reportUnknownVariableType]
 
 
 def credentials_in(config: zenoh.Config) -> Credentials | None:
-    """What it shows to those it connects to, if that is of the kind that ``connect`` takes."""
+    """The credentials in ``config``; None if ``connect`` does not accept their kind."""
     tls: dict[str, Any] = json.loads(config.get_json("transport/link/tls"))
     user: dict[str, Any] = json.loads(config.get_json("transport/auth/usrpwd"))
     try:
@@ -205,47 +187,40 @@ def _load(source: ConfigSource) -> zenoh.Config:
     try:
         return _parse(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"the Zenoh configuration {str(path)!r} cannot be read: {error}", path=str(path)
-        ) from None
+        text = f"the Zenoh configuration {str(path)!r} cannot be read: {error}"
+        raise ConfigError(text, path=str(path)) from None
 
 
 def _parse(text: str, name: str) -> zenoh.Config:
     try:
         return zenoh.Config.from_json5(text)
     except zenoh.ZError as error:
-        raise ConfigError(f"{name!r} is no Zenoh configuration: {error}", path=name) from None
-
-
-_WITHIN_A_HOST = ("unixsock-stream/", "unixpipe/")
+        raise ConfigError(f"{name!r} is not a Zenoh configuration: {error}", path=name) from None
 
 
 def check_mode(mode: str) -> Mode:
-    """``mode`` if it is one. Raises InvalidInput naming all of them."""
-    for known in get_args(Mode):
-        if mode == known:
-            return known
+    """``mode`` if it is one. Raises InvalidInput with all modes."""
+    for allowed in get_args(Mode):
+        if mode == allowed:
+            return allowed
     raise InvalidInput(f"{mode!r} is not a mode; the modes are {', '.join(map(repr, get_args(Mode)))}")
 
 
 def listen_endpoints(mode: Mode, listen: Sequence[str], credentials: Credentials | None) -> tuple[str, ...]:
-    """Where to listen: ``listen``, or where ``mode`` does unless told otherwise."""
+    """The endpoints to listen at: ``listen``, or the default of ``mode``."""
     if listen or mode == "client":
         return tuple(listen)
-    default = {"router": ROUTER_ENDPOINT, "lan": _any_port()}.get(mode, ANY_LOOPBACK_PORT)
+    # If IPv6 is switched off, Zenoh cannot listen at its own default.
+    any_port = "tcp/[::]:0" if socket.has_dualstack_ipv6() else "tcp/0.0.0.0:0"
+    default = {"router": ROUTER_ENDPOINT, "lan": any_port}.get(mode, ANY_LOOPBACK_PORT)
     is_encrypted = credentials is not None and credentials.ca is not None
     return (default.replace("tcp/", "tls/", 1) if is_encrypted else default,)
 
 
-def _any_port() -> str:
-    # Where IPv6 is switched off, Zenoh cannot listen at its own default.
-    return "tcp/[::]:0" if socket.has_dualstack_ipv6() else "tcp/0.0.0.0:0"
-
-
 def check_loopback_only(endpoints: Iterable[str]) -> None:
-    """Raise InvalidInput for an endpoint through which something could leave this host, or come in."""
+    """Raise InvalidInput for an endpoint that is reachable from, or leads to, another host."""
     for endpoint in endpoints:
-        if not endpoint.startswith(_WITHIN_A_HOST) and not _is_loopback(endpoint):
+        if not endpoint.startswith(("unixsock-stream/", "unixpipe/")) and not _is_loopback(endpoint):
             raise InvalidInput(
                 f"{endpoint!r} leaves this host, which mode 'loopback' forbids; write an address in "
                 "127.0.0.0/8, '[::1]' or 'localhost', or choose mode 'peer', 'lan' or 'client'"
@@ -258,11 +233,11 @@ def _is_loopback(endpoint: str) -> bool:
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return False  # a name may mean another address tomorrow
+        return False  # a host name may get another address later
 
 
 def check_credentials(mode: Mode, credentials: Credentials | None, listen: Iterable[str]) -> None:
-    """Raise ConfigError for what would keep everybody out."""
+    """Raise ConfigError for settings that would refuse every connection."""
     if credentials is None:
         for endpoint in listen:
             if endpoint.startswith(("tls/", "quic/")):
@@ -273,8 +248,8 @@ def check_credentials(mode: Mode, credentials: Credentials | None, listen: Itera
                 )
     elif mode == "router" and credentials.user is not None and credentials.users is None:
         raise ConfigError(
-            "a router with a user and no users would let nobody in; give users= (--users FILE), a file of "
-            "user:password lines",
+            "a router with a user and no users refuses every connection; give users= (--users FILE), a file "
+            "of user:password lines",
             path="users",
         )
 
@@ -288,7 +263,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """How to join, as ``connect`` takes it."""
+    """The arguments of ``connect``."""
 
     mode: Mode
     endpoints: tuple[str, ...]
@@ -297,10 +272,10 @@ class SessionSettings:
     credentials: Credentials | None
 
 
-def said_in_environment() -> SessionSettings | None:
-    """What ZSTATE_MODE, _CONNECT, _LISTEN and _CONFIG say, and who this is; None where they say nothing.
+def settings_from_environment() -> SessionSettings | None:
+    """The settings in ZSTATE_MODE, _CONNECT, _LISTEN and _CONFIG, with credentials; None if all are unset.
 
-    Endpoints stand with blanks between them. Raises ConfigError naming the variable.
+    Endpoints are separated by blanks. Raises ConfigError with the variable.
     """
     mode, config = os.environ.get(MODE), os.environ.get(FILE) or None
     endpoints, listen = _endpoints(CONNECT), _endpoints(LISTEN)
@@ -308,32 +283,32 @@ def said_in_environment() -> SessionSettings | None:
         return None
     checked: Mode = _checked(MODE, lambda: check_mode(mode or implied_mode(endpoints, listen, config)))
     if checked == "loopback":
-        for variable, said in ((CONNECT, endpoints), (LISTEN, listen)):
-            _checked(variable, lambda said=said: check_loopback_only(said))
+        for variable, used in ((CONNECT, endpoints), (LISTEN, listen)):
+            _checked(variable, lambda used=used: check_loopback_only(used))
     if checked == "client" and not (endpoints or config or os.environ.get(CONFIG_VARIABLE)):
         raise ConfigError(
-            f"{MODE} is 'client', and {CONNECT} does not say where the router is, for instance "
+            f"{MODE} is 'client' and {CONNECT} is not set; set it to the router's endpoint, for instance "
             "tcp/192.168.1.10:7447",
             path=MODE,
         )
-    return SessionSettings(checked, endpoints, listen, config, _credentials())
+    return SessionSettings(checked, endpoints, listen, config, _credentials_in_environment())
 
 
 def implied_mode(endpoints: object, listen: object, config: object) -> str:
-    """What is meant by whoever names places and no mode."""
-    # Whoever only says where to connect means a router, and peers do not pass on what others say.
+    """The mode if endpoints are set, but no mode."""
+    # An endpoint to connect to is usually a router, and peers do not forward.
     return "client" if endpoints and not listen and not config else "peer"
 
 
 @contextmanager
 def blame_variable() -> Generator[None]:
-    """Let an error of the network name the variable that sent us there."""
+    """Add the variable that holds the endpoint to network errors."""
     try:
         yield
     except NetworkError as error:
         variable = LISTEN if isinstance(error, PortBusy) else CONNECT
         if os.environ.get(variable):
-            error.args = (f"{error} ({variable} in the environment says where)",)
+            error.args = (f"{error} (the endpoint is from {variable} in the environment)",)
         raise
 
 
@@ -348,27 +323,22 @@ def _checked(variable: str, check: Callable[[], T]) -> T:
         raise ConfigError(f"{variable} in the environment: {error}", path=variable) from None
 
 
-def _credentials() -> Credentials | None:
+def _credentials_in_environment() -> Credentials | None:
     certs, identity, user = (os.environ.get(variable) for variable in (CERTS, IDENTITY, USER))
     if bool(certs) != bool(identity):
         has, lacks = (CERTS, IDENTITY) if certs else (IDENTITY, CERTS)
-        raise ConfigError(f"{has} in the environment is of no use without {lacks}", path=has)
-    password = _password(user) if user else None
+        raise ConfigError(f"{has} is set but {lacks} is not; set both or neither", path=has)
+    password = os.environ.get(PASSWORD) if user else None
+    if user and (file := os.environ.get(PASSWORD_FILE)):
+        from zstate.net.security.credential_files import password_in  # noqa: PLC0415  # loads ssl, which few need
+
+        password = password_in(file)
+    elif user and not password:
+        raise ConfigError(
+            f"the password of {user!r} ({USER} in the environment) is missing; put it into {PASSWORD}, or "
+            f"the path of its file into {PASSWORD_FILE}",
+            path=PASSWORD,
+        )
     if certs and identity:
         return Credentials.from_folder(certs, identity, user=user or None, password=password)
     return Credentials(user=user, password=password) if user else None
-
-
-def _password(user: str) -> str:
-    file, password = os.environ.get(PASSWORD_FILE), os.environ.get(PASSWORD)
-    if file:
-        from zstate.net.security.credential_files import password_in  # noqa: PLC0415  # loads ssl, which few need
-
-        return password_in(file)
-    if not password:
-        raise ConfigError(
-            f"the password of {user!r} ({USER} in the environment) is missing; put it into {PASSWORD}, or "
-            f"where it stands into {PASSWORD_FILE}",
-            path=PASSWORD,
-        )
-    return password

@@ -1,17 +1,14 @@
-"""The graph: which programs write and read the streams of robots, and which ROS nodes use their topics.
+"""Graph of the programs that write and read the streams of robots, and of ROS nodes and topics.
 
 It is discovered from the liveliness tokens of writers and readers. Programs that subscribe to keys without
 zstate have no token.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -90,52 +87,47 @@ class Graph:
         return [StreamGroup(*ends, tuple(streams)) for ends, streams in groups.items()]
 
 
-RateOf = Callable[[str, Stream, WriterId], float | None]
+RateLookup = Callable[[str, Stream, WriterId], float | None]
 """The measured rate [Hz] of a robot's stream, as one writer publishes it; None if it is unknown."""
 
 
-def graph_of(
-    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateOf | None = None
+def build_graph(
+    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateLookup | None = None
 ) -> Graph:
     """The graph of discovered writers and readers.
 
     Static edges have a stream for each name under which they are written. The rate is that of the first
     writer whose rate is known: usually there is only one.
     """
-    return Graph(tuple(_stream_uses(robots, readers, rate_of)))
 
+    def programs(writers: Iterable[WriterId]) -> tuple[str, ...]:
+        return tuple(sorted({str(writer) for writer in writers}))
 
-def _stream_uses(
-    robots: Sequence[RobotInfo], readers: Sequence[Announcement], rate_of: RateOf | None
-) -> Iterator[StreamUse]:
-    written: set[tuple[str, Stream]] = {
-        (robot.name, stream) for robot in robots for stream, _ in robot.writers
-    }
+    written: dict[tuple[str, Stream], dict[str, list[WriterId]]] = {}
+    """The writers of each stream, by the name under which they write static edges; else ""."""
+    for robot in robots:
+        for stream, writer in robot.writers:
+            by_name = written.setdefault((robot.name, stream), {})
+            names = [name for name in robot.names_of(writer) if name != MODEL_WRITER]
+            for name in names if stream == "tf_static" and names else ("",):
+                by_name.setdefault(name, []).append(writer)
     # A reader of all robots does not miss a stream that one of them lacks.
-    read: set[tuple[str, Stream]] = {
-        (one.robot, one.stream) for one in readers if one.robot != ANY or not written
+    used: set[tuple[str, Stream]] = {
+        *written,
+        *((one.robot, one.stream) for one in readers if one.robot != ANY or not written),
     }
-    for robot, stream in sorted(written | read):
-        reading = [one.writer for one in readers if one.stream == stream and one.robot in (robot, ANY)]
-        named = [pair for info in robots if info.name == robot for pair in _named_writers(info, stream)]
-        for name in dict.fromkeys(name for name, _ in named) or ("",):
-            writers = [writer for writer_name, writer in named if writer_name == name]
+    unwritten: dict[str, list[WriterId]] = {"": []}
+    uses: list[StreamUse] = []
+    for robot, stream in sorted(used):
+        reading = programs(
+            one.writer for one in readers if one.stream == stream and one.robot in (robot, ANY)
+        )
+        for name, writers in written.get((robot, stream), unwritten).items():
             rates = (rate_of(robot, stream, writer) for writer in writers) if rate_of else ()
             rate_hz = next((rate for rate in rates if rate is not None), None)
-            shown = f"{stream}/{name}" if name else stream
-            yield StreamUse(robot, shown, _programs(writers), _programs(reading), rate_hz)
-
-
-def _named_writers(robot: RobotInfo, stream: Stream) -> Iterator[tuple[str, WriterId]]:
-    """The writers of a stream, with the names under which they write static edges."""
-    for written, writer in robot.writers:
-        if written == stream:
-            names = [name for name in robot.names_of(writer) if name != MODEL_WRITER]
-            yield from ((name, writer) for name in (names if stream == "tf_static" and names else [""]))
-
-
-def _programs(writers: Iterable[WriterId]) -> tuple[str, ...]:
-    return tuple(sorted({str(writer) for writer in writers}))
+            label = f"{stream}/{name}" if name else stream
+            uses.append(StreamUse(robot, label, programs(writers), reading, rate_hz))
+    return Graph(tuple(uses))
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +140,7 @@ class WriterState:
 
 
 class GraphMonitor(Closeable):
-    """Keeps the graph and the status of all publishers up to date, from a thread of its own.
+    """Keeps the graph and the status of all publishers up to date, from its own thread.
 
     Discovery runs every 2 s, and only if ``graph`` was called in the last 3 s.
     """
@@ -185,21 +177,19 @@ class GraphMonitor(Closeable):
 
     def _run(self) -> None:
         while not self._stop.wait(_PERIOD_S if self._graph.streams else _FIRST_PERIOD_S):
-            if time.monotonic() - self._used_at < _IDLE_AFTER_S:
-                try:
-                    self._update()
-                except NetworkError:
-                    return
-
-    def _update(self) -> None:
-        robots = discover(self._session, _DISCOVERY_TIMEOUT_S)
-        graph = graph_of(robots, discover_readers(self._session, _DISCOVERY_TIMEOUT_S))
-        # The process of this monitor may itself read all robots, which is no stream of a robot.
-        self._graph = Graph(tuple(stream for stream in graph.streams if stream.robot != ANY))
-        alive = {(robot.name, writer.session) for robot in robots for _, writer in robot.writers}
-        with self._lock:
-            for key in self._statuses.keys() - alive:
-                del self._statuses[key]
+            if time.monotonic() - self._used_at >= _IDLE_AFTER_S:
+                continue
+            try:
+                robots = discover(self._session, _DISCOVERY_TIMEOUT_S)
+                graph = build_graph(robots, discover_readers(self._session, _DISCOVERY_TIMEOUT_S))
+            except NetworkError:
+                return
+            # The process of this monitor may itself read all robots, which is no stream of a robot.
+            self._graph = Graph(tuple(stream for stream in graph.streams if stream.robot != ANY))
+            alive = {(robot.name, writer.session) for robot in robots for _, writer in robot.writers}
+            with self._lock:
+                for key in self._statuses.keys() - alive:
+                    del self._statuses[key]
 
     def close(self) -> None:
         """Stop the thread. A second call does nothing."""

@@ -1,6 +1,6 @@
-"""Latched values: whoever joins late still receives the present value of each key."""
+"""Latched values (ROS 1; transient local in DDS): late joiners receive the current value of each key."""
 
-# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownLambdaType=false
 # zenoh's stubs leave the return types of some methods out
 
 from __future__ import annotations
@@ -20,59 +20,57 @@ HEARTBEAT_S = 0.5
 
 
 class LatchedPublisher(Closeable):
-    """Keeps one value on one key for everybody, now and later, as long as this publisher lives.
+    """Publisher of one value on one key for current and later subscribers, while this publisher lives.
 
-    When it closes or dies, later joiners do not get the value any more; those who have it keep it,
-    unless it was withdrawn.
+    Once it closes or dies, late joiners do not receive the value. Subscribers that have it keep it, unless it
+    was withdrawn.
     """
 
     def __init__(self, session: Session, key: str, encoding: str) -> None:
         self._session = session
         self._key = key
+        misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_S)
         self._publisher = zenoh.ext.declare_advanced_publisher(
             session.zenoh,
             key,
             encoding=encoding or None,
             congestion_control=zenoh.CongestionControl.BLOCK,
             cache=zenoh.ext.CacheConfig(1),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
-            ),
+            sample_miss_detection=misses,
             publisher_detection=True,
         )
 
     def set(self, payload: bytes, attachment: bytes | None = None) -> None:
-        """Replace the value, for everybody. An empty one is InvalidInput. Raises Closed."""
+        """Replace the value. Raises InvalidInput if it is empty, and Closed."""
         if not payload:
-            raise InvalidInput(f"the value of {self._key!r} is empty; withdraw() takes a value back")
-        self._session.check()
-        try:
-            self._publisher.put(payload, attachment=attachment)
-        except zenoh.ZError:
-            raise Closed(f"the publisher of {self._key!r} is closed") from None
+            raise InvalidInput(f"the value of {self._key!r} is empty; withdraw() withdraws a value")
+        self._send(lambda: self._publisher.put(payload, attachment=attachment))
 
     def withdraw(self) -> None:
-        """Take the value back, from everybody. Raises Closed."""
+        """Withdraw the value from all subscribers. Raises Closed."""
+        self._send(self._publisher.delete)
+
+    def _send(self, action: Callable[[], object]) -> None:
         self._session.check()
         try:
-            self._publisher.delete()
+            action()
         except zenoh.ZError:
             raise Closed(f"the publisher of {self._key!r} is closed") from None
 
     def close(self) -> None:
-        """Stop keeping the value. A second call does nothing."""
+        """Stop publishing the value. A second call does nothing."""
         self._session.release(self._publisher)
 
 
 class LatchedSubscriber(Closeable):
-    """Hears the present value of every matching key, then each change.
+    """Subscriber to the current value of every matching key, then to each change.
 
-    ``on_value(arrival)`` is called from one thread of this subscriber; the payload is empty when the
-    value was withdrawn. See ``Receiver`` for what happens when it raises.
+    ``on_value(sample)`` is called from one thread of this subscriber; the payload is empty if the value was
+    withdrawn. ``Receiver`` describes slow and failing callbacks.
     """
 
     def __init__(self, session: Session, keyexpr: str, on_value: Callable[[SerializedSample], None]) -> None:
-        def hand_over(batch: list[zenoh.Sample]) -> None:
+        def on_batch(batch: list[zenoh.Sample]) -> None:
             # A delete has no payload, and Zenoh's cache replays it to late joiners as an empty put.
             call_for_each(batch, lambda sample: on_value(to_serialized(sample)))
 
@@ -84,7 +82,7 @@ class LatchedSubscriber(Closeable):
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
             recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
-        self._receiver = Receiver(session, subscriber, hand_over, CAPACITY)
+        self._receiver = Receiver(session, subscriber, on_batch, CAPACITY)
 
     @property
     def failures(self) -> int:

@@ -1,6 +1,6 @@
-"""Opening a Zenoh session: again and again, until somebody lets it in or all that are there have refused.
+"""Opening a Zenoh session: retried until a router or peer accepts it, or all of them refuse.
 
-How many threads Zenoh has: enough that those who vanished hold nobody up who comes back.
+Also sets Zenoh's thread-pool sizes: enough that closing dead links does not block reconnecting peers.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -14,7 +14,7 @@ import os
 import re
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import zenoh
 
@@ -23,31 +23,30 @@ from zstate.net.at_exit import session_opening
 from zstate.net.config import endpoints_in
 from zstate.net.security.credentials import Credentials
 
-if TYPE_CHECKING:
-    from zstate.net.security.connection_check import CheckResults
-
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
+RETRY_PERIOD_S = 0.1
+CHECK_PERIOD_S = 1.0
 
 # Of Zenoh's runtimes the sockets belong to "net" and "acc", and what receives from them to "rx": each sample
 # wakes a thread to wake another. With one runtime for the three, a reader's sample costs 30 us less CPU.
 #
-# Zenoh sets SO_LINGER to 10 s: closing the socket of a neighbour who was cut off blocks the thread that
-# does it for so long (eclipse-zenoh/zenoh#1101), and with all of them blocked nobody can connect: so there
-# are more threads than one. "tx" closes nothing and keeps its single one: a second is woken in vain.
+# Zenoh sets SO_LINGER to 10 s: closing the socket of a neighbour that was cut off blocks the closing thread
+# for that time (eclipse-zenoh/zenoh#1101). With all threads blocked nothing can connect, so there are more
+# threads than one. "tx" closes nothing and keeps its single one: a second is woken in vain.
 _THREADS = 4
-_THREADS_OF_A_ROUTER = 128
+_ROUTER_THREADS = 128
 
 
 def runtime(*, is_router: bool) -> str:
-    """What ``ZENOH_RUNTIME`` is set to."""
-    threads = _THREADS_OF_A_ROUTER if is_router else _THREADS
+    """The value for ``ZENOH_RUNTIME``."""
+    threads = _ROUTER_THREADS if is_router else _THREADS
     return f"(rx: (handover: net), acc: (handover: net), net: (worker_threads: {threads}))"
 
 
 def open_zenoh(config: zenoh.Config) -> zenoh.Session:
-    """``zenoh.open``; a process's first session decides on the threads, unless ZENOH_RUNTIME does.
+    """``zenoh.open``. The first session of a process fixes the thread counts, unless ZENOH_RUNTIME is set.
 
-    Raises Closed in a forked process (see ``session_opening``), and where the process ends.
+    Raises Closed in a forked process (see ``session_opening``), and while the process ends.
     """
     with session_opening():
         if RUNTIME_VARIABLE in os.environ:
@@ -57,11 +56,7 @@ def open_zenoh(config: zenoh.Config) -> zenoh.Session:
         try:
             return zenoh.open(config)
         finally:
-            os.environ.pop(RUNTIME_VARIABLE, None)  # it was read, and is not for the processes started here
-
-
-AGAIN_S = 0.1
-KNOCK_PERIOD_S = 1.0
+            os.environ.pop(RUNTIME_VARIABLE, None)  # it has been read; child processes do not inherit it
 
 
 def open_with_retry(
@@ -70,75 +65,61 @@ def open_with_retry(
     credentials: Credentials | None = None,
     timeout_s: float = 0.0,
 ) -> zenoh.Session:
-    """A session as ``config`` says; where that fails for want of a link, tried again for ``timeout_s`` [s].
+    """A session with ``config``; if it gets no link, retried for ``timeout_s`` [s].
 
-    Raises PortBusy, Unreachable, NetworkError; and AccessDenied, without waiting for the time to be over
-    where all of ``endpoints`` refuse.
+    Raises PortBusy, Unreachable, NetworkError; and AccessDenied, before the timeout, if all of ``endpoints``
+    refuse.
     """
-    deadline, next_knock = time.monotonic() + timeout_s, 0.0
+    deadline, next_check = time.monotonic() + timeout_s, 0.0
     while (session := _attempt(config)) is None:
-        if time.monotonic() >= min(deadline, next_knock):
-            answers = _answers(endpoints, credentials)
-            next_knock = time.monotonic() + KNOCK_PERIOD_S
-            if answers.are_refusals or time.monotonic() >= deadline:
-                return _confirmed(config, answers.error)
-        time.sleep(AGAIN_S)
+        if time.monotonic() >= min(deadline, next_check):
+            from zstate.net.security.connection_check import check_endpoints  # noqa: PLC0415  # loads ssl
+
+            results = check_endpoints(endpoints, credentials)
+            next_check = time.monotonic() + CHECK_PERIOD_S
+            if results.are_refusals or time.monotonic() >= deadline:
+                # A router that answers the check may have started after our attempt, and refuse nothing.
+                session = _attempt(config) if isinstance(results.error, AccessDenied) else None
+                if session is None:
+                    raise results.error
+                return session
+        time.sleep(RETRY_PERIOD_S)
     return session
 
 
 def _attempt(config: zenoh.Config) -> zenoh.Session | None:
+    """A session, or None without a link. Zenoh has one error for everything; its text distinguishes them."""
     try:
         return open_zenoh(config)
     except zenoh.ZError as error:
-        _check_is_link_error(str(error))
-        return None
-
-
-def _confirmed(config: zenoh.Config, error: NetworkError) -> zenoh.Session:
-    # Whoever answered the knock may have started after our attempt, and refuse nobody.
-    session = _attempt(config) if isinstance(error, AccessDenied) else None
-    if session is None:
-        raise error
-    return session
+        text = str(error)
+    busy = re.search(r"bound to (\S+?):? .*Address already in use", text)
+    if busy:
+        raise PortBusy(
+            f"another program listens at {busy[1]!r}; choose another port, or stop that program",
+            endpoint=busy[1],
+        )
+    if "Unable to connect" not in text:
+        text = re.sub(r" at /[^\s\]]*", "", text)  # places in Zenoh's sources
+        raise NetworkError(f"Zenoh cannot open a session: {text}")
+    return None
 
 
 def connect_timeout(config: zenoh.Config) -> float:
-    """How long the client that ``config`` describes goes on asking [s]; from now on, that is up to us.
+    """How long the client that ``config`` describes retries [s]; clears that time in ``config``.
 
-    Zenoh spends all of that time on the first endpoint; without, it asks each of them once. Zero where
-    ``config`` describes something else, or leaves the waiting out.
+    Zenoh spends all of that time on the first endpoint; without it, Zenoh tries each endpoint once. 0 if
+    ``config`` describes no client, or does not retry.
     """
-    told: dict[str, Any] = json.loads(config.get_json("connect"))
-    timeout_ms, is_needed = (_client_value(told[name]) for name in ("timeout_ms", "exit_on_failure"))
+
+    def client_value(value: Any) -> Any:
+        """The client's part of a setting that may have a value for each mode."""
+        return cast("dict[str, Any]", value).get("client") if isinstance(value, dict) else value
+
+    settings: dict[str, Any] = json.loads(config.get_json("connect"))
+    timeout_ms, is_needed = (client_value(settings[name]) for name in ("timeout_ms", "exit_on_failure"))
     is_client = json.loads(config.get_json("mode")) == "client"
     if not (is_client and endpoints_in(config) and timeout_ms) or is_needed is False:
         return 0.0
     config.insert_json5("connect/timeout_ms", "0")
     return math.inf if timeout_ms < 0 else timeout_ms / 1000.0
-
-
-def _client_value(value: Any) -> Any:
-    """What a setting says that may say something else for each mode."""
-    return cast("dict[str, Any]", value).get("client") if isinstance(value, dict) else value
-
-
-def _check_is_link_error(text: str) -> None:
-    """Zenoh has one error for everything; its text tells them apart."""
-    busy = re.search(r"bound to (\S+?):? .*Address already in use", text)
-    if busy:
-        raise PortBusy(
-            f"somebody listens at {busy[1]!r} already; choose another port, or stop that program",
-            endpoint=busy[1],
-        ) from None
-    if "Unable to connect" not in text:
-        raise NetworkError(f"Zenoh cannot open a session: {_without_places(text)}") from None
-
-
-def _answers(endpoints: Sequence[str], credentials: Credentials | None) -> CheckResults:
-    from zstate.net.security.connection_check import check_endpoints  # noqa: PLC0415  # loads ssl, which few need
-
-    return check_endpoints(endpoints, credentials)
-
-
-def _without_places(text: str) -> str:
-    return re.sub(r" at /[^\s\]]*", "", text)

@@ -1,8 +1,6 @@
-"""Who writes what: a liveliness token for every writer, which says who it is and vanishes with it.
+"""Presence (Zenoh liveliness): a token for every writer and reader, which disappears with its process.
 
-RouterLosses: whether what has just vanished went with a router of ours.
-
-Connections: whom a session has links to.
+Discovery queries the tokens; ``WriterWatch`` follows their changes. ``connections`` counts links.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -27,7 +25,7 @@ import zenoh
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput
-from zstate.net.queryable import MOST_REPLIES, query_tokens
+from zstate.net.queryable import MAX_REPLIES, query_tokens
 from zstate.net.session import Session
 from zstate.net.streams import Receiver, Ring, call_for_each
 from zstate.wire.identity import Announcement, WriterId
@@ -35,64 +33,21 @@ from zstate.wire.keys import ANY, MAX_NAME_LENGTH, READERS, Stream, parse_reader
 from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
 
-_JUST_NOW_S = 0.1
-_TOLD_WITHIN_S = 0.02
-_ROUND_S = 0.002
-
-
-class RouterLossDetector(Closeable):
-    """The routers that a session is connected to, as they come and go. Has no thread: is asked."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._known: set[str] = set()
-        self._lost_at = -math.inf
-        self._lock = fork_safe_lock()
-        channel: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(256)
-        self._events = session.zenoh.info.declare_transport_events_listener(channel, history=True)
-
-    def lost_recently(self) -> bool:
-        """Whether a router was lost within the last tenth of a second.
-
-        What a router told us of is gone up to a millisecond before we are told that the router is:
-        waits for that, up to 20 ms, where there is a router at all.
-        """
-        deadline = time.monotonic() + _TOLD_WITHIN_S
-        while True:
-            self._follow()
-            if time.monotonic() - self._lost_at < _JUST_NOW_S:
-                return True
-            if not self._known or time.monotonic() > deadline:
-                return False
-            time.sleep(_ROUND_S)
-
-    def _follow(self) -> None:
-        # Closing may come between: a listener that is undeclared has nothing more to tell.
-        with self._lock, suppress(zenoh.ZError):
-            while (event := self._events.try_recv()) is not None:
-                zid, is_router = str(event.transport.zid), event.transport.whatami == zenoh.WhatAmI.ROUTER
-                if event.kind == zenoh.SampleKind.PUT and is_router:
-                    self._known.add(zid)
-                elif event.kind == zenoh.SampleKind.DELETE and zid in self._known:
-                    self._known.discard(zid)
-                    self._lost_at = time.monotonic()
-
-    def close(self) -> None:
-        """Follow them no more. A second call does nothing."""
-        self._session.release(self._events)
-
-
 CAPACITY = 16_384
-"""So many changes of tokens wait. When more come, the tokens are queried instead: see ``WriterWatch``."""
+"""Waiting changes of tokens. If more arrive, the tokens are queried instead: see ``WriterWatch``."""
 
 ANSWER_WITHIN_S = 0.5
 ROUND_S = 0.1
 
+_RECENT_S = 0.1
+_ROUTER_EVENT_S = 0.02
+_POLL_S = 0.002
+
 
 def local_writer(session: int, program: str = "") -> WriterId:
-    """A writer in this process, starting now; ``program`` is the script's name unless given.
+    """A writer in this process that starts now; ``program`` is the script's name by default.
 
-    Raises InvalidInput for a name of more than 255 characters, which readers would not accept.
+    Raises InvalidInput for a name of more than 255 characters, which readers would refuse.
     """
     if len(program) > MAX_NAME_LENGTH:
         text = f"the program name {shortened(program)!r} has {len(program)} characters"
@@ -103,7 +58,7 @@ def local_writer(session: int, program: str = "") -> WriterId:
 
 @dataclass(frozen=True, order=True, slots=True)
 class RobotInfo:
-    """A robot that somebody writes for: its writers as (stream, writer), sorted.
+    """A robot with its writers as (stream, writer), sorted.
 
     ``static_names`` are (name, writer) for the names under which static edges are written.
     """
@@ -116,125 +71,159 @@ class RobotInfo:
         streams: dict[str, list[str]] = {}
         for stream, writer in self.writers:
             streams.setdefault(str(writer), []).append(stream)
-        written = "; ".join(f"{writer} writes {', '.join(what)}" for writer, what in streams.items())
+        written = "; ".join(f"{writer} writes {', '.join(names)}" for writer, names in streams.items())
         return f"<robot {self.name!r}: {written or 'no writer'}>"
 
     def names_of(self, writer: WriterId) -> tuple[str, ...]:
         """The names under which ``writer`` writes static edges, sorted."""
-        return tuple(name for name, said_by in self.static_names if said_by == writer)
+        return tuple(name for name, owner in self.static_names if owner == writer)
 
 
 class LivelinessToken(Closeable):
-    """The token of one writer, there until closed or until its process ends."""
+    """Liveliness token of one writer, until closed or until its process ends."""
 
     def __init__(self, session: Session, token: zenoh.LivelinessToken) -> None:
         self._session = session
         self._token = token
 
     def close(self) -> None:
-        """Say that this writer is gone. A second call does nothing."""
+        """Undeclare the token. A second call does nothing."""
         self._session.release(self._token)
 
 
 def announce(session: Session, token: str) -> LivelinessToken:
-    """Keep a liveliness token, for everybody to see, until closed."""
+    """Declare a liveliness token, visible on the whole network until it is closed."""
     return LivelinessToken(session, session.zenoh.liveliness().declare_token(token))
 
 
 def announce_reader(
     session: Session, wire: Wire, robot: str, streams: Sequence[Stream]
 ) -> list[LivelinessToken]:
-    """Tell everybody that this program reads ``streams`` of ``robot``, on wires that tell such things."""
+    """Announce this program as a reader of ``streams`` of ``robot``, if ``wire`` announces readers."""
     tokens = wire.reader_tokens(robot, streams, local_writer(0), session.zid, session.next_number)
     return [announce(session, token) for token in tokens]
 
 
 def discover(session: Session, timeout_s: float = 1.0, *, wire: str = "native") -> tuple[RobotInfo, ...]:
-    """Every robot that is announced, with its writers, sorted by name.
+    """Every announced robot with its writers, sorted by name.
 
-    A session that has just connected has not met everybody yet: asks until two answers in a row, a
-    tenth of a second apart, name the same writers; for nobody at all it waits ``timeout_s`` [s].
+    A session that has just connected has not discovered all others yet: queries until two replies in a row,
+    a tenth of a second apart, have the same writers; without any writer for ``timeout_s`` [s].
     """
-    spoken = get_wire(wire)
-    tokens = discover_tokens(session, spoken.writers_expression(ANY), timeout_s)
-    announced = (spoken.parse_token(token, ANY) for token in tokens)
+    format_ = get_wire(wire)
+    tokens = discover_tokens(session, format_.writers_expression(ANY), timeout_s)
+    announced = (format_.parse_token(token, ANY) for token in tokens)
     return by_robot({one for one in announced if one is not None})
 
 
 def discover_readers(session: Session, timeout_s: float = 1.0) -> tuple[Announcement, ...]:
-    """Every reader that is announced on the native wire, sorted; the robot "*" stands for all robots.
+    """Every announced reader of the native wire, sorted; the robot "*" stands for all robots.
 
-    Asks as ``discover`` does. Programs that subscribe to keys by themselves are not announced.
+    Queries like ``discover``. Programs that subscribe to keys without zstate are not announced.
     """
-    tokens = discover_tokens(session, READERS, timeout_s)
-    found = {one for one in map(_reader, tokens) if one is not None}
+    found: set[Announcement] = set()
+    for token in discover_tokens(session, READERS, timeout_s):
+        with suppress(InvalidInput):
+            found.add(Announcement.parse(*parse_reader_key(token)))
     return tuple(sorted(found, key=lambda one: (one.robot, one.stream, one.writer)))
 
 
-def _reader(token: str) -> Announcement | None:
-    try:
-        return Announcement.parse(*parse_reader_key(token))
-    except InvalidInput:
-        return None
-
-
 def discover_tokens(session: Session, expression: str, timeout_s: float = 1.0) -> frozenset[str]:
-    """The liveliness tokens there are, asked for as ``discover`` does."""
+    """The liveliness tokens that match ``expression``, queried like ``discover``."""
     if not timeout_s > 0.0:
         raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
     deadline = time.monotonic() + timeout_s
     found = last = frozenset[str]()
     while (remaining_s := deadline - time.monotonic()) > 0.0:
-        # Thousands of tokens take a moment: what is asked for last is not cut short.
-        within_s, asked_s = max(remaining_s, ANSWER_WITHIN_S), time.monotonic()
-        answer = current_tokens(session, expression, within_s)
-        if answer and answer == found:
+        # Thousands of tokens take a moment: the last query is not cut short.
+        within_s, start_s = max(remaining_s, ANSWER_WITHIN_S), time.monotonic()
+        tokens = current_tokens(session, expression, within_s)
+        if tokens and tokens == found:
             break
-        if time.monotonic() - asked_s >= within_s:
-            found |= answer
-        elif answer or not last:  # an answer without tokens may be wrong; two are not
-            found = answer
-        last = answer
+        if time.monotonic() - start_s >= within_s:
+            found |= tokens
+        elif tokens or not last:  # one reply without tokens may be wrong; two are not
+            found = tokens
+        last = tokens
         time.sleep(min(ROUND_S, max(0.0, deadline - time.monotonic())))
     return found
 
 
 def current_tokens(session: Session, expression: str, timeout_s: float) -> frozenset[str]:
-    """The liveliness tokens that are known where this session is connected, within ``timeout_s`` [s]."""
+    """The liveliness tokens known to the routers or peers of this session; waits up to ``timeout_s`` [s]."""
     return frozenset(query_tokens(session.zenoh, expression, timeout_s))
 
 
-def tokens_there(session: Session, expression: str) -> frozenset[str]:
-    """The liveliness tokens there are, asked for twice before there are said to be none."""
-    # Of a router's answers to a session that follows the same tokens, one in 1500 was empty.
+def confirmed_tokens(session: Session, expression: str) -> frozenset[str]:
+    """The current liveliness tokens, queried a second time if the first reply has none."""
+    # Of a router's replies to a session that subscribes to the same tokens, one in 1500 was empty.
     found = current_tokens(session, expression, ANSWER_WITHIN_S)
     return found or current_tokens(session, expression, ANSWER_WITHIN_S)
 
 
 def by_robot(found: Iterable[Announcement]) -> tuple[RobotInfo, ...]:
-    """What was announced, robot by robot, sorted."""
-    robots: dict[str, list[Announcement]] = {}
-    for token in found:
-        robots.setdefault(token.robot, []).append(token)
-    return tuple(_info(name, tokens) for name, tokens in sorted(robots.items()))
+    """The announced writers, grouped by robot, sorted."""
+    writers: dict[str, set[tuple[Stream, WriterId]]] = {}
+    names: dict[str, set[tuple[str, WriterId]]] = {}
+    for one in found:
+        writers.setdefault(one.robot, set()).add((one.stream, one.writer))
+        if one.name:
+            names.setdefault(one.robot, set()).add((one.name, one.writer))
+    return tuple(
+        RobotInfo(robot, tuple(sorted(writers[robot])), tuple(sorted(names.get(robot, ()))))
+        for robot in sorted(writers)
+    )
 
 
-def _info(robot: str, tokens: Iterable[Announcement]) -> RobotInfo:
-    writers: set[tuple[Stream, WriterId]] = {(token.stream, token.writer) for token in tokens}
-    names = {(token.name, token.writer) for token in tokens if token.name}
-    return RobotInfo(robot, tuple(sorted(writers)), tuple(sorted(names)))
+class RouterLossDetector(Closeable):
+    """The routers that a session is connected to. Has no thread: reads events when it is asked."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._routers: set[str] = set()
+        self._lost_at = -math.inf
+        self._lock = fork_safe_lock()
+        channel: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(256)
+        self._events = session.zenoh.info.declare_transport_events_listener(channel, history=True)
+
+    def lost_recently(self) -> bool:
+        """Whether a router was lost within the last tenth of a second.
+
+        Tokens behind a router disappear up to a millisecond before the event of its loss. Waits for that
+        event, up to 20 ms, if there is a router at all.
+        """
+        deadline = time.monotonic() + _ROUTER_EVENT_S
+        while True:
+            # The listener may be undeclared at the same time: then it has no events.
+            with self._lock, suppress(zenoh.ZError):
+                while (event := self._events.try_recv()) is not None:
+                    zid, is_router = str(event.transport.zid), event.transport.whatami == zenoh.WhatAmI.ROUTER
+                    if event.kind == zenoh.SampleKind.PUT and is_router:
+                        self._routers.add(zid)
+                    elif event.kind == zenoh.SampleKind.DELETE and zid in self._routers:
+                        self._routers.discard(zid)
+                        self._lost_at = time.monotonic()
+            if time.monotonic() - self._lost_at < _RECENT_S:
+                return True
+            if not self._routers or time.monotonic() > deadline:
+                return False
+            time.sleep(_POLL_S)
+
+    def close(self) -> None:
+        """Undeclare the listener. A second call does nothing."""
+        self._session.release(self._events)
 
 
 class WriterWatch(Closeable):
-    """Follows the writers of ``robot`` ("*": of all robots), those already there included.
+    """Watches the writers of ``robot`` ("*": of all robots), beginning with the current ones.
 
-    ``callback(announced, alive)`` is called from one thread. Losing a router takes every writer behind it
-    away as well: for those ``on_cut_off(announced)`` is called instead, if it is given. ``foreign`` counts
-    tokens that announce no stream of a robot, ``ignored`` those beyond the 100,000 that are kept. An
-    exception of a callback is counted in ``failures``, and costs no other token its call.
+    ``callback(announced, alive)`` is called from one thread. The loss of a router removes every writer behind
+    it; for these ``on_cut_off(announced)`` is called instead, if it is given. ``foreign`` counts tokens that
+    announce no stream of a robot, ``ignored`` those beyond the 100,000 that are kept. An exception of a
+    callback is counted in ``failures``; the calls for other tokens still happen.
 
     A burst of tokens can overflow the ring between Zenoh and this thread. Nothing is lost by that: the
-    tokens that are there are queried then, and compared with those known.
+    current tokens are queried then, and compared with the previous ones.
     """
 
     def __init__(
@@ -257,33 +246,30 @@ class WriterWatch(Closeable):
         ring: Ring = zenoh.handlers.RingChannel(CAPACITY)
         self._expression = wire.writers_expression(robot)
         tokens = session.zenoh.liveliness().declare_subscriber(self._expression, ring, history=True)
-        self._receiver = Receiver(session, tokens, self._hand_over, CAPACITY)
+        self._receiver = Receiver(session, tokens, self._on_batch, CAPACITY)
 
     @property
     def failures(self) -> int:
-        """How often a callback raised, tokens that came together counted once."""
+        """How often a callback raised, counted once for tokens that arrived together."""
         return self._receiver.failures
 
-    def _hand_over(self, batch: list[zenoh.Sample]) -> None:
+    def _on_batch(self, batch: list[zenoh.Sample]) -> None:
         if len(batch) < CAPACITY:
             puts = zenoh.SampleKind.PUT
             changes = [(str(sample.key_expr), sample.kind == puts) for sample in batch]
         else:
-            changes = self._changes()
-        gone = any(not alive for _, alive in changes)
-        cut_off = gone and self._routers is not None and self._routers.lost_recently()
+            # Differences since the last batch; later changes are still in the ring.
+            current, known = confirmed_tokens(self._session, self._expression), self._known.keys()
+            changes = [(token, False) for token in known - current]
+            changes += [(token, True) for token in current - known]
+        is_loss = any(not alive for _, alive in changes)
+        cut_off = is_loss and self._routers is not None and self._routers.lost_recently()
         call_for_each(changes, lambda change: self._on_change(*change, cut_off=cut_off))
-
-    def _changes(self) -> list[tuple[str, bool]]:
-        """What has come and gone since the last batch; later changes are still in the ring."""
-        there = tokens_there(self._session, self._expression)
-        gone, come = self._known.keys() - there, there - self._known.keys()
-        return [*((token, False) for token in gone), *((token, True) for token in come)]
 
     def _on_change(self, token: str, alive: bool, *, cut_off: bool) -> None:
         if alive == (token in self._known):
             return
-        if alive and len(self._known) >= MOST_REPLIES:
+        if alive and len(self._known) >= MAX_REPLIES:
             self.ignored += 1
             return
         announced = self._wire.parse_token(token, self._robot) if alive else self._known.pop(token)
@@ -299,7 +285,7 @@ class WriterWatch(Closeable):
 
     def close(self) -> None:
         """Stop within a second. A second call does nothing."""
-        self._receiver.close()  # its thread asks the other
+        self._receiver.close()  # first: its thread uses the detector
         if self._routers is not None:
             self._routers.close()
 
@@ -311,23 +297,20 @@ def watch(
     wire: str = "native",
     on_cut_off: Callable[[Announcement], None] | None = None,
 ) -> WriterWatch:
-    """Call ``callback(announced, alive)`` for each writer there is, comes or goes; see ``WriterWatch``."""
+    """Call ``callback(announced, alive)`` for each current writer and each change; see ``WriterWatch``."""
     return WriterWatch(session, robot, callback, get_wire(wire), on_cut_off)
 
 
-_MODES = ("client", "peer", "router")
-
-
 class Connections(NamedTuple):
-    """How many: sessions by their mode, of all three; links by their protocol ("tcp", "tls", ...)."""
+    """Numbers of sessions by their mode, of all three, and of links by their protocol ("tcp", "tls", ...)."""
 
     sessions: dict[str, int]
     links: dict[str, int]
 
 
 def connections(session: Session) -> Connections:
-    """Who is connected to ``session`` directly, now. Raises Closed."""
+    """The current direct connections of ``session``. Raises Closed."""
     info = session.zenoh.info
-    met = Counter(str(transport.whatami).lower() for transport in info.transports())
+    sessions = Counter(str(transport.whatami).lower() for transport in info.transports())
     links = Counter(str(link.dst).partition("/")[0] for link in info.links())
-    return Connections({mode: met[mode] for mode in _MODES}, dict(links))
+    return Connections({mode: sessions[mode] for mode in ("client", "peer", "router")}, dict(links))

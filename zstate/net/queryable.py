@@ -1,12 +1,10 @@
-"""Service: questions on one key, answered by one thread of ours.
+"""Queryables (Zenoh) with one worker thread, and queries that never block a thread of Zenoh.
 
-Replies: the replies to a Zenoh query, received without blocking a thread of Zenoh.
-
-Zenoh delivers what it knows of itself, and all local liveliness tokens, inside ``get`` and under the lock of
-its session, before the caller can read anything. A channel that is full at that moment blocks the session
-for ever; the default one holds 256 replies. A callback in Python would need the interpreter lock for each
-reply, while Zenoh holds its own: beside a thread that computes, 8000 replies then take more than 5 s.
-So the replies go into a channel that is never full, and the bound is applied where they are read.
+Zenoh delivers its own replies, and all local liveliness tokens, inside ``get`` and under the lock of its
+session, before the caller can read anything. A channel that is full at that moment blocks the session for
+ever; the default one holds 256 replies. A callback in Python would need the interpreter lock for each reply
+while Zenoh holds its own: next to a computing thread, 8000 replies then take more than 5 s. So the replies go
+into a channel that is never full, and the limit is applied where they are read.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -30,15 +28,21 @@ from zstate.transform import Transform
 from zstate.wire.keys import lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_from_json, from_json
 
-MOST_REPLIES = 100_000
-"""At most so many replies to one query are kept. The rest are counted, and logged as a warning."""
+MAX_REPLIES = 100_000
+"""Limit of the replies to one query that are used. More are counted, and logged as a warning."""
 
 _NEVER_FULL = 2**24
-"""For so many tokens Zenoh itself would need more than 10 GB. The channel allocates what it holds."""
+"""Zenoh itself would need more than 10 GB for as many tokens. The channel allocates only what it holds."""
+
+CAPACITY = 64
+"""Waiting queries. If more arrive the oldest are lost, and end for their senders without a reply."""
+
+MAX_PAUSE_S = 0.2
 
 _LOG = logging.getLogger("zstate")
 
 _Channel: TypeAlias = "zenoh.handlers.FifoChannel[zenoh.Reply]"
+_Queries: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Query]"
 
 
 def query(
@@ -76,24 +80,16 @@ def query_tokens(session: zenoh.Session, expression: str, timeout_s: float) -> I
 def _bounded(replies: Iterable[zenoh.Reply], selector: str) -> Iterator[zenoh.Reply]:
     count = 0
     for count, reply in enumerate(replies, 1):
-        if count <= MOST_REPLIES:
+        if count <= MAX_REPLIES:
             yield reply
-    if count > MOST_REPLIES:
+    if count > MAX_REPLIES:
         facts = {"event": "too many replies", "selector": selector, "replies": count}
         text = "%r has %d replies; only the first %d are used"
-        _LOG.warning(text, selector, count, MOST_REPLIES, extra=facts)
-
-
-CAPACITY = 64
-"""So many questions wait. When more come the oldest are lost, and who asked is told that nobody answers."""
-
-LONGEST_REST_S = 0.2
-
-Queries: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Query]"
+        _LOG.warning(text, selector, count, MAX_REPLIES, extra=facts)
 
 
 class Reply(NamedTuple):
-    """What is answered, and under which Zenoh encoding; an error travels as Zenoh's own error reply."""
+    """A payload and its Zenoh encoding; an error is sent as Zenoh's own error reply."""
 
     payload: bytes
     encoding: str
@@ -101,13 +97,13 @@ class Reply(NamedTuple):
 
 
 class Queryable(Closeable):
-    """Answers whoever asks on ``key``, until it is closed.
+    """Replies to queries on ``key``, until it is closed.
 
-    ``answer(parameters)`` is called from one thread of this service, question after question; None is
-    no answer. What it raises is counted in ``failures``, and the first is reported to
-    ``threading.excepthook``. Neither a slow answer nor a flood of questions delays Zenoh or those who
-    publish: what finds no room is lost, and ``overflows`` counts how often that may have been so. Then it
-    rests, so that a flood takes no more than a quarter of one processor.
+    ``answer(parameters)`` is called from one thread of this queryable, for one query after the other; None
+    sends no reply. Its exceptions are counted in ``failures``, and the first goes to
+    ``threading.excepthook``. Neither a slow answer nor a flood of queries delays Zenoh or publishers: queries
+    beyond ``capacity`` are lost, and ``overflows`` counts how often that may have happened. After a full
+    batch the thread pauses, so that a flood takes no more than a quarter of one processor.
     """
 
     def __init__(
@@ -121,42 +117,42 @@ class Queryable(Closeable):
         self._key = key
         self._answer = answer
         self._capacity = capacity
-        ring: Queries = zenoh.handlers.RingChannel(capacity)
+        ring: _Queries = zenoh.handlers.RingChannel(capacity)
         queryable = session.zenoh.declare_queryable(key, ring)
-        self._receiver = Receiver(session, queryable, self._answer_all, capacity)
+        self._receiver = Receiver(session, queryable, self._on_queries, capacity)
 
     @property
     def overflows(self) -> int:
-        """How often the room for questions was found full: some may have been lost there."""
+        """How often the ring was full: some queries may have been lost there."""
         return self._receiver.full_batches
 
     @property
     def failures(self) -> int:
-        """How often ``answer`` raised, batches of questions that came together counted once."""
+        """How often ``answer`` raised, counted once for queries that arrived together."""
         return self._receiver.failures
 
-    def _answer_all(self, queries: list[zenoh.Query]) -> None:
-        began = time.monotonic()
+    def _on_queries(self, queries: list[zenoh.Query]) -> None:
+        start = time.monotonic()
         try:
-            call_for_each(queries, self._answer_one)
+            call_for_each(queries, self._on_query)
         finally:
             if len(queries) >= self._capacity:
-                time.sleep(min(3.0 * (time.monotonic() - began), LONGEST_REST_S))
+                time.sleep(min(3.0 * (time.monotonic() - start), MAX_PAUSE_S))
 
-    def _answer_one(self, asked: zenoh.Query) -> None:
-        with asked:  # leaving tells the one who asks that this was all
-            answer = self._answer(parse_parameters(str(asked.parameters)))
-            if answer is None:
+    def _on_query(self, received: zenoh.Query) -> None:
+        with received:  # the end of the block ends the query for its sender
+            reply = self._answer(parse_parameters(str(received.parameters)))
+            if reply is None:
                 return
-            with suppress(zenoh.ZError):  # who asked, or the session, is gone
-                if answer.is_error:
-                    asked.reply_err(answer.payload, encoding=answer.encoding)
+            with suppress(zenoh.ZError):  # the sender, or the session, is gone
+                if reply.is_error:
+                    received.reply_err(reply.payload, encoding=reply.encoding)
                 else:
-                    asked.reply(self._key, answer.payload, encoding=answer.encoding)
+                    received.reply(self._key, reply.payload, encoding=reply.encoding)
                 self.answered += 1
 
     def close(self) -> None:
-        """Answer no more, within a second. A second call does nothing."""
+        """Stop replying, within a second. A second call does nothing."""
         self._receiver.close()
 
 
@@ -169,21 +165,21 @@ def parse_parameters(text: str) -> dict[str, str]:
 def query_lookup(
     session: Session, robot: str, target: str, source: str, at: int | None = None, *, timeout_s: float = 1.0
 ) -> Transform:
-    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns], or the newest there is.
+    """The pose of ``source`` in ``target`` at the stamp ``at`` [ns], or the newest one.
 
-    Asks whoever answers for ``robot``, for instance `zstate publish`; needs no buffer here. Raises what
-    ``TransformBuffer.lookup`` raised there, and Unreachable when nobody answers within ``timeout_s``.
+    Queries a lookup service of ``robot``, for instance `zstate publish`; needs no buffer here. Raises the
+    error that ``TransformBuffer.lookup`` raised there, and Unreachable without a reply within ``timeout_s``.
     """
     if not timeout_s > 0.0:
         raise InvalidInput(f"timeout_s is {timeout_s}; give a positive number of seconds")
     key = lookup_key(robot)
     selector = f"{key}?{LookupRequest(target, source, at).parameters()}"
     error: ZStateError = Unreachable(
-        f"nobody answers at {key!r} within {timeout_s:g} s; run `zstate publish {robot}`, or a LookupService",
+        f"no reply at {key!r} within {timeout_s:g} s; run `zstate publish {robot}`, or a LookupService",
         endpoints=(key,),
     )
     for reply in query(session.zenoh, selector, timeout_s):
-        # On another key, such as one with a wildcard, it is no answer of this robot.
+        # A reply on another key, such as one with a wildcard, is not from this robot.
         if reply.ok is not None and str(reply.ok.key_expr) == key:
             return from_json(reply.ok.payload.to_bytes())
         if reply.err is not None and str(reply.err.encoding) == "application/json":

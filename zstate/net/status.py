@@ -1,4 +1,7 @@
-"""Status: how writers do, said once a second to those who ask, on the native wire."""
+"""Status of writers: published once a second while subscribed, on the native wire only.
+
+ROS's diagnostics are not among the message types of zstate.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +26,13 @@ from zstate.wire.protocol import SerializedSample
 
 PERIOD_S = 1.0
 JOIN_WITHIN_S = 0.5
-MOST_BYTES = 65_536
-"""A longer status is refused."""
+MAX_STATUS_BYTES = 65_536
 
 
 class StatusPublisher(Closeable):
-    """Asks ``status()`` once a second, from a thread of its own, and says it while somebody reads it.
+    """Calls ``status()`` once a second, from its own thread, and publishes the result if it has subscribers.
 
-    So it goes on when what it tells of stands still, and ends with the process.
+    So it continues if the writer stands still, and ends with the process.
     """
 
     def __init__(self, session: Session, robot: str, identity: str, status: Callable[[], Status]) -> None:
@@ -42,7 +44,7 @@ class StatusPublisher(Closeable):
         self._thread.start()
 
     def close(self) -> None:
-        """Say no more. A second call does nothing."""
+        """Stop publishing. A second call does nothing."""
         self._stop.set()
         self._publisher.close()
         if threading.current_thread() is not self._thread:
@@ -52,33 +54,29 @@ class StatusPublisher(Closeable):
         due = time.monotonic() + PERIOD_S
         while not self._stop.wait(max(0.0, due - time.monotonic())):
             try:
-                self._publish()
+                self._session.check()
+                status = self._status()
+                if self._publisher.has_readers:
+                    self._publisher.put(encode(status))
             except (Closed, zenoh.ZError):
                 return
             # After a pause (a suspended laptop) one status is enough.
             due = max(due + PERIOD_S, time.monotonic())
 
-    def _publish(self) -> None:
-        self._session.check()
-        status = self._status()
-        if self._publisher.has_readers:
-            self._publisher.put(encode(status))
 
-
-class StatusWatch(Closeable):
-    """Hears every status of ``robot`` ("*": of all robots); ``refused`` counts what was none, by reason."""
+class StatusSubscriber(Closeable):
+    """Receives every status of ``robot`` ("*": of all robots); ``refused`` counts invalid ones by reason."""
 
     def __init__(self, session: Session, robot: str, callback: Callable[[str, Status], None]) -> None:
         self.refused: Counter[str] = Counter()
         self._callback = callback
-        self._subscriber = StreamSubscriber(session, status_expression(robot), self._on_status)
+        self._subscriber = StreamSubscriber(
+            session, status_expression(robot), lambda samples: call_for_each(samples, self._on_sample)
+        )
 
-    def _on_status(self, arrivals: list[SerializedSample]) -> None:
-        call_for_each(arrivals, self._decode_status)
-
-    def _decode_status(self, arrival: SerializedSample) -> None:
+    def _on_sample(self, sample: SerializedSample) -> None:
         try:
-            robot, status = _status_in(arrival)
+            robot, status = _decode_status(sample)
         except (MessageError, InvalidInput) as error:
             self.refused[getattr(error, "reason", "foreign")] += 1
         else:
@@ -89,25 +87,24 @@ class StatusWatch(Closeable):
         self._subscriber.close()
 
 
-def _status_in(arrival: SerializedSample) -> tuple[str, Status]:
+def _decode_status(sample: SerializedSample) -> tuple[str, Status]:
     """The robot and its writer's status. Raises MessageError, or InvalidInput for a key of no writer."""
-    if len(arrival.payload) > MOST_BYTES:
-        text = f"a Status of {len(arrival.payload)} bytes, more than {MOST_BYTES}"
+    if len(sample.payload) > MAX_STATUS_BYTES:
+        text = f"a Status of {len(sample.payload)} bytes, more than {MAX_STATUS_BYTES}"
         raise MessageError(text, reason="too large")
-    robot, identity = parse_status_key(arrival.key)
-    status = decode(arrival.payload, arrival.encoding, Status)
+    robot, identity = parse_status_key(sample.key)
+    status = decode(sample.payload, sample.encoding, Status)
     if status.session != WriterId.parse(identity).session:
-        raise MessageError(f"the Status of another writer on {arrival.key!r}", reason="foreign")
+        raise MessageError(f"the Status of another writer on {sample.key!r}", reason="foreign")
     if not math.isfinite(status.rate_hz):
         raise MessageError(f"a Status with the rate {status.rate_hz}", reason="malformed")
     return robot, status
 
 
-def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusWatch:
-    """Call ``callback(robot, status)`` with what each publisher of ``robot`` says of itself, once a second.
+def watch_status(session: Session, robot: str, callback: Callable[[str, Status], None]) -> StatusSubscriber:
+    """Call ``callback(robot, status)`` with the status of each publisher of ``robot``, once a second.
 
-    They begin within a second. It is called from one thread. A process that is frozen or gone says
-    nothing: look at the age of what it said last. Said on the native wire alone; ROS's diagnostics are
-    not among the messages that zstate speaks.
+    Starts within a second; called from one thread. A process that is frozen or gone publishes no status:
+    check the age of its last one.
     """
-    return StatusWatch(session, robot, callback)
+    return StatusSubscriber(session, robot, callback)

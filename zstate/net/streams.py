@@ -1,6 +1,6 @@
-"""Streams: each sample matters less than the next one. Newest wins, nobody waits.
+"""Sample streams (best effort, keep last): the newest sample replaces older ones, and writers never wait.
 
-One daemon thread that drains a Zenoh channel in batches.
+A ``Receiver`` is one daemon thread that drains a Zenoh channel in batches.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
@@ -23,7 +23,17 @@ from zstate.net.session import Session, Undeclarable
 from zstate.wire.messages import ATTACHMENT_BYTES, LATCHED_BYTES, SAMPLE_BYTES
 from zstate.wire.protocol import SerializedSample
 
+CAPACITY = 1024
+"""Samples of one key that wait for a delayed reader: a second at 1 kHz."""
+
+WILDCARD_CAPACITY = 4096
+"""The same for an expression that matches many keys: 0.8 s of 100 robots at 50 Hz.
+
+Not more, because a waiting sample holds the memory it was received in, 10 to 20 kB.
+"""
+
 JOIN_WITHIN_S = 0.8
+_MAX_KEYS = 4096
 
 Ring: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Sample]"
 
@@ -37,25 +47,25 @@ class Subscribed(Undeclarable, Protocol[T]):
     def handler(self) -> zenoh.Handler[T]: ...
 
 
-def call_for_each(batch: Iterable[T], take: Callable[[T], object]) -> None:
-    """Call ``take`` with each item of ``batch``; an exception of one is raised after the last item."""
+def call_for_each(batch: Iterable[T], function: Callable[[T], object]) -> None:
+    """Call ``function`` with each item of ``batch``; an exception of one is raised after the last item."""
     failure: Exception | None = None
     for item in batch:
         try:
-            take(item)
-        except Exception as error:  # noqa: PERF203 - the other items are not to blame
+            function(item)
+        except Exception as error:  # noqa: PERF203 - the other items still get their call
             failure = error
     if failure is not None:
         raise failure
 
 
 class Receiver(Generic[T]):
-    """Hands what arrives to ``on_batch``, everything that waits at once, oldest first.
+    """Calls ``on_batch`` with all waiting items, oldest first.
 
-    A ring of ``capacity`` lies between: when it is full the oldest samples are lost. A batch that
-    fills it is counted in ``full_batches``, so that a gap in front of it, or in it, can be told from
-    one of the network. An exception of ``on_batch`` is counted in ``failures``; the first also goes to
-    ``threading.excepthook``. The thread goes on.
+    The ring in between holds ``capacity`` items: if it is full the oldest are lost. A batch that fills it is
+    counted in ``full_batches``, which distinguishes a gap before or in it from a loss in the network. An
+    exception of ``on_batch`` is counted in ``failures``, and the first goes to ``threading.excepthook``; the
+    thread continues.
     """
 
     def __init__(
@@ -77,7 +87,7 @@ class Receiver(Generic[T]):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop within a second; nothing is handed over afterwards. May be called from ``on_batch``."""
+        """Stop within a second; ``on_batch``, from which this may be called, is not called afterwards."""
         self._closed = True
         self._session.release(self._subscribed)
         if threading.current_thread() is not self._thread:
@@ -92,65 +102,41 @@ class Receiver(Generic[T]):
                     batch.append(sample)
             except zenoh.ZError:
                 return  # undeclared, or the session was closed
-            self._hand_over(batch)
+            if len(batch) >= self._capacity:
+                self.full_batches += 1
+            if self._closed:
+                return
+            try:
+                self._on_batch(batch)
+            except Exception:
+                self.failures += 1
+                if self.failures == 1:
+                    threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
-    def _hand_over(self, batch: list[T]) -> None:
-        if len(batch) >= self._capacity:
-            self.full_batches += 1
-        if self._closed:
-            return
-        try:
-            self._on_batch(batch)
-        except Exception:
-            self.failures += 1
-            if self.failures == 1:
-                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
-
-
-CAPACITY = 1024
-"""So many samples of one key wait for a reader that is held up: a second at 1 kHz."""
-
-CAPACITY_OF_MANY = 4096
-"""And so many of an expression that hears many keys: 0.8 s of 100 robots at 50 Hz.
-
-Not more, because a sample that waits holds the memory it was received in, 10 to 20 kB.
-"""
-
-_MOST_KEYS = 4096
 
 _Statuses: TypeAlias = "zenoh.handlers.Handler[zenoh.MatchingStatus]"
 
 
 def capacity_for(keyexpr: str) -> int:
-    """How many samples of ``keyexpr`` wait for who reads them; of more the oldest are lost."""
-    return CAPACITY_OF_MANY if "*" in keyexpr else CAPACITY
+    """The number of samples of ``keyexpr`` that wait for their reader; beyond it the oldest are lost."""
+    return WILDCARD_CAPACITY if "*" in keyexpr else CAPACITY
 
 
-def to_serialized(sample: zenoh.Sample, key: str = "", most_bytes: int = LATCHED_BYTES) -> SerializedSample:
-    """What came, as the wires read it; ``key`` is on which, where that is known.
+def to_serialized(sample: zenoh.Sample, key: str = "", max_bytes: int = LATCHED_BYTES) -> SerializedSample:
+    """``sample`` as wire formats decode it; ``key`` is its key if that is known.
 
-    A payload of more than ``most_bytes`` is not copied: of such a one only the size is given.
+    A payload of more than ``max_bytes`` is not copied: only its size is kept.
     """
-    payload, beside = sample.payload, sample.attachment
+    payload, attachment, encoding = sample.payload, sample.attachment, str(sample.encoding)
     key = key or str(sample.key_expr)
-    if len(payload) > most_bytes or (beside is not None and len(beside) > ATTACHMENT_BYTES):
-        return SerializedSample(key, b"\0", str(sample.encoding), None, max(len(payload), LATCHED_BYTES + 1))
-    return SerializedSample(
-        key, payload.to_bytes(), str(sample.encoding), None if beside is None else beside.to_bytes()
-    )
-
-
-def _arrivals(batch: Sequence[zenoh.Sample], key: str) -> list[SerializedSample]:
-    arrivals = [to_serialized(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
-    if all(arrival.payload for arrival in arrivals):
-        return arrivals
-    # What is deleted has no payload either; to ask every sample which kind it is costs as much as its key.
-    puts = zenoh.SampleKind.PUT
-    return [arrival for arrival, sample in zip(arrivals, batch, strict=True) if sample.kind == puts]
+    if len(payload) > max_bytes or (attachment is not None and len(attachment) > ATTACHMENT_BYTES):
+        return SerializedSample(key, b"\0", encoding, None, max(len(payload), LATCHED_BYTES + 1))
+    attached = None if attachment is None else attachment.to_bytes()
+    return SerializedSample(key, payload.to_bytes(), encoding, attached)
 
 
 class StreamPublisher(Closeable):
-    """Publishes samples on one key. Under congestion samples are dropped; the writer is never delayed."""
+    """Publisher of samples on one key. Under congestion samples are dropped; the writer is never delayed."""
 
     def __init__(self, session: Session, key: str, encoding: str) -> None:
         self._session = session
@@ -193,10 +179,9 @@ class StreamPublisher(Closeable):
 
 
 class StreamSubscriber(Closeable):
-    """Hears a key expression; ``on_samples`` gets all that waits as a list, oldest first.
+    """Subscriber to a key expression; ``on_samples`` is called with all waiting samples, oldest first.
 
-    It is called from one thread of this subscriber. See ``Receiver`` for what happens when it is
-    slow or raises.
+    It is called from one thread of this subscriber. ``Receiver`` describes slow and failing callbacks.
     """
 
     def __init__(
@@ -206,24 +191,27 @@ class StreamSubscriber(Closeable):
         on_samples: Callable[[list[SerializedSample]], None],
         capacity: int | None = None,
     ) -> None:
-        self._keys = keys = _DeclaredKeys(session, keyexpr)
+        self._keys = keys = _DeclaredKeys(session)
         key = "" if "*" in keyexpr else keyexpr
 
-        def hand_over(batch: list[zenoh.Sample]) -> None:
-            arrivals = _arrivals(batch, key)
+        def on_batch(batch: list[zenoh.Sample]) -> None:
+            samples = [to_serialized(sample, key, 4 * SAMPLE_BYTES) for sample in batch]
+            if not all(sample.payload for sample in samples):
+                # A delete has no payload; reading the kind of every sample would cost as much as its key.
+                puts = zenoh.SampleKind.PUT
+                samples = [one for one, sample in zip(samples, batch, strict=True) if sample.kind == puts]
             if not key:
-                keys.declare({arrival.key for arrival in arrivals})
-            on_samples(arrivals)
+                keys.declare({sample.key for sample in samples})
+            on_samples(samples)
 
         capacity = capacity or capacity_for(keyexpr)
         ring: Ring = zenoh.handlers.RingChannel(capacity)
-        self._receiver = Receiver(
-            session, session.zenoh.declare_subscriber(keyexpr, ring), hand_over, capacity
-        )
+        subscriber = session.zenoh.declare_subscriber(keyexpr, ring)
+        self._receiver = Receiver(session, subscriber, on_batch, capacity)
 
     @property
     def full_batches(self) -> int:
-        """How often the ring was found full: samples of ours, not of the network, were lost there."""
+        """How often the ring was full: samples were lost in this process, not in the network."""
         return self._receiver.full_batches
 
     @property
@@ -238,34 +226,33 @@ class StreamSubscriber(Closeable):
 
 
 class _DeclaredKeys:
-    """The keys on which samples of an expression come, which are declared to Zenoh.
+    """Keys of received samples, declared to Zenoh.
 
-    It keeps the way of samples on keys that it knows. On others it searches all that was declared under
-    them for each sample anew: beside the tokens of 100 robots that is a quarter of what a reader's sample
-    costs.
+    Zenoh keeps the route of samples on declared keys. On others it searches all declarations under them for
+    each sample: with the tokens of 100 robots that is a quarter of what a reader's sample costs.
     """
 
-    def __init__(self, session: Session, keyexpr: str) -> None:
+    def __init__(self, session: Session) -> None:
         self._session = session
-        self._known: dict[str, _Key] = {}
-        self._most = _MOST_KEYS
+        self._keys: dict[str, _Key] = {}
+        self._max = _MAX_KEYS
 
     def declare(self, keys: set[str]) -> None:
-        """Samples have come on ``keys``."""
-        if len(self._known) < self._most:
-            for key in keys.difference(self._known):
-                with suppress(Closed, zenoh.ZError):  # closed meanwhile: then nothing more will come
-                    self._known[key] = _Key(self._session, key)
+        """Declare ``keys``, up to 4096 in all."""
+        if len(self._keys) < self._max:
+            for key in keys.difference(self._keys):
+                with suppress(Closed, zenoh.ZError):  # closed at the same time: no more samples will arrive
+                    self._keys[key] = _Key(self._session, key)
 
     def close(self) -> None:
-        """Declare them no more. A second call does nothing."""
-        self._most = 0
-        while self._known:
-            self._session.release(self._known.popitem()[1])
+        """Undeclare them. A second call does nothing."""
+        self._max = 0
+        while self._keys:
+            self._session.release(self._keys.popitem()[1])
 
 
 class _Key:
-    """A key that is declared to Zenoh."""
+    """A key expression that is declared to Zenoh."""
 
     def __init__(self, session: Session, key: str) -> None:
         self._session = session.zenoh

@@ -37,32 +37,32 @@ def subscribe(
     """Subscribe to ``stream`` of ``robot``, or of all robots with ``"*"``.
 
     ``on_messages`` is called from one thread of the subscription with the messages of each batch, oldest
-    first; ``on_error(reason, text)`` for every payload that cannot be decoded; ``on_withdrawn(key)`` if a
+    first; ``on_error(reason, text)`` for each payload that cannot be decoded; ``on_withdrawn(key)`` if a
     latched value is withdrawn.
     """
     is_latched = stream in _LATCHED
 
-    def decode(arrivals: Iterable[SerializedSample]) -> Iterator[Received]:
-        for arrival in arrivals:
-            # In ROS nothing can be withdrawn: an empty payload there is a broken message.
-            if is_latched and not arrival.payload and not wire.shared:
+    def decode(samples: Iterable[SerializedSample]) -> Iterator[Received]:
+        for sample in samples:
+            # ROS cannot withdraw values: an empty payload there is a broken message.
+            if is_latched and not sample.payload and not wire.shared:
                 if on_withdrawn is not None:
-                    on_withdrawn(arrival.key)
+                    on_withdrawn(sample.key)
                 continue
             try:
-                name = wire.robot_from_key(arrival.key) if robot == ANY else robot
-                for message in wire.decode(stream, arrival, name):
-                    yield Received(name, arrival.key, message)
+                name = wire.robot_from_key(sample.key) if robot == ANY else robot
+                for message in wire.decode(stream, sample, name):
+                    yield Received(name, sample.key, message)
             except (MessageError, InvalidInput) as error:
                 if on_error is not None:
                     reason = error.reason if isinstance(error, MessageError) else "foreign"
-                    on_error(reason, f"{shortened(arrival.key)}: {error}")
+                    on_error(reason, f"{shortened(sample.key)}: {error}")
 
-    def on_arrivals(arrivals: Iterable[SerializedSample]) -> None:
-        if messages := list(decode(arrivals)):
+    def on_samples(samples: Iterable[SerializedSample]) -> None:
+        if messages := list(decode(samples)):
             on_messages(messages)
 
     key = wire.expression(robot, stream)
     if is_latched:
-        return LatchedSubscriber(session, key, lambda arrival: on_arrivals((arrival,)))
-    return StreamSubscriber(session, key, on_arrivals)
+        return LatchedSubscriber(session, key, lambda sample: on_samples((sample,)))
+    return StreamSubscriber(session, key, on_samples)

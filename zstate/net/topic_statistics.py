@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 WINDOW = 10_000
 """Ten seconds at 1 kHz."""
-FEW = 200
+FLEET_WINDOW = 200
 """Enough for a rate, and few enough for a large fleet."""
 _MEASURABLE_NS = 200_000_000
 _PUBLISHED_NS = 2_000_000_000
 
 
 def mean_rate_hz(count: int, span: int) -> float | None:
-    """The rate of ``count`` samples, the last of which is ``span`` [ns] after the first; None if unknown."""
+    """The rate of ``count`` samples, the last ``span`` [ns] after the first; None if unknown."""
     return (count - 1) * 1e9 / span if count > 1 and span > 0 else None
 
 
@@ -109,12 +109,8 @@ class IntervalStatistics:
         self._received.append(received)
         self.count += 1
 
-    def is_of_message(self, session: int, seq: int) -> bool:
-        """Whether the newest sample has these numbers: ROS messages hold several samples, counted as one."""
-        return bool(self._received) and self._received[-1].seq == seq and self.session == session
-
     def clear(self) -> None:
-        """Begin a new window."""
+        """Start a new window."""
         self._received.clear()
 
     @property
@@ -140,7 +136,7 @@ class IntervalStatistics:
         return None if window is None else window.stamp_rate_hz
 
     def silent_s(self, now: int | None = None) -> float:
-        """How long ago the newest sample arrived; 0 if there is none."""
+        """How long ago the newest sample arrived; 0 without samples."""
         newest = self.newest
         return 0.0 if newest is None else ((time.monotonic_ns() if now is None else now) - newest.at) * 1e-9
 
@@ -150,21 +146,22 @@ class IntervalStatistics:
 
 
 class SequenceGaps:
-    """How many samples of each session are missing, by their sequence numbers."""
+    """Counts the missing samples of each session by sequence numbers."""
 
     def __init__(self) -> None:
-        self._sessions: BoundedDict[int, list[int]] = BoundedDict()  # the largest number, and what is missing
+        self._sessions: BoundedDict[int, list[int]] = BoundedDict()
+        """The largest sequence number, and how many are missing."""
 
     def add(self, session: int, seq: int) -> bool:
         """Count a sample. Returns whether it is the first of its message: ROS puts several into one."""
-        known = self._sessions.get(session)
-        if known is None:
+        counted = self._sessions.get(session)
+        if counted is None:
             self._sessions[session] = [seq, 0]
-        elif seq == known[0]:
+        elif seq == counted[0]:
             return False
         else:
-            known[1] += max(0, seq - known[0] - 1)
-            known[0] = max(known[0], seq)
+            counted[1] += max(0, seq - counted[0] - 1)
+            counted[0] = max(counted[0], seq)
         return True
 
     def missed(self, session: int | None = None) -> int:
@@ -191,9 +188,9 @@ def by_writer(robot: str, stream: Stream, sample: Sample) -> Iterator[WriterKey]
 
 
 class TopicStatistics(Closeable):
-    """Statistics of subscribed streams, by source. Messages that cannot be decoded are skipped.
+    """Statistics of subscribed streams by source; messages that cannot be decoded are skipped.
 
-    ``clock`` is the one of the stamps. ``on_sample`` is called with each sample, in the subscriber's thread.
+    ``clock`` is that of the stamps. ``on_sample`` is called with each sample, in the subscriber's thread.
     """
 
     def __init__(
@@ -217,19 +214,19 @@ class TopicStatistics(Closeable):
     def subscribe(self, stream: Stream, robot: str = ANY) -> None:
         """Count ``stream`` of ``robot``, or of all robots, from now on."""
 
-        def receive(arrivals: list[SerializedSample]) -> None:
+        def on_samples(received: list[SerializedSample]) -> None:
             at, now = time.monotonic_ns(), self._clock.now()
             with self._arrived:
-                for arrival in arrivals:
+                for serialized in received:
                     with suppress(InvalidInput, MessageError):
-                        named = self._wire.robot_from_key(arrival.key) if robot == ANY else robot
-                        for sample in self._wire.decode(stream, arrival, named):
+                        name = self._wire.robot_from_key(serialized.key) if robot == ANY else robot
+                        for sample in self._wire.decode(stream, serialized, name):
                             if isinstance(sample, Sample):
-                                self.add(named, stream, sample, at, now)
+                                self.add(name, stream, sample, at, now)
                 self._arrived.notify_all()
 
         key = self._wire.expression(robot, stream)
-        self._subscriptions.enter_context(StreamSubscriber(self._session, key, receive))
+        self._subscriptions.enter_context(StreamSubscriber(self._session, key, on_samples))
 
     def add(self, robot: str, stream: Stream, sample: Sample, at: int, now: int) -> None:
         """Count a sample that arrived ``at``, when it was ``now`` by the clock of the stamps."""
@@ -239,8 +236,9 @@ class TopicStatistics(Closeable):
             statistics = self._statistics.get(source)
             if statistics is None:
                 statistics = self._statistics[source] = IntervalStatistics(self._window)
-            elif statistics.is_of_message(sample.session, sample.seq):
-                continue
+            newest = statistics.newest
+            if newest is not None and (statistics.session, newest.seq) == (sample.session, sample.seq):
+                continue  # a ROS message holds several samples, counted as one
             statistics.add(received, sample.session)
         if self._on_sample is not None:
             self._on_sample(stream, sample)
@@ -250,14 +248,15 @@ class TopicStatistics(Closeable):
         return self._statistics.get(source)
 
     def wait(self, sources: Collection[Hashable], timeout_s: float) -> None:
-        """Until a rate of each source can be measured, 0.2 s of samples, or for ``timeout_s``."""
-        with self._arrived:
-            self._arrived.wait_for(lambda: all(map(self._is_measurable, sources)), timeout_s)
+        """Wait until each source has 0.2 s of samples, enough for a rate, or for ``timeout_s``."""
 
-    def _is_measurable(self, source: Hashable) -> bool:
-        statistics = self.get(source)
-        window = None if statistics is None else statistics.window()
-        return window is not None and window.received[-1].at - window.received[0].at >= _MEASURABLE_NS
+        def is_measurable(source: Hashable) -> bool:
+            statistics = self.get(source)
+            window = None if statistics is None else statistics.window()
+            return window is not None and window.received[-1].at - window.received[0].at >= _MEASURABLE_NS
+
+        with self._arrived:
+            self._arrived.wait_for(lambda: all(map(is_measurable, sources)), timeout_s)
 
     def close(self) -> None:
         """Unsubscribe. A second call does nothing."""

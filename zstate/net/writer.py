@@ -119,7 +119,7 @@ class WireWriter(Closeable):
             return
         self._opened.enter_context(announce(self._session, token))
         if not self._is_permitted:
-            # One check suffices: the permissions of all streams of a robot are the same.
+            # One check is enough: all streams of a robot have the same permissions.
             check_may_write(self._session, self._robot, token)
             self._is_permitted = True
 

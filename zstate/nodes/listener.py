@@ -332,7 +332,7 @@ class TransformListener(Closeable):
         if self._clock_offsets is not None:
             self._clock_offsets.on_writer(announced, alive=alive)
         if alive and self._history is not None:
-            self._history.ask(self._wire.expression(robot, self._follow), session)
+            self._history.request(self._wire.expression(robot, self._follow), session)
         if self._is_shared and (robot, session) not in self._ingests:
             return  # a ROS node that has not published yet
         ingest = self._ingest_for(robot, session)
@@ -361,7 +361,7 @@ class _WriterClockOffsets(Closeable):
             if offset is not None and self._offsets.get(str(writer)) is offset:
                 del self._offsets[str(writer)]
         elif self._is_enabled and writer not in self._measured:
-            offset = self._measured[writer] = self._meter.follow(announced.robot, writer)
+            offset = self._measured[writer] = self._meter.watch(announced.robot, writer)
             self._offsets[str(writer)] = offset
 
     def close(self) -> None:

@@ -277,7 +277,7 @@ class PassthroughPublisher(Closeable):
         with ExitStack() as placed:
             if new:
                 announced = self._announced("tf_static", writer)
-                placed.enter_context(claim_edges(self._session, announced, new, beside=self._sessions))
+                placed.enter_context(claim_edges(self._session, announced, new, allowed=self._sessions))
             yield
         self._placed[writer] = edges
 

@@ -34,7 +34,7 @@ def test_clients_communicate_through_the_router(spawn: Spawn, free_port: int):
 def test_busy_port_is_reported_at_once(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
-    assert f"somebody listens at '{endpoint}' already" in failure("router", "--listen", endpoint)
+    assert f"another program listens at '{endpoint}'" in failure("router", "--listen", endpoint)
 
 
 def ros_node(port: int) -> zenoh.Session:

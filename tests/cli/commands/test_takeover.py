@@ -15,7 +15,7 @@ def test_stream_with_a_writer_needs_takeover(spawn: Spawn, command):
     with standing():
         message = failure(*command)
         assert f"pid {os.getpid()}'" in message
-        assert "joint_states of 'rrbot' already" in message
+        assert "already writes joint_states of 'rrbot'" in message
         assert "rrbot" in started(spawn, *command, "--takeover").line()
 
 

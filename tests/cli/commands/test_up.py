@@ -153,7 +153,7 @@ def test_last_error_of_a_process_is_reported_as_the_cause(up, free_port: int):
     with connect(listen=endpoint):
         child = up(f"[network]\nlisten = ['{endpoint}']\n" + robot())
         assert child.wait() == 1
-    assert f"'rrbot' ended with exit code 1: zstate: somebody listens at {endpoint!r}" in child.stderr
+    assert f"'rrbot' ended with exit code 1: zstate: another program listens at {endpoint!r}" in child.stderr
 
 
 def test_error_of_several_lines_is_reported_in_full(up):

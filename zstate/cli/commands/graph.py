@@ -75,13 +75,13 @@ def graph_command(network: SessionOptions, robot: str, form: str | None, wire: s
 
 def _discover_measured_graph(session: Session) -> Graph:
     """The graph of the native wire, with the rates of the streams that move."""
-    from zstate.net.graph import graph_of
+    from zstate.net.graph import build_graph
     from zstate.net.presence import discover, discover_readers
-    from zstate.net.topic_statistics import FEW, TopicStatistics, WriterKey
+    from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
     from zstate.wire.keys import ANY
     from zstate.wire.registry import get_wire
 
-    with TopicStatistics(session, get_wire("native"), window=FEW) as statistics:
+    with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         statistics.subscribe("joint_states")
         robots = discover(session)
         readers = discover_readers(session, _READERS_WITHIN_S)
@@ -104,7 +104,7 @@ def _discover_measured_graph(session: Session) -> Graph:
             source = statistics.get(WriterKey(robot, stream, writer.session))
             return None if source is None else source.published_hz()
 
-        return graph_of(robots, readers, rate_hz)
+        return build_graph(robots, readers, rate_hz)
 
 
 def graph_text(graph: Graph) -> str:

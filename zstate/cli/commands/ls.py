@@ -103,7 +103,7 @@ def _list_graph(session: Session, wire: str, *, watch: bool, as_json: bool) -> N
 def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
     from zstate.cli.robot_directory import RobotDirectory
     from zstate.net.presence import discover
-    from zstate.net.topic_statistics import FEW, TopicStatistics, WriterKey
+    from zstate.net.topic_statistics import FLEET_WINDOW, TopicStatistics, WriterKey
     from zstate.wire.registry import get_wire
 
     def text(robots: tuple[RobotInfo, ...]) -> str:
@@ -111,7 +111,7 @@ def _list_robots(session: Session, *, watch: bool, as_json: bool) -> None:
             return messages_for("native").announced(robots)
         return robots_text(robots, statistics, width=output_width())
 
-    with TopicStatistics(session, get_wire("native"), window=FEW) as statistics:
+    with TopicStatistics(session, get_wire("native"), window=FLEET_WINDOW) as statistics:
         statistics.subscribe("joint_states")
         if watch:
             with RobotDirectory(session) as directory:

@@ -16,7 +16,7 @@ from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.presence import announce, connections, discover
-from zstate.net.rendezvous import lobby_key, rendezvous_addresses, silent_addresses
+from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
 from zstate.net.security.connection_check import (
     accepts_tcp,
     check_all_tcp,
@@ -106,7 +106,7 @@ def _met_at(session: Session, count: int) -> int | None:
     """Number of the first rendezvous address with a lobby; None if none is seen within 1 s."""
     waiter = ConditionWaiter()
     with ExitStack() as opened:
-        publishers = [session.zenoh.declare_publisher(lobby_key(number)) for number in range(count)]
+        publishers = [session.zenoh.declare_publisher(rendezvous_key(number)) for number in range(count)]
         for publisher in publishers:
             opened.callback(session.release, publisher)
             opened.callback(session.release, publisher.declare_matching_listener(waiter.notify))

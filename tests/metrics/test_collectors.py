@@ -1,4 +1,4 @@
-"""What collectors find: the values are those of the stats, and there is no end of labels."""
+"""Collectors report the values of the stats, with a bounded number of labels."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from zstate.metrics.buffer import InstrumentedBuffer
 from zstate.metrics.collectors import (
     MAX_ROBOTS,
     ConnectionMetrics,
+    CounterRates,
     ListenerMetrics,
     MetricFamilies,
     PublisherMetrics,
@@ -35,7 +36,7 @@ JOINTS = {"robot": "r1", "wire": "native", "stream": "joint_states"}
 TF = {**JOINTS, "stream": "tf"}
 
 
-def test_a_publisher_tells_what_it_put_suppressed_and_refused(sessions):
+def test_publisher_samples_suppressed_and_refused_are_counted(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         for _ in range(3):
             publisher.publish([0.0, 0.0])
@@ -52,7 +53,7 @@ def test_a_publisher_tells_what_it_put_suppressed_and_refused(sessions):
     assert row("zstate_publisher_ticks_total", robot="r1") not in rows
 
 
-def test_a_publisher_at_a_rate_tells_how_it_keeps_it(sessions):
+def test_publisher_with_a_rate_reports_late_and_skipped_ticks(sessions):
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         report = publisher.run(SineSource(RRBOT), 200.0, seconds=0.05)
         rows = collected(PublisherMetrics([publisher]))
@@ -62,7 +63,7 @@ def test_a_publisher_at_a_rate_tells_how_it_keeps_it(sessions):
     assert rows[row("zstate_publisher_skipped_ticks_total", robot="r1")] == report.skipped
 
 
-def test_being_served_costs_a_publisher_nothing(sessions):
+def test_an_endpoint_does_not_slow_a_publisher_down(sessions):
     def tick_ns() -> float:
         before = time.thread_time_ns()
         for _ in range(300):
@@ -77,11 +78,11 @@ def test_being_served_costs_a_publisher_nothing(sessions):
             alone.append(tick_ns())
             with MetricsEndpoint([PublisherMetrics([publisher])]):
                 served.append(tick_ns())
-    # The fastest of each, in turn: what else the machine does is in neither.
+    # The fastest of each, alternating: other load of the machine is in neither.
     assert min(served) < 1.5 * min(alone)
 
 
-def test_a_listener_tells_its_stats_ages_latency_and_lookups(sessions):
+def test_listener_stats_age_latency_and_lookups_are_reported(sessions):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
@@ -107,7 +108,7 @@ def test_a_listener_tells_its_stats_ages_latency_and_lookups(sessions):
     assert rows[row("zstate_listener_lookup_errors_total", robot="r1", kind="InFuture")] == 1
 
 
-def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
+def test_listener_of_all_robots_reports_the_age_of_each(sessions):
     writer, reader = sessions
     with (
         TransformListener(reader, history_on_join=False) as listener,
@@ -116,14 +117,14 @@ def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
     ):
         settle(writer, "r1")
 
-        def all_heard() -> bool:
+        def all_received() -> bool:
             for publisher in (one, two):
                 publisher.publish([0.0, 0.0])
             return listener.robots() == ("r1", "r2") and all(
                 listener.buffer.can_lookup(f"{robot}/base", f"{robot}/lower") for robot in ("r1", "r2")
             )
 
-        until(all_heard)
+        until(all_received)
         rows = collected(ListenerMetrics(lambda: [listener]))
     assert {labels for name, labels in rows if name == "zstate_listener_age_seconds"} == {
         frozenset({("robot", "r1")}),
@@ -132,7 +133,7 @@ def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
     assert row("zstate_listener_received_total", robot="*") in rows
 
 
-def test_a_writer_that_starts_again_and_again_adds_no_row(sessions):
+def test_restarts_of_a_writer_add_no_rows(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener:
         settle(writer, "r1")
@@ -148,7 +149,7 @@ def test_a_writer_that_starts_again_and_again_adds_no_row(sessions):
     assert all(rows == seen[0] for rows in seen)
 
 
-def test_robots_beyond_a_limit_are_counted_and_have_no_rows():
+def test_robots_beyond_the_limit_are_counted_without_rows():
     writer = local_writer(1)
     robots = [
         RobotInfo(f"r{number:04}", (("joint_states", replace(writer, session=number)),))
@@ -159,13 +160,13 @@ def test_robots_beyond_a_limit_are_counted_and_have_no_rows():
     assert len([name for name, _ in rows if name == "zstate_writers"]) == MAX_ROBOTS
 
 
-def test_two_writers_of_a_stream_are_two():
+def test_two_writers_of_a_stream_count_as_two():
     writers = (("tf_static", local_writer(1)), ("tf_static", local_writer(2)))
     rows = collected(WriterMetrics(lambda: [RobotInfo("r1", writers)]))
     assert rows[row("zstate_writers", robot="r1", stream="tf_static")] == 2
 
 
-def test_rows_of_the_same_labels_add_up_and_counters_end_in_total():
+def test_rows_with_the_same_labels_add_up_and_counter_names_end_in_total():
     families = MetricFamilies()
     for value in (2, 3):
         families.count("zstate_things", "Things.", value, robot="r1")
@@ -174,7 +175,7 @@ def test_rows_of_the_same_labels_add_up_and_counters_end_in_total():
     assert [(sample.name, sample.value) for sample in family.samples] == [("zstate_things_total", 5)]
 
 
-def test_a_router_tells_whom_it_has_links_to(free_port: int):
+def test_router_reports_its_sessions_and_links(free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     with connect(mode="router", listen=endpoint) as router:
         with connect(mode="client", endpoints=endpoint), connect(mode="peer", endpoints=endpoint):
@@ -183,3 +184,66 @@ def test_a_router_tells_whom_it_has_links_to(free_port: int):
             assert rows[row("zstate_router_sessions", mode="client")] == 1
             assert rows[row("zstate_router_links", protocol="tcp")] == 2
         until(lambda: not any(connections(router).sessions.values()))
+
+
+class FakeClock:
+    def __init__(self) -> None:
+        self.time_s = 100.0
+
+    def __call__(self) -> float:
+        return self.time_s
+
+
+def updated(rates: CounterRates, clock: FakeClock, seconds: int, rate_hz: float, count: float = 0.0) -> float:
+    """The count after ``seconds`` with an update each second."""
+    for _ in range(seconds):
+        rates.update("a", count)
+        clock.time_s += 1.0
+        count += rate_hz
+    return count
+
+
+def test_the_first_reading_has_the_rate_of_the_window_before_it():
+    clock = FakeClock()
+    rates = CounterRates(clock)
+    count = updated(rates, clock, 35, 100.0)
+    assert rates.update("a", count) == 100.0
+
+
+def test_two_readers_of_a_rate_do_not_affect_each_other():
+    clock = FakeClock()
+    rates = CounterRates(clock)
+    count = updated(rates, clock, 20, 50.0)
+    for _ in range(100):
+        assert rates.update("a", count) == pytest.approx(50.0)
+        clock.time_s += 0.02
+        count += 1.0
+
+
+def test_a_rate_covers_the_last_ten_seconds():
+    clock = FakeClock()
+    rates = CounterRates(clock)
+    count = updated(rates, clock, 30, 100.0)
+    count = updated(rates, clock, 5, 0.0, count)
+    assert rates.update("a", count) == 50.0
+    count = updated(rates, clock, 5, 0.0, count)
+    assert rates.update("a", count) == 0.0
+
+
+def test_rare_readings_have_the_rate_since_the_previous_reading():
+    clock = FakeClock()
+    rates = CounterRates(clock)
+    assert rates.update("a", 40) == 0.0
+    clock.time_s += 20.0
+    assert rates.update("a", 240) == (240 - 40) / 20.0
+    clock.time_s += 20.0
+    assert rates.update("a", 240) == 0.0
+
+
+def test_a_restarted_counter_has_no_negative_rate():
+    clock = FakeClock()
+    rates = CounterRates(clock)
+    rates.update("a", 1000)
+    clock.time_s += 1.0
+    assert rates.update("a", 3) == 0.0
+    assert rates.update("b", 3) == 0.0
