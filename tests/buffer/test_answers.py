@@ -186,7 +186,7 @@ def test_edges_of_two_times_have_no_instant_in_common_and_the_reason_says_so() -
     buffer = filled(moving("a", "b", NOW // 1_000_000), moving("b", "c", NOW))
     reason = failure(buffer, "a", "c")
     assert (type(reason), reason.edge) == (Stale, ("a", "b"))
-    assert "their writer gives milliseconds where nanoseconds are meant" in str(reason)
+    assert "the writer's stamps look like milliseconds, but stamps are nanoseconds" in str(reason)
 
 
 def test_a_wait_for_an_edge_that_is_silent_ends_with_its_next_sample() -> None:

@@ -70,7 +70,7 @@ def only_pose(model: RobotModel, *positions: float) -> np.ndarray:
     return pose
 
 
-def test_a_hinge_turns_about_its_axis_in_the_frame_of_its_origin() -> None:
+def test_a_revolute_joint_turns_about_its_axis_in_the_frame_of_its_origin() -> None:
     # x of the joint is y of the parent: turning by a about x takes z of the child towards -y of the
     # joint, which is +x of the parent.
     pose = only_pose(robot(joint("hip", "revolute", "root")), 0.3)
@@ -148,10 +148,10 @@ def test_one_form_evaluated_by_its_formula_is_the_row_of_the_table() -> None:
     (positions,) = random_positions(model, 1, 3.0)
     poses = JointTransforms(model).poses(positions)
     for form, pose in zip(edge_forms(model), poses, strict=True):
-        if form.kind not in ("hinge", "slide"):
+        if form.kind not in ("revolute", "prismatic"):
             continue
         x = form.scale * positions[form.column] + form.shift
-        half = x / 2 if form.kind == "hinge" else 0.0
+        half = x / 2 if form.kind == "revolute" else 0.0
         rotation = np.array(form.q_cos) * cos(half) + np.array(form.q_sin) * sin(half)
         assert np.allclose(pose, [*(np.array(form.t0) + np.array(form.t1) * x), *rotation], atol=1e-15)
 

@@ -25,16 +25,16 @@ from zstate.se3 import multiply, rotate, to_matrix
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
 
-EdgeKind = Literal["fixed", "hinge", "slide", "planar", "floating"]
+EdgeKind = Literal["fixed", "revolute", "prismatic", "planar", "floating"]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Floats = NDArray[np.float64]
 
 _KINDS: dict[JointType, EdgeKind] = {
     "fixed": "fixed",
-    "revolute": "hinge",
-    "continuous": "hinge",
-    "prismatic": "slide",
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
     "planar": "planar",
     "floating": "floating",
 }
@@ -134,7 +134,7 @@ class _RevoluteBatch:
 
     @classmethod
     def poses(cls, forms: tuple[JointTransform, ...]) -> _RevoluteBatch | None:
-        turning = [(row, form) for row, form in enumerate(forms) if form.kind in ("hinge", "planar")]
+        turning = [(row, form) for row, form in enumerate(forms) if form.kind in ("revolute", "planar")]
         if not turning:
             return None
         return cls(
@@ -166,7 +166,7 @@ class _PrismaticBatch:
 
     @classmethod
     def poses(cls, forms: tuple[JointTransform, ...]) -> _PrismaticBatch | None:
-        sliding = [(row, form) for row, form in enumerate(forms) if form.kind in ("slide", "planar")]
+        sliding = [(row, form) for row, form in enumerate(forms) if form.kind in ("prismatic", "planar")]
         if not sliding:
             return None
         return cls(
@@ -244,9 +244,9 @@ def _form(model: RobotModel, joint: Joint) -> JointTransform:
         scale=master.multiplier,
         shift=master.offset,
         q_cos=rotation,
-        q_sin=multiply(rotation, (*axis, 0.0)) if kind in ("hinge", "planar") else (*still, 0.0),
+        q_sin=multiply(rotation, (*axis, 0.0)) if kind in ("revolute", "planar") else (*still, 0.0),
         t0=joint.origin[:3],
-        t1=rotate(rotation, axis) if kind == "slide" else still,
+        t1=rotate(rotation, axis) if kind == "prismatic" else still,
         origin=(*joint.origin[:3], *rotation),
         axis=axis,
     )
@@ -265,8 +265,8 @@ def _compiled(width: int, forms: tuple[JointTransform, ...]) -> _kernel.Edges:
 
 
 def _numbers(form: JointTransform) -> tuple[float, ...]:
-    if form.kind in ("hinge", "slide"):
-        along = form.q_sin if form.kind == "hinge" else form.t1
+    if form.kind in ("revolute", "prismatic"):
+        along = form.q_sin if form.kind == "revolute" else form.t1
         return (form.scale, form.shift, *form.q_cos, *form.t0, *along)
     return form.origin
 

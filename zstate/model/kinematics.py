@@ -100,7 +100,7 @@ class _Solver:
         self._joint_ids: dict[JointTransform, int] = {}
         self._add_links(model, forms)
         self._data: Any = self._model.createData()
-        single = [form for form in self._joint_ids if form.kind in ("hinge", "slide")]
+        single = [form for form in self._joint_ids if form.kind in ("revolute", "prismatic")]
         self._q_rows = np.array([self._q_row(form) for form in single], dtype=np.intp)
         self._v_rows = np.array([self._v_row(form) for form in single], dtype=np.intp)
         self._columns = np.array([form.column for form in single], dtype=np.intp)
@@ -188,9 +188,9 @@ class _Solver:
         return added, self._pin.SE3.Identity()
 
     def _joint_of(self, form: JointTransform) -> Any:
-        if form.kind == "hinge":
+        if form.kind == "revolute":
             return self._pin.JointModelRevoluteUnaligned(np.array(form.axis))
-        if form.kind == "slide":
+        if form.kind == "prismatic":
             return self._pin.JointModelPrismaticUnaligned(np.array(form.axis))
         return self._pin.JointModelPlanar() if form.kind == "planar" else self._pin.JointModelFreeFlyer()
 
