@@ -90,8 +90,8 @@ GUESTS = {
 }
 
 PURE = {"model", "buffer", "wire"}
-# The catalog and the expander are where a model comes from: they look for files and read them.
-READS_FILES = {"model/load.py", "model/catalog.py", "model/xacro.py"}
+# The loader and the catalog find and read model files.
+READS_FILES = {"model/load.py", "model/catalog.py"}
 READS_ENVIRONMENT = {"wire/registry.py"}  # ROS_DOMAIN_ID
 IMPURE_MODULES = {
     "io",

@@ -84,7 +84,7 @@ def _default_robot() -> str:
 
 
 def _load(robot: str, xacro_args: dict[str, str]) -> tuple[RobotModel, str]:
-    from zstate.model.representative_links import representative_links
+    from zstate.model.robot import representative_links
 
     try:
         model, called = load_robot(robot, None, xacro_args)
@@ -106,7 +106,7 @@ def _look(
 ) -> None:
     from zstate.cli.output.demo_table import DemoTable
     from zstate.metrics.buffer import MeteredBuffer
-    from zstate.model.representative_links import representative_links
+    from zstate.model.robot import representative_links
     from zstate.nodes.listener import TransformListener
 
     buffer = MeteredBuffer()

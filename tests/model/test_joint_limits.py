@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from zstate.model.joint_limits import JointLimits
 from zstate.model.load import load_model
-from zstate.model.urdf_joint import JointLimits
 
 
 def limits_of(*joints: str) -> JointLimits:
