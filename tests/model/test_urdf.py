@@ -107,8 +107,8 @@ def test_a_sound_robot_is_read_in_the_order_of_its_document():
         (tip("planar", '<mimic joint="elbow"/>'), 8, "is planar and cannot mimic"),
         (tip("floating", '<mimic joint="elbow"/>'), 8, "is floating and cannot mimic"),
         (ARM + '<robot name="b"/>', 8, "a second <robot>; the first begins in line 1"),
-        (ARM + '<group><link name="b"/></group>', 8, "<link> stands inside <group> (line 8)"),
-        ('<link name="a">\n<link name="b"/></link>', 3, "<link> stands inside <link> (line 2)"),
+        (ARM + '<group><link name="b"/></group>', 8, "<link> is inside <group> (line 8)"),
+        ('<link name="a">\n<link name="b"/></link>', 3, "<link> is inside <link> (line 2)"),
     ],
 )
 def test_a_fault_is_refused_with_its_line(body: str, line: int, words: str):
@@ -178,7 +178,7 @@ def test_all_findings_come_at_once_in_the_order_of_lines():
         (tip("continuous", '<limit lower="0" upper="1"/>'), "lower and upper limits are not used"),
         (tip("continuous", '<axis xyz="0 3 4"/>'), "of length 5; it is made a unit vector"),
         (tip("fixed", '<mimic joint="elbow"/>'), "is fixed, so its <mimic> is not used"),
-        (ARM + '<extra><link name="b"/></extra>', "<link> stands inside <extra>"),
+        (ARM + '<extra><link name="b"/></extra>', "<link> is inside <extra>"),
     ],
 )
 def test_what_is_doubtful_but_usable_is_a_warning(body: str, words: str):

@@ -45,9 +45,11 @@ def load_model(
     if isinstance(source, bytes) or (isinstance(source, str) and ("<" in source or not source.strip())):
         data, label = source, "URDF text"
     else:
-        is_name = isinstance(source, str) and not is_path(source)
-        path = find_entry(source).path if is_name else Path(source)
-        label = str(path) if is_name else os.fspath(source)
+        if isinstance(source, str) and not is_path(source):
+            path = find_entry(source).path
+            label = str(path)
+        else:
+            path, label = Path(source), os.fspath(source)
         data = _read(path, label)
     document = read_document(data, label)
     if xacro_elements(document.root) or (path is not None and path.suffix == ".xacro"):
