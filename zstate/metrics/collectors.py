@@ -317,7 +317,7 @@ class BridgeMetrics:
             families.gauge(
                 "zstate_bridge_carried",
                 text,
-                carrier.has_begun,
+                carrier.has_model,
                 robot=carrier.robot,
                 way=carrier.source.direction,
             )

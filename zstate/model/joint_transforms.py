@@ -202,7 +202,9 @@ class _FloatingBatch:
         origins = np.zeros((len(floating), 7, 7))
         for matrix, (_, form) in zip(origins, floating, strict=True):
             matrix[:3, :3] = to_matrix(form.origin)[:3, :3]
-            matrix[3:, 3:] = np.transpose([multiply(form.q_cos, unit) for unit in np.eye(4).tolist()])
+            matrix[3:, 3:] = np.transpose(
+                [multiply(form.q_cos, (x, y, z, w)) for x, y, z, w in np.eye(4).tolist()]
+            )
         return cls(
             rows=np.array([row for row, _ in floating], dtype=np.intp),
             columns=np.array([np.arange(form.column, form.column + 7) for _, form in floating]),
