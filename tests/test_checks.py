@@ -60,7 +60,7 @@ def doors(numbers: Callable[[Any], Any]) -> dict[str, tuple[Callable[[], object]
 
 
 @pytest.mark.parametrize("kind", NOT_REAL)
-def test_what_are_no_real_numbers_is_refused_at_every_door_and_named(kind: str) -> None:
+def test_every_entry_point_refuses_values_that_are_not_real_numbers(kind: str) -> None:
     for door, (call, what) in doors(NOT_REAL[kind]).items():
         if (kind, door) in (("dates", "stamps"), ("nothing", "velocities")):
             continue  # which they may be
@@ -93,7 +93,7 @@ def test_a_named_position_is_one_real_number(value) -> None:
         [np.float32(1), np.int64(2)],
     ],
 )
-def test_integers_and_floats_of_any_width_are_taken_from_any_sequence(numbers) -> None:
+def test_integers_and_floats_of_any_width_are_accepted_in_any_sequence(numbers) -> None:
     taken = real_numbers(numbers, "numbers")
     assert (taken.dtype, taken.tolist()) == (np.dtype(np.float64), [1.0, 2.0])
     buffer = TransformBuffer()

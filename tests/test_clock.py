@@ -25,7 +25,7 @@ def test_an_integer_of_numpy_comes_back_as_an_int() -> None:
 @pytest.mark.parametrize(
     "stamp", [1.0, np.float64(1.0), True, "1", None, 2**63, -(2**63) - 1, np.uint64(2**63)]
 )
-def test_what_is_no_64_bit_integer_is_refused_with_the_way_out(stamp: object) -> None:
+def test_a_stamp_that_is_no_64_bit_integer_is_refused_with_advice(stamp: object) -> None:
     with pytest.raises(InvalidInput, match=r"time\.time_ns\(\)"):
         check_stamp(stamp)
 
@@ -38,7 +38,7 @@ def test_a_stamp_reads_as_seconds_with_all_nine_digits(stamp: int, text: str) ->
     assert format_stamp(stamp) == text
 
 
-def test_the_system_clock_tells_the_time_of_the_system() -> None:
+def test_the_system_clock_has_the_time_of_the_system() -> None:
     before = time.time_ns()
     assert before <= SystemClock().now() <= time.time_ns()
 
@@ -58,7 +58,7 @@ def test_a_wait_for_an_instant_ends_when_it_is_stopped() -> None:
     assert not SystemClock().wait_until(0, stop)
 
 
-def test_a_manual_clock_moves_only_when_told_to() -> None:
+def test_a_manual_clock_moves_only_when_it_is_set() -> None:
     clock = ManualClock(5)
     assert clock.now() == 5
     clock.advance(1e-9)
@@ -67,7 +67,7 @@ def test_a_manual_clock_moves_only_when_told_to() -> None:
     assert clock.now() == -3
 
 
-def test_whoever_waits_for_a_manual_clock_wakes_when_it_gets_there() -> None:
+def test_a_wait_for_a_manual_clock_ends_when_the_clock_reaches_the_stamp() -> None:
     clock, reached = ManualClock(), threading.Event()
 
     def wait() -> None:

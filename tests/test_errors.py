@@ -1,4 +1,4 @@
-"""Errors: one tree, facts as attributes, sentences that say what to do."""
+"""Errors: one tree, facts as attributes, texts with advice."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_every_exception_is_a_zstate_error() -> None:
     assert all(issubclass(thing, ZStateError) for thing in exceptions)
 
 
-def test_bad_input_is_a_value_error_and_a_failed_question_is_not() -> None:
+def test_invalid_input_is_a_value_error_and_a_failed_lookup_is_not() -> None:
     assert issubclass(InsertRefused, ValueError)
     assert not issubclass(LookupFailed, ValueError)
 
@@ -50,7 +50,7 @@ def test_bad_input_is_a_value_error_and_a_failed_question_is_not() -> None:
         (-3_000_000, "-3.0 ms"),
     ],
 )
-def test_durations_read_as_a_person_says_them(nanoseconds: int, text: str) -> None:
+def test_durations_have_a_readable_unit(nanoseconds: int, text: str) -> None:
     assert format_duration(nanoseconds) == text
 
 
@@ -67,20 +67,20 @@ def in_future() -> InFuture:
     )
 
 
-def test_in_future_says_how_far_after_whose_newest_sample_and_what_to_do() -> None:
+def test_in_future_names_distance_edge_and_advice() -> None:
     text = str(in_future())
     assert text.startswith("pose of 'hand' in 'map': asked 1.0 s after the newest sample of 'map' -> 'base'")
     for part in ("writer odom", "50 Hz", "timeout_s", "at=None", "predict_s"):
         assert part in text
 
 
-def test_in_past_says_how_far_before_and_how_long_the_history_is() -> None:
+def test_in_past_names_distance_and_length_of_the_history() -> None:
     error = InPast("map", "hand", edge=("map", "base"), requested=S, oldest=3 * S, newest=7 * S)
     assert "asked 2.0 s before the oldest sample of 'map' -> 'base'" in str(error)
     assert "the history there spans 4.0 s" in str(error)
 
 
-def test_a_single_sample_is_told_as_that() -> None:
+def test_a_single_sample_is_called_the_only_one() -> None:
     before = InPast("map", "hand", edge=("map", "base"), requested=S, oldest=3 * S, newest=3 * S)
     assert "asked 2.0 s before the only sample of 'map' -> 'base' so far; " in str(before)
     assert "spans" not in str(before)
@@ -94,11 +94,12 @@ WALL = 1_704_449_877_278_544_000
 SIMULATED = 250_655_000_000
 
 
-def test_wall_clock_time_asked_of_a_simulation_is_told_in_words() -> None:
+def test_wall_clock_lookup_among_simulated_stamps_is_explained() -> None:
     error = InFuture("a", "b", edge=("a", "b"), requested=WALL, oldest=S, newest=SIMULATED)
     assert (
-        "that instant, 2024-01-05 10:17:57 UTC, is wall-clock time, and those samples keep simulated time, "
-        "or that of a machine whose clock was never set (the newest 250.655 s); ask in the time" in str(error)
+        "the requested stamp, 2024-01-05 10:17:57 UTC, is wall-clock time, but the samples have simulated "
+        "stamps, or those of a machine whose clock was never set (newest 250.655 s); use stamps of "
+        "their clock" in str(error)
     )
     assert error.is_of_another_time
     assert "wait for it" not in str(error)
@@ -106,34 +107,34 @@ def test_wall_clock_time_asked_of_a_simulation_is_told_in_words() -> None:
     assert str(again).endswith(str(error))
 
 
-def test_simulated_time_asked_of_a_wall_clock_is_told_in_words() -> None:
+def test_simulated_lookup_among_wall_clock_stamps_is_explained() -> None:
     error = InPast("a", "b", edge=("a", "b"), requested=SIMULATED, oldest=WALL, newest=WALL + S)
     assert (
-        "that instant, 250.655 s, is simulated time or one since a machine was switched on, and those "
-        "samples keep wall-clock time (the newest 2024-01-05 10:17:58 UTC)" in str(error)
+        "the requested stamp, 250.655 s, is simulated time or time since a machine was switched on, but the "
+        "samples have wall-clock stamps (newest 2024-01-05 10:17:58 UTC)" in str(error)
     )
 
 
 @pytest.mark.parametrize(
     ("unit", "scale"), [("seconds", S), ("milliseconds", 1_000_000), ("microseconds", 1_000)]
 )
-def test_a_mistaken_unit_is_told_on_either_side(unit: str, scale: int) -> None:
+def test_a_mistaken_unit_is_named_on_either_side(unit: str, scale: int) -> None:
     asked = InPast("a", "b", edge=("a", "b"), requested=WALL // scale, oldest=WALL, newest=WALL + S)
-    assert f"that instant, {WALL // scale}, looks like {unit}: stamps are nanoseconds" in str(asked)
+    assert f"the requested stamp {WALL // scale} looks like {unit}, but stamps are nanoseconds" in str(asked)
     stamped = InFuture("a", "b", edge=("a", "b"), requested=WALL, oldest=1, newest=WALL // scale)
-    assert f"their writer gives {unit} where nanoseconds are meant" in str(stamped)
+    assert f"the writer's stamps look like {unit}, but stamps are nanoseconds" in str(stamped)
 
 
 @pytest.mark.parametrize(
     ("asked", "newest"), [(100_000 * S, 100 * S), (WALL, WALL - 90_000 * S), (S, 40_000 * S)]
 )
-def test_stamps_of_one_time_that_are_far_apart_are_only_that(asked: int, newest: int) -> None:
+def test_distant_stamps_of_one_clock_are_a_plain_extrapolation(asked: int, newest: int) -> None:
     error = InFuture("a", "b", edge=("a", "b"), requested=asked, oldest=newest - S, newest=newest)
     assert not error.is_of_another_time
     assert "wait for it" in str(error)
 
 
-def test_an_unknown_frame_comes_with_near_misses_or_with_what_lists_the_frames() -> None:
+def test_unknown_frame_names_near_misses_or_the_command_that_lists_frames() -> None:
     assert "did you mean 'hand'?" in str(
         UnknownFrame("a", "hnd", name="hnd", near_misses=["hand"], frame_count=3)
     )
@@ -141,7 +142,7 @@ def test_an_unknown_frame_comes_with_near_misses_or_with_what_lists_the_frames()
     assert "is a publisher running" in str(UnknownFrame("a", "q", name="q"))
 
 
-def test_the_other_reasons_name_what_is_at_fault() -> None:
+def test_other_lookup_errors_name_the_edge_or_frame_at_fault() -> None:
     assert "'r1/hand' or 'r2/hand'" in str(
         AmbiguousFrame("a", "hand", name="hand", candidates=["r1/hand", "r2/hand"])
     )
@@ -150,20 +151,20 @@ def test_the_other_reasons_name_what_is_at_fault() -> None:
     assert "zstate static map base" in disconnected
     gone = Disconnected("a", "b", roots=("map", "base"))
     gone.edge, gone.writer, gone.gone_s = ("map", "base"), "odom", 40.9
-    assert str(gone).endswith("'map' -> 'base' (writer odom) was taken away 40 s ago")
+    assert str(gone).endswith("'map' -> 'base' (writer odom) was withdrawn 40 s ago")
     assert "no sample of 'a' -> 'b'" in str(NoData("a", "b", edge=("a", "b")))
     assert "every edge of the path is static" in str(NoData("a", "b"))
     stale = Stale("a", "b", age_s=2.0, max_age_s=0.5, edge=("a", "b"))
     assert "2.0 s old, 0.5 s are allowed" in str(stale)
 
 
-def test_a_note_stands_behind_the_sentence() -> None:
+def test_a_note_follows_the_message() -> None:
     error = in_future()
     error.note = "one thing more"
     assert str(error).endswith("(one thing more)")
 
 
-def test_a_wait_that_ran_out_keeps_its_reasons_class_and_facts_and_is_a_timeout() -> None:
+def test_a_wait_timeout_has_class_and_facts_of_its_reason() -> None:
     error = as_timeout(in_future(), 0.25)
     assert isinstance(error, InFuture)
     assert isinstance(error, TimeoutError)
@@ -173,7 +174,7 @@ def test_a_wait_that_ran_out_keeps_its_reasons_class_and_facts_and_is_a_timeout(
     assert str(error).startswith("after waiting 0.25 s, pose of 'hand'")
 
 
-def test_each_reason_has_one_class_of_timeouts() -> None:
+def test_each_reason_has_one_timeout_class() -> None:
     assert type(as_timeout(in_future(), 1.0)) is type(as_timeout(in_future(), 2.0))
 
 
@@ -216,7 +217,7 @@ def test_every_error_crosses_processes_whole(error: errors.ZStateError) -> None:
         (2_000_000, 2_000_001, ""),
     ],
 )
-def test_the_writers_clock_is_named_where_it_may_be_the_cause(
+def test_the_writers_clock_is_named_if_it_may_be_the_cause(
     offset_ns: int, uncertainty_ns: int, text: str
 ) -> None:
     error = InFuture(
@@ -269,7 +270,7 @@ def test_the_repr_of_an_error_has_its_text_and_both_survive_pickling(error: ZSta
     assert (type(again), str(again), repr(again)) == (type(error), str(error), repr(error))
 
 
-def test_the_past_of_a_recording_is_not_had_by_starting_a_listener() -> None:
+def test_in_past_of_a_recording_does_not_advise_on_listeners() -> None:
     error = InPast("a", "b", edge=("a", "b"), requested=0, oldest=S, newest=3 * S)
     error.is_recorded = True
     assert "the recording has nothing older of it, and 2.0 s in all" in str(error)

@@ -27,7 +27,7 @@ def python(code: str, wish: str = "") -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
-def test_the_front_door_says_which_kernel_is_used_and_why() -> None:
+def test_the_package_exports_the_kernel_and_its_reason() -> None:
     assert zstate.kernel in ("c", "reference")
     assert zstate.kernel.reason
     assert zstate.kernel is kernel
@@ -35,7 +35,7 @@ def test_the_front_door_says_which_kernel_is_used_and_why() -> None:
 
 def test_the_environment_forces_the_reference() -> None:
     done = python(SHOW + LOOK, "reference")
-    assert done.stdout.startswith(f"reference | {VARIABLE} asks for it\n<pose of b in a")
+    assert done.stdout.startswith(f"reference | {VARIABLE} selects it\n<pose of b in a")
 
 
 def test_without_the_extension_the_reference_answers() -> None:
@@ -52,12 +52,12 @@ def test_an_extension_of_another_revision_is_not_used() -> None:
     assert done.stdout.startswith("reference | the extension is of revision -1, not")
 
 
-def test_a_wish_for_the_extension_is_not_silently_unmet() -> None:
+def test_requiring_a_missing_extension_is_an_error() -> None:
     done = python(SHADOW + SHOW, "c")
     assert done.returncode != 0
-    assert f"{VARIABLE} asks for 'c', but the extension cannot be loaded" in done.stderr
+    assert f"{VARIABLE} selects 'c', but the extension cannot be loaded" in done.stderr
 
 
-def test_another_wish_is_refused() -> None:
+def test_another_value_is_refused() -> None:
     with pytest.raises(InvalidInput, match="'c', 'reference' or not set; got 'fast'"):
         select_kernel("fast")

@@ -57,7 +57,7 @@ def test_the_wheel_holds_the_code_the_robots_and_nothing_else(wheel: Path):
     assert shipped == code | robots | {"zstate/py.typed", "zstate/_kernel.pyi"}
 
 
-def test_the_wheel_says_its_licence_and_its_command(wheel: Path):
+def test_the_wheel_has_its_licence_and_its_command(wheel: Path):
     with zipfile.ZipFile(wheel) as archive:
         texts = {
             Path(name).name: archive.read(name).decode() for name in names_in(wheel) if "dist-info" in name

@@ -492,7 +492,8 @@ def test_exceptions_with_their_bases():
     found = {
         name: [base.__name__ for base in kind.__mro__[1:-1] if not base.__name__.startswith("_")]
         for name in dir(zstate.errors)
-        if isinstance(kind := getattr(zstate.errors, name), type)
+        if not name.startswith("_")
+        and isinstance(kind := getattr(zstate.errors, name), type)
         and issubclass(kind, zstate.errors.ZStateError)
     }
     check_pin("exceptions", found)

@@ -17,7 +17,7 @@ def test_a_rate_that_cannot_be_kept_is_refused_with_its_value(rate_hz: float):
 
 
 @pytest.mark.parametrize("rate_hz", [1e-3, 1, 10_000.0])
-def test_a_rate_between_nothing_and_ten_kilohertz_is_taken(rate_hz: float):
+def test_a_rate_between_zero_and_ten_kilohertz_is_accepted(rate_hz: float):
     assert check_rate(rate_hz) == rate_hz
 
 
@@ -37,7 +37,7 @@ def test_the_kth_tick_is_k_periods_after_the_first_to_the_nanosecond(rate_hz: fl
     assert (rate.report().ticks, rate.report().skipped) == (len(stamps), 0)
 
 
-def test_lateness_is_not_handed_on():
+def test_a_late_tick_does_not_delay_the_next():
     late = 30_000_000
     clock = Stepping(0, lateness={2: late})
     stamps = list(Rate(100.0, clock, threading.Event(), 0.08))
@@ -55,7 +55,7 @@ def test_after_a_long_delay_the_ticks_that_passed_are_skipped_and_counted():
     assert (rate.report().ticks, rate.report().skipped) == (20, 10)
 
 
-def test_ticks_and_skipped_ticks_are_all_there_were_to_be():
+def test_ticks_and_skipped_ticks_add_up():
     rate = Rate(10.0, Stepping(0, lateness={1: 100 * SECOND}), threading.Event(), 3.0)
     list(rate)
     assert rate.report().ticks + rate.report().skipped == 30
@@ -72,7 +72,7 @@ def test_a_clock_that_is_set_back_is_followed_at_the_same_rate():
     assert stamps[3:] == [400 * SECOND + tick * period for tick in range(1, 8)]
 
 
-def test_stop_ends_it_and_the_report_tells_what_was_done():
+def test_stop_ends_the_rate_and_the_report_has_its_ticks():
     stop = threading.Event()
     rate = Rate(10.0, Stepping(), stop)
     for number, _ in enumerate(rate, 1):
@@ -81,7 +81,7 @@ def test_stop_ends_it_and_the_report_tells_what_was_done():
     assert rate.report().ticks == 4
 
 
-def test_a_report_before_the_second_tick_claims_no_rate():
+def test_a_report_before_the_second_tick_has_rate_zero():
     rate = Rate(10.0, Stepping(), threading.Event(), 0.1)
     assert rate.report().rate_hz == 0.0
     list(rate)

@@ -67,7 +67,7 @@ def test_rpy_and_matrix_of_a_quaternion_lead_back_to_the_same_turn(q) -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_at_a_pitch_of_a_right_angle_all_of_the_turn_is_yaw(sign: float) -> None:
+def test_at_a_pitch_of_a_right_angle_roll_is_zero(sign: float) -> None:
     q = se3.quaternion_from_rpy(0.25, sign * math.pi / 2, 0.5)
     roll, pitch, yaw = se3.rpy_from_quaternion(q)
     assert roll == 0.0
@@ -109,7 +109,7 @@ def test_slerp_keeps_the_smallest_turns(exponent) -> None:
 
 
 @given(poses, poses, ratios)
-def test_slerp_takes_no_notice_of_the_sign_of_a_quaternion(first, second, ratio) -> None:
+def test_slerp_ignores_the_sign_of_a_quaternion(first, second, ratio) -> None:
     opposite = (*second[:3], *(-value for value in second[3:]))
     a = se3.interpolate(first, second, ratio, se3.SCALARS)
     b = se3.interpolate(first, opposite, ratio, se3.SCALARS)
@@ -117,7 +117,7 @@ def test_slerp_takes_no_notice_of_the_sign_of_a_quaternion(first, second, ratio)
         np.testing.assert_allclose(matrix_of(a[3:]), matrix_of(b[3:]), atol=1e-9)
 
 
-def test_at_exactly_half_a_turn_the_quaternion_is_taken_as_given() -> None:
+def test_at_exactly_half_a_turn_the_quaternion_keeps_its_sign() -> None:
     for axis in (1.0, -1.0):
         between = se3.interpolate(se3.IDENTITY, (0, 0, 0, 0, 0, axis, 0), 0.5, se3.SCALARS)
         np.testing.assert_allclose(between[3:], (0, 0, axis * math.sqrt(0.5), math.sqrt(0.5)), atol=1e-15)

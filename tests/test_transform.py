@@ -46,7 +46,7 @@ def test_composition_is_associative(a_from_b: Transform, b_from_c: Transform, c_
 
 
 @given(transforms("a", "b"), st.tuples(numbers, numbers, numbers))
-def test_points_of_the_source_come_out_in_the_target(a_from_b: Transform, p_b) -> None:
+def test_points_are_mapped_from_source_to_target(a_from_b: Transform, p_b) -> None:
     expected = (a_from_b.matrix @ (*p_b, 1.0))[:3]
     np.testing.assert_allclose(a_from_b.apply(p_b), expected, atol=1e-12)
     np.testing.assert_allclose(a_from_b.apply([p_b, p_b])[1], expected, atol=1e-12)
@@ -92,12 +92,12 @@ def test_products_with_points_associate() -> None:
 @pytest.mark.parametrize(
     "points", [np.eye(4), [1.0, 2.0, 3.0, 1.0], np.float64(3), [[1j, 0, 0]], ["1", "2", "3"]]
 )
-def test_what_are_no_points_is_no_factor(points) -> None:
+def test_values_that_are_not_points_are_no_factor(points) -> None:
     with pytest.raises(InvalidInput, match="points"):
         _ = Transform("a", "b", (0, 0, 0), TURN) @ points
 
 
-def test_a_transform_is_no_right_factor_of_an_array_and_has_none_that_is_no_array() -> None:
+def test_an_array_as_left_factor_and_other_types_as_factor_are_refused() -> None:
     a_from_b = Transform("a", "b", (0, 0, 0), TURN)
     for left, right in ((np.eye(3), a_from_b), (a_from_b, "xyz"), (a_from_b, None), (a_from_b, 5)):
         with pytest.raises(TypeError):
@@ -113,7 +113,7 @@ def test_a_product_and_an_inverse_that_are_not_finite_are_refused() -> None:
         turned.inverse()
 
 
-def test_angles_beyond_a_full_turn_ask_for_degrees_and_say_what_they_are_in_radians() -> None:
+def test_angles_beyond_a_full_turn_are_refused_with_their_value_in_radians() -> None:
     with pytest.raises(
         InvalidInput, match=r"got 0, -90, 0\. If these are degrees, they are 0, -1\.5708, 0 rad"
     ):
@@ -149,7 +149,7 @@ def test_a_product_is_of_the_less_certain_kind() -> None:
     assert (exact @ predicted).kind == "predicted"
 
 
-def test_what_has_no_stamp_is_static_and_what_has_one_exact() -> None:
+def test_a_transform_without_stamp_is_static_and_with_stamp_exact() -> None:
     assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1)).kind == "static"
     assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 0).kind == "exact"
 
@@ -191,7 +191,7 @@ def test_nan_and_infinity_are_refused_in_each_number(place: int, value: float) -
 
 
 @pytest.mark.parametrize("pose7", [[0.0] * 6, [[0.0] * 7], "not a pose", ["x"] * 7, None])
-def test_what_is_no_seven_numbers_is_refused(pose7) -> None:
+def test_a_pose_that_is_not_seven_numbers_is_refused(pose7) -> None:
     with pytest.raises(InvalidInput):
         Transform.from_pose7("a", "b", pose7)
 
@@ -206,12 +206,12 @@ def test_what_is_no_seven_numbers_is_refused(pose7) -> None:
         np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * 1e-3,
     ],
 )
-def test_what_is_no_homogeneous_matrix_is_refused(matrix) -> None:
+def test_a_matrix_that_is_not_homogeneous_is_refused(matrix) -> None:
     with pytest.raises(InvalidInput):
         Transform.from_matrix("a", "b", matrix)
 
 
-def test_shapes_stamps_and_kinds_that_cannot_be_are_refused() -> None:
+def test_invalid_shapes_stamps_and_kinds_are_refused() -> None:
     with pytest.raises(InvalidInput, match="shapes"):
         Transform("a", "b", (0, 0), (0, 0, 0, 1))
     with pytest.raises(InvalidInput, match="rpy"):
@@ -236,7 +236,7 @@ def test_a_transform_cannot_be_changed_not_even_through_its_arrays() -> None:
             array[0] = 9.0
 
 
-def test_equality_knows_that_q_and_minus_q_are_one_turn() -> None:
+def test_q_and_minus_q_are_equal() -> None:
     transform = Transform("a", "b", (1, 2, 3), TURN, 5)
     opposite = Transform("a", "b", (1, 2, 3), np.negative(TURN), 5)
     assert transform == opposite
@@ -271,13 +271,13 @@ def test_a_transform_survives_json_and_pickle() -> None:
         Transform.from_dict({"source": "b"})
 
 
-def test_age_is_counted_by_the_clock_given_and_static_never_ages() -> None:
+def test_age_is_measured_by_the_clock_and_is_zero_if_static() -> None:
     clock = ManualClock(3_500_000_000)
     assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1), 1_000_000_000).age(clock) == 2.5
     assert Transform("a", "b", (0, 0, 0), (0, 0, 0, 1)).age(clock) == 0.0
 
 
-def test_a_twist_says_whose_motion_it_is_and_in_whose_axes() -> None:
+def test_a_twist_names_its_frame_and_its_axes() -> None:
     twist = Twist("hand", "map", (1, 2, 3), (4, 5, 6), None)
     assert (twist.about, twist.expressed_in) == ("hand", "map")
     assert repr(twist).startswith("<twist of hand in map: linear [1.0000, 2.0000, 3.0000] m/s")

@@ -1,10 +1,10 @@
-"""A robot's state wherever Zenoh reaches: joint states, transforms, and a buffer that answers.
+"""Robot state over Zenoh: joint states, transforms, and a time-indexed transform buffer.
 
 ``lookup("a", "b")`` is ``a_from_b``: the pose of frame b in frame a, which also maps coordinates in b
 into a. Quaternions are x y z w, units are SI, stamps are integer nanoseconds since the Unix epoch.
 
-Names are loaded when they are first used: a program that only reads transforms loads no kinematics.
-``zstate.errors`` has every exception; those that programs catch most stand here, too.
+Names are loaded at their first use: a program that only reads transforms loads no kinematics.
+``zstate.errors`` has every exception; the most common ones are also here.
 """
 
 from __future__ import annotations

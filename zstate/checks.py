@@ -1,7 +1,7 @@
-"""Checks of arguments: what is no frame name and what are no real numbers is refused where it comes in.
+"""Checks of arguments: frame names and arrays of real numbers.
 
-numpy converts a good deal that is not meant: a string of digits is parsed, the imaginary part of a complex
-number is dropped, and so is the mask of a masked array. A silent conversion of a pose is a wrong pose.
+numpy converts silently: it parses a string of digits, and drops the imaginary part of a complex number and
+the mask of a masked array. A silent conversion of a pose is a wrong pose.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _KINDS = {
 
 
 def name_problem(name: object) -> str:
-    """Why ``name`` cannot be the name of a frame; empty if it can."""
+    """The reason why ``name`` cannot be a frame name; empty if it can."""
     if not isinstance(name, str):
         return f"a frame name is text; got {name!r} of type {type(name).__name__}"
     if not name:
@@ -36,7 +36,7 @@ def name_problem(name: object) -> str:
 
 
 def check_names(*names: object) -> None:
-    """Raises InvalidInput for what cannot be a frame name: anything but text, "", a leading slash."""
+    """Raises InvalidInput unless each name is a non-empty str without a leading slash."""
     for name in names:
         if problem := name_problem(name):
             raise InvalidInput(problem)
@@ -61,6 +61,6 @@ def real_numbers(values: ArrayLike, what: str) -> NDArray[np.float64]:
 
 
 def is_masked(values: object) -> bool:
-    """Whether it is a masked array of numpy, whose numbers are not all meant."""
-    # numpy.ma itself is not imported for this: it takes a hundredth of a second.
+    """Whether ``values`` is a masked array of numpy."""
+    # Without importing numpy.ma, which takes 10 ms.
     return hasattr(values, "mask") and isinstance(values, np.ndarray)

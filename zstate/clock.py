@@ -1,6 +1,6 @@
-"""Where "now" comes from: the system, a simulation, or the hand of a test.
+"""Clocks (system, simulated, manual) and checks of stamps.
 
-Nothing in ``model``, ``buffer`` or ``wire`` reads a clock by itself; it is handed one of these.
+``model``, ``buffer`` and ``wire`` never read the system clock; callers pass them a clock.
 """
 
 from __future__ import annotations
@@ -17,36 +17,35 @@ from zstate.errors import InvalidInput
 
 _STAMP_RANGE = 2**63
 
-# A signal that arrives just as a lock is being waited for is not seen before that wait ends.
+# A signal that arrives as a thread starts to wait for a lock is handled only after that wait.
 LONGEST_WAIT_S = 0.5
 
 SYSTEM = "system"
-"""The domain of real time, which all machines share as far as their clocks agree."""
+"""The domain of real time, shared by all machines whose clocks agree."""
 
 SIMULATED = "sim"
-"""The domain of the time that a simulation or a replay tells."""
+"""The domain of the time of a simulation or a playback."""
 
 SET_BACK_NS = 100_000_000
-"""The clock of a writer was set back if the next samples are stamped by more before those it sent earlier."""
+"""Samples older than their predecessors by more than this mean that the writer's clock was set back."""
 
 
 class ClockOffset(NamedTuple):
-    """How far another clock is ahead of this host's, and the uncertainty of that [ns]."""
+    """Offset of another clock ahead of this host's, and its uncertainty [ns]."""
 
     offset_ns: int
     uncertainty_ns: int
 
 
 class Clock(Protocol):
-    """Two questions about time. Stamps are integer nanoseconds since the Unix epoch.
+    """Source of the present time. Stamps are integer nanoseconds since the Unix epoch.
 
-    Stamps of one ``domain`` may be compared, those of two say nothing of each other: it is "system", or
-    the name of a simulated time.
+    Only stamps of the same ``domain`` may be compared: "system", or the name of a simulated time.
     """
 
     @property
     def domain(self) -> str:
-        """Whose time it tells."""
+        """The clock domain."""
         ...
 
     def now(self) -> int:
@@ -56,7 +55,7 @@ class Clock(Protocol):
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
         """Block until ``stamp``, or until ``stop`` is set. True when the stamp was reached.
 
-        A clock that is set back may end the wait, with True, before that: ask it for the time.
+        If the clock is set back, the wait may end with True before the stamp: check ``now()``.
         """
         ...
 
@@ -75,7 +74,7 @@ class SystemClock:
 
 
 class ManualClock:
-    """A clock that moves only when told to, for tests and for replay by hand."""
+    """A clock that is set by its owner, for tests and manual playback."""
 
     def __init__(self, start: int = 0, domain: str = SYSTEM) -> None:
         self.domain = domain
@@ -86,7 +85,7 @@ class ManualClock:
         return self._now
 
     def set(self, stamp: int) -> None:
-        """Jump to ``stamp``, forwards or backwards, and wake whoever waits for it."""
+        """Jump to ``stamp``, forwards or backwards, and wake all waiting threads."""
         with self._moved:
             self._now = stamp
             self._moved.notify_all()
@@ -97,14 +96,14 @@ class ManualClock:
 
     def wait_until(self, stamp: int, stop: threading.Event) -> bool:
         with self._moved:
-            # ``stop`` cannot notify this condition, so it is looked at every 50 ms of real time.
+            # ``stop`` cannot notify this condition, so it is checked every 50 ms of real time.
             while self._now < stamp and not stop.is_set():
                 self._moved.wait(0.05)
         return not stop.is_set()
 
 
 def wait_interruptible(event: threading.Event, timeout_s: float | None = None) -> bool:
-    """``event.wait(timeout_s)`` that Ctrl-C ends within half a second, whenever it comes."""
+    """``event.wait(timeout_s)`` that Ctrl-C always ends within half a second."""
     deadline = None if timeout_s is None else time.monotonic() + timeout_s
     while True:
         left_s = LONGEST_WAIT_S if deadline is None else deadline - time.monotonic()
@@ -115,9 +114,9 @@ def wait_interruptible(event: threading.Event, timeout_s: float | None = None) -
 
 
 def check_stamp(stamp: Any) -> int:
-    """A stamp as an int; integers and datetime64[ns] of numpy are welcome.
+    """A stamp as an int, from an int or numpy's integers and datetime64[ns].
 
-    Floats are not: they lose nanoseconds.
+    Raises InvalidInput for other types; floats would lose nanoseconds.
     """
     if type(stamp) is int and -_STAMP_RANGE <= stamp < _STAMP_RANGE:
         return stamp
@@ -127,7 +126,7 @@ def check_stamp(stamp: Any) -> int:
         return int(check_stamps(np.atleast_1d(cast("np.datetime64[Any]", stamp)))[0])
     raise InvalidInput(
         f"a stamp is a 64-bit integer count of nanoseconds since the Unix epoch, not {stamp!r}; "
-        "use time.time_ns(), or round(seconds * 1e9) when seconds is all there is"
+        "use time.time_ns(), or round(seconds * 1e9) if only seconds are known"
     )
 
 
@@ -141,7 +140,15 @@ def check_stamps(stamps: ArrayLike) -> NDArray[np.int64]:
     except (TypeError, ValueError) as error:
         raise InvalidInput(f"stamps are a flat array of integer nanoseconds: {error}") from None
     if array.dtype.kind == "M":
-        return _stamps_from_dates(array)
+        unit, _ = np.datetime_data(array.dtype)
+        if array.ndim != 1 or array.dtype != np.dtype("datetime64[ns]"):
+            raise InvalidInput(
+                f"dates as stamps are a flat array of datetime64[ns]; got shape {array.shape} in units of "
+                f"{unit!r}: convert with .astype('datetime64[ns]')"
+            )
+        if np.isnat(array).any():
+            raise InvalidInput("a stamp is NaT, which is no instant")
+        return array.astype(np.int64)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu") or is_masked(stamps):
         raise InvalidInput(
             f"stamps are a flat array of integer nanoseconds, or of datetime64[ns]; got shape {array.shape} "
@@ -150,18 +157,6 @@ def check_stamps(stamps: ArrayLike) -> NDArray[np.int64]:
     if array.size and array.dtype.kind == "u" and int(array.max()) >= _STAMP_RANGE:
         raise InvalidInput(f"stamps must fit 64-bit signed integers; got {array.max()}")
     return array.astype(np.int64)
-
-
-def _stamps_from_dates(dates: NDArray[np.datetime64]) -> NDArray[np.int64]:
-    unit, _ = np.datetime_data(dates.dtype)
-    if dates.ndim != 1 or dates.dtype != np.dtype("datetime64[ns]"):
-        raise InvalidInput(
-            f"dates as stamps are a flat array of datetime64[ns]; got shape {dates.shape} in units of "
-            f"{unit!r}: convert with .astype('datetime64[ns]')"
-        )
-    if np.isnat(dates).any():
-        raise InvalidInput("a stamp is NaT, which is no instant")
-    return dates.astype(np.int64)
 
 
 def format_stamp(stamp: int) -> str:

@@ -1,7 +1,7 @@
-"""The optional C extension: whether it is used, and why not.
+"""Selection of the C extension or the reference in Python.
 
-``ZSTATE_KERNEL=reference`` in the environment forces the reference in Python, ``ZSTATE_KERNEL=c`` refuses to
-do without the extension. Both give the same answers.
+``ZSTATE_KERNEL=reference`` in the environment forces the reference, ``ZSTATE_KERNEL=c`` is an error without
+the extension. Both give the same results.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from zstate.errors import InvalidInput
 
 VARIABLE = "ZSTATE_KERNEL"
 REVISION = 6
-"""What the extension's own REVISION has to be; see there."""
+"""The REVISION that the extension must have; see there."""
 
 
 class Kernel(str):
-    """Which kernel the buffer runs on, "c" or "reference"; ``reason`` says why."""
+    """Name of the kernel of the buffer, "c" or "reference"; ``reason`` explains the choice."""
 
     __slots__ = ("reason",)
 
@@ -29,29 +29,23 @@ class Kernel(str):
         return kernel
 
 
-def select_kernel(wish: str) -> Kernel:
-    """The kernel for what the environment wishes; raises InvalidInput where that cannot be."""
-    if wish not in ("", "c", "reference"):
-        raise InvalidInput(f"{VARIABLE} is 'c', 'reference' or not set; got {wish!r}")
-    if wish == "reference":
-        return Kernel("reference", f"{VARIABLE} asks for it")
-    problem = _problem()
-    if not problem:
-        return Kernel("c", "the extension is there")
-    if wish == "c":
-        raise InvalidInput(f"{VARIABLE} asks for 'c', but {problem}")
-    return Kernel("reference", problem)
-
-
-def _problem() -> str:
-    """Why the extension cannot be used; nothing when it can."""
+def select_kernel(setting: str) -> Kernel:
+    """The kernel for a value of ``ZSTATE_KERNEL``. Raises InvalidInput for another value, or without it."""
+    if setting not in ("", "c", "reference"):
+        raise InvalidInput(f"{VARIABLE} is 'c', 'reference' or not set; got {setting!r}")
+    if setting == "reference":
+        return Kernel("reference", f"{VARIABLE} selects it")
     try:
         from zstate import _kernel  # noqa: PLC0415 - it may be missing
     except ImportError as error:
-        return f"the extension cannot be loaded ({error}); installing zstate with a C compiler builds it"
-    if _kernel.REVISION != REVISION:
-        return f"the extension is of revision {_kernel.REVISION}, not {REVISION}; install zstate again"
-    return ""
+        problem = f"the extension cannot be loaded ({error}); installing zstate with a C compiler builds it"
+    else:
+        if _kernel.REVISION == REVISION:
+            return Kernel("c", "the extension is installed")
+        problem = f"the extension is of revision {_kernel.REVISION}, not {REVISION}; install zstate again"
+    if setting == "c":
+        raise InvalidInput(f"{VARIABLE} selects 'c', but {problem}")
+    return Kernel("reference", problem)
 
 
 kernel = select_kernel(os.environ.get(VARIABLE, ""))

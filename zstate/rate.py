@@ -1,4 +1,4 @@
-"""Exact rates: absolute deadlines, so that no tick's lateness is handed on to the next."""
+"""Rate with absolute deadlines: a late tick does not delay the following ones."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from zstate.errors import InvalidInput
 
 @dataclass(frozen=True, slots=True)
 class RateReport:
-    """What became of a commanded rate.
+    """Statistics of a Rate.
 
-    ``rate_hz`` is what was achieved: the ticks after the first, over the time between the first and
-    the last. ``skipped`` counts ticks that were given up after a long delay, ``late`` those that began
-    more than a period after they were due.
+    ``rate_hz`` is the achieved rate: the ticks after the first, over the time between the first and
+    the last. ``skipped`` counts ticks that were dropped after a long delay, ``late`` the ticks that started
+    more than a period after their deadline.
     """
 
     commanded_hz: float
@@ -27,22 +27,21 @@ class RateReport:
     late: int
 
 
-# A busy machine holds a process up for some milliseconds now and then; that is made up for. After a
-# longer pause (a debugger, a suspended laptop) a burst of old ticks would help nobody.
+# Delays of some milliseconds on a busy machine are made up for. After a longer pause (a debugger, a
+# suspended laptop) a burst of old ticks would be useless.
 _LONGEST_DELAY_NS = 100_000_000
 
-# A simulated time comes in steps, which are long when it runs fast.
+# Simulated time advances in steps, which are long if it runs fast.
 _LONGEST_STEP_NS = 1_000_000_000
 
 
 class Rate:
     """Iterate to get the stamp [ns] of each tick; the k-th deadline is ``start + k / rate_hz``.
 
-    Of simulated time, which comes in steps, a tick's stamp is its deadline, and 1 s is a long delay.
-
     Late ticks follow at once, so the rate stays exact; after a delay of more than 0.1 s the deadlines
-    that passed meanwhile are skipped and counted. A clock that is set back is followed. Ends when
-    ``stop`` is set, or after ``seconds``.
+    in the past are skipped and counted. Simulated time advances in steps: there a tick's stamp is its
+    deadline, and only more than 1 s counts as a long delay. If the clock is set back, the deadlines move
+    with it. Ends when ``stop`` is set, or after ``seconds``.
     """
 
     def __init__(
@@ -52,7 +51,7 @@ class Rate:
         self._period_ns = 1e9 / rate_hz
         if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
             raise InvalidInput(f"seconds is a positive number, or None for ever; got {seconds!r}")
-        self._ticks_wanted = math.inf if seconds is None else max(1, round(seconds * rate_hz))
+        self._max_ticks = math.inf if seconds is None else max(1, round(seconds * rate_hz))
         self._clock = clock
         self._is_stepping = clock.domain != SYSTEM
         self._longest_delay_ns = _LONGEST_STEP_NS if self._is_stepping else _LONGEST_DELAY_NS
@@ -66,7 +65,7 @@ class Rate:
     def __iter__(self) -> Iterator[int]:
         start = self._clock.now()
         tick = 0
-        while tick < self._ticks_wanted:
+        while tick < self._max_ticks:
             # No deadline is further away than one period, unless the clock was set back.
             set_back = start + round((tick - 1) * 1e9 / self.rate_hz) - self._clock.now()
             if set_back > _LONGEST_DELAY_NS:
@@ -77,7 +76,7 @@ class Rate:
             now = self._clock.now()
             self._late += now - deadline > self._period_ns
             if now - deadline > self._longest_delay_ns:
-                due = int(min((now - start) * self.rate_hz / 1e9, self._ticks_wanted - 1))
+                due = int(min((now - start) * self.rate_hz / 1e9, self._max_ticks - 1))
                 self._skipped += due - tick
                 tick = due
                 deadline = start + round(tick * 1e9 / self.rate_hz)
@@ -90,14 +89,14 @@ class Rate:
             tick += 1
 
     def report(self) -> RateReport:
-        """How it went so far."""
+        """Statistics so far."""
         span_ns = 0 if self._first is None else self._last - self._first
         achieved = (self._ticks - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
         return RateReport(self.rate_hz, achieved, self._ticks, self._skipped, self._late)
 
 
 def check_rate(rate_hz: float) -> float:
-    """A rate that can be kept: above 0, at most 10 kHz. Raises InvalidInput."""
+    """``rate_hz``. Raises InvalidInput unless it is above 0 and at most 10 kHz."""
     if not (math.isfinite(rate_hz) and 0.0 < rate_hz <= 10_000.0):
         raise InvalidInput(f"a rate is above 0 and at most 10000 Hz; got {rate_hz!r}")
     return rate_hz

@@ -1,8 +1,8 @@
-"""Rigid motions, number by number: the one place where poses are multiplied.
+"""Arithmetic of rigid motions, for single poses and for arrays of poses.
 
-A pose is seven components x y z qx qy qz qw; a component is a float, or an array of them when many
-poses are handled at once. Every function works on both, because ``+ - *`` do. Where a function of
-``math`` or ``numpy`` is needed, the caller hands in ``SCALARS`` or ``ARRAYS``.
+A pose is seven components x y z qx qy qz qw; a component is a float, or an array of them for many
+poses at once. Every function works on both, because ``+ - *`` do. Functions that need sin, cos, sqrt,
+atan2 or a selection have a parameter for it, ``SCALARS`` or ``ARRAYS``.
 
 Formulas: unit quaternions act as ``R(q) p = p + 2 w (u x p) + 2 u x (u x p)`` with u = (qx, qy, qz).
 """
@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Floats or arrays of one shape: what cannot be said more exactly without writing everything twice.
+# Floats or arrays of one shape; exact types would need every function twice.
 Component: TypeAlias = Any
 Vector: TypeAlias = tuple[Component, Component, Component]
 Quaternion: TypeAlias = tuple[Component, Component, Component, Component]
@@ -28,7 +28,7 @@ IDENTITY: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """What arithmetic alone cannot do. ``select(condition, a, b)`` evaluates both a and b."""
+    """Functions beyond arithmetic. ``select(condition, a, b)`` evaluates both a and b."""
 
     sin: Any
     cos: Any
@@ -49,7 +49,7 @@ def _cos(angle: float) -> float:
     return math.cos(angle) if math.isfinite(angle) else math.nan
 
 
-# ``math`` raises ValueError for infinite angles, where numpy and C answer NaN.
+# ``math`` raises ValueError for infinite angles; numpy and C return NaN.
 SCALARS = Backend(_sin, _cos, math.sqrt, math.atan2, _select)
 ARRAYS = Backend(np.sin, np.cos, np.sqrt, np.arctan2, np.where)
 
@@ -84,7 +84,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """The opposite turn of a unit quaternion."""
+    """The inverse of a unit quaternion."""
     return (-q[0], -q[1], -q[2], q[3])
 
 
@@ -104,7 +104,7 @@ def invert(a_from_b: Pose) -> Pose:
 
 
 def normalize(pose: Pose, f: Backend) -> Pose:
-    """The same pose with a quaternion of length one."""
+    """The pose with its quaternion scaled to length one."""
     x, y, z, qx, qy, qz, qw = pose
     scale = 1.0 / f.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     return (x, y, z, qx * scale, qy * scale, qz * scale, qw * scale)
@@ -184,7 +184,7 @@ def quaternion_from_matrix(rotation: NDArray[np.float64]) -> Quaternion:
 
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """URDF's angles: roll about x, then pitch about y, then yaw about z, all of the fixed axes."""
+    """From URDF's angles: roll about x, then pitch about y, then yaw about z, all of the fixed axes."""
     about_x = (math.sin(roll / 2.0), 0.0, 0.0, math.cos(roll / 2.0))
     about_y = (0.0, math.sin(pitch / 2.0), 0.0, math.cos(pitch / 2.0))
     about_z = (0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))
@@ -192,7 +192,7 @@ def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def rpy_from_quaternion(q: Quaternion) -> tuple[float, float, float]:
-    """Roll, pitch, yaw as in URDF. At a pitch of a right angle all of the turn is given to yaw."""
+    """Roll, pitch, yaw as in URDF. At a pitch of a right angle roll is 0."""
     m00, m10, m20 = rotate(q, (1.0, 0.0, 0.0))
     m01, m11, m21 = rotate(q, (0.0, 1.0, 0.0))
     _, _, m22 = rotate(q, (0.0, 0.0, 1.0))

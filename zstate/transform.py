@@ -23,22 +23,22 @@ Array: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["static", "exact", "interpolated", "predicted"]
 F = TypeVar("F", bound="TransformFields")
 
-# A path is as good as its least certain part: the later kind wins.
+# By decreasing certainty: the kind of a product is the later one of its factors.
 KINDS: tuple[Kind, ...] = ("static", "exact", "interpolated", "predicted")
 
-# Quaternions this far from length one are normalised; beyond, something is wrong with the writer.
+# Quaternions within this distance of length one are normalised; others are refused.
 QUATERNION_TOLERANCE = 1e-3
 
 
 def combine_kinds(*kinds: Kind) -> Kind:
-    """The kind of an answer that is made of parts of these kinds."""
+    """The kind of a product of transforms of these kinds."""
     return KINDS[max(map(KINDS.index, kinds))]
 
 
 def check_pose(numbers: ArrayLike, what: str = "a pose") -> tuple[float, ...]:
     """x y z qx qy qz qw as seven finite floats with a quaternion of length one.
 
-    Lengths within 1e-3 of one are normalised. Raises InvalidInput saying which number is at fault.
+    Lengths within 1e-3 of one are normalised. Raises InvalidInput for others.
     """
     array = real_numbers(numbers, what)
     if array.shape != (7,):
@@ -94,7 +94,7 @@ if TYPE_CHECKING or kernel == "reference":
             kind: Kind,
             predicted_s: float = 0.0,
         ) -> F:
-            """From seven floats that are known to be a pose: for the buffer, which checked at insert."""
+            """From seven floats without a check: for the buffer, which checked them at insert."""
             fields = cls.__new__(cls)
             fields._fill(target, source, pose, stamp, kind, predicted_s)
             return fields
@@ -107,16 +107,15 @@ class Transform(TransformFields):
     """The pose of frame ``source`` in frame ``target``, at one instant or for ever.
 
     ``translation`` is x y z [m] in target axes, ``rotation`` the unit quaternion x y z w, ``stamp``
-    nanoseconds since the Unix epoch or None for what holds at any time. ``kind`` tells how a buffer
-    made it: "static", "exact", "interpolated" or "predicted", the last ``predicted_s`` seconds beyond
-    the newest sample. Immutable, and so are its arrays. Raises InvalidInput for numbers that are no pose
-    and for names that are no frame names.
+    nanoseconds since the Unix epoch or None if it holds at any time. ``kind`` is "static", "exact",
+    "interpolated" or "predicted", the last ``predicted_s`` seconds beyond the newest sample. Immutable,
+    and so are its arrays. Raises InvalidInput if the numbers are not a pose or a name is not a frame name.
 
     ``transform @ points`` is ``apply``: ``p_a = a_from_b @ p_b``.
     """
 
     __slots__ = ()
-    # numpy must not take ``transform @ array`` for a product of matrices.
+    # Prevents numpy from computing ``transform @ array`` as a matrix product.
     __array_ufunc__ = None
 
     def __init__(
@@ -180,10 +179,10 @@ class Transform(TransformFields):
         if angles.shape != (3,) or not np.isfinite(angles).all():
             raise InvalidInput(f"rpy is three finite angles [rad]; got {angles!r}")
         if np.abs(angles).max() > math.tau:
-            given = ", ".join(f"{angle:g}" for angle in angles.tolist())
+            degrees = ", ".join(f"{angle:g}" for angle in angles.tolist())
             radians = ", ".join(f"{angle:.6g}" for angle in np.radians(angles).tolist())
             raise InvalidInput(
-                f"rpy is three angles in radians, none beyond 2 pi; got {given}. If these are degrees, "
+                f"rpy is three angles in radians, none beyond 2 pi; got {degrees}. If these are degrees, "
                 f"they are {radians} rad"
             )
         return cls(target, source, translation, se3.quaternion_from_rpy(*angles.tolist()), stamp)
@@ -235,8 +234,8 @@ class Transform(TransformFields):
     def __matmul__(self, other: Transform | ArrayLike) -> Transform | Array:
         """``a_from_b @ b_from_c`` is a_from_c, and ``a_from_b @ p_b`` is p_a: points (3,) or (..., 3).
 
-        FrameMismatch when the inner frames differ. The stamp is the one both share or the only one there
-        is; of two instants, None.
+        Raises FrameMismatch if the inner frames differ. The stamp is the common or the only one; None
+        for two different stamps.
         """
         if not isinstance(other, Transform):
             return self._apply_to_points(other)
@@ -263,10 +262,10 @@ class Transform(TransformFields):
             return NotImplemented
         array = real_numbers(cast("ArrayLike", points), "points")
         if array.ndim == 0 or array.shape[-1] != 3:
-            # Four columns could be homogeneous points, each in a row, or a matrix.
+            # Four columns could be homogeneous points or a matrix.
             raise InvalidInput(
-                f"transform @ points takes points of shape (3,) or (N, 3); got shape {array.shape}. Of "
-                "homogeneous points use transform.apply(points), of a matrix transform.matrix @ matrix"
+                f"transform @ points takes points of shape (3,) or (N, 3); got shape {array.shape}. For "
+                "homogeneous points use transform.apply(points), for a matrix transform.matrix @ matrix"
             )
         return self.apply(array)
 
@@ -297,7 +296,7 @@ class Transform(TransformFields):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Transform:
-        """What ``to_dict`` gave, checked as the constructor checks."""
+        """From the result of ``to_dict``, with the checks of the constructor."""
         names = ("target", "source", "translation", "rotation", "stamp")
         missing = [name for name in names if name not in values]
         if missing:
@@ -309,7 +308,7 @@ class Transform(TransformFields):
         return (Transform.trusted, fields)
 
     def __eq__(self, other: object) -> bool:
-        """The same frames, instant and motion; q and -q are the same turn."""
+        """The same frames, instant and motion; q and -q are the same rotation."""
         if not isinstance(other, Transform):
             return NotImplemented
         mine, theirs = self._pose, other._pose
@@ -333,7 +332,7 @@ class Transform(TransformFields):
 
 
 def _frozen(numbers: Sequence[float]) -> Array:
-    """A copy that cannot be written to, as that would change nothing."""
+    """A read-only copy, because writing to it would not change the transform."""
     array = np.array(numbers)
     array.flags.writeable = False
     return array

@@ -16,21 +16,21 @@ def idle(_: float) -> float:
 
 
 def test_items_are_passed_on_in_order_from_one_thread():
-    heard: list[tuple[int, int]] = []
-    with CallbackThread[int](lambda one: heard.append((one, threading.get_ident())), idle) as thread:
+    received: list[tuple[int, int]] = []
+    with CallbackThread[int](lambda one: received.append((one, threading.get_ident())), idle) as thread:
         for number in range(100):
             thread.submit(number)
-        until(lambda: len(heard) == 100)
-    assert [one for one, _ in heard] == list(range(100))
-    assert len({ident for _, ident in heard} - {threading.get_ident()}) == 1
+        until(lambda: len(received) == 100)
+    assert [one for one, _ in received] == list(range(100))
+    assert len({ident for _, ident in received} - {threading.get_ident()}) == 1
 
 
 def test_a_slow_callback_blocks_no_caller_and_drops_the_oldest_items():
     begun, go_on = threading.Event(), threading.Event()
-    heard: list[int] = []
+    received: list[int] = []
 
     def slow(one: int) -> None:
-        heard.append(one)
+        received.append(one)
         begun.set()
         go_on.wait(10.0)
 
@@ -40,8 +40,8 @@ def test_a_slow_callback_blocks_no_caller_and_drops_the_oldest_items():
         for number in range(QUEUE_SIZE + 5):
             thread.submit(number)
         go_on.set()
-        until(lambda: len(heard) == 1 + QUEUE_SIZE)
-    assert heard[1:] == list(range(5, QUEUE_SIZE + 5))
+        until(lambda: len(received) == 1 + QUEUE_SIZE)
+    assert received[1:] == list(range(5, QUEUE_SIZE + 5))
 
 
 def test_exceptions_are_counted_and_the_first_goes_to_excepthook(monkeypatch: pytest.MonkeyPatch):
@@ -60,7 +60,7 @@ def test_exceptions_are_counted_and_the_first_goes_to_excepthook(monkeypatch: py
 
 def test_tick_is_called_when_due_and_may_submit_items():
     looked: list[float] = []
-    heard: list[int] = []
+    received: list[int] = []
 
     def look(now: float) -> float:
         looked.append(now)
@@ -68,9 +68,9 @@ def test_tick_is_called_when_due_and_may_submit_items():
         return now + 0.05
 
     opened = threading.Event()
-    with CallbackThread[int](heard.append, lambda now: look(now) if opened.is_set() else now) as thread:
+    with CallbackThread[int](received.append, lambda now: look(now) if opened.is_set() else now) as thread:
         opened.set()
-        until(lambda: len(heard) >= 3)
+        until(lambda: len(received) >= 3)
     assert len(looked) >= 3
 
 

@@ -37,7 +37,7 @@ TO_ROS, TO_NATIVE = "native to ROS", "ROS to native"
 
 @dataclass
 class World:
-    """Two networks and the bridges between them; ``changes`` is what those said."""
+    """Two networks and the bridges between them; ``changes`` has their ``on_change`` calls."""
 
     endpoint: str
     join: Callable[[str], Session]
@@ -45,8 +45,8 @@ class World:
     changes: list[tuple[str, str | None]] = field(default_factory=list)
 
     def bridge(self, *robots: str, wire: str = "ros2") -> Bridge:
-        said = lambda robot, way: self.changes.append((robot, way))  # noqa: E731
-        return self.open(self.join("native"), self.join("ros2"), wire, robots or None, on_change=said)
+        on_change = lambda robot, way: self.changes.append((robot, way))  # noqa: E731
+        return self.open(self.join("native"), self.join("ros2"), wire, robots or None, on_change=on_change)
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def world() -> Iterator[World]:
 
 @pytest.fixture(params=["native", "ros2"])
 def here(request: pytest.FixtureRequest) -> str:
-    """The wire on which the robot is written."""
+    """The wire on which the robot is published."""
     return request.param
 
 
@@ -90,7 +90,7 @@ def publish_until(publisher: StatePublisher, arrived: Callable[[], object]) -> N
 
 
 class Ear:
-    """Counts what is heard of a robot's joint states, by stamp."""
+    """Counts received joint states of a robot by stamp."""
 
     def __init__(self, session: Session, robot: str, wire: str) -> None:
         self.stamps: Counter[int] = Counter()
@@ -108,7 +108,7 @@ class Ear:
         self._subscriber.close()
 
 
-def hears(listener: TransformListener, stamp: int | None = None) -> bool:
+def receives(listener: TransformListener, stamp: int | None = None) -> bool:
     return listener.buffer.can_lookup("world", "tool", stamp)
 
 
@@ -129,9 +129,9 @@ def test_a_robot_is_carried_bit_for_bit_with_its_stamps(world, here, there):
         TransformListener(world.join(here), "r1", wire=here) as original,
         TransformListener(world.join(there), "r1", wire=there) as carried,
     ):
-        publish_until(publisher, lambda: hears(original) and hears(carried))
+        publish_until(publisher, lambda: receives(original) and receives(carried))
         publish(publisher)
-        until(lambda: hears(original, STAMPS[-1]) and hears(carried, STAMPS[-1]))
+        until(lambda: receives(original, STAMPS[-1]) and receives(carried, STAMPS[-1]))
         for stamp in [*STAMPS, STAMP + 5_000_001]:
             one, other = (side.buffer.lookup("world", "tool", stamp) for side in (original, carried))
             assert one.pose7.tobytes() == other.pose7.tobytes()
@@ -155,7 +155,7 @@ def test_every_number_of_a_joint_state_is_carried(world, here, there):
         assert carried.efforts.tolist() == EFFORTS
 
 
-def test_who_joins_late_is_given_the_model_and_the_fixed_edges(world, here, there):
+def test_late_joiners_receive_the_model_and_the_fixed_edges(world, here, there):
     with StatePublisher(world.join(here), RRBOT, "r1", (here,)):
         world.bridge("r1")
         until(lambda: world.changes)
@@ -163,7 +163,7 @@ def test_who_joins_late_is_given_the_model_and_the_fixed_edges(world, here, ther
             until(lambda: listener.buffer.can_lookup("tool", "camera_link"))
 
 
-def test_static_edges_of_others_are_carried_and_those_of_the_model_are_not_repeated(world, here, there):
+def test_other_static_edges_are_carried_and_edges_of_the_model_are_not_repeated(world, here, there):
     world.bridge("r1")
     hook = Transform("tool", "hook", (0.0, 0.125, 0.25), UPRIGHT)
     session = world.join(here)
@@ -183,7 +183,7 @@ def test_static_edges_of_others_are_carried_and_those_of_the_model_are_not_repea
         assert listener.stats.refused == {}
 
 
-def test_what_is_withdrawn_natively_is_withdrawn_on_ros_for_late_joiners(world):
+def test_a_native_withdrawal_reaches_late_joiners_in_ros(world):
     world.bridge("r1")
     session = world.join("native")
     with (
@@ -218,7 +218,7 @@ def test_another_model_replaces_the_first(world, here, there):
     assert world.changes[:2] == [("r1", way_of(here))] * 2
 
 
-def test_a_robot_that_is_gone_is_carried_no_more_and_its_return_is_a_new_beginning(world, here, there):
+def test_carrying_stops_with_the_robot_and_restarts_with_its_return(world, here, there):
     world.bridge("r1")
     session, other = world.join(here), world.join(there)
     with TransformListener(other, "r1", wire=there) as listener:
@@ -227,7 +227,7 @@ def test_a_robot_that_is_gone_is_carried_no_more_and_its_return_is_a_new_beginni
                 until(lambda: programs(other, there) == {bridge_on(there)})
                 # The second run begins at earlier stamps, as after a reset of simulated time.
                 stamp = STAMP - time * 3600 * 10**9
-                until(lambda s=stamp, p=publisher: publish(p, [s]) or hears(listener, s))
+                until(lambda s=stamp, p=publisher: publish(p, [s]) or receives(listener, s))
             until(lambda n=time: len(world.changes) == 2 * n)
             until(lambda: not programs(other, there))
         assert listener.buffer.latest("world", "tool") == STAMP - 2 * 3600 * 10**9
@@ -249,7 +249,7 @@ WRITER = """
 
 
 @pytest.mark.processes
-def test_a_writer_that_is_killed_is_carried_no_more(world, here, there, spawn):
+def test_carrying_stops_when_the_writer_is_killed(world, here, there, spawn):
     world.bridge("r1")
     other = world.join(there)
     child = spawn(WRITER, here, world.endpoint if here == "ros2" else "")
@@ -261,7 +261,7 @@ def test_a_writer_that_is_killed_is_carried_no_more(world, here, there, spawn):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_nothing_comes_back_through_bridges_side_by_side(world, count):
+def test_parallel_bridges_do_not_carry_messages_back(world, count):
     bridges = [world.bridge(wire=EACH) for _ in range(count)]
     with ExitStack() as opened:
         for robot, here, there in (("r1", "native", EACH), ("r2", EACH, "native")):
@@ -284,7 +284,7 @@ def test_nothing_comes_back_through_bridges_side_by_side(world, count):
     assert [bridge.carriers for bridge in bridges] == [()] * count
 
 
-def test_every_robot_stands_in_a_namespace_of_its_own(world):
+def test_every_robot_has_its_own_namespace(world):
     world.bridge(wire=EACH)
     session = world.join("native")
     with (
@@ -305,7 +305,7 @@ def test_every_robot_stands_in_a_namespace_of_its_own(world):
         assert {"r1", "r2"} <= set(listener.robots())
 
 
-def test_static_edges_of_another_robot_are_not_taken_for_ones_own(world):
+def test_static_edges_of_another_robot_are_not_carried(world):
     world.bridge(wire=EACH)
     ros = world.join("ros2")
     with (
@@ -323,7 +323,7 @@ def test_static_edges_of_another_robot_are_not_taken_for_ones_own(world):
         assert not any("plate" in frame.name for frame in listener.buffer.frames())
 
 
-def test_a_robot_that_is_written_on_both_sides_is_not_carried_and_that_is_said_once(world, caplog):
+def test_a_robot_published_on_both_sides_is_not_carried_and_logged_once(world, caplog):
     bridge = world.bridge("r1")
     native, ros = world.join("native"), world.join("ros2")
     with caplog.at_level(logging.WARNING, "zstate"), StatePublisher(native, RRBOT, "r1"):
@@ -332,27 +332,27 @@ def test_a_robot_that_is_written_on_both_sides_is_not_carried_and_that_is_said_o
             until(lambda: programs(ros, "ros2") == {"/driver"} and bridge.carriers == ())
         # With one of them gone the other one is carried again.
         until(lambda: world.changes[-1:] == [("r1", TO_ROS)])
-    said = [record.message for record in caplog.records if "not carried" in record.message]
-    assert len(said) == 1
-    assert "on ROS by '/driver'" in said[0]
+    warnings = [record.message for record in caplog.records if "not carried" in record.message]
+    assert len(warnings) == 1
+    assert "in ROS by '/driver'" in warnings[0]
     assert {way for _, way in world.changes} <= {TO_ROS, None}
 
 
-def test_what_ros_cannot_say_is_counted_and_ends_nothing(world, caplog):
+def test_messages_without_a_ros_form_are_counted_and_carrying_continues(world, caplog):
     bridge = world.bridge("r1")
     with (
         StatePublisher(world.join("native"), RRBOT, "r1") as publisher,
         TransformListener(world.join("ros2"), "r1", wire="ros2") as listener,
     ):
-        publish_until(publisher, lambda: hears(listener))
+        publish_until(publisher, lambda: receives(listener))
         publish(publisher, [0, 0, STAMP])
-        until(lambda: hears(listener, STAMP))
+        until(lambda: receives(listener, STAMP))
         (carrier,) = bridge.carriers
         assert carrier.refused == {"joint state": 2}
     assert sum("the stamp is 0" in record.message for record in caplog.records) == 1
 
 
-def test_a_name_that_no_ros_namespace_can_have_is_said(world, caplog):
+def test_a_name_that_is_no_ros_namespace_is_logged(world, caplog):
     bridge = world.bridge(wire=EACH)
     with StatePublisher(world.join("native"), RRBOT, "arm-1"):
         until(lambda: bridge.carriers and bridge.carriers[0].refused)
@@ -368,19 +368,19 @@ def test_a_name_that_no_ros_namespace_can_have_is_said(world, caplog):
         ("ros2:namespace=cell", None, ["namespace '/cell'"]),
         ("ros2:namespace=*,frame_prefix=x/", None, ["mixed up in /tf", EACH]),
         ("ros2:node=mine", ["r1"], ["node is 'mine'", "zstate_bridge"]),
-        ("ros2dds", ["r1"], ["'ros2dds'", "wrote itself"]),
+        ("ros2dds", ["r1"], ["'ros2dds'", "its own messages"]),
         ("native", ["r1"], ["'native'"]),
         ("ros2", ["a/b"], ["'a/b'"]),
     ],
 )
-def test_what_would_be_mixed_up_is_refused(sessions, wire, robots, words):
+def test_ambiguous_arguments_are_refused(sessions, wire, robots, words):
     with pytest.raises(InvalidInput) as caught:
         Bridge(*sessions, wire, robots)
     assert all(word in str(caught.value) for word in words)
 
 
 @pytest.mark.parametrize("wire", ["ros2:namespace=*,tf=namespace", "ros2:namespace=cell", "ros2:domain=7"])
-def test_one_robot_may_stand_anywhere(sessions, wire):
+def test_one_robot_may_use_any_namespace(sessions, wire):
     with Bridge(*sessions, wire, ["r1"]) as bridge:
         assert bridge.carriers == ()
     bridge.close()

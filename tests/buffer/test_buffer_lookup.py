@@ -186,7 +186,7 @@ def test_edges_without_a_common_instant_raise_with_that_reason() -> None:
     buffer = filled(moving("a", "b", NOW // 1_000_000), moving("b", "c", NOW))
     reason = failure(buffer, "a", "c")
     assert (type(reason), reason.edge) == (Stale, ("a", "b"))
-    assert "their writer gives milliseconds where nanoseconds are meant" in str(reason)
+    assert "the writer's stamps look like milliseconds, but stamps are nanoseconds" in str(reason)
 
 
 def test_wait_for_a_silent_edge_ends_with_its_next_sample() -> None:

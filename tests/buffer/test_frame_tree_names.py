@@ -231,7 +231,7 @@ def test_disconnection_of_connected_frames_names_the_removed_edge_and_its_writer
     assert (error.edge, error.writer) == (("a", "x"), "calibration")
     assert error.gone_s is not None
     assert error.gone_s >= 0.0
-    assert "'a' -> 'x' (writer calibration) was taken away just now" in str(error)
+    assert "'a' -> 'x' (writer calibration) was withdrawn just now" in str(error)
     buffer.insert_static(static("b", "x"))
     error = failure(buffer, "a", "y")
     assert isinstance(error, Disconnected)

@@ -1,4 +1,4 @@
-"""What a finding says to write instead is right: written there, the finding is gone."""
+"""The fix of each finding is right: with it, the finding is gone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def findings(text: str) -> list[Finding]:
         return [Finding(one.line, one.message, "error", one.fix) for one in error.findings]
 
 
-def test_what_the_faults_are_made_of_is_sound():
+def test_the_base_of_the_faulty_models_is_valid():
     assert findings(SOUND) == []
 
 
@@ -45,7 +45,7 @@ def test_what_the_faults_are_made_of_is_sound():
         ('<mass value="2"/>', '<mass value="heavy"/>'),
     ],
 )
-def test_the_fix_in_the_place_of_the_fault_makes_the_model_sound(right: str, wrong: str):
+def test_the_fix_in_place_of_the_fault_makes_the_model_valid(right: str, wrong: str):
     (finding,) = findings(SOUND.replace(right, wrong))
     fix = re.match(r'<[^<>]*/>|\w+="[^"]*"', finding.fix)
     assert fix
@@ -82,7 +82,7 @@ def test_the_fix_in_the_place_of_the_fault_makes_the_model_sound(right: str, wro
         SOUND.replace('type="revolute"', 'type="continuous"'),
     ],
 )
-def test_every_finding_says_what_to_write_instead(text: str):
+def test_every_finding_has_a_fix(text: str):
     found = findings(text)
     assert found
     assert [one.message for one in found if not one.fix] == []

@@ -12,7 +12,7 @@ from zstate.model.urdf import parse_urdf
 
 
 def robot(link: str, top: str = "") -> RobotModel:
-    """One link in line 2, and what stands beside it."""
+    """One link in line 2, and other elements of the robot."""
     return parse_urdf(f'<robot name="thing">\n<link name="base">{link}</link>\n{top}</robot>', "thing.urdf")
 
 
@@ -43,7 +43,7 @@ def test_each_geometry_is_read(text: str, geometry: object):
     assert only(robot(visual(text))).geometry == geometry
 
 
-def test_a_shape_stands_at_the_links_frame_unless_it_says_where():
+def test_a_shape_without_origin_is_at_the_links_frame():
     assert only(robot(visual())).origin == (0, 0, 0, 0, 0, 0, 1)
     moved = only(robot(visual(more=f'<origin xyz="1 2 3" rpy="0 0 {math.pi}"/>')))
     assert moved.origin == pytest.approx((1, 2, 3, 0, 0, 1, 0))
@@ -81,18 +81,18 @@ def test_the_robots_material_wins_over_the_links_as_in_rviz():
     assert only(robot(visual(more=inside), top)).color == (1, 0, 0, 1)
 
 
-def test_a_texture_is_named_beside_the_colour():
+def test_a_material_has_a_texture_and_a_colour():
     inside = '<material name="wood"><texture filename="package://a/wood.png"/></material>'
     shape = only(robot(visual(more=inside)))
     assert (shape.color, shape.texture) == (None, "package://a/wood.png")
 
 
-def test_colours_beyond_the_scale_are_the_ends_of_it():
+def test_colours_outside_the_range_are_clamped():
     inside = '<material name=""><color rgba="2 -1 0 1"/></material>'
     assert only(robot(visual(more=inside))).color == (1, 0, 0, 1)
 
 
-def test_a_shape_that_cannot_be_drawn_is_told_and_the_others_are_drawn():
+def test_a_faulty_shape_is_a_finding_and_the_others_are_drawn():
     model = robot(visual('<box size="1 2"/>') + visual())
     assert [shape.geometry for shape in parse_shapes(model)] == [Sphere(1.0)]
     assert complaints(model) == [
@@ -111,7 +111,7 @@ def test_a_shape_that_cannot_be_drawn_is_told_and_the_others_are_drawn():
         ('<mesh filename="a.stl" scale="0,001 1 1"/>', "mesh scale: '0,001' has a decimal comma"),
     ],
 )
-def test_what_is_wrong_with_a_shape_is_said(text: str, words: str):
+def test_the_fault_of_a_shape_is_named(text: str, words: str):
     model = robot(visual(text))
     assert parse_shapes(model) == ()
     ((line, message),) = complaints(model)
@@ -119,7 +119,7 @@ def test_what_is_wrong_with_a_shape_is_said(text: str, words: str):
     assert words in message
 
 
-def test_a_material_nobody_defines_is_told_with_what_was_probably_meant():
+def test_an_undefined_material_is_a_finding_with_a_near_miss():
     top = '<material name="Grey"><color rgba="0.5 0.5 0.5 1"/></material>'
     model = robot(visual(more='<material name="grey"/>'), top)
     assert only(model).color is None
@@ -128,7 +128,7 @@ def test_a_material_nobody_defines_is_told_with_what_was_probably_meant():
     ]
 
 
-def test_a_colour_that_is_no_colour_is_told_once():
+def test_an_unreadable_colour_is_one_finding():
     model = robot(visual(more='<material name="red"><color rgba="1 0 0"/></material>'))
     assert only(model).color is None
     assert complaints(model) == [(2, "material 'red': rgba: '1 0 0' has 3 of 4 numbers")]

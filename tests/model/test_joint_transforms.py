@@ -70,7 +70,7 @@ def only_pose(model: RobotModel, *positions: float) -> np.ndarray:
     return pose
 
 
-def test_a_hinge_turns_about_its_axis_in_the_frame_of_its_origin() -> None:
+def test_a_revolute_joint_turns_about_its_axis_in_the_frame_of_its_origin() -> None:
     # x of the joint is y of the parent: turning by a about x takes z of the child towards -y of the
     # joint, which is +x of the parent.
     pose = only_pose(robot(joint("hip", "revolute", "root")), 0.3)
@@ -79,7 +79,7 @@ def test_a_hinge_turns_about_its_axis_in_the_frame_of_its_origin() -> None:
     assert pose[:3].tolist() == [1.0, 2.0, 3.0]
 
 
-def test_a_slide_moves_along_its_axis_in_the_frame_of_its_origin_and_keeps_the_rotation() -> None:
+def test_a_prismatic_joint_moves_along_its_axis_in_the_frame_of_its_origin_without_rotation() -> None:
     pose = only_pose(robot(joint("shin", "prismatic", "root")), 0.25)
     assert np.allclose(pose, [1.0, 2.25, 3.0, 0.0, 0.0, QUARTER, QUARTER], atol=1e-15)
 
@@ -91,7 +91,7 @@ def test_a_planar_joint_moves_in_its_plane_first_and_then_turns() -> None:
     assert np.allclose(pose, [0.75, 2.5, 3.0, 0.0, 0.0, sin(half), cos(half)], atol=1e-15)
 
 
-def test_a_planar_joint_keeps_to_the_x_y_plane_whatever_axis_its_urdf_names() -> None:
+def test_a_planar_joint_moves_in_the_x_y_plane_regardless_of_its_axis() -> None:
     (form,) = edge_forms(robot(joint("sole", "planar", "root", axis=(1.0, 0.0, 0.0))))
     assert form.axis == (0.0, 0.0, 1.0)
 
@@ -134,7 +134,7 @@ def test_a_chain_of_mimics_is_multiplied_out() -> None:
     assert np.allclose(poses[1], only_pose(robot(joint("shin", "prismatic", "root")), 0.8), atol=1e-15)
 
 
-def test_forms_stand_in_the_order_of_the_joints_and_name_their_columns() -> None:
+def test_forms_have_the_order_of_the_joints_and_their_columns() -> None:
     model = everything()
     forms = edge_forms(model)
     assert [(f.parent, f.child) for f in forms] == [(j.parent, j.child) for j in model.joints]
@@ -148,10 +148,10 @@ def test_one_form_evaluated_by_its_formula_is_the_row_of_the_table() -> None:
     (positions,) = random_positions(model, 1, 3.0)
     poses = JointTransforms(model).poses(positions)
     for form, pose in zip(edge_forms(model), poses, strict=True):
-        if form.kind not in ("hinge", "slide"):
+        if form.kind not in ("revolute", "prismatic"):
             continue
         x = form.scale * positions[form.column] + form.shift
-        half = x / 2 if form.kind == "hinge" else 0.0
+        half = x / 2 if form.kind == "revolute" else 0.0
         rotation = np.array(form.q_cos) * cos(half) + np.array(form.q_sin) * sin(half)
         assert np.allclose(pose, [*(np.array(form.t0) + np.array(form.t1) * x), *rotation], atol=1e-15)
 
@@ -175,7 +175,7 @@ def test_a_batch_is_its_rows_one_by_one() -> None:
     assert table.poses(positions[:0]).shape == (0, 8, 7)
 
 
-def test_the_answer_is_written_into_out_and_positions_are_left_alone() -> None:
+def test_poses_are_written_into_out_and_positions_are_unchanged() -> None:
     model = everything()
     table = JointTransforms(model)
     (positions,) = random_positions(model, 1, 4.0)

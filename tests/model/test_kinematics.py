@@ -106,7 +106,7 @@ def test_our_own_robots_agree_with_matrices_multiplied_from_the_xml(name: str) -
     assert_agrees_with_matrices(own(name).model)
 
 
-def test_a_thousand_turns_are_where_none_is() -> None:
+def test_a_thousand_turns_give_the_same_pose_as_none() -> None:
     kinematics = own("diffbot")
     turned = kinematics.link_poses([0.3 + 2000 * pi, -0.4 - 2000 * pi])
     # 2000 pi is rounded to 1e-12 of itself.
@@ -129,7 +129,7 @@ def test_a_quaternion_far_from_unit_length_is_refused() -> None:
             answer(zeros)
 
 
-def test_wrong_positions_are_refused_with_what_is_wanted() -> None:
+def test_wrong_positions_are_refused_with_the_expected_count() -> None:
     kinematics = own("rrbot")
     for answer in (kinematics.edge_poses, kinematics.link_poses):
         with pytest.raises(InvalidInput, match="takes 2 positions"):
@@ -158,7 +158,7 @@ def test_poses_are_written_into_out_which_must_fit() -> None:
                 answer([0.1, 0.2], wrong)
 
 
-def test_an_answer_is_the_callers_own() -> None:
+def test_returned_arrays_are_not_reused() -> None:
     kinematics = own("rrbot")
     first = kinematics.link_poses([0.1, 0.2])
     kept = first.copy()
@@ -167,7 +167,7 @@ def test_an_answer_is_the_callers_own() -> None:
     assert first.flags.c_contiguous
 
 
-def test_threads_that_share_a_kinematics_get_their_own_answers() -> None:
+def test_threads_that_share_a_kinematics_get_correct_poses() -> None:
     kinematics = every_joint()
     questions = [random_positions(kinematics.model, seed) for seed in range(8)]
     alone = [kinematics.link_poses(question) for question in questions]
@@ -198,7 +198,7 @@ def test_edge_poses_need_no_pinocchio() -> None:
     assert subprocess.run([sys.executable, "-c", program], input=urdf, text=True, check=False).returncode == 0
 
 
-def test_without_openmp_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_openmp_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pinocchio", None)
     kinematics = own("rrbot")
     kinematics.edge_poses([0.0, 0.0])

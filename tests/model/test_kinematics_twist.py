@@ -63,7 +63,7 @@ def test_a_twist_is_the_slope_of_the_pose(reference: str) -> None:
         assert np.allclose(twist, expected, rtol=1e-7, atol=1e-7), link
 
 
-def test_a_twist_is_seen_from_the_root_unless_a_reference_is_named() -> None:
+def test_the_default_reference_of_a_twist_is_the_root() -> None:
     kinematics = every_joint()
     positions = random_positions(kinematics.model, 4)
     velocities = np.arange(1.0, kinematics.model.velocity_count + 1)
@@ -71,7 +71,7 @@ def test_a_twist_is_seen_from_the_root_unless_a_reference_is_named() -> None:
     assert np.array_equal(seen, kinematics.twist("nail", positions, velocities, "universe"))
 
 
-def test_the_twist_of_a_swinging_arm_is_that_of_the_textbook() -> None:
+def test_the_twist_of_a_swinging_arm_agrees_with_the_textbook() -> None:
     kinematics = own("rrbot")
     shoulder, elbow, shoulder_rate, elbow_rate = 0.4, -1.1, 0.7, 0.2
     twist = kinematics.twist("tool", [shoulder, elbow], [shoulder_rate, elbow_rate])

@@ -1,4 +1,4 @@
-"""load_model and the catalog: names, paths and text, and what is said when there is nothing."""
+"""load_model and the catalog: names, paths, text, and the errors of missing ones."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from zstate.model.xml import MAX_BYTES
 TEXT = '<robot name="one"><link name="only"/></robot>'
 
 
-def test_text_bytes_paths_and_names_are_told_apart(tmp_path: Path):
+def test_text_bytes_paths_and_names_are_distinguished(tmp_path: Path):
     path = tmp_path / "one.urdf"
     path.write_text(TEXT)
     assert load_model(TEXT) == load_model(TEXT.encode()) == load_model(path) == load_model(str(path))
@@ -35,7 +35,9 @@ def test_a_folder_does_not_hide_a_name(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("missing", ["gone.urdf", "gone.xacro", "./gone", Path("gone")])
-def test_a_path_without_a_file_says_so(missing: str | Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_file_is_an_error_with_its_path(
+    missing: str | Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ModelError, match="there is no such file") as caught:
         load_model(missing)
@@ -43,7 +45,7 @@ def test_a_path_without_a_file_says_so(missing: str | Path, tmp_path: Path, monk
     assert f"no such file in {tmp_path}" in str(caught.value)  # the folder that a relative path starts from
 
 
-def test_the_findings_name_the_path_as_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_findings_have_the_path_as_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     Path("bad.urdf").write_text("<robot/>")
     with pytest.raises(ModelError, match=r"^bad.urdf cannot be used \(1 finding\)\n  line 1  "):
@@ -62,7 +64,7 @@ def test_folders_and_files_beyond_the_limit_are_refused(tmp_path: Path):
         load_model("zero\0byte.urdf")
 
 
-def test_an_unknown_name_has_near_misses_and_says_where_was_looked():
+def test_an_unknown_name_has_near_misses_and_the_searched_collections():
     with pytest.raises(UnknownModel) as caught:
         load_model("rrbott")
     assert caught.value.name == "rrbott"
@@ -71,7 +73,7 @@ def test_an_unknown_name_has_near_misses_and_says_where_was_looked():
     assert "looked in zstate (" in str(caught.value)
 
 
-def test_without_example_robot_data_it_is_told_what_to_install(
+def test_without_example_robot_data_the_error_names_the_extra_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     def absent(name: str) -> metadata.Distribution:
@@ -107,7 +109,7 @@ def test_every_entry_of_the_catalog_is_a_file_of_its_name():
         ("solo12", "solo", 12),
     ],
 )
-def test_names_people_type_are_known(name: str, robot: str, velocities: int):
+def test_common_names_are_known(name: str, robot: str, velocities: int):
     model = load_model(name)
     assert (model.name, model.velocity_count) == (robot, velocities)
 
@@ -137,14 +139,14 @@ def test_loading_a_model_imports_neither_pinocchio_nor_zenoh():
     assert done.stdout.strip() == "set()"
 
 
-def test_xacro_arguments_for_what_is_no_xacro_are_refused():
+def test_xacro_arguments_for_a_file_without_xacro_are_refused():
     with pytest.raises(
         InvalidInput, match="'URDF text' contains no xacro, so it takes no xacro arguments; got length:=1"
     ):
         load_model(TEXT, xacro_args={"length": "1"})
 
 
-def test_the_robot_of_examples_is_one_that_is_here(monkeypatch: pytest.MonkeyPatch):
+def test_the_robot_of_examples_is_installed(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(catalog, "_COLLECTIONS", {"zstate": catalog._bundled})
     assert catalog.example_name() == "rrbot"
     monkeypatch.setattr(

@@ -9,7 +9,7 @@ from zstate.model.robot import VELOCITY_COUNTS, coordinate_names, velocity_colum
 EVERY = every_joint().model
 
 
-def test_a_joint_of_one_number_is_called_by_its_name_and_others_by_their_parts():
+def test_a_coordinate_has_the_joints_name_or_its_name_and_part():
     # mimic joints (toe, nail) and fixed ones have no numbers of their own
     assert coordinate_names(EVERY) == (
         *(f"zz body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")),
@@ -22,7 +22,7 @@ def test_a_joint_of_one_number_is_called_by_its_name_and_others_by_their_parts()
     )
 
 
-def test_velocities_stand_under_their_coordinates_but_none_under_the_last_of_a_quaternion():
+def test_each_velocity_has_a_coordinate_and_the_last_of_a_quaternion_has_none():
     names = coordinate_names(EVERY)
     assert [names[slot] for slot in velocity_columns_by_position(EVERY)] == [
         *(f"zz body.{part}" for part in ("x", "y", "z", "qx", "qy", "qz")),
@@ -31,7 +31,7 @@ def test_velocities_stand_under_their_coordinates_but_none_under_the_last_of_a_q
 
 
 @pytest.mark.parametrize("model", [EVERY, *map(load_model, ("rrbot", "gripper"))])
-def test_there_are_as_many_as_numbers_each_its_own(model):
+def test_there_is_one_unique_name_for_each_number(model):
     names, slots = coordinate_names(model), velocity_columns_by_position(model)
     assert len(names) == len(set(names)) == model.position_count
     assert len(slots) == len(set(slots)) == sum(VELOCITY_COUNTS[j.type] for j in model.driven_joints)
@@ -41,6 +41,6 @@ def test_there_are_as_many_as_numbers_each_its_own(model):
         assert names[start] in (joint.name, f"{joint.name}.x")
 
 
-def test_a_robot_that_does_not_move_has_none():
+def test_a_robot_without_joints_has_no_coordinates():
     stone = load_model('<robot name="stone"><link name="only"/></robot>')
     assert (coordinate_names(stone), velocity_columns_by_position(stone)) == ((), ())

@@ -29,11 +29,11 @@ JOINTS = ("pan", "lift", "elbow", "wrist_1_joint", "wrist_2_joint", "finger_left
         (5, None),
     ],
 )
-def test_the_joint_that_was_probably_meant_is_named(name, meant: str | None) -> None:
+def test_the_most_similar_joint_is_found(name, meant: str | None) -> None:
     assert near_joint(name, JOINTS) == meant
 
 
-def test_an_unknown_joint_comes_with_the_missing_one_that_it_looks_like() -> None:
+def test_an_unknown_joint_is_reported_with_the_most_similar_missing_one() -> None:
     model = load_model("rrbot")
     first, second = model.joint_names
     with pytest.raises(InvalidInput) as caught:
@@ -42,7 +42,7 @@ def test_an_unknown_joint_comes_with_the_missing_one_that_it_looks_like() -> Non
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-200, 0.9989, 1.0011, 2.0])
-def test_a_floating_joint_without_a_unit_quaternion_is_refused_however_it_is_given(length: float) -> None:
+def test_a_floating_joint_without_a_unit_quaternion_is_refused_by_every_method(length: float) -> None:
     model = every_joint().model
     name = next(joint.name for joint in model.driven_joints if joint.type == "floating")
     values = dict.fromkeys(model.joint_names, 0.0)
@@ -57,7 +57,7 @@ def test_a_floating_joint_without_a_unit_quaternion_is_refused_however_it_is_giv
         model.check_positions(positions)
 
 
-def test_a_quaternion_within_a_thousandth_of_unit_length_is_left_as_it_is_given() -> None:
+def test_a_quaternion_within_a_thousandth_of_unit_length_is_unchanged() -> None:
     model = every_joint().model
     positions = np.array(model.neutral)
     column = next(model.columns[joint.name] for joint in model.driven_joints if joint.type == "floating")

@@ -8,7 +8,7 @@ from helpers.urdf_text import ARM, errors, joint, refusal, robot, tip, warnings
 from zstate.model.urdf import parse_urdf
 
 
-def test_a_sound_robot_is_read_in_the_order_of_its_document():
+def test_a_valid_robot_is_read_in_the_order_of_its_document():
     model = parse_urdf(robot(ARM), "arm.urdf")
     assert (model.name, model.root) == ("arm", "base")
     assert model.links == ("base", "upper", "lower")
@@ -107,8 +107,8 @@ def test_a_sound_robot_is_read_in_the_order_of_its_document():
         (tip("planar", '<mimic joint="elbow"/>'), 8, "is planar and cannot mimic"),
         (tip("floating", '<mimic joint="elbow"/>'), 8, "is floating and cannot mimic"),
         (ARM + '<robot name="b"/>', 8, "a second <robot>; the first begins in line 1"),
-        (ARM + '<group><link name="b"/></group>', 8, "<link> stands inside <group> (line 8)"),
-        ('<link name="a">\n<link name="b"/></link>', 3, "<link> stands inside <link> (line 2)"),
+        (ARM + '<group><link name="b"/></group>', 8, "<link> is inside <group> (line 8)"),
+        ('<link name="a">\n<link name="b"/></link>', 3, "<link> is inside <link> (line 2)"),
     ],
 )
 def test_a_fault_is_refused_with_its_line(body: str, line: int, words: str):
@@ -143,7 +143,7 @@ def test_mimics_in_a_cycle_are_named_and_a_chain_is_fine():
     assert (leader.joint, leader.multiplier, leader.offset) == ("elbow", -2.0, 0.5)
 
 
-def test_all_findings_come_at_once_in_the_order_of_lines():
+def test_all_findings_are_reported_in_the_order_of_lines():
     body = (
         ARM
         + joint("a", "Fixed", "base", "tip")
@@ -178,10 +178,10 @@ def test_all_findings_come_at_once_in_the_order_of_lines():
         (tip("continuous", '<limit lower="0" upper="1"/>'), "lower and upper limits are not used"),
         (tip("continuous", '<axis xyz="0 3 4"/>'), "of length 5; it is made a unit vector"),
         (tip("fixed", '<mimic joint="elbow"/>'), "is fixed, so its <mimic> is not used"),
-        (ARM + '<extra><link name="b"/></extra>', "<link> stands inside <extra>"),
+        (ARM + '<extra><link name="b"/></extra>', "<link> is inside <extra>"),
     ],
 )
-def test_what_is_doubtful_but_usable_is_a_warning(body: str, words: str):
+def test_usable_faults_are_warnings(body: str, words: str):
     found = warnings(robot(body))
     assert len(found) == 1
     assert words in found[0][1]
@@ -214,7 +214,7 @@ def test_an_axis_is_made_a_unit_vector():
         robot(ARM) + "\n<!-- the end -->\n",
     ],
 )
-def test_what_files_in_use_have_is_fine_without_a_warning(text: str):
+def test_common_forms_of_existing_files_give_no_warning(text: str):
     assert warnings(text) == []
 
 

@@ -57,7 +57,7 @@ def parse(data: str | bytes) -> None:
 
 @given(st.one_of(st.binary(), st.text()))
 @settings(max_examples=300, deadline=None)
-def test_anything_at_all_is_answered(data: str | bytes):
+def test_any_bytes_give_a_model_or_a_model_error(data: str | bytes):
     parse(data)
 
 
@@ -65,7 +65,7 @@ def test_anything_at_all_is_answered(data: str | bytes):
     st.lists(st.tuples(st.integers(0, len(SEED)), st.integers(0, 40), st.sampled_from(TOKENS)), max_size=6)
 )
 @settings(max_examples=200, deadline=None)
-def test_a_damaged_file_is_answered(edits: list[tuple[int, int, bytes]]):
+def test_a_damaged_file_gives_a_model_or_a_model_error(edits: list[tuple[int, int, bytes]]):
     data = SEED
     for start, length, replacement in edits:
         data = data[:start] + replacement + data[start + length :]
@@ -74,5 +74,5 @@ def test_a_damaged_file_is_answered(edits: list[tuple[int, int, bytes]]):
 
 @given(st.lists(st.recursive(st.just(""), element, max_leaves=8), max_size=8))
 @settings(max_examples=300, deadline=None)
-def test_well_formed_nonsense_is_answered(elements: list[str]):
+def test_well_formed_nonsense_gives_a_model_or_a_model_error(elements: list[str]):
     parse(f'<robot name="r"><link name="a"/>{"".join(elements)}</robot>')

@@ -38,7 +38,7 @@ def test_67_of_the_69_load():
     assert (len(FILES), {path.name for path in FILES if not loads(path)}) == (69, REFUSED)
 
 
-def test_the_refused_are_told_why():
+def test_each_refused_robot_has_the_expected_finding():
     named = {path.name: path for path in FILES}
     with pytest.raises(ModelError, match="the robot has no <link>"):
         load_model(named["ur3.urdf"])

@@ -1,4 +1,4 @@
-"""Xacro: expanded where a package for it is installed, otherwise an error that says which."""
+"""Xacro: expanded if a package for it is installed, otherwise an error that names the package."""
 
 import subprocess
 import sys
@@ -69,7 +69,7 @@ def test_an_argument_that_the_file_does_not_use_is_a_finding_with_its_near_miss(
     assert finding.message == "the xacro argument 'lenght' is not used by the file; did you mean 'length'?"
 
 
-def test_findings_of_an_expanded_file_say_that_lines_are_of_the_expansion(tmp_path: Path):
+def test_findings_of_an_expanded_file_refer_to_lines_of_the_expansion(tmp_path: Path):
     pytest.importorskip("xacro")
     path = tmp_path / "empty.xacro"
     path.write_text(f'<robot name="r" {NAMESPACE}/>')
@@ -86,7 +86,7 @@ def test_findings_of_an_expanded_file_say_that_lines_are_of_the_expansion(tmp_pa
         ('<xacro:include filename="$(find no_such_package)/a.xacro"/>', "packages are found by"),
     ],
 )
-def test_a_failed_expansion_gives_its_cause_in_one_line(inner: str, words: str):
+def test_a_failed_expansion_has_its_cause_in_one_line(inner: str, words: str):
     pytest.importorskip("xacro")
     with pytest.raises(ModelError) as caught:
         load_model(f'<robot name="r" {NAMESPACE}>{inner}</robot>')
@@ -96,7 +96,7 @@ def test_a_failed_expansion_gives_its_cause_in_one_line(inner: str, words: str):
     assert "\n" not in finding.message
 
 
-def test_without_a_xacro_package_it_is_told_what_to_install(arm: Path):
+def test_without_a_xacro_package_the_error_names_the_extra_to_install(arm: Path):
     code = (
         "import sys; sys.modules['xacro'] = sys.modules['xacrodoc'] = None\n"
         "from zstate.errors import ModelError\n"

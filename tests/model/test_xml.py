@@ -25,7 +25,7 @@ def finding(data: str | bytes) -> tuple[int | None, str]:
 
 
 @pytest.mark.parametrize("empty", ["", b"", "  \n ", b"\xef\xbb\xbf"])
-def test_nothing_is_called_empty(empty: str | bytes):
+def test_empty_text_is_reported_as_empty(empty: str | bytes):
     assert finding(empty) == (None, 'the text is empty; a URDF begins with <robot name="...">')
 
 
@@ -44,7 +44,7 @@ def test_nothing_is_called_empty(empty: str | bytes):
         ("\n\n<robot>\n<\x01/>", 4, "malformed XML"),
     ],
 )
-def test_malformed_xml_is_placed_and_explained(text: str, line: int, words: str):
+def test_malformed_xml_has_line_column_and_cause(text: str, line: int, words: str):
     for data in (text, text.encode()):
         at, message = finding(data)
         assert at == line
@@ -66,11 +66,11 @@ def test_entities_and_foreign_files_are_refused(text: str):
     assert message.startswith("a DOCTYPE with declarations (entities) or a reference to a file is refused")
 
 
-def test_binary_data_is_called_binary():
+def test_binary_data_is_reported_as_binary():
     assert finding(b"<robot>\n\x7fELF\0\0")[1].endswith("a zero byte; this is a binary file, not a URDF")
 
 
-def test_latin_1_without_a_declaration_is_placed_and_told_what_to_do():
+def test_latin_1_without_a_declaration_has_line_column_and_advice():
     data = f"<!-- top -->\n{SMALL}".encode("latin-1")
     assert finding(data) == (
         2,
@@ -96,7 +96,7 @@ def test_text_reads_the_same_in_every_encoding(data: str | bytes):
     assert read_document(data, "small.urdf").root.attributes["name"] == "\u00e9"
 
 
-def test_an_encoding_that_is_none_of_files_is_refused():
+def test_a_codec_that_is_no_text_encoding_is_refused():
     data = b'<?xml version="1.0" encoding="rot13"?><robot/>'
     assert finding(data) == (1, "the declared encoding 'rot13' is not read; save the file as UTF-8")
 
@@ -105,7 +105,7 @@ def test_half_a_surrogate_pair_is_refused():
     assert finding("<robot>\n<a b='\ud800'/></robot>")[0] == 2
 
 
-def test_lines_count_the_blanks_before_the_document_which_the_model_does_not_keep():
+def test_lines_include_leading_blanks_which_the_model_drops():
     model = parse_urdf("\n\n" + SMALL, "small.urdf")
     assert model.urdf == SMALL
     assert read_document("\n\n" + SMALL, "small.urdf").root.line == 3

@@ -28,7 +28,7 @@ from zstate.model.urdf import parse_urdf
         ('<mimic joint="elbow" offset="inf"/>', "mimic offset: 'inf' is not a finite number"),
     ],
 )
-def test_numbers_that_only_some_readers_take_are_refused(inner: str, words: str):
+def test_numbers_that_only_some_parsers_accept_are_refused(inner: str, words: str):
     found = errors(robot(tip("continuous", inner)))
     assert len(found) == 1
     assert found[0][0] == 8

@@ -90,7 +90,7 @@ def test_two_sources_agree_at_every_instant_and_after_each_period():
         assert one.read(stamp).positions.tolist() == one.read(stamp + 2 * SECOND).positions.tolist()
 
 
-def test_neighbouring_nanoseconds_of_today_are_told_apart():
+def test_neighbouring_nanoseconds_of_today_are_distinguished():
     sine = SineSource(load_model("rrbot"), period_s=0.001)
     assert sine.read(NOW).positions.tolist() != sine.read(NOW + 1).positions.tolist()
 

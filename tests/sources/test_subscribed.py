@@ -44,7 +44,7 @@ def test_every_sample_is_read_in_order_with_its_stamp(sessions):
     assert all(reading.efforts.tolist() == [3.0, 4.0] for reading in readings)
 
 
-def test_read_gives_the_newest_once(sessions):
+def test_read_returns_the_newest_once(sessions):
     writer, reader = sessions
     with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
         await_reader(writer, KEY)
@@ -64,7 +64,7 @@ def test_read_gives_the_newest_once(sessions):
         assert source.read(0) is None
 
 
-def test_the_robot_is_the_models_name_unless_given(sessions):
+def test_the_robot_defaults_to_the_models_name(sessions):
     writer, reader = sessions
     with SubscribedSource(reader, RRBOT) as source, StatePublisher(writer, RRBOT) as publisher:
         await_reader(writer, "zstate/rrbot/joint_states")
@@ -88,7 +88,7 @@ def test_the_robot_is_the_models_name_unless_given(sessions):
     ],
     ids=lambda value: value if isinstance(value, str) else value[:9].hex(),
 )
-def test_what_cannot_be_used_is_counted_and_logged_once_and_the_next_is_read(
+def test_unusable_samples_are_counted_and_logged_once_and_the_next_is_read(
     sessions, caplog, payload: bytes, encoding: str, reason: str
 ):
     writer, reader = sessions
@@ -102,7 +102,7 @@ def test_what_cannot_be_used_is_counted_and_logged_once_and_the_next_is_read(
     assert reason in caplog.text
 
 
-def test_a_floating_joint_without_a_unit_quaternion_is_refused_here_and_not_by_who_republishes(sessions):
+def test_a_floating_joint_without_a_unit_quaternion_is_refused_before_republishing(sessions):
     writer, reader = sessions
     with SubscribedSource(reader, FLOATING, "r1") as source:
         put(writer, joint_state([0, 0, 0, 0, 0, 0, 0.5], model=FLOATING))
@@ -127,14 +127,14 @@ def test_a_publisher_runs_on_what_another_publishes(sessions):
         SubscribedSource(reader, RRBOT, "r1") as source,
         StatePublisher(writer, RRBOT, "r1", streams=["joint_states"]) as driver,
         StatePublisher(reader, RRBOT, "r2") as echo,
-        SubscribedSource(writer, RRBOT, "r2") as heard,
+        SubscribedSource(writer, RRBOT, "r2") as echoed,
     ):
         await_reader(writer, KEY)
         await_reader(reader, "zstate/r2/joint_states")
         runner = threading.Thread(target=echo.run, args=(source, 200.0))
         runner.start()
         driver.publish([0.25, 0.5], stamp=11)
-        reading = next(iter(heard))
+        reading = next(iter(echoed))
         assert (reading.stamp, reading.positions.tolist()) == (11, [0.25, 0.5])
         echo.close()
         runner.join(1.0)

@@ -20,10 +20,10 @@ GRIPPER = load_model("gripper")
 EACH = "ros2:namespace=*"
 
 
-class Heard(list):
+class Received(list):
     """Who was described, with the digest of the model."""
 
-    def note(self, robot, model):
+    def add(self, robot, model):
         self.append((robot, model.digest))
 
 
@@ -40,42 +40,45 @@ def latch(session: Session, *payloads: bytes, encoding: str = ENCODING) -> Latch
 
 @pytest.mark.parametrize("wire", ["native", "ros2", "ros2dds"])
 @pytest.mark.parametrize("publisher_is_first", [True, False], ids=["late", "early"])
-def test_the_model_is_heard_on_every_wire_by_early_and_late_joiners(sessions, wire, publisher_is_first):
+def test_early_and_late_joiners_receive_the_model_on_every_wire(sessions, wire, publisher_is_first):
     writer, reader = sessions
-    heard = Heard()
+    received = Received()
     opened = [
         lambda: StatePublisher(writer, RRBOT, "r1", (wire,)),
-        lambda: DescriptionSubscriber(reader, "r1", heard.note, wire),
+        lambda: DescriptionSubscriber(reader, "r1", received.add, wire),
     ]
     first, second = opened if publisher_is_first else reversed(opened)
     with first(), second():
-        until(lambda: heard)
-    assert heard == [("r1", RRBOT.digest)]
+        until(lambda: received)
+    assert received == [("r1", RRBOT.digest)]
 
 
 @pytest.mark.parametrize("wire", ["native", EACH], ids=["native", "ros2"])
-def test_every_robot_is_heard_with_its_own_name(sessions, wire):
+def test_every_robot_is_received_under_its_own_name(sessions, wire):
     writer, reader = sessions
-    heard = Heard()
+    received = Received()
     with (
         StatePublisher(writer, RRBOT, "r1", (wire,)),
         StatePublisher(writer, GRIPPER, "r2", (wire,)),
-        DescriptionSubscriber(reader, "*", heard.note, wire),
+        DescriptionSubscriber(reader, "*", received.add, wire),
     ):
-        until(lambda: len(heard) == 2)
-    assert sorted(heard) == [("r1", RRBOT.digest), ("r2", GRIPPER.digest)]
+        until(lambda: len(received) == 2)
+    assert sorted(received) == [("r1", RRBOT.digest), ("r2", GRIPPER.digest)]
 
 
-def test_only_another_model_is_told_again(sessions):
+def test_only_a_changed_model_is_reported_again(sessions):
     writer, reader = sessions
-    heard = Heard()
-    with DescriptionSubscriber(reader, "r1", heard.note), latch(writer, description(RRBOT.urdf)) as publisher:
-        until(lambda: heard)
+    received = Received()
+    with (
+        DescriptionSubscriber(reader, "r1", received.add),
+        latch(writer, description(RRBOT.urdf)) as publisher,
+    ):
+        until(lambda: received)
         publisher.set(description(RRBOT.urdf, session=2))
         publisher.withdraw()
         publisher.set(description(GRIPPER.urdf))
-        until(lambda: len(heard) == 2)
-    assert heard == [("r1", RRBOT.digest), ("r1", GRIPPER.digest)]
+        until(lambda: len(received) == 2)
+    assert received == [("r1", RRBOT.digest), ("r1", GRIPPER.digest)]
 
 
 @pytest.mark.parametrize(
@@ -88,11 +91,11 @@ def test_only_another_model_is_told_again(sessions):
     ],
     ids=["truncated", "foreign", "no links", "a path"],
 )
-def test_what_describes_no_robot_is_counted_and_logged_once(sessions, caplog, payload, encoding, reason):
+def test_unusable_descriptions_are_counted_and_logged_once(sessions, caplog, payload, encoding, reason):
     writer, reader = sessions
-    heard = Heard()
+    received = Received()
     with (
-        DescriptionSubscriber(reader, "r1", heard.note) as descriptions,
+        DescriptionSubscriber(reader, "r1", received.add) as descriptions,
         caplog.at_level(logging.WARNING, "zstate"),
     ):
         with latch(writer, payload, encoding=encoding) as publisher:
@@ -100,7 +103,7 @@ def test_what_describes_no_robot_is_counted_and_logged_once(sessions, caplog, pa
             publisher.set(payload)
             until(lambda: descriptions.refused[reason] == 2)
         with latch(writer, description(RRBOT.urdf)):
-            until(lambda: heard)
+            until(lambda: received)
     assert [record.message.partition(":")[0] for record in caplog.records] == [
         f"robot_description refused ({reason})"
     ]

@@ -1,1 +1,1 @@
-"""Utilities that no package owns: bounded containers, callback threads, refusal counters."""
+"""Utilities for all packages: bounded containers, callback threads, refusal counters, texts."""

@@ -1,4 +1,4 @@
-"""Thread that calls a user's function, so that a slow one delays nothing else."""
+"""Thread for a user's callback, so that a slow one delays nothing else."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CLOSES_WITHIN_S = 0.8
 class CallbackThread(Closeable, Generic[T]):
     """Calls ``callback`` with every submitted item, in order. Drops the oldest of more than 1024.
 
-    ``tick(now)`` is called from the same thread at least every half second; it returns when it is due next,
+    ``tick(now)`` is called from the same thread at least every half second; it returns its next due time,
     both by ``time.monotonic`` [s]. An exception of ``callback`` is counted in ``failures``; the first also
     goes to ``threading.excepthook``.
     """
@@ -62,13 +62,11 @@ class CallbackThread(Closeable, Generic[T]):
                 items = list(self._queue)
                 self._queue.clear()
             for item in items:
-                if self._is_open:
-                    self._call(item)
-
-    def _call(self, item: T) -> None:
-        try:
-            self._callback(item)
-        except Exception:
-            self.failures += 1
-            if self.failures == 1:
-                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
+                if not self._is_open:
+                    return
+                try:
+                    self._callback(item)
+                except Exception:
+                    self.failures += 1
+                    if self.failures == 1:
+                        threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))

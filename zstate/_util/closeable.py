@@ -1,4 +1,4 @@
-"""Closing: whatever opens closes, at the latest at the end of its ``with``."""
+"""Base class of resources with ``close()``."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ Self = TypeVar("Self", bound="Closeable")
 
 
 class Closeable(ABC):
-    """Something that is open until ``close()``; a context manager."""
+    """A resource that is open until ``close()``; a context manager."""
 
     @abstractmethod
     def close(self) -> None:
-        """End it. A second call does nothing."""
+        """Release the resource. A second call does nothing."""
 
     def __enter__(self: Self) -> Self:
         return self

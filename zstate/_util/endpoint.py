@@ -10,7 +10,7 @@ _METADATA = re.compile(r"[?#]")
 
 
 class Endpoint(NamedTuple):
-    """An endpoint of a protocol that is addressed by host and port; IPv6 hosts without brackets."""
+    """Protocol, host and port of an endpoint; IPv6 hosts without brackets."""
 
     protocol: str
     host: str
@@ -33,5 +33,5 @@ def parse_host_port(text: str) -> tuple[str, int] | None:
 
 
 def format_host(host: str) -> str:
-    """``host`` as it stands before ``:port``: IPv6 addresses in brackets."""
+    """``host`` as written before ``:port``: IPv6 addresses in brackets."""
     return f"[{host}]" if ":" in host else host

@@ -1,4 +1,4 @@
-"""Times as errors say them: how long, when, and why two stamps may be of different times."""
+"""Texts of durations and stamps, and the likely reason why two stamps are far apart."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ _SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * _SECOND_NS
 _UNITS = (("seconds", _SECOND_NS), ("milliseconds", 1_000_000), ("microseconds", 1_000))
 
-# No clock that was set tells a year before 1980, and no simulation lasts until then.
+# A clock that was set shows 1980 or later; no simulation lasts ten years.
 _FIRST_DECADE_NS = 3650 * DAY_NS
 
 
 def format_duration(nanoseconds: int) -> str:
-    """A duration as a person says it: 85 ns, 12.0 us, 3.5 ms, 4.2 s, 20458.0 days."""
+    """A duration in a readable unit: 85 ns, 12.0 us, 3.5 ms, 4.2 s, 20458.0 days."""
     size = abs(nanoseconds)
     if size >= 2 * DAY_NS:
         return f"{nanoseconds / DAY_NS:.1f} days"
@@ -24,42 +24,43 @@ def format_duration(nanoseconds: int) -> str:
 
 
 def format_time(stamp: int) -> str:
-    """When a stamp [ns] is: the date and time of a wall clock, or how long after 1970 began."""
+    """A stamp [ns] as date and time, or as seconds if it is within ten years of zero."""
     if counts_from_start(stamp):
         return f"{stamp / _SECOND_NS:.3f} s"
     return f"{datetime.fromtimestamp(stamp // _SECOND_NS, timezone.utc):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def counts_from_start(stamp: int) -> bool:
-    """Whether a stamp [ns] is of 1970 and after: simulated, or the time since something was switched on."""
+    """Whether a stamp [ns] is within ten years of zero: simulated time, or time since a start."""
     return abs(stamp) < _FIRST_DECADE_NS
 
 
 def guess_unit(stamp: int, near: int) -> str:
-    """The unit that puts ``stamp`` within a day of the wall-clock time ``near`` [ns], where ns do not."""
+    """The unit that puts ``stamp`` within a day of the wall-clock time ``near`` [ns]; empty for ns."""
     if counts_from_start(near) or abs(stamp - near) < DAY_NS:
         return ""
     return next((unit for unit, scale in _UNITS if abs(stamp * scale - near) < DAY_NS), "")
 
 
-def difference_text(asked: int, newest: int) -> str:
-    """Why ``asked`` and the stamps of samples up to ``newest`` [ns] may not be of one time.
+def difference_text(requested: int, newest: int) -> str:
+    """Why ``requested`` and the stamps of samples up to ``newest`` [ns] may be of unrelated clocks.
 
-    Empty where nothing points to it.
+    Empty if nothing points to it.
     """
-    if unit := guess_unit(asked, newest):
-        return f"that instant, {asked}, looks like {unit}: stamps are nanoseconds"
-    if unit := guess_unit(newest, asked):
-        return f"their writer gives {unit} where nanoseconds are meant"
-    if counts_from_start(asked) == counts_from_start(newest):
+    if unit := guess_unit(requested, newest):
+        return f"the requested stamp {requested} looks like {unit}, but stamps are nanoseconds"
+    if unit := guess_unit(newest, requested):
+        return f"the writer's stamps look like {unit}, but stamps are nanoseconds"
+    if counts_from_start(requested) == counts_from_start(newest):
         return ""
-    ours, theirs = f"that instant, {format_time(asked)}", f"(the newest {format_time(newest)})"
-    if counts_from_start(asked):
+    requested_text = f"the requested stamp, {format_time(requested)}"
+    newest_text = f"(newest {format_time(newest)})"
+    if counts_from_start(requested):
         return (
-            f"{ours}, is simulated time or one since a machine was switched on, and those samples keep "
-            f"wall-clock time {theirs}"
+            f"{requested_text}, is simulated time or time since a machine was switched on, but the samples "
+            f"have wall-clock stamps {newest_text}"
         )
     return (
-        f"{ours}, is wall-clock time, and those samples keep simulated time, or that of a machine whose "
-        f"clock was never set {theirs}"
+        f"{requested_text}, is wall-clock time, but the samples have simulated stamps, or those of a "
+        f"machine whose clock was never set {newest_text}"
     )

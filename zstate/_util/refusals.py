@@ -1,4 +1,4 @@
-"""Counter of input that was refused, which logs the first refusal of each reason."""
+"""Counter of refused input, which logs the first refusal of each reason."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
-def did_you_mean(name: str, known: Iterable[str], *, count: int = 1) -> str:
-    """``; did you mean 'x'?`` with the names of ``known`` most similar to ``name``; empty without any."""
-    return suggestion_text(*get_close_matches(name, list(known), n=count))
+def did_you_mean(name: str, candidates: Iterable[str], *, count: int = 1) -> str:
+    """``; did you mean 'x'?`` with the ``candidates`` most similar to ``name``; empty without any."""
+    return suggestion_text(*get_close_matches(name, list(candidates), n=count))
 
 
 def suggestion_text(*names: str | None) -> str:

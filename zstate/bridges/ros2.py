@@ -1,8 +1,7 @@
-"""Bridge: whole robots between the native wire and a ROS wire, both ways, and nothing in a circle.
+"""Bidirectional bridge of robots between the native and the ROS 2 wire, without feedback loops.
 
-Carrier: one robot, one way.
-
-StaticCarrier: the static edges around a robot, from one wire to another.
+``StaticBridge`` carries the static edges of one robot in one direction, ``RobotBridge`` the whole robot;
+``Bridge`` opens a ``RobotBridge`` for each robot that is published on one side only.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from itertools import compress
 from typing import Literal, NamedTuple
 
 from zstate._util.closeable import Closeable
@@ -27,7 +27,6 @@ from zstate.net.presence import watch
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
-from zstate.sources.joint_source import JointReading
 from zstate.sources.subscribed import DescriptionSubscriber, SubscribedSource
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
@@ -39,10 +38,10 @@ from zstate.wire.ros2.wire import Ros2Wire
 
 
 class StaticBridge(Closeable):
-    """Publishes with ``publisher`` the static edges of its robot that ``model`` does not place.
+    """Publishes with ``publisher`` the static edges of its robot that are not part of ``model``.
 
-    Where a key tells whose edges are on it, they are also withdrawn with it. Where all robots share
-    one, those are taken that place a frame of this robot.
+    If keys name the writer, the edges of a key are withdrawn with it. If all robots share one key, the
+    edges whose child is a frame of this robot are published.
     """
 
     def __init__(
@@ -59,7 +58,7 @@ class StaticBridge(Closeable):
         self._subscriber = LatchedSubscriber(session, key, self._on_static)
 
     def close(self) -> None:
-        """Follow the edges no more; those that were published stay. A second call does nothing."""
+        """Unsubscribe; published edges stay. A second call does nothing."""
         self._subscriber.close()
 
     def _on_static(self, arrival: SerializedSample) -> None:
@@ -77,18 +76,20 @@ class StaticBridge(Closeable):
         except MessageError as error:
             self._counters.count_refusal(error.reason, f"{arrival.key}: {error}")
             return
-        # The publisher may have gone with its session.
+        # The session of the publisher may be closed already.
         with suppress(Closed):
             if not arrival.payload:
                 ingest.withdraw()
             for message in messages:
                 assert isinstance(message, StaticTransforms)
-                ingest.add(self._ours(message)) if writer is None else ingest.replace(message)
-
-    def _ours(self, message: StaticTransforms) -> StaticTransforms:
-        is_ours = [child.partition("/")[0] == self._robot or "/" not in child for _, child in message.edges]
-        edges = tuple(edge for edge, ours in zip(message.edges, is_ours, strict=True) if ours)
-        return StaticTransforms(message.session, edges, to_block(poses_from_block(message.poses)[is_ours]))
+                if writer is not None:
+                    ingest.replace(message)
+                    continue
+                # One key for all robots: the edges of this one.
+                kept = [child.partition("/")[0] in (self._robot, child) for _, child in message.edges]
+                edges = tuple(compress(message.edges, kept))
+                poses = to_block(poses_from_block(message.poses)[kept])
+                ingest.add(StaticTransforms(message.session, edges, poses))
 
 
 class _PublishedBuffer(TransformBuffer):
@@ -108,13 +109,13 @@ class _PublishedBuffer(TransformBuffer):
 
 
 PROGRAM = "zstate_bridge"
-"""As whom a bridge writes, on both wires: by this name bridges know what was carried already."""
+"""The program name of a bridge on both wires; bridges do not carry what has this name."""
 
 Way = Literal["native to ROS", "ROS to native"]
 
 
 class BridgeSide(NamedTuple):
-    """One of two networks: a place on it, what is spoken there, and where that is carried."""
+    """One side of a bridge: session, wire format, and the direction from there."""
 
     session: Session
     wire: str
@@ -122,21 +123,21 @@ class BridgeSide(NamedTuple):
 
 
 class RobotBridge(Closeable):
-    """Writes on ``target`` what others write of ``robot`` on ``source``, from its first model on.
+    """Publishes on ``target`` the messages of ``robot`` from ``source``, from its first model on.
 
-    Every joint state keeps its stamp and its numbers; model and static edges are there for late
-    joiners, too. ``on_begin()`` is called with each model. What ``target`` cannot say is counted in
-    ``refused``, and the first of each kind is logged.
+    Joint states keep their stamps and numbers; model and static edges are latched for late joiners.
+    ``on_model()`` is called with each model. ``refused`` counts messages that ``target`` cannot express; the
+    first of each kind is logged.
     """
 
     def __init__(
-        self, robot: str, source: BridgeSide, target: BridgeSide, on_begin: Callable[[], object]
+        self, robot: str, source: BridgeSide, target: BridgeSide, on_model: Callable[[], object]
     ) -> None:
         self.robot = robot
         self.source = source
         self.target = target
-        self.has_begun = False
-        self._on_begin = on_begin
+        self.has_model = False
+        self._on_model = on_model
         self._counters = Counters()
         self._lock = threading.Lock()
         self._closed = False
@@ -145,7 +146,7 @@ class RobotBridge(Closeable):
 
     @property
     def refused(self) -> dict[str, int]:
-        """How many joint states, static edges and models could not be carried."""
+        """Counts of joint states, static edges and models that could not be carried."""
         return self._counters.stats().refused
 
     def _carry(self, robot: str, model: RobotModel) -> None:
@@ -158,14 +159,14 @@ class RobotBridge(Closeable):
             except ZStateError as error:
                 self._counters.count_refusal("model", f"{robot!r} is not carried: {error}")
                 return
-        self.has_begun = True
-        self._on_begin()
+        self.has_model = True
+        self._on_model()
 
     def _open_publisher(self, model: RobotModel) -> None:
         robot, source, target = self.robot, self.source, self.target
         with ExitStack() as opening:
             publisher = opening.enter_context(
-                # Beside other bridges, too; which way a robot is carried was decided before.
+                # takeover: other bridges may publish it as well; the direction is already chosen.
                 StatePublisher(target.session, model, robot, (target.wire,), program=PROGRAM, takeover=True)
             )
             statics = opening.enter_context(
@@ -181,16 +182,13 @@ class RobotBridge(Closeable):
     def _publish(self, readings: SubscribedSource, publisher: StatePublisher) -> None:
         with suppress(Closed):
             for reading in readings:
-                self._publish_one(reading, publisher)
-
-    def _publish_one(self, reading: JointReading, publisher: StatePublisher) -> None:
-        try:
-            publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
-        except InvalidInput as error:
-            self._counters.count_refusal("joint state", f"{self.robot!r}: {error}")
+                try:
+                    publisher.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
+                except InvalidInput as error:  # noqa: PERF203 - the next reading may be good
+                    self._counters.count_refusal("joint state", f"{self.robot!r}: {error}")
 
     def close(self) -> None:
-        """Carry no more, and withdraw what was written. A second call does nothing."""
+        """Stop, and withdraw what was published. A second call does nothing."""
         self._descriptions.close()
         with self._lock:
             self._closed = True
@@ -199,8 +197,8 @@ class RobotBridge(Closeable):
 
 _LOG = logging.getLogger("zstate")
 
-# Whoever writes these writes the robot. All robots may stand in one /tf, which tells nothing of one.
-_TELLING: tuple[Stream, ...] = ("joint_states", "robot_description")
+# Streams that identify the publisher of a robot; one /tf may contain all robots.
+_ROBOT_STREAMS: tuple[Stream, ...] = ("joint_states", "robot_description")
 
 _ADVICE = (
     "name one, as `zstate bridge panda` does, or give each its own namespace with the wire 'ros2:namespace=*'"
@@ -208,16 +206,16 @@ _ADVICE = (
 
 
 class Bridge(Closeable):
-    """Carries each robot that is written on one side to the other: joint states, model, static edges.
+    """Carries each robot that is published on one side to the other: joint states, model, static edges.
 
-    Its moving transforms are derived again over there; those of ROS's /tf that belong to no model are
+    Moving transforms are recomputed on the other side; edges of ROS's /tf that belong to no model are
     not carried. ``robots`` names the robots; None is all, which needs a namespace for each: the
-    ``ros_wire`` "ros2:namespace=*". What a bridge has written, this one or another, is
-    never carried back, and a robot that others write on both sides is not carried, which is logged.
+    ``ros_wire`` "ros2:namespace=*". Messages of bridges are never carried back. A robot with other
+    publishers on both sides is not carried, which is logged.
 
-    ``on_change(robot, way)`` is called when a robot begins to be carried, or to have another model, and
-    with None when it is carried no more; from threads of the bridge. Raises InvalidInput for robots
-    that would share a namespace, and for a wire that does not tell who writes.
+    ``on_change(robot, way)`` is called with each first or new model of a carried robot, and with None when
+    carrying stops; from threads of the bridge. Raises InvalidInput for robots that would share a namespace,
+    and for a wire format without the names of writers.
     """
 
     def __init__(
@@ -234,32 +232,33 @@ class Bridge(Closeable):
             BridgeSide(native, "native", "native to ROS"),
             BridgeSide(ros, ros_wire, "ROS to native"),
         )
-        self._on_change = on_change or _ignore
+        ignore: Callable[[str, Way | None], object] = lambda _robot, _way: None  # noqa: E731
+        self._on_change = on_change or ignore
         self._writers: defaultdict[str, tuple[set[Announcement], ...]] = defaultdict(lambda: (set(), set()))
         self._carriers: dict[str, RobotBridge] = {}
         self._conflicts: set[str] = set()
-        self._lock = threading.RLock()  # on_change may ask for the carriers
+        self._lock = threading.RLock()  # on_change may read ``carriers``
         with ExitStack() as opening:
-            opening.callback(self._end_all)
+            opening.callback(self._close_robots)
             for number, side in enumerate(self._sides):
                 for robot in robots or (ANY,):
-                    note = partial(self._on_writer, number)
-                    opening.enter_context(watch(side.session, robot, note, side.wire))
+                    on_writer = partial(self._on_writer, number)
+                    opening.enter_context(watch(side.session, robot, on_writer, side.wire))
             self._opened = opening.pop_all()
 
     @property
     def carriers(self) -> tuple[RobotBridge, ...]:
-        """Those at work, also for robots that nobody has described yet."""
+        """The open robot bridges, including robots without a description so far."""
         with self._lock:
             return tuple(self._carriers.values())
 
     def close(self) -> None:
-        """Carry nothing any more. A second call does nothing."""
+        """Stop carrying. A second call does nothing."""
         self._opened.close()
 
     def _on_writer(self, side: int, announced: Announcement, alive: bool) -> None:
-        # A ROS node is called with its namespace.
-        if announced.stream in _TELLING and announced.writer.program.rpartition("/")[2] != PROGRAM:
+        # The name of a ROS node includes its namespace.
+        if announced.stream in _ROBOT_STREAMS and announced.writer.program.rpartition("/")[2] != PROGRAM:
             with self._lock:
                 writers = self._writers[announced.robot]
                 (writers[side].add if alive else writers[side].discard)(announced)
@@ -267,22 +266,19 @@ class Bridge(Closeable):
 
     def _decide(self, robot: str, native: set[Announcement], ros: set[Announcement]) -> None:
         source, target = self._sides if native else reversed(self._sides)
-        is_wanted = bool(native) != bool(ros)
+        is_one_sided = bool(native) != bool(ros)
         carrier = self._carriers.get(robot)
-        if carrier is not None and not (is_wanted and carrier.source is source):
+        if carrier is not None and not (is_one_sided and carrier.source is source):
             self._close_robot(robot)
-        if is_wanted and robot not in self._carriers:
-            begin = partial(self._on_change, robot, source.direction)
-            self._carriers[robot] = RobotBridge(robot, source, target, begin)
-        self._report_conflict(robot, native, ros)
-
-    def _report_conflict(self, robot: str, native: set[Announcement], ros: set[Announcement]) -> None:
+        if is_one_sided and robot not in self._carriers:
+            on_model = partial(self._on_change, robot, source.direction)
+            self._carriers[robot] = RobotBridge(robot, source, target, on_model)
         if not (native and ros):
             self._conflicts.discard(robot)
         elif robot not in self._conflicts:
             self._conflicts.add(robot)
             _LOG.warning(
-                "%r is written natively by %s and on ROS by %s, so it is not carried; stop one of them, "
+                "%r is published natively by %s and in ROS by %s, so it is not carried; stop one of them, "
                 "or give them different names",
                 robot,
                 _named(native),
@@ -293,17 +289,13 @@ class Bridge(Closeable):
     def _close_robot(self, robot: str) -> None:
         carrier = self._carriers.pop(robot)
         carrier.close()
-        if carrier.has_begun:
+        if carrier.has_model:
             self._on_change(robot, None)
 
-    def _end_all(self) -> None:
+    def _close_robots(self) -> None:
         with self._lock:
             for robot in list(self._carriers):
                 self._close_robot(robot)
-
-
-def _ignore(robot: str, way: Way | None) -> None:
-    pass
 
 
 def _named(writers: set[Announcement]) -> str:
@@ -314,14 +306,14 @@ def _check(ros_wire: str, robots: Sequence[str] | None) -> None:
     wire = get_wire(ros_wire)
     if not isinstance(wire, Ros2Wire) or wire.name != "ros2":
         raise InvalidInput(
-            f"a bridge leads to the wire 'ros2', not {wire.name!r}, on which it could not tell what it "
-            "wrote itself"
+            f"a bridge connects the native wire to 'ros2', not to {wire.name!r}, where it cannot identify "
+            "its own messages"
         )
     options = wire.options
     if options.node:
         raise InvalidInput(
-            f"the ros2 option node is {options.node!r}, but the nodes of a bridge are called "
-            f"{PROGRAM!r}: by that bridges know each other; leave it out"
+            f"the ros2 option node is {options.node!r}, but the nodes of a bridge are called {PROGRAM!r}, "
+            "by which bridges recognise each other; leave it out"
         )
     names = [check_robot(robot) for robot in robots or ()]
     if len(names) == 1:

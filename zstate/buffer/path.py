@@ -410,9 +410,9 @@ def _step(edge: Edge, table: _TrackUseTable) -> Step:
         return PoseStep(se3.IDENTITY, *table.add(edge, edge.track, [PoseInterpolator(7 * edge.index)]))
     form = edge.track.forms[edge.index]
     place = table.add(edge, edge.track, _joint_interpolators(edge.track, edge.index))
-    if form.kind == "hinge":
+    if form.kind == "revolute":
         return RevoluteStep(form, *place)
-    if form.kind == "slide":
+    if form.kind == "prismatic":
         return PrismaticStep(form, *place)
     if form.kind == "planar":
         return PlanarStep(form, *place)

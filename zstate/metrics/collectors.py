@@ -289,7 +289,7 @@ class BridgeMetrics:
         families = MetricFamilies()
         for carrier in sorted(self._bridge.carriers, key=lambda carrier: carrier.robot)[:MAX_ROBOTS]:
             robot, way, text = carrier.robot, carrier.source.direction, "Bridged robots by direction."
-            families.gauge("zstate_bridge_carried", text, carrier.has_begun, robot=robot, way=way)
+            families.gauge("zstate_bridge_carried", text, carrier.has_model, robot=robot, way=way)
             for reason, count in carrier.refused.items():
                 text = "Messages that could not be bridged."
                 families.count("zstate_bridge_refused", text, count, robot=robot, reason=reason)

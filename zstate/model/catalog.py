@@ -1,7 +1,7 @@
-"""Robots known by name, such as "panda", and the URDF files behind them. Never touches the network.
+"""Catalog of robots by name, such as "panda", with their URDF files. Never uses the network.
 
-Looked in, in this order: zstate's own models/, the example-robot-data package, and what
-robot_descriptions has cloned earlier.
+Collections, in this order: zstate's own models/, the example-robot-data package, and the existing clones
+of robot_descriptions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from zstate.model.findings import quoted
 
 _HERE = Path(__file__).resolve()
 
-# What people type, where the file is called otherwise; paths in example-robot-data/robots.
+# Common names of files that are called otherwise; paths in example-robot-data/robots.
 _ALIASES = {
     "alexander": "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf",
     "allegro": "allegro_hand_description/urdf/allegro_right_hand.urdf",
@@ -43,7 +43,7 @@ _ALIASES = {
 
 @dataclass(frozen=True, slots=True)
 class CatalogEntry:
-    """A robot that ``load_model`` knows by name, its file, and the collection the file belongs to."""
+    """A robot that ``load_model`` finds by name, its file, and the collection of the file."""
 
     name: str
     path: Path
@@ -51,7 +51,7 @@ class CatalogEntry:
 
 
 def catalog() -> tuple[CatalogEntry, ...]:
-    """Every robot known by name, sorted by name; the first collection that has a name wins."""
+    """Every robot, sorted by name; the first collection that has a name wins."""
     entries: dict[str, CatalogEntry] = {}
     for origin, collect in _COLLECTIONS.items():
         for name, path in collect().items():
@@ -60,45 +60,41 @@ def catalog() -> tuple[CatalogEntry, ...]:
 
 
 def find_entry(name: str) -> CatalogEntry:
-    """The entry of that name; case does not matter, nor do ``-`` for ``_`` and a final ``_description``.
+    """The entry of that name, regardless of case, ``-`` for ``_``, and a final ``_description``.
 
-    Raises UnknownModel with near misses, where was looked, and what to install.
+    Raises UnknownModel with near misses, the searched collections, and what to install.
     """
-    wanted = _normal(name)
+    normal = _normal(name)
     for origin, collect in _COLLECTIONS.items():
-        path = collect().get(wanted)
+        path = collect().get(normal)
         if path is not None:
-            return CatalogEntry(wanted, path, origin)
-    raise _unknown(name, wanted)
+            return CatalogEntry(normal, path, origin)
+    entries = catalog()
+    near = get_close_matches(normal[:100], [entry.name for entry in entries], n=3)
+    parts = [f"no robot is called {quoted(name)}{suggestion_text(*near)}"]
+    counts = {origin: sum(entry.origin == origin for entry in entries) for origin in _COLLECTIONS}
+    searched = ", ".join(f"{origin} ({count} names)" for origin, count in counts.items())
+    parts.append(f"looked in {searched}; a path to a file works as well")
+    if not counts["example-robot-data"]:
+        parts.append("for many more robots, pip install 'zstate[robots]'")
+    raise UnknownModel(name, near, "; ".join(parts))
 
 
 def example_name() -> str:
-    """The robot of examples and advice: panda, or one of zstate's own where panda is not installed."""
+    """The robot for examples and advice: panda if it is installed, else rrbot."""
     return "panda" if any("panda" in collect() for collect in _COLLECTIONS.values()) else "rrbot"
 
 
 def package_folders() -> tuple[Path, ...]:
-    """The folders in and below which the collections keep packages, whose meshes their robots name."""
+    """The folders with the packages of the collections, which contain the meshes of their robots."""
     folders = [folder.parents[1] for folder in _example_folders()] + list(_example_folders())
     if util.find_spec("robot_descriptions") is not None:
         folders.append(_cloned())
     return tuple(folder for folder in folders if folder.is_dir())
 
 
-def _unknown(name: str, wanted: str) -> UnknownModel:
-    entries = catalog()
-    near = get_close_matches(wanted[:100], [entry.name for entry in entries], n=3)
-    parts = [f"no robot is called {quoted(name)}{suggestion_text(*near)}"]
-    counts = {origin: sum(entry.origin == origin for entry in entries) for origin in _COLLECTIONS}
-    looked = ", ".join(f"{origin} ({count} names)" for origin, count in counts.items())
-    parts.append(f"looked in {looked}; a path to a file works as well")
-    if not counts["example-robot-data"]:
-        parts.append("for many more robots, pip install 'zstate[robots]'")
-    return UnknownModel(name, near, "; ".join(parts))
-
-
 def _bundled() -> dict[str, Path]:
-    # Beside the package when installed, beside its folder in a checkout.
+    # Next to the modules when installed, next to the package in a checkout.
     for folder in (_HERE.parents[1] / "models", _HERE.parents[2] / "models"):
         if folder.is_dir():
             return _by_stem(folder.glob("*.urdf"))
@@ -128,7 +124,7 @@ def _example_folders() -> Iterator[Path]:
 
 @cache
 def _robot_descriptions() -> dict[str, Path]:
-    # Its modules clone repositories when imported, so only its cache is looked at.
+    # Its modules clone repositories when imported, so only its cache is read.
     if util.find_spec("robot_descriptions") is None:
         return {}
     return _by_stem(_cloned().rglob("*.urdf"))
@@ -147,7 +143,7 @@ _COLLECTIONS: dict[str, Callable[[], dict[str, Path]]] = {
 
 
 def _by_stem(paths: Iterable[Path]) -> dict[str, Path]:
-    """Files by name; of several with one name, that with the shortest path."""
+    """Files by name; among files of one name, the one with the shortest path."""
     named: dict[str, Path] = {}
     for path in sorted(paths, key=lambda path: (len(str(path)), str(path))):
         named.setdefault(_normal(path.stem), path)

@@ -1,4 +1,4 @@
-"""Finding: one thing a validator has to say about a model; Findings collects them."""
+"""Findings of the model validator: errors and warnings with lines and fixes."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _LONGEST_QUOTED = 80
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One fault or doubt: in which line (None: of the file as a whole), what, and how bad.
+    """One fault of a model in ``line`` (None: of the whole file).
 
-    An "error" makes the model unusable; a "warning" is something its author should know. ``fix`` says
-    what to write instead, where that can be said.
+    An "error" makes the model unusable, a "warning" does not. ``fix`` is what to write instead; empty if
+    unknown.
     """
 
     line: int | None
@@ -32,7 +32,7 @@ class Finding:
 
 
 class Findings:
-    """What has been found so far in one source."""
+    """The findings in one source so far."""
 
     def __init__(self, source: str) -> None:
         self.source = source
@@ -40,40 +40,42 @@ class Findings:
         self._suggestions_left = _MOST_SUGGESTIONS
 
     def error(self, line: int | None, message: str, fix: str = "") -> None:
-        """Note a fault that makes the model unusable, and what to write instead."""
+        """Add a fault that makes the model unusable, and what to write instead."""
         self._found.append(Finding(line, message, "error", fix))
 
     def warning(self, line: int | None, message: str, fix: str = "") -> None:
-        """Note something doubtful that does not prevent use, and what to write instead."""
+        """Add a fault that does not prevent use, and what to write instead."""
         self._found.append(Finding(line, message, "warning", fix))
 
     def did_you_mean(self, name: str, candidates: Iterable[str]) -> str | None:
-        """The candidate that was probably meant by ``name``, if there is one."""
+        """The candidate most similar to ``name``, if there is one."""
         if not self._suggestions_left or len(name) > _LONGEST_COMPARED:
             return None
         self._suggestions_left -= 1
         comparable = [candidate for candidate in candidates if len(candidate) <= _LONGEST_COMPARED]
-        for candidate in comparable:
-            if candidate.lower() == name.lower():
-                return candidate
-        near = get_close_matches(name, comparable, n=1)
-        return near[0] if near else None
+        same = [candidate for candidate in comparable if candidate.lower() == name.lower()]
+        return next(iter(same or get_close_matches(name, comparable, n=1)), None)
 
     def sorted(self) -> tuple[Finding, ...]:
-        """All findings by line; those of the whole file first."""
+        """All findings by line, after those of the whole file."""
         return tuple(sorted(self._found, key=lambda finding: finding.line or 0))
 
     def raise_errors(self) -> None:
-        """Raise ModelError with everything found if there is an error among it."""
+        """Raise ModelError with all findings if one of them is an error."""
         if any(finding.severity == "error" for finding in self._found):
             raise ModelError(self.source, self.sorted())
 
 
+def model_error(source: str, message: str, line: int | None = None, fix: str = "") -> ModelError:
+    """A ModelError with one finding."""
+    return ModelError(source, [Finding(line, message, "error", fix)])
+
+
 def quoted(text: str) -> str:
-    """``text`` in quotes, shortened where a file holds something endless."""
+    """``text`` in quotes, cut after 80 characters."""
     return repr(shortened(text))
 
 
 def shortened(text: str) -> str:
-    """``text``, without its end where a file holds something endless."""
+    """``text``, cut after 80 characters."""
     return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."

@@ -1,8 +1,8 @@
-"""Shapes: what the links of a robot look like, and what they are for collisions.
+"""Visual and collision shapes of the links of a robot.
 
-Read as rviz and urdfdom read it: a material defined directly in <robot> wins over one of the same name
-inside a link; one that is only named means the first of that name; and a mesh that brings its own
-materials keeps them, so that the URDF's colour is for meshes without.
+Materials follow rviz and urdfdom: one defined directly in <robot> wins over one of the same name inside a
+link; a reference by name is to the first of that name; and a mesh with materials of its own keeps them, so
+that the URDF's colour is for meshes without.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _SOME_GEOMETRY = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box about its middle; ``size`` along x, y, z [m]."""
+    """A box about its centre; ``size`` along x, y, z [m]."""
 
     size: tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """A cylinder about its middle, along z [m]."""
+    """A cylinder about its centre, along z [m]."""
 
     radius: float
     length: float
@@ -43,14 +43,14 @@ class Cylinder:
 
 @dataclass(frozen=True, slots=True)
 class Sphere:
-    """A sphere about its middle [m]."""
+    """A sphere about its centre [m]."""
 
     radius: float
 
 
 @dataclass(frozen=True, slots=True)
 class MeshFile:
-    """A mesh in a file, whose name is as the URDF writes it; ``scale`` along x, y, z."""
+    """A mesh file, named as in the URDF; ``scale`` along x, y, z."""
 
     uri: str
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -61,7 +61,7 @@ Geometry: TypeAlias = Box | Cylinder | Sphere | MeshFile
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """What a surface looks like: red, green, blue, opacity in 0..1 (sRGB), and the name of an image."""
+    """Surface of a shape: red, green, blue, opacity in 0..1 (sRGB), and the name of an image."""
 
     color: Color | None = None
     texture: str | None = None
@@ -85,13 +85,13 @@ def parse_shapes(model: RobotModel) -> tuple[Shape, ...]:
 
 
 def read_shapes(model: RobotModel) -> tuple[tuple[Shape, ...], tuple[Finding, ...]]:
-    """The shapes that can be drawn, and what is wrong with those that cannot, by line."""
+    """The shapes that can be drawn, and the faults of the others by line."""
     reader = _Reader(model)
     return tuple(reader.shapes()), reader.findings.sorted()
 
 
-class _Fault(ValueError):
-    """Why a shape cannot be drawn, and what to write instead."""
+class _ShapeError(ValueError):
+    """The fault of a shape that cannot be drawn, and what to write instead."""
 
     def __init__(self, element: Element, message: str, fix: str = "") -> None:
         super().__init__(message)
@@ -121,9 +121,13 @@ class _Reader:
                         yield from self._shape(name, role, child)
 
     def _shape(self, link: str, role: Role, element: Element) -> Iterator[Shape]:
+        origin = IDENTITY
         try:
-            origin, geometry = _origin(element), _geometry(element)
-        except _Fault as fault:
+            for child in element.all("origin")[:1]:
+                x, y, z = _vector(child, "xyz", (0.0, 0.0, 0.0))
+                origin = (x, y, z, *quaternion_from_rpy(*_vector(child, "rpy", (0.0, 0.0, 0.0))))
+            geometry = _geometry(element)
+        except _ShapeError as fault:
             message = f"link {quoted(link)}: a <{role}> is not drawn: {fault}"
             self.findings.warning(fault.line, message, fault.fix)
             return
@@ -146,37 +150,29 @@ class _Reader:
 
     def _material(self, element: Element) -> Material:
         files = (texture.attributes.get("filename", "") for texture in element.all("texture"))
-        colors = (self._color(element, color) for color in element.all("color"))
-        return Material(next(colors, None), next(filter(None, files), None))
-
-    def _color(self, material: Element, element: Element) -> Color | None:
-        try:
-            numbers = read_numbers(element.attributes.get("rgba", ""), 4)
-        except NumberError as fault:
-            name = quoted(material.attributes.get("name", ""))
-            self.findings.warning(element.line, f"material {name}: rgba: {fault}", 'rgba="0.7 0.7 0.7 1"')
-            return None
-        red, green, blue, opacity = (min(max(number, 0.0), 1.0) for number in numbers)
-        return red, green, blue, opacity
+        color: Color | None = None
+        for child in element.all("color")[:1]:
+            try:
+                numbers = read_numbers(child.attributes.get("rgba", ""), 4)
+            except NumberError as fault:
+                name = quoted(element.attributes.get("name", ""))
+                self.findings.warning(child.line, f"material {name}: rgba: {fault}", 'rgba="0.7 0.7 0.7 1"')
+                break
+            red, green, blue, opacity = (min(max(number, 0.0), 1.0) for number in numbers)
+            color = (red, green, blue, opacity)
+        return Material(color, next(filter(None, files), None))
 
 
 def _defined(materials: Iterable[Element]) -> Iterator[Element]:
-    """Those that say what they look like, where others only name it."""
-    return (one for one in materials if one.all("color") or one.all("texture"))
-
-
-def _origin(element: Element) -> Pose7:
-    for origin in element.all("origin"):
-        x, y, z = _vector(origin, "xyz", (0.0, 0.0, 0.0))
-        return (x, y, z, *quaternion_from_rpy(*_vector(origin, "rpy", (0.0, 0.0, 0.0))))
-    return IDENTITY
+    """The materials that define a color or texture; the others are references by name."""
+    return (material for material in materials if material.all("color") or material.all("texture"))
 
 
 def _geometry(element: Element) -> Geometry:
-    given = [child for geometry in element.all("geometry") for child in geometry.children]
-    if not given:
-        raise _Fault(element, "it has no <geometry> with something inside", _SOME_GEOMETRY)
-    shape = given[0]
+    shapes = [child for geometry in element.all("geometry") for child in geometry.children]
+    if not shapes:
+        raise _ShapeError(element, "it has no <geometry> with something inside", _SOME_GEOMETRY)
+    shape = shapes[0]
     if shape.tag == "box":
         x, y, z = _vector(shape, "size")
         return Box((_length(shape, x), _length(shape, y), _length(shape, z)))
@@ -185,22 +181,18 @@ def _geometry(element: Element) -> Geometry:
     if shape.tag == "sphere":
         return Sphere(_length(shape, _number(shape, "radius")))
     if shape.tag == "mesh":
-        return _mesh(shape)
+        uri = shape.attributes.get("filename", "").strip()
+        if not uri:
+            fix = '<mesh filename="package://PACKAGE/meshes/FILE.stl"/>'
+            raise _ShapeError(shape, "its <mesh> names no file", fix)
+        return MeshFile(uri, _vector(shape, "scale", (1.0, 1.0, 1.0)))
     message = f"<{quoted(shape.tag)[1:-1]}> is none of {', '.join(_GEOMETRIES)}"
-    raise _Fault(shape, message, _SOME_GEOMETRY)
-
-
-def _mesh(element: Element) -> MeshFile:
-    uri = element.attributes.get("filename", "").strip()
-    if not uri:
-        fix = '<mesh filename="package://PACKAGE/meshes/FILE.stl"/>'
-        raise _Fault(element, "its <mesh> names no file", fix)
-    return MeshFile(uri, _vector(element, "scale", (1.0, 1.0, 1.0)))
+    raise _ShapeError(shape, message, _SOME_GEOMETRY)
 
 
 def _length(element: Element, length: float) -> float:
     if length < 0.0:
-        raise _Fault(element, f"its <{element.tag}> has the negative length {length:g} m")
+        raise _ShapeError(element, f"its <{element.tag}> has the negative length {length:g} m")
     return length
 
 
@@ -212,7 +204,7 @@ def _vector(
     try:
         x, y, z = read_numbers(element.attributes.get(name, ""), 3)
     except NumberError as fault:
-        raise _Fault(element, f"{element.tag} {name}: {fault}", f'{name}="0 0 0"') from None
+        raise _ShapeError(element, f"{element.tag} {name}: {fault}", f'{name}="0 0 0"') from None
     return x, y, z
 
 
@@ -220,4 +212,4 @@ def _number(element: Element, name: str) -> float:
     try:
         return read_number(element.attributes.get(name, ""))
     except NumberError as fault:
-        raise _Fault(element, f"{element.tag} {name}: {fault}", f'{name}="0.1"') from None
+        raise _ShapeError(element, f"{element.tag} {name}: {fault}", f'{name}="0.1"') from None

@@ -1,16 +1,17 @@
-"""What each joint does to its link, as a formula of the joint's numbers.
+"""Closed forms of ``parent_from_child`` as a function of the joint's positions.
 
-The pose of a link in its parent needs no tree and no solver: with ``x = scale * position + shift``,
+With ``x = scale * position + shift``,
 
-- a hinge turns by ``x`` about a fixed axis: ``q = q_cos cos(x/2) + q_sin sin(x/2)``, where ``q_cos`` is
-  the origin's rotation and ``q_sin`` is that times the half turn about the axis;
-- a slide moves by ``x`` along a fixed axis: ``t = t0 + t1 x``;
+- a revolute or continuous joint turns by ``x`` about a fixed axis: ``q = q_cos cos(x/2) + q_sin sin(x/2)``,
+  where ``q_cos`` is the origin's rotation and ``q_sin`` is that times the half turn about the axis;
+- a prismatic joint moves by ``x`` along a fixed axis: ``t = t0 + t1 x``;
 - a planar joint moves by x, y in the plane of its frame and then turns by yaw about its z;
 - a floating joint is its origin times the given pose.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -20,35 +21,33 @@ from numpy.typing import NDArray
 from zstate.errors import InvalidInput
 from zstate.extension import kernel
 from zstate.model.robot import NORM_TOLERANCE, Joint, JointType, RobotModel
-from zstate.se3 import multiply, rotate, to_matrix
+from zstate.se3 import SCALARS, multiply, normalize, rotate, to_matrix
 
 if TYPE_CHECKING or kernel == "c":
     from zstate import _kernel
 
-EdgeKind = Literal["fixed", "hinge", "slide", "planar", "floating"]
+EdgeKind = Literal["fixed", "revolute", "prismatic", "planar", "floating"]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Floats = NDArray[np.float64]
 
 _KINDS: dict[JointType, EdgeKind] = {
     "fixed": "fixed",
-    "revolute": "hinge",
-    "continuous": "hinge",
-    "prismatic": "slide",
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
     "planar": "planar",
     "floating": "floating",
 }
-
-_UNIT_QUATERNIONS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class JointTransform:
     """``parent_from_child`` as a function of the position vector.
 
-    ``column`` and ``velocity_column`` say where the numbers of the joint (of its master, for a mimic)
-    begin in the vectors of positions and velocities; -1 for a fixed edge. ``scale`` and ``shift`` are
-    1 and 0 except for mimics. ``q_cos``, ``q_sin``, ``t0`` and ``t1`` are those of the module's formulas
+    ``column`` and ``velocity_column`` are the indices of the joint's first number (its master's, for a
+    mimic) in the vectors of positions and velocities; -1 for a fixed edge. ``scale`` and ``shift`` are
+    1 and 0 except for mimics. ``q_cos``, ``q_sin``, ``t0`` and ``t1`` stand in the module's formulas
     (quaternions x y z w; a planar joint's turn by yaw); ``origin`` is ``parent_from_joint`` as pose7
     with a unit quaternion and ``axis`` the unit axis in the joint's frame, z for planar joints.
     """
@@ -69,28 +68,28 @@ class JointTransform:
 
 
 def edge_forms(model: RobotModel) -> tuple[JointTransform, ...]:
-    """The formula of every edge, fixed ones included, in the order of ``model.joints``."""
+    """The closed form of every edge, fixed ones included, in the order of ``model.joints``."""
     return tuple(_form(model, joint) for joint in model.joints)
 
 
 class JointTransforms:
-    """All edges of a robot at once: positions in, ``parent_from_child`` out.
+    """Poses ``parent_from_child`` of all edges of a robot, from one position vector.
 
-    Immutable, so any thread may use it. Positions are trusted to be finite and of the right length.
+    Immutable, so any thread may use it. Positions must be finite and of the right length (not checked).
     """
 
     def __init__(self, model: RobotModel) -> None:
         self.forms = edge_forms(model)
-        self._rest = _rest_poses(self.forms)
-        self._turns = _RevoluteBatch.poses(self.forms)
-        self._slides = _PrismaticBatch.poses(self.forms)
-        self._floats = _FloatingBatch.poses(self.forms)
+        self._rest = np.array([(*form.t0, *form.q_cos) for form in self.forms]).reshape(-1, 7)
+        self._floats = _FloatingBatch.build(self.forms)
+        batches = (_RevoluteBatch.build(self.forms), _PrismaticBatch.build(self.forms), self._floats)
+        self._batches = tuple(batch for batch in batches if batch is not None)
         self._compiled = _compiled(model.position_count, self.forms) if kernel == "c" else None
 
     def poses(self, positions: Floats, out: Floats | None = None) -> Floats:
         """``parent_from_child`` of every edge, rows as ``forms``: x y z [m], qx qy qz qw.
 
-        ``positions`` (..., nq) give (..., E, 7), written into ``out`` when that is given. The sign of a
+        ``positions`` (..., nq) give (..., E, 7), written into ``out`` if passed. The sign of a
         quaternion is arbitrary. Raises InvalidInput for a floating joint without a unit quaternion.
         """
         if out is None:
@@ -100,30 +99,26 @@ class JointTransforms:
             self._compiled.poses(positions, out)
             return out
         out[...] = self._rest
-        if self._turns is not None:
-            self._turns.write(positions, out)
-        if self._slides is not None:
-            self._slides.write(positions, out)
-        if self._floats is not None:
-            self._floats.write(positions, out)
+        for batch in self._batches:
+            batch.write(positions, out)
         return out
 
     @property
     def has_floats(self) -> bool:
-        """Whether there are floating joints, whose quaternions have to be looked at."""
+        """Whether there are floating joints, whose quaternions need a check."""
         return self._floats is not None
 
     def normalised(self, positions: Floats) -> Floats:
         """``positions`` with the quaternions of floating joints at unit length.
 
-        Raises InvalidInput where a length is off by more than ``NORM_TOLERANCE``.
+        Raises InvalidInput if a length is off by more than ``NORM_TOLERANCE``.
         """
         return positions if self._floats is None else self._floats.normalised(positions)
 
 
 @dataclass(frozen=True, slots=True)
 class _RevoluteBatch:
-    """The edges that turn about an axis: hinges, and planar joints by their yaw."""
+    """The edges that turn about an axis: revolute joints, and planar joints by their yaw."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
@@ -133,8 +128,8 @@ class _RevoluteBatch:
     q_sin: Floats
 
     @classmethod
-    def poses(cls, forms: tuple[JointTransform, ...]) -> _RevoluteBatch | None:
-        turning = [(row, form) for row, form in enumerate(forms) if form.kind in ("hinge", "planar")]
+    def build(cls, forms: tuple[JointTransform, ...]) -> _RevoluteBatch | None:
+        turning = [(row, form) for row, form in enumerate(forms) if form.kind in ("revolute", "planar")]
         if not turning:
             return None
         return cls(
@@ -157,7 +152,7 @@ class _RevoluteBatch:
 
 @dataclass(frozen=True, slots=True)
 class _PrismaticBatch:
-    """The edges whose translation moves along one axis, or along two: planar joints."""
+    """The edges that move along one axis (prismatic joints) or along two (planar joints)."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
@@ -165,15 +160,23 @@ class _PrismaticBatch:
     steps: Floats
 
     @classmethod
-    def poses(cls, forms: tuple[JointTransform, ...]) -> _PrismaticBatch | None:
-        sliding = [(row, form) for row, form in enumerate(forms) if form.kind in ("slide", "planar")]
+    def build(cls, forms: tuple[JointTransform, ...]) -> _PrismaticBatch | None:
+        sliding = [(row, form) for row, form in enumerate(forms) if form.kind in ("prismatic", "planar")]
         if not sliding:
             return None
         return cls(
             rows=np.array([row for row, _ in sliding], dtype=np.intp),
             columns=np.array([(form.column, form.column + (form.kind == "planar")) for _, form in sliding]),
             offsets=np.array([np.array(form.t0) + np.array(form.t1) * form.shift for _, form in sliding]),
-            steps=np.array([_steps(form) for _, form in sliding]),
+            # The derivative of the translation by the joint's two numbers; a prismatic joint has one.
+            steps=np.array(
+                [
+                    to_matrix(form.origin)[:3, :2]
+                    if form.kind == "planar"
+                    else np.outer(form.t1, (form.scale, 0.0))
+                    for _, form in sliding
+                ]
+            ),
         )
 
     def write(self, positions: Floats, out: Floats) -> None:
@@ -183,7 +186,7 @@ class _PrismaticBatch:
 
 @dataclass(frozen=True, slots=True)
 class _FloatingBatch:
-    """The edges that are given as a pose: the origin acts on it linearly, as a 7 x 7 matrix."""
+    """Floating joints, whose positions are a pose: the origin acts on it linearly, as a 7 x 7 matrix."""
 
     rows: NDArray[np.intp]
     columns: NDArray[np.intp]
@@ -192,14 +195,16 @@ class _FloatingBatch:
     names: tuple[str, ...]
 
     @classmethod
-    def poses(cls, forms: tuple[JointTransform, ...]) -> _FloatingBatch | None:
+    def build(cls, forms: tuple[JointTransform, ...]) -> _FloatingBatch | None:
         floating = [(row, form) for row, form in enumerate(forms) if form.kind == "floating"]
         if not floating:
             return None
         origins = np.zeros((len(floating), 7, 7))
         for matrix, (_, form) in zip(origins, floating, strict=True):
             matrix[:3, :3] = to_matrix(form.origin)[:3, :3]
-            matrix[3:, 3:] = np.transpose([multiply(form.q_cos, unit) for unit in _UNIT_QUATERNIONS])
+            matrix[3:, 3:] = np.transpose(
+                [multiply(form.q_cos, (x, y, z, w)) for x, y, z, w in np.eye(4).tolist()]
+            )
         return cls(
             rows=np.array([row for row, _ in floating], dtype=np.intp),
             columns=np.array([np.arange(form.column, form.column + 7) for _, form in floating]),
@@ -212,7 +217,11 @@ class _FloatingBatch:
         quaternions = positions[..., self.columns[:, 3:]]
         norms: Floats = np.sqrt(np.square(quaternions).sum(axis=-1, keepdims=True))
         if not np.all(np.abs(norms - 1.0) <= NORM_TOLERANCE):
-            self._refuse(norms)
+            worst = int(np.abs(norms - 1.0).argmax())
+            raise InvalidInput(
+                f"the floating joint of {self.names[worst % len(self.names)]} was given a quaternion of "
+                f"length {norms.item(worst):.6g}; its last four numbers are qx qy qz qw of length 1"
+            )
         unit = positions.copy()
         unit[..., self.columns[:, 3:]] = quaternions / norms
         return unit
@@ -221,18 +230,15 @@ class _FloatingBatch:
         poses = self.origins @ positions.take(self.columns, axis=-1)[..., None]
         out[..., self.rows, :] = poses[..., 0] + self.offsets
 
-    def _refuse(self, norms: Floats) -> None:
-        worst = int(np.abs(norms - 1.0).argmax())
-        raise InvalidInput(
-            f"the floating joint of {self.names[worst % len(self.names)]} was given a quaternion of length "
-            f"{norms.item(worst):.6g}; its last four numbers are qx qy qz qw of length 1"
-        )
-
 
 def _form(model: RobotModel, joint: Joint) -> JointTransform:
     kind = _KINDS[joint.type]
-    axis = _unit3((0.0, 0.0, 1.0) if kind == "planar" else joint.axis) if kind != "fixed" else joint.axis
-    rotation = _unit4(joint.origin[3:])
+    axis = joint.axis
+    if kind != "fixed":
+        x, y, z = (0.0, 0.0, 1.0) if kind == "planar" else joint.axis
+        length = math.hypot(x, y, z)
+        axis = (x / length, y / length, z / length)
+    rotation = normalize(joint.origin, SCALARS)[3:]
     still = (0.0, 0.0, 0.0)
     master = model.mimic_of(joint)
     return JointTransform(
@@ -244,9 +250,9 @@ def _form(model: RobotModel, joint: Joint) -> JointTransform:
         scale=master.multiplier,
         shift=master.offset,
         q_cos=rotation,
-        q_sin=multiply(rotation, (*axis, 0.0)) if kind in ("hinge", "planar") else (*still, 0.0),
+        q_sin=multiply(rotation, (*axis, 0.0)) if kind in ("revolute", "planar") else (*still, 0.0),
         t0=joint.origin[:3],
-        t1=rotate(rotation, axis) if kind == "slide" else still,
+        t1=rotate(rotation, axis) if kind == "prismatic" else still,
         origin=(*joint.origin[:3], *rotation),
         axis=axis,
     )
@@ -257,40 +263,13 @@ def _plain(array: Floats) -> bool:
 
 
 def _compiled(width: int, forms: tuple[JointTransform, ...]) -> _kernel.Edges:
-    """The same formulas in the C extension, which takes the kinds in the order of ``EdgeKind``."""
+    """The same formulas in the C extension, which expects the kinds in the order of ``EdgeKind``."""
     kinds = get_args(EdgeKind)
-    return _kernel.Edges(
-        width, tuple((kinds.index(form.kind), 0, form.column, False, _numbers(form)) for form in forms)
-    )
-
-
-def _numbers(form: JointTransform) -> tuple[float, ...]:
-    if form.kind in ("hinge", "slide"):
-        along = form.q_sin if form.kind == "hinge" else form.t1
-        return (form.scale, form.shift, *form.q_cos, *form.t0, *along)
-    return form.origin
-
-
-def _rest_poses(forms: tuple[JointTransform, ...]) -> Floats:
-    rest = np.zeros((len(forms), 7))
-    for row, form in zip(rest, forms, strict=True):
-        row[:3] = form.t0
-        row[3:] = form.q_cos
-    return rest
-
-
-def _steps(form: JointTransform) -> Floats:
-    """How the translation changes per unit of the joint's two numbers; a slide has but one."""
-    if form.kind == "planar":
-        return to_matrix(form.origin)[:3, :2]
-    return np.outer(form.t1, (form.scale, 0.0))
-
-
-def _unit3(values: Vector) -> Vector:
-    x, y, z = (np.array(values) / np.linalg.norm(values)).tolist()
-    return (x, y, z)
-
-
-def _unit4(values: Quaternion) -> Quaternion:
-    x, y, z, w = (np.array(values) / np.linalg.norm(values)).tolist()
-    return (x, y, z, w)
+    edges: list[tuple[int, int, int, bool, tuple[float, ...]]] = []
+    for form in forms:
+        numbers: tuple[float, ...] = form.origin
+        if form.kind in ("revolute", "prismatic"):
+            along = form.q_sin if form.kind == "revolute" else form.t1
+            numbers = (form.scale, form.shift, *form.q_cos, *form.t0, *along)
+        edges.append((kinds.index(form.kind), 0, form.column, False, numbers))
+    return _kernel.Edges(width, tuple(edges))

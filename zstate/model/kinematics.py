@@ -1,8 +1,9 @@
-"""Kinematics: positions in, poses and velocities of links out.
+"""Forward kinematics: poses and velocities of links from positions.
 
-Poses of links in their parents come from closed forms (``edges.py``) and need numpy only. Poses in the
-root and velocities are Pinocchio's, which is imported at their first use. It sees numbers, never names
-or text: its model is built joint by joint from the RobotModel, depth first as its algorithms expect.
+Poses of links in their parents come from closed forms (``joint_transforms.py``) and need numpy only.
+Pinocchio computes poses in the root and velocities; it is imported at the first such call. It gets
+numbers, never names or text: its model is built joint by joint from the RobotModel, depth first as its
+algorithms expect.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from zstate.model.robot import RobotModel
 class Kinematics:
     """Forward kinematics of one robot.
 
-    ``edges`` are the (parent, child) of every joint, in the order of ``model.joints``. All methods take
-    positions in the order of ``model.joint_names`` (lists will do) and raise InvalidInput for a wrong
+    ``edges`` are the (parent, child) of every joint, in the order of ``model.joints``. Positions are
+    arrays or lists in the order of ``model.joint_names``; methods raise InvalidInput for a wrong
     count, NaN or infinity, and for a floating joint's quaternion that is not of unit length. Mimic
-    joints follow their master. Any thread may call; ``link_poses`` and ``twist`` take turns at one
+    joints follow their master. Any thread may call; ``link_poses`` and ``twist`` share one locked
     workspace, whose memory grows with the cube of the joint count (8 MB at 44, 0.5 GB at 200, which is
     why ``load_model`` refuses larger robots). ``edge_poses`` needs no workspace and no lock.
     """
@@ -45,7 +46,7 @@ class Kinematics:
         """The pose of every link but the root in its parent.
 
         Row i is ``parent_from_child`` of ``edges[i]``: (E, 7), x y z [m], qx qy qz qw; written into
-        ``out`` when that is given. The sign of a quaternion is arbitrary.
+        ``out`` if passed. The sign of a quaternion is arbitrary.
         """
         checked = self.model.check_positions(positions)
         return self._table.poses(checked, _destination(out, len(self.edges)))
@@ -54,7 +55,7 @@ class Kinematics:
         """The pose of every link in the root link.
 
         Row i is ``root_from_link`` of ``model.links[i]``: (L, 7), x y z [m], qx qy qz qw; written into
-        ``out`` when that is given. The sign of a quaternion is arbitrary.
+        ``out`` if passed. The sign of a quaternion is arbitrary.
         """
         checked = self._table.normalised(self.model.check_positions(positions))
         out = _destination(out, len(self.model.links))
@@ -64,7 +65,7 @@ class Kinematics:
     def twist(
         self, link: str, positions: ArrayLike, velocities: ArrayLike, reference: str | None = None
     ) -> Floats:
-        """How fast ``link`` moves as seen from ``reference`` (the root when None): (6,).
+        """The velocity of ``link`` in ``reference`` (None: the root): (6,).
 
         The rate of ``reference_from_link``: linear velocity of the link's origin [m/s], then angular
         velocity [rad/s], both in the axes of ``reference``. Velocities as ``model.check_velocities``.
@@ -88,19 +89,27 @@ class Kinematics:
 
 
 class _Solver:
-    """Pinocchio's model and workspace of one robot; not for two threads at a time.
+    """Pinocchio's model and workspace of one robot. Not thread-safe.
 
     Frame i + 1 of Pinocchio is link i, frame 0 its universe, which is the root link. Continuous joints
-    are ordinary hinges here: Pinocchio turns angles into cosine and sine itself, at any number of turns.
+    are ordinary revolute joints here: Pinocchio computes cosine and sine of any angle itself.
     """
 
     def __init__(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
-        self._pin = _pinocchio()
+        # Imported here because edge_poses does not need it; it comes without types.
+        try:
+            import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
+        except ImportError as error:
+            raise LibraryMissing(
+                f"link poses and twists need Pinocchio, which cannot be loaded: {error}; "
+                "its wheel needs the system's OpenMP: apt-get install libgomp1"
+            ) from error
+        self._pin: Any = pinocchio
         self._model: Any = self._pin.Model()
         self._joint_ids: dict[JointTransform, int] = {}
         self._add_links(model, forms)
         self._data: Any = self._model.createData()
-        single = [form for form in self._joint_ids if form.kind in ("hinge", "slide")]
+        single = [form for form in self._joint_ids if form.kind in ("revolute", "prismatic")]
         self._q_rows = np.array([self._q_row(form) for form in single], dtype=np.intp)
         self._v_rows = np.array([self._v_row(form) for form in single], dtype=np.intp)
         self._columns = np.array([form.column for form in single], dtype=np.intp)
@@ -109,7 +118,11 @@ class _Solver:
         self._shift = np.array([form.shift for form in single])
         self._planar = [form for form in self._joint_ids if form.kind == "planar"]
         self._floating = [form for form in self._joint_ids if form.kind == "floating"]
-        self._frames = _placement_rows(self._data.oMf, len(model.links) + 1)[1:]
+        # A view of Pinocchio's placements, which are contiguous, twelve doubles each: the rotation by
+        # columns, then the translation. Reading them one by one from Python costs more than ten times
+        # what computing them does. The view keeps the workspace alive.
+        first = self._data.oMf[0].rotation
+        self._frames = np.lib.stride_tricks.as_strided(first, (len(model.links) + 1, 12), (96, 8))[1:]
 
     def link_poses(self, positions: Floats, out: Floats) -> Floats:
         self._pin.framesForwardKinematics(self._model, self._data, self._configuration(positions))
@@ -128,7 +141,7 @@ class _Solver:
         return np.concatenate((rotation @ linear, rotation @ (angular - reference_angular)))
 
     def _motion(self, link: int) -> tuple[Floats, Floats, Any]:
-        """Velocity of a link's origin and its angular velocity in the root, and its pose there."""
+        """Linear velocity of a link's origin, its angular velocity and its pose, in the root."""
         pose = self._pin.updateFramePlacement(self._model, self._data, link + 1).copy()
         axes = self._pin.LOCAL_WORLD_ALIGNED
         motion = self._pin.getFrameVelocity(self._model, self._data, link + 1, axes)
@@ -151,16 +164,16 @@ class _Solver:
         v = np.empty(self._model.nv)
         v[self._v_rows] = velocities[self._velocity_columns] * self._scale
         for form in self._planar:
-            given = velocities[form.velocity_column : form.velocity_column + 3]
+            x, y, yaw_rate = velocities[form.velocity_column : form.velocity_column + 3]
             yaw = positions[form.column + 2]
             cos, sin = np.cos(yaw), np.sin(yaw)
             row = self._v_row(form)
-            v[row : row + 3] = cos * given[0] + sin * given[1], cos * given[1] - sin * given[0], given[2]
+            v[row : row + 3] = cos * x + sin * y, cos * y - sin * x, yaw_rate
         for form in self._floating:
             pose = self._pin.XYZQUATToSE3(positions[form.column : form.column + 7])
-            given = velocities[form.velocity_column : form.velocity_column + 6]
+            rates = velocities[form.velocity_column : form.velocity_column + 6]
             row = self._v_row(form)
-            v[row : row + 6] = (given.reshape(2, 3) @ pose.rotation).ravel()
+            v[row : row + 6] = (rates.reshape(2, 3) @ pose.rotation).ravel()
         return v
 
     def _add_links(self, model: RobotModel, forms: tuple[JointTransform, ...]) -> None:
@@ -182,17 +195,15 @@ class _Solver:
         joint_from_origin = placement * self._pin.XYZQUATToSE3(np.array(form.origin))
         if form.kind == "fixed":
             return joint_id, joint_from_origin
-        name = f"j{len(self._joint_ids)}"
-        added: int = self._model.addJoint(joint_id, self._joint_of(form), joint_from_origin, name)
+        if form.kind == "revolute":
+            joint = self._pin.JointModelRevoluteUnaligned(np.array(form.axis))
+        elif form.kind == "prismatic":
+            joint = self._pin.JointModelPrismaticUnaligned(np.array(form.axis))
+        else:
+            joint = self._pin.JointModelPlanar() if form.kind == "planar" else self._pin.JointModelFreeFlyer()
+        added: int = self._model.addJoint(joint_id, joint, joint_from_origin, f"j{len(self._joint_ids)}")
         self._joint_ids[form] = added
         return added, self._pin.SE3.Identity()
-
-    def _joint_of(self, form: JointTransform) -> Any:
-        if form.kind == "hinge":
-            return self._pin.JointModelRevoluteUnaligned(np.array(form.axis))
-        if form.kind == "slide":
-            return self._pin.JointModelPrismaticUnaligned(np.array(form.axis))
-        return self._pin.JointModelPlanar() if form.kind == "planar" else self._pin.JointModelFreeFlyer()
 
     def _q_row(self, form: JointTransform) -> int:
         return self._model.idx_qs[self._joint_ids[form]]
@@ -209,17 +220,8 @@ def _destination(out: Floats | None, rows: int) -> Floats:
     return out
 
 
-def _placement_rows(placements: Any, count: int) -> Floats:
-    """A live view of Pinocchio's placements: (count, 12), the rotation by columns, then the translation.
-
-    Pinocchio keeps them side by side, each as twelve doubles; reading them one by one from Python
-    costs more than ten times what computing them does. The view keeps the workspace alive.
-    """
-    return np.lib.stride_tricks.as_strided(placements[0].rotation, (count, 12), (96, 8))
-
-
 def _quaternion_products() -> tuple[Floats, Floats]:
-    """``rotation @ matrix + offset`` is 4 q q^T for a rotation whose nine numbers stand by columns."""
+    """``rotation @ matrix + offset`` is 4 q q^T for a rotation given as nine numbers by columns."""
     matrix = np.zeros((3, 3, 4, 4))
     offset = np.eye(4)
     for i in range(3):
@@ -244,15 +246,3 @@ def _quaternions(rotations: Floats) -> Floats:
     largest: NDArray[np.intp] = products[:, ::5].argmax(axis=1)
     rows = products.reshape(-1, 4, 4)[np.arange(len(largest)), largest]
     return rows / np.sqrt(np.einsum("ij,ij->i", rows, rows))[:, None]
-
-
-def _pinocchio() -> Any:
-    # Imported here because edge_poses needs none of it; it comes without types.
-    try:
-        import pinocchio  # noqa: PLC0415  # pyright: ignore[reportMissingTypeStubs]
-    except ImportError as error:
-        raise LibraryMissing(
-            f"link poses and twists need Pinocchio, which cannot be loaded: {error}; "
-            "its wheel wants the system's OpenMP: apt-get install libgomp1"
-        ) from error
-    return pinocchio

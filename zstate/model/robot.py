@@ -1,7 +1,7 @@
-"""RobotModel: what the robot is. Frozen once made; everything else asks it.
+"""Robot model: links, joints and the layout of position vectors, as frozen values.
 
 Positions of a robot are one flat vector in the order of ``RobotModel.joint_names``, the order in
-which the URDF names its driven joints. Each joint type takes a fixed count of numbers there:
+which the URDF names its driven joints. The count of numbers depends on the joint type:
 
 ============  =========  =======================================  ==========
 type          positions  meaning                                  velocities
@@ -16,8 +16,6 @@ fixed, mimic  0          -                                        0
 
 Velocities are the rates of these numbers; those of a floating joint are its linear velocity [m/s]
 and its angular velocity [rad/s], both in the axes of the joint's own (zero) frame.
-
-Coordinates: a name for each number of a robot's position vector.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -51,14 +50,18 @@ POSITION_COUNTS: dict[JointType, int] = {
 VELOCITY_COUNTS: dict[JointType, int] = {**POSITION_COUNTS, "floating": 6}
 
 NORM_TOLERANCE = 1e-3
-"""A floating joint's quaternion this close to unit length is normalised; beyond, it is refused."""
+"""A floating joint's quaternion is normalised if its length is this close to 1, else refused."""
 
 _SEPARATORS = re.compile(r"[^a-z0-9]+")
+_COORDINATES = {
+    "floating": (".x", ".y", ".z", ".qx", ".qy", ".qz", ".qw"),
+    "planar": (".x", ".y", ".yaw"),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a joint may do: [rad] or [m], per second, and [Nm] or [N]. Infinite where not stated."""
+    """Limits of a joint: [rad] or [m], per second, and [Nm] or [N]. Infinite unless stated."""
 
     lower: float = -np.inf
     upper: float = np.inf
@@ -77,10 +80,10 @@ class Mimic:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One edge of the robot: how ``child`` sits on ``parent``.
+    """One edge of the robot, from link ``parent`` to link ``child``.
 
     ``origin`` is ``parent_from_joint`` as pose7; ``axis`` is the unit axis in the joint's frame.
-    ``line`` is where the URDF names the joint.
+    ``line`` is its line in the URDF.
     """
 
     name: str
@@ -95,7 +98,7 @@ class Joint:
 
     @property
     def driven(self) -> bool:
-        """Whether positions are given for this joint: neither fixed nor a mimic."""
+        """Whether the position vector has numbers for this joint: neither fixed nor a mimic."""
         return self.type != "fixed" and self.mimic is None
 
 
@@ -104,7 +107,7 @@ class RobotModel:
     """A robot: links and joints in the order of the URDF, which is kept as text.
 
     ``root`` is the link without a parent. ``findings`` are the validator's warnings.
-    Made by ``load_model``; whoever builds one by hand answers for its consistency.
+    ``load_model`` returns consistent models; the constructor checks nothing.
     """
 
     name: str
@@ -119,12 +122,12 @@ class RobotModel:
 
     @cached_property
     def driven_joints(self) -> tuple[Joint, ...]:
-        """The joints positions are given for, in the order of the URDF."""
+        """The joints with positions, in the order of the URDF."""
         return tuple(joint for joint in self.joints if joint.driven)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """The driven joints by name, in the order of the URDF: the order of all positions."""
+        """Names of the driven joints in the order of the URDF, which is the order of all positions."""
         return tuple(joint.name for joint in self.driven_joints)
 
     @cached_property
@@ -134,27 +137,27 @@ class RobotModel:
 
     @cached_property
     def position_count(self) -> int:
-        """How many numbers a position vector of this robot has."""
+        """Length of a position vector."""
         return sum(POSITION_COUNTS[joint.type] for joint in self.driven_joints)
 
     @cached_property
     def velocity_count(self) -> int:
-        """How many numbers a velocity or effort vector of this robot has."""
+        """Length of a velocity or effort vector."""
         return sum(VELOCITY_COUNTS[joint.type] for joint in self.driven_joints)
 
     @cached_property
     def columns(self) -> dict[str, int]:
-        """Where in the position vector each driven joint's numbers begin."""
+        """Index of each driven joint's first number in the position vector."""
         return _offsets(self.driven_joints, POSITION_COUNTS)
 
     @cached_property
     def velocity_columns(self) -> dict[str, int]:
-        """Where in the velocity vector each driven joint's numbers begin."""
+        """Index of each driven joint's first number in the velocity vector."""
         return _offsets(self.driven_joints, VELOCITY_COUNTS)
 
     @cached_property
     def neutral(self) -> NDArray[np.float64]:
-        """Positions of rest: zero, or the middle of the limits where zero is outside them."""
+        """Rest positions: zero, or the middle of the limits if zero is outside them."""
         positions = np.zeros(self.position_count)
         for joint in self.driven_joints:
             column = self.columns[joint.name]
@@ -166,7 +169,7 @@ class RobotModel:
         return positions
 
     def mimic_of(self, joint: Joint) -> Mimic:
-        """The driven joint behind ``joint``, with chains of mimics multiplied out."""
+        """The driven joint that ``joint`` follows, with chains of mimics multiplied out."""
         if joint.mimic is None:
             return Mimic(joint.name)
         master = self.mimic_of(self._joints_by_name[joint.mimic.joint])
@@ -181,32 +184,32 @@ class RobotModel:
         return {joint.name: joint for joint in self.joints}
 
     def positions(self, values: Mapping[str, float | Sequence[float]]) -> NDArray[np.float64]:
-        """A position vector from numbers by joint name; every driven joint must be named.
+        """A position vector from numbers by joint name; every driven joint is required.
 
-        Raises InvalidInput naming the joints that are unknown (with near misses) or missing.
+        Raises InvalidInput, which names the unknown (with near misses) and the missing joints.
         """
         missing = [name for name in self.joint_names if name not in values]
         problems = [self._unknown_joint(name, missing) for name in values if name not in self.columns]
         if missing:
-            problems.append(f"missing: {', '.join(repr(name) for name in missing)}")
+            problems.append(f"missing: {', '.join(map(repr, missing))}")
         if problems:
             raise InvalidInput(f"joint positions of {self.name!r}: {'; '.join(problems)}")
         numbers: list[float] = []
         for joint in self.driven_joints:
-            given = np.atleast_1d(real_numbers(values[joint.name], f"the position of {joint.name!r}"))
-            if given.size != POSITION_COUNTS[joint.type]:
+            value = np.atleast_1d(real_numbers(values[joint.name], f"the position of {joint.name!r}"))
+            count = POSITION_COUNTS[joint.type]
+            if value.size != count:
                 raise InvalidInput(
-                    f"joint {joint.name!r} is {joint.type} and takes {POSITION_COUNTS[joint.type]} "
-                    f"number(s), not {given.size}"
+                    f"joint {joint.name!r} is {joint.type} and takes {count} number(s), not {value.size}"
                 )
-            numbers.extend(given.tolist())
+            numbers.extend(value.tolist())
         return self.check_positions(numbers)
 
     def check_positions(self, positions: ArrayLike) -> NDArray[np.float64]:
-        """``positions`` as a contiguous float64 vector of the right length without NaN or infinity.
+        """``positions`` as a contiguous, finite float64 vector of the right length.
 
-        Raises InvalidInput saying how many numbers are wanted, or which joint is not finite, or is floating
-        and has a quaternion whose length is more than 1e-3 from 1.
+        Raises InvalidInput if the count is wrong, a number is NaN or infinite, or the length of a floating
+        joint's quaternion is more than 1e-3 from 1.
         """
         vector = self._check(positions, self.position_count, "positions", POSITION_COUNTS)
         for joint in self._floating_joints:
@@ -224,11 +227,11 @@ class RobotModel:
         return tuple(joint for joint in self.driven_joints if joint.type == "floating")
 
     def check_velocities(self, velocities: ArrayLike) -> NDArray[np.float64]:
-        """The same for velocities."""
+        """``velocities`` as a contiguous, finite float64 vector. Raises InvalidInput."""
         return self._check(velocities, self.velocity_count, "velocities", VELOCITY_COUNTS)
 
     def check_efforts(self, efforts: ArrayLike) -> NDArray[np.float64]:
-        """The same for efforts [Nm] or [N], which are as many as velocities."""
+        """``efforts`` [Nm] or [N], as many as velocities, likewise."""
         return self._check(efforts, self.velocity_count, "efforts", VELOCITY_COUNTS)
 
     def _check(
@@ -240,21 +243,13 @@ class RobotModel:
                 f"{self.name!r} takes {count} {what}, shape ({count},), in the order of its "
                 f"{len(self.joint_names)} joint_names; got shape {vector.shape}"
             )
-        # The sum is finite nearly always and costs a third of asking each number.
+        # The sum is nearly always finite and costs a third of checking each number.
         if not math.isfinite(sum(vector.tolist())) and not np.isfinite(vector).all():
-            self._refuse_not_finite(vector, what, counts)
+            owners = [joint.name for joint in self.driven_joints for _ in range(counts[joint.type])]
+            pairs = zip(owners, vector.tolist(), strict=True)
+            bad = ", ".join(f"{name!r} ({value})" for name, value in pairs if not math.isfinite(value))
+            raise InvalidInput(f"{what} of {self.name!r} must be finite; not so: {bad}")
         return vector
-
-    def _refuse_not_finite(
-        self, vector: NDArray[np.float64], what: str, counts: Mapping[JointType, int]
-    ) -> None:
-        owners = [joint.name for joint in self.driven_joints for _ in range(counts[joint.type])]
-        bad = [
-            f"{name!r} ({value})"
-            for name, value in zip(owners, vector.tolist(), strict=True)
-            if not np.isfinite(value)
-        ]
-        raise InvalidInput(f"{what} of {self.name!r} must be finite; not so: {', '.join(bad)}")
 
     def _unknown_joint(self, name: str, missing: Sequence[str]) -> str:
         joint = self._joints_by_name.get(name)
@@ -265,20 +260,20 @@ class RobotModel:
         return f"unknown joint {name!r}{suggestion_text(near)}"
 
 
-def near_joint(name: object, known: Sequence[str]) -> str | None:
-    """The joint that was probably meant: one of nearly that name, or the only one that shares a word."""
-    words = _words(str(name))
-    by_words = {_words(one): one for one in reversed(known)}
-    near = get_close_matches("_".join(words), map("_".join, by_words), n=1)
+def near_joint(name: object, joints: Sequence[str]) -> str | None:
+    """The most similar joint name, else the only one that has a word in common with ``name``."""
+    parts = _name_parts(str(name))
+    by_parts = {_name_parts(joint): joint for joint in reversed(joints)}
+    near = get_close_matches("_".join(parts), map("_".join, by_parts), n=1)
     if near:
-        return next(one for parts, one in by_words.items() if "_".join(parts) == near[0])
-    sharing = [one for parts, one in by_words.items() if set(parts).intersection(words)]
+        return next(joint for key, joint in by_parts.items() if "_".join(key) == near[0])
+    sharing = [joint for key, joint in by_parts.items() if set(key).intersection(parts)]
     return sharing[0] if len(sharing) == 1 else None
 
 
-def _words(name: str) -> tuple[str, ...]:
-    """What tells a joint's name from others: its words in small letters, without "joint"."""
-    return tuple(word for word in _SEPARATORS.split(name.lower()) if word not in ("", "joint"))
+def _name_parts(name: str) -> tuple[str, ...]:
+    """The distinctive parts of a joint's name: its words in lower case, without "joint"."""
+    return tuple(part for part in _SEPARATORS.split(name.lower()) if part not in ("", "joint"))
 
 
 def _offsets(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[str, int]:
@@ -290,21 +285,17 @@ def _offsets(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[s
     return starts
 
 
-_PARTS = {
-    "floating": ("x", "y", "z", "qx", "qy", "qz", "qw"),
-    "planar": ("x", "y", "yaw"),
-}
-
-
 def coordinate_names(model: RobotModel) -> tuple[str, ...]:
-    """One name for each position: the joint's, or "base.x", "base.y" ... where a joint has several."""
-    return tuple(name for joint in model.driven_joints for name in _names(joint))
+    """One name for each position: the joint's, or "base.x", "base.y" ... if a joint has several."""
+    return tuple(
+        f"{joint.name}{part}" for joint in model.driven_joints for part in _COORDINATES.get(joint.type, ("",))
+    )
 
 
 def velocity_columns_by_position(model: RobotModel) -> tuple[int, ...]:
-    """The coordinate under which each number of a velocity or effort vector stands.
+    """For each number of a velocity or effort vector, the index of its coordinate in the positions.
 
-    A floating joint has six velocities for seven positions: nothing stands under its last coordinate.
+    A floating joint has six velocities for seven positions: its last coordinate has none.
     """
     return tuple(
         model.columns[joint.name] + number
@@ -313,6 +304,37 @@ def velocity_columns_by_position(model: RobotModel) -> tuple[int, ...]:
     )
 
 
-def _names(joint: Joint) -> tuple[str, ...]:
-    parts = _PARTS.get(joint.type)
-    return (joint.name,) if parts is None else tuple(f"{joint.name}.{part}" for part in parts)
+def representative_links(model: RobotModel, count: int = 3) -> tuple[str, ...]:
+    """At most ``count`` moving links: the ends of the longest branches, and links inside the longest.
+
+    Several ends on one link, such as fingers, count as that link. Empty when nothing moves.
+    """
+    inbound = {joint.child: joint for joint in model.joints}
+    paths: dict[str, list[str]] = {}  # for each link that moves in the root, the moving links above it
+    for link in model.links:
+        path: list[str] = []
+        joint = inbound.get(link)
+        while joint is not None:
+            path.append(joint.child)
+            joint = inbound.get(joint.parent)
+        while path and inbound[path[-1]].type == "fixed":
+            path.pop()
+        if path:
+            paths[link] = path[::-1]
+    children = Counter(joint.parent for joint in model.joints)
+    ends: dict[str, None] = {}
+    for leaf in (link for link in paths if not children[link]):
+        parent = inbound[leaf].parent
+        ends[parent if children[parent] > 1 and parent in paths else leaf] = None
+    branches: list[str] = []
+    for end in sorted(ends, key=lambda link: -len(paths[link])):
+        # A separate branch shares at most half of its links with each longer one.
+        if all(2 * len(set(paths[end]) & set(paths[other])) <= len(paths[end]) for other in branches):
+            branches.append(end)
+    if not branches:
+        return ()
+    longest = paths[branches[0]]
+    del branches[count - 1 :]
+    inner = count - len(branches)
+    between = [longest[len(longest) * part // (inner + 1)] for part in range(inner, 0, -1)]
+    return tuple(dict.fromkeys([*branches, *between]))

@@ -1,21 +1,15 @@
-"""One <joint> element to one Joint, with everything that is wrong with it.
-
-JointLimits: which positions are outside the limits of their joints, and which look like degrees.
-"""
+"""Reader of one <joint> element, which reports all of its faults."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from zstate._util.suggestions import suggestion_text
 from zstate.model.findings import Findings, quoted, shortened
-from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic, RobotModel
+from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic
 from zstate.model.xml import Element, NumberError, read_number, read_numbers
 from zstate.se3 import quaternion_from_rpy
 
@@ -25,7 +19,7 @@ Vector3 = tuple[float, float, float]
 _X: Final = (1.0, 0.0, 0.0)
 _Z: Final = (0.0, 0.0, 1.0)
 _SMALLEST_AXIS = 1e-6
-_AXIS_TOLERANCE = 1e-3  # files round axes to three or four digits; that is no reason for a warning
+_AXIS_TOLERANCE = 1e-3  # files round axes to three or four digits, which deserves no warning
 _SOME_AXIS = '<axis xyz="0 0 1"/>: what it turns about, or slides along'
 _SOME_LIMITS = {
     "revolute": '<limit lower="-3.14" upper="3.14" effort="10" velocity="1"/> in rad, or type="continuous"',
@@ -37,8 +31,8 @@ _ONCE = ("parent", "child", "origin", "axis", "limit", "mimic")
 class JointReader:
     """Reads joints whose parents and children must be among ``links``.
 
-    A joint with faults is returned as well, with neutral values where they were wrong, and an
-    unknown parent or child as "": so that the checks of the tree need not stumble over them.
+    A joint with faults is returned as well, with neutral values in place of wrong ones and "" for an
+    unknown parent or child, so that the checks of the tree can skip them.
     """
 
     def __init__(self, findings: Findings, links: Iterable[str]) -> None:
@@ -67,21 +61,21 @@ class JointReader:
         )
 
     def _type(self, element: Element, label: str) -> JointType:
-        given = element.attributes.get("type")
-        for known in POSITION_COUNTS:
-            if given == known:
-                return known
-        if given is None:
-            near, message = None, f"{label} has no type; one of {', '.join(POSITION_COUNTS)}"
+        text = element.attributes.get("type")
+        for kind in POSITION_COUNTS:
+            if text == kind:
+                return kind
+        choices = f"; one of {', '.join(POSITION_COUNTS)}"
+        if text is None:
+            near, message = None, f"{label} has no type{choices}"
         else:
-            near = self._findings.did_you_mean(given, POSITION_COUNTS)
-            choice = suggestion_text(near) or _choices(POSITION_COUNTS)
-            message = f"{label} has the unknown type {quoted(given)}{choice}"
+            near = self._findings.did_you_mean(text, POSITION_COUNTS)
+            message = f"{label} has the unknown type {quoted(text)}{suggestion_text(near) or choices}"
         self._findings.error(element.line, message, f'type="{near or "revolute"}"')
         return "fixed"
 
     def _link_name(self, element: Element, label: str, tag: str) -> str:
-        """The link named by <parent> or <child>, or "" when there is none of that name."""
+        """The link in <parent> or <child>, or "" if there is no link of that name."""
         ends = element.all(tag)
         if not ends:
             fix = f'<{tag} link="{self._example_link}"/> inside the joint'
@@ -95,16 +89,14 @@ class JointReader:
         if link not in self._links:
             near = self._findings.did_you_mean(link, self._links)
             message = f"{label}: its {tag} {quoted(link)} is not a link{suggestion_text(near)}"
-            fix = (
-                f'<link name="{shortened(link)}"/> in <robot>' if near is None else f'<{tag} link="{near}"/>'
-            )
+            fix = f'<{tag} link="{near}"/>' if near else f'<link name="{shortened(link)}"/> in <robot>'
             self._findings.error(ends[0].line, message, fix)
             return ""
         return link
 
     @property
     def _example_link(self) -> str:
-        """One of several links would have to be guessed."""
+        """The only link, or a placeholder."""
         return next(iter(self._links)) if len(self._links) == 1 else "LINK"
 
     def _origin(self, element: Element, label: str) -> Pose7:
@@ -120,7 +112,7 @@ class JointReader:
     def _axis(self, element: Element, label: str, kind: JointType) -> Vector3:
         axes = element.all("axis")
         default = _Z if kind == "planar" else _X
-        # Exporters write an axis of zeros for joints that have none.
+        # Exporters write an axis of zeros for joints without one.
         if not axes or kind in {"fixed", "floating"}:
             return default
         if "xyz" not in axes[0].attributes:
@@ -139,18 +131,14 @@ class JointReader:
             )
             fix = f'<axis xyz="{" ".join(f"{part:.6g}" for part in axis)}"/>'
             self._findings.warning(axes[0].line, message, fix)
-        if kind == "planar":
-            self._check_planar_axis(axes[0], label, axis)
-        return axis
-
-    def _check_planar_axis(self, element: Element, label: str, axis: Vector3) -> None:
-        if math.dist(axis, _Z) > _AXIS_TOLERANCE:
+        if kind == "planar" and math.dist(axis, _Z) > _AXIS_TOLERANCE:
             self._findings.error(
-                element.line,
+                axes[0].line,
                 f"{label} is planar about the axis {_text(*axis)}; planar joints move in the x-y plane of "
                 "their own frame and turn about +z: turn its origin instead",
                 '<axis xyz="0 0 1"/>, and <origin rpy="R P Y"/> that turns the joint',
             )
+        return axis
 
     def _limits(self, element: Element, label: str, kind: JointType) -> Limits:
         limits = element.all("limit")
@@ -165,19 +153,18 @@ class JointReader:
         )
         if kind == "fixed":
             return Limits()
-        rest = (math.inf if velocity is None else velocity, math.inf if effort is None else effort)
-        if kind in {"revolute", "prismatic"}:
-            return Limits(*self._range(limit, label, lower or 0.0, upper or 0.0), *rest)
         if kind == "continuous" and (lower, upper) != (None, None):
             message = f"{label} is continuous, so its lower and upper limits are not used"
             self._findings.warning(limit.line, message, 'delete lower and upper, or type="revolute"')
-        return Limits(-math.inf, math.inf, *rest)
-
-    def _range(self, limit: Element, label: str, lower: float, upper: float) -> tuple[float, float]:
-        if lower > upper:
-            message = f"{label} has its limits reversed: lower {lower:g}, upper {upper:g}"
-            self._findings.error(limit.line, message, f'<limit lower="{upper:g}" upper="{lower:g}"/>')
-        return lower, upper
+        if kind in {"revolute", "prismatic"}:
+            lower, upper = lower or 0.0, upper or 0.0
+            if lower > upper:
+                message = f"{label} has its limits reversed: lower {lower:g}, upper {upper:g}"
+                self._findings.error(limit.line, message, f'<limit lower="{upper:g}" upper="{lower:g}"/>')
+        else:
+            lower, upper = -math.inf, math.inf
+        velocity = math.inf if velocity is None else velocity
+        return Limits(lower, upper, velocity, math.inf if effort is None else effort)
 
     def _mimic(self, element: Element, label: str, kind: JointType) -> Mimic | None:
         mimics = element.all("mimic")
@@ -193,10 +180,8 @@ class JointReader:
         multiplier = self._number(mimics[0], label, "multiplier")
         offset = self._number(mimics[0], label, "offset")
         if kind == "fixed":
-            message = f"{label} is fixed, so its <mimic> is not used"
-            self._findings.warning(
-                mimics[0].line, message, "delete the <mimic>, or give the joint a type that moves"
-            )
+            fix = "delete the <mimic>, or give the joint a type that moves"
+            self._findings.warning(mimics[0].line, f"{label} is fixed, so its <mimic> is not used", fix)
             return None
         return Mimic(mimics[0].attributes["joint"], 1.0 if multiplier is None else multiplier, offset or 0.0)
 
@@ -207,26 +192,27 @@ class JointReader:
         try:
             x, y, z = read_numbers(text, 3)
         except NumberError as fault:
-            message = f"{label}: {element.tag} {name}: {fault}"
-            self._findings.error(element.line, message, f'{name}="{_as_numbers(text, 3)}"')
+            self._report(element, label, name, fault, _as_numbers(text, 3))
             return default
         return x, y, z
 
     def _number(self, element: Element, label: str, name: str) -> float | None:
-        """The number in that attribute; None when there is none, or none that can be read."""
+        """The number in that attribute; None if it is missing or unreadable."""
         text = element.attributes.get(name)
         if text is None:
             return None
         try:
             return read_number(text)
         except NumberError as fault:
-            message = f"{label}: {element.tag} {name}: {fault}"
-            self._findings.error(element.line, message, f'{name}="{_as_numbers(text, 1)}"')
+            self._report(element, label, name, fault, _as_numbers(text, 1))
             return None
+
+    def _report(self, element: Element, label: str, name: str, fault: NumberError, fix: str) -> None:
+        self._findings.error(element.line, f"{label}: {element.tag} {name}: {fault}", f'{name}="{fix}"')
 
 
 def _as_numbers(text: str, count: int) -> str:
-    """``text`` as ``count`` numbers, where a comma is all that is wrong with it; else zeros."""
+    """``text`` as ``count`` numbers if a comma is its only fault; else zeros."""
     for guess in (text.replace(",", "."), text.replace(",", " ")):
         with suppress(NumberError):
             return " ".join(f"{number:g}" for number in read_numbers(guess, count))
@@ -235,75 +221,3 @@ def _as_numbers(text: str, count: int) -> str:
 
 def _text(*numbers: float) -> str:
     return f"'{' '.join(f'{number:g}' for number in numbers)}'"
-
-
-def _choices(names: Iterable[str]) -> str:
-    return f"; one of {', '.join(names)}"
-
-
-TOLERANCE = 1e-3
-"""[rad] or [m]; an encoder at its end stop may exceed the limit by less."""
-
-_NAMED = 3
-
-
-class JointLimits:
-    """The position limits of a model's revolute and prismatic joints.
-
-    Continuous joints turn without limit, and a joint whose limits are equal states none: neither is checked.
-    """
-
-    def __init__(self, model: RobotModel) -> None:
-        self._joints = [joint for joint in model.driven_joints if _is_limited(joint)]
-        self._columns = np.array([model.columns[joint.name] for joint in self._joints], dtype=np.intp)
-        self._lower = np.array([joint.limits.lower for joint in self._joints]) - TOLERANCE
-        self._upper = np.array([joint.limits.upper for joint in self._joints]) + TOLERANCE
-
-    def __bool__(self) -> bool:
-        """Whether any joint has limits."""
-        return bool(self._joints)
-
-    def are_exceeded(self, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """For each row of ``positions``, (n, position_count), whether any joint is outside its limits."""
-        values = positions[:, self._columns]
-        exceeded: NDArray[np.bool_] = (values < self._lower) | (values > self._upper)
-        return np.logical_or.reduce(exceeded, axis=1)
-
-    def explanation(self, positions: NDArray[np.float64]) -> str:
-        """The joints outside their limits in any row, each with its worst value; empty if there are none.
-
-        Names a probable cause: an angle beyond a full turn that is within the limits once converted from
-        degrees.
-        """
-        found = list(self._exceeding(positions))
-        if not found:
-            return ""
-        parts = [_excess_text(joint, value) for joint, value in found[:_NAMED]]
-        if len(found) > _NAMED:
-            parts.append(f"{len(found) - _NAMED} more joints are outside theirs")
-        degrees = any(_looks_like_degrees(joint, value) for joint, value in found)
-        return ", ".join(parts) + "; this looks like degrees: convert with math.radians" * degrees
-
-    def _exceeding(self, positions: NDArray[np.float64]) -> Iterator[tuple[Joint, float]]:
-        values = positions[:, self._columns]
-        excess = np.maximum(self._lower - values, values - self._upper)
-        rows = excess.argmax(axis=0)
-        for column, joint in enumerate(self._joints):
-            if excess[rows[column], column] > 0.0:
-                yield joint, float(values[rows[column], column])
-
-
-def _is_limited(joint: Joint) -> bool:
-    return joint.type in ("revolute", "prismatic") and joint.limits.lower < joint.limits.upper
-
-
-def _excess_text(joint: Joint, value: float) -> str:
-    unit = "rad" if joint.type == "revolute" else "m"
-    lower, upper = joint.limits.lower, joint.limits.upper
-    return f"{joint.name!r} at {round(value, 4)} {unit} is outside {lower:g} to {upper:g}"
-
-
-def _looks_like_degrees(joint: Joint, value: float) -> bool:
-    turned, limits = math.radians(value), joint.limits
-    within = limits.lower - TOLERANCE <= turned <= limits.upper + TOLERANCE
-    return joint.type == "revolute" and abs(value) > math.tau and within

@@ -1,12 +1,9 @@
-"""Document: XML text as a tree whose elements know their lines, read without trust.
+"""XML reader for untrusted input: bytes to text, to elements with lines, to numbers.
 
 Limits: 16 MiB, 200,000 elements, 100 levels. Entities are neither declared nor fetched: a DOCTYPE
 with declarations or a reference to a file is refused. Prefixes are kept as written (``xacro:macro``)
-and need no declaration, because URDF files in use lack it.
-
-Numbers as a URDF writes them: plain decimals, the same for every reader whatever its language.
-
-Bytes of an XML file to text: byte order mark, declared encoding, and clear words when neither fits.
+and need no declaration, because existing URDF files lack it. Numbers are plain decimals, independent
+of the locale.
 """
 
 from __future__ import annotations
@@ -18,24 +15,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from zstate.errors import ModelError
-from zstate.model.findings import Finding, quoted
+from zstate.model.findings import model_error, quoted
 
 _BYTE_ORDER_MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
-# Python knows codecs that are no text encodings of files (rot13, unicode_escape): a list, not a lookup.
+# Fixed, because Python has codecs that are no text encodings of files (rot13, unicode_escape).
 _ENCODINGS = {"utf-8", "us-ascii", "ascii", "iso-8859-1", "latin-1", "iso-8859-15", "windows-1252", "cp1252"}
 _DECLARED = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]*)["']""")
 
 
-class EncodingError(ValueError):
-    """Bytes that are not the text they should be; ``line`` is where, when that can be said.
-
-    ``fix`` is what to write instead.
-    """
+class XmlError(ValueError):
+    """Unreadable text or XML, in ``line`` if known; ``fix`` is what to write instead."""
 
     def __init__(self, message: str, line: int | None = None, fix: str = "") -> None:
         super().__init__(message)
@@ -44,13 +37,17 @@ class EncodingError(ValueError):
 
 
 def decode(data: str | bytes) -> str:
-    """The text of ``data`` without its byte order mark. Raises TextFault.
+    """The text of ``data`` without its byte order mark. Raises XmlError.
 
-    Read are UTF-8, UTF-16 with a byte order mark, and, where the XML declaration says so, US-ASCII,
+    Encodings: UTF-8, UTF-16 with a byte order mark, and, if the XML declaration names them, US-ASCII,
     ISO-8859-1, ISO-8859-15 and windows-1252.
     """
     text = data.removeprefix("\ufeff") if isinstance(data, str) else _decode_bytes(data)
-    _check_is_text(text)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        line = text.count("\n", 0, error.start) + 1
+        raise XmlError(f"the character {text[error.start]!r} is half of a pair, not text", line) from None
     return text
 
 
@@ -60,18 +57,12 @@ def _decode_bytes(data: bytes) -> str:
             return _decode_as(data[len(mark) :], encoding)
     if b"\0" in data:
         line, column = _place(data, data.index(b"\0"))
-        raise EncodingError(f"column {column}: a zero byte; this is a binary file, not a URDF", line)
-    return _decode_as(data, _declared_encoding(data))
-
-
-def _declared_encoding(data: bytes) -> str:
+        raise XmlError(f"column {column}: a zero byte; this is a binary file, not a URDF", line)
     declared = _DECLARED.match(data[:1000])
-    if declared is None:
-        return "utf-8"
-    encoding = declared[1].decode("latin-1")
+    encoding = "utf-8" if declared is None else declared[1].decode("latin-1")
     if encoding.lower() not in _ENCODINGS:
-        raise EncodingError(f"the declared encoding {encoding[:40]!r} is not read; save the file as UTF-8", 1)
-    return encoding
+        raise XmlError(f"the declared encoding {encoding[:40]!r} is not read; save the file as UTF-8", 1)
+    return _decode_as(data, encoding)
 
 
 def _decode_as(data: bytes, encoding: str) -> str:
@@ -79,7 +70,7 @@ def _decode_as(data: bytes, encoding: str) -> str:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
         line, column = _place(data, error.start)
-        raise EncodingError(
+        raise XmlError(
             f"column {column}: byte 0x{data[error.start]:02x} is not {encoding.upper()}; save the file as "
             'UTF-8, or declare its encoding in line 1 (<?xml version="1.0" encoding="ISO-8859-1"?>)',
             line,
@@ -89,16 +80,6 @@ def _decode_as(data: bytes, encoding: str) -> str:
 def _place(data: bytes, offset: int) -> tuple[int, int]:
     """Line and column of a byte, both counted from 1."""
     return data.count(b"\n", 0, offset) + 1, offset - data.rfind(b"\n", 0, offset)
-
-
-def _check_is_text(text: str) -> None:
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        line = text.count("\n", 0, error.start) + 1
-        raise EncodingError(
-            f"the character {text[error.start]!r} is half of a pair, not text", line
-        ) from None
 
 
 MAX_BYTES = 16 * 1024 * 1024
@@ -116,7 +97,7 @@ _MISMATCH = _CODES[expat.errors.XML_ERROR_TAG_MISMATCH]
 
 @dataclass(slots=True)
 class Element:
-    """One XML element: its tag as written, attributes, the line it begins in, and its children."""
+    """One XML element: its tag as written, attributes, first line and children."""
 
     tag: str
     attributes: dict[str, str]
@@ -124,7 +105,7 @@ class Element:
     children: list[Element] = field(default_factory=list["Element"])
 
     def all(self, tag: str) -> list[Element]:
-        """The direct children of that tag."""
+        """The direct children with that tag."""
         return [child for child in self.children if child.tag == tag]
 
     def walk(self) -> Iterator[Element]:
@@ -143,21 +124,21 @@ class Document:
 
 
 def read_document(data: str | bytes, source: str) -> Document:
-    """The tree of ``data``. Raises ModelError saying where and why it is not (trustworthy) XML."""
+    """The element tree of ``data``. Raises ModelError if it is not XML, or not safe to read."""
     try:
         return _read(data)
-    except EncodingError as fault:
-        raise ModelError(source, [Finding(fault.line, str(fault), "error", fault.fix)]) from None
+    except XmlError as fault:
+        raise model_error(source, str(fault), fault.line, fault.fix) from None
 
 
 def _read(data: str | bytes) -> Document:
     if len(data) > MAX_BYTES:
-        raise EncodingError(f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
+        raise XmlError(f"the text has {len(data)} bytes; the limit is {MAX_BYTES}")
     text = decode(data)
     body = text.lstrip()
     if not body:
         whole = '<robot name="NAME"><link name="base_link"/></robot>'
-        raise EncodingError('the text is empty; a URDF begins with <robot name="...">', fix=whole)
+        raise XmlError('the text is empty; a URDF begins with <robot name="...">', fix=whole)
     lines_before = text.count("\n", 0, len(text) - len(body))
     return Document(body, _Reader(body, lines_before).read())
 
@@ -171,7 +152,7 @@ class _Reader:
         self._count = 0
         self._parser = expat.ParserCreate()
         self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._close_element
+        self._parser.EndElementHandler = lambda _tag: self._open.pop()
         self._parser.StartDoctypeDeclHandler = self._doctype
 
     def read(self) -> Element:
@@ -180,7 +161,7 @@ class _Reader:
         except expat.ExpatError as error:
             line = error.lineno + self._lines_before
             cause, fix = self._cause(error)
-            raise EncodingError(f"column {error.offset + 1}: {cause}", line, fix) from None
+            raise XmlError(f"column {error.offset + 1}: {cause}", line, fix) from None
         assert self._root is not None, "expat accepts no document without an element"
         return self._root
 
@@ -191,21 +172,18 @@ class _Reader:
         element = Element(tag, attributes, self._line())
         self._count += 1
         if self._count > MAX_ELEMENTS:
-            raise EncodingError(f"more than {MAX_ELEMENTS} elements, which is the limit", element.line)
+            raise XmlError(f"more than {MAX_ELEMENTS} elements, which is the limit", element.line)
         if len(self._open) == MAX_NESTING:
-            raise EncodingError(f"<{_short(tag)}> is nested deeper than {MAX_NESTING} levels", element.line)
+            raise XmlError(f"<{_short(tag)}> is nested deeper than {MAX_NESTING} levels", element.line)
         if self._open:
             self._open[-1].children.append(element)
         else:
             self._root = element
         self._open.append(element)
 
-    def _close_element(self, _tag: str) -> None:
-        self._open.pop()
-
     def _doctype(self, _name: str, system: str | None, public: str | None, has_declarations: int) -> None:
         if system or public or has_declarations:
-            raise EncodingError(
+            raise XmlError(
                 "a DOCTYPE with declarations (entities) or a reference to a file is refused: it can make "
                 "a small file huge or read others; remove it",
                 self._line(),
@@ -213,9 +191,13 @@ class _Reader:
             )
 
     def _cause(self, error: expat.ExpatError) -> tuple[str, str]:
-        """What is wrong, and what to write instead."""
-        if self._root is not None and not self._open:
-            return self._after_root(error, self._root), "delete what stands there, or move it before that"
+        """The fault, and what to write instead."""
+        if (root := self._root) is not None and not self._open:
+            fault = f"there is something after </{_short(root.tag)}>, which must end the file"
+            if self._markup_at(error).startswith("<robot") and root.tag == "robot":
+                first = f"the first begins in line {root.line}"
+                fault = f"a second <robot>; {first}, and one file holds one robot"
+            return fault, "delete what stands there, or move it before that"
         closing = f"</{_short(self._open[-1].tag)}>" if self._open else ""
         if error.code == _MISMATCH:
             return f"{self._markup_at(error)}> closes {self._innermost()}", f"{closing} before it"
@@ -223,17 +205,12 @@ class _Reader:
             return f"the file ends inside {self._innermost()}; is it truncated?", f"{closing} at its end"
         return f"malformed XML: {expat.ErrorString(error.code)}", _MALFORMED
 
-    def _after_root(self, error: expat.ExpatError, root: Element) -> str:
-        if self._markup_at(error).startswith("<robot") and root.tag == "robot":
-            return f"a second <robot>; the first begins in line {root.line}, and one file holds one robot"
-        return f"there is something after </{_short(root.tag)}>, which must end the file"
-
     def _innermost(self) -> str:
         element = self._open[-1]
         return f"<{_short(element.tag)}>, which was opened in line {element.line}"
 
     def _markup_at(self, error: expat.ExpatError) -> str:
-        """The tag that the parser stumbled over, as written, without its attributes."""
+        """The tag at which the parser failed, as written, without its attributes."""
         line = self._text.split("\n")[error.lineno - 1]
         found = re.match(r"[^\s>]*", line[max(0, line.rfind("<", 0, error.offset + 1)) :])
         return _short(found[0]) if found else ""
@@ -248,11 +225,11 @@ _BLANKS = re.compile(r"[ \t\r\n]+")
 
 
 class NumberError(ValueError):
-    """Text that is not the number or numbers it should be."""
+    """Text that is not a number, or not the right count of numbers."""
 
 
 def read_numbers(text: str, count: int) -> tuple[float, ...]:
-    """``count`` finite numbers separated by blanks. Raises NumberFault saying which is wrong."""
+    """``count`` finite numbers separated by blanks. Raises NumberError."""
     _refuse_expression(text)
     tokens = [token for token in _BLANKS.split(text) if token]
     if len(tokens) != count:
@@ -262,11 +239,11 @@ def read_numbers(text: str, count: int) -> tuple[float, ...]:
 
 
 def read_number(text: str) -> float:
-    """One finite number. Raises NumberFault."""
+    """One finite number. Raises NumberError."""
     _refuse_expression(text)
     token = text.strip(" \t\r\n")
     if not _DECIMAL.fullmatch(token):
-        raise NumberError(_complaint(token))
+        raise NumberError(_fault(token))
     value = float(token)
     if not math.isfinite(value):
         raise NumberError(f"{quoted(token)} is too large to be a number here")
@@ -278,7 +255,7 @@ def _refuse_expression(text: str) -> None:
         raise NumberError(f"{quoted(text.strip())} is a xacro expression, not a number")
 
 
-def _complaint(token: str) -> str:
+def _fault(token: str) -> str:
     if not token:
         return "an empty text is not a number"
     if _DECIMAL.fullmatch(token.replace(",", ".")):

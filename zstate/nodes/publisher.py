@@ -16,9 +16,9 @@ from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
 from zstate.errors import Closed, InvalidInput, SecondWriter
 from zstate.extension import kernel
+from zstate.model.joint_limits import JointLimits
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
-from zstate.model.urdf_joint import JointLimits
 from zstate.net.clock_offset import ClockService
 from zstate.net.ownership import WriterClaim
 from zstate.net.presence import local_writer

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zstate.errors import format_duration
-from zstate.model.urdf_joint import JointLimits
+from zstate.model.joint_limits import JointLimits
 from zstate.rate import RateReport
 from zstate.wire.identity import WriterId
 from zstate.wire.keys import Stream

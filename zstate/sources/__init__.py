@@ -1,4 +1,4 @@
-"""Where joint states come from."""
+"""Sources of joint states: test signals and other publishers."""
 
 from zstate.sources.joint_source import JointReading, JointSource
 from zstate.sources.sine import SineSource

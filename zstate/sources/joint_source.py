@@ -1,7 +1,4 @@
-"""What a joint source is: whatever can say where the joints are.
-
-StateReader: what joint states say of the joints of a model, if it can be used.
-"""
+"""Interface of joint sources, and the check of joint states against a model."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ class JointReading:
     """The joints of a robot at one instant, in the order of its model's ``joint_names``.
 
     ``positions`` [rad] or [m], ``velocities`` per second, ``efforts`` [Nm] or [N]; the last two are
-    None when they are not known. ``stamp`` [ns] is None when the reading is of the instant asked for.
+    None when they are not known. ``stamp`` [ns] is None if the reading is of the requested instant.
     """
 
     positions: NDArray[np.float64]
@@ -32,15 +29,15 @@ class JointReading:
 
 
 class JointSource(Protocol):
-    """The seam to drivers, simulators and test signals."""
+    """Interface of drivers, simulators and test signals."""
 
     def read(self, stamp: int) -> JointReading | None:
-        """Where the joints are at ``stamp`` [ns], which is now; None when there is nothing new."""
+        """The joints at ``stamp`` [ns], the present instant; None when there is nothing new."""
         ...
 
 
 class JointStateValidator:
-    """Reads joint states for a robot with ``model``, and refuses all that a StatePublisher would refuse."""
+    """Reads joint states of a robot with ``model``, with the checks of a StatePublisher."""
 
     def __init__(self, model: RobotModel) -> None:
         self._model = model
@@ -50,7 +47,7 @@ class JointStateValidator:
         )
 
     def read(self, state: JointState) -> JointNumbers:
-        """The numbers of a sample. Raises MessageError and InvalidInput for what cannot be used."""
+        """The numbers of a sample. Raises MessageError or InvalidInput if they cannot be used."""
         numbers = self._order.read(state)
         self._table.normalised(self._model.check_positions(numbers.positions))
         if numbers.velocities is not None:

@@ -1,4 +1,4 @@
-"""A sine on every joint, so that something moves."""
+"""Test signal: a sine on every joint."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import math
 import numpy as np
 
 from zstate.errors import InvalidInput
-from zstate.model.robot import Joint, RobotModel
+from zstate.model.robot import Joint, RobotModel, velocity_columns_by_position
 from zstate.sources.joint_source import JointReading
 
 _LARGEST_SWING = {"revolute": 1.2, "continuous": math.pi, "prismatic": 0.5, "planar": 0.5, "floating": 0.0}
-# Joints side by side move a little apart, so that each can be told from its neighbour.
+# The phase between neighbouring joints, which makes their curves distinguishable.
 _PHASE_STEP = 0.5
 
 
 class SineSource:
     """Every driven joint swings about the middle of its range, inside its limits of position and speed.
 
-    A function of the stamp alone: two sources of one model agree at every instant. ``period_s`` is
-    the shortest period [s]; a joint that would exceed its velocity limit swings less far. Planar joints
-    circle, floating joints rest at their origin.
+    A function of the stamp alone: two sources of one model agree at every instant. All joints have the
+    period ``period_s`` [s]; a velocity limit reduces the amplitude. Planar joints circle, floating joints
+    rest at their origin.
     """
 
     def __init__(self, model: RobotModel, period_s: float = 6.0) -> None:
@@ -28,19 +28,16 @@ class SineSource:
             raise InvalidInput(f"period_s is a positive number of seconds, not {period_s!r}")
         self._period_ns = round(period_s * 1e9)
         self._omega = math.tau / period_s
-        self._model = model
         self._center = model.neutral.copy()
         self._swing = np.zeros(model.position_count)
         self._phase = np.zeros(model.position_count)
         for number, joint in enumerate(model.driven_joints):
-            self._plan(joint, number * _PHASE_STEP)
-        # A floating joint has one number less in its velocity than in its pose, and it rests.
-        self._rates = np.array(
-            [c for j in model.driven_joints for c in _rate_columns(model, j)], dtype=np.intp
-        )
+            self._set_swing(joint, model.columns[joint.name], number * _PHASE_STEP)
+        # A floating joint has fewer velocities (6) than positions (7), and it rests.
+        self._rates = np.array(velocity_columns_by_position(model), dtype=np.intp)
 
-    def _plan(self, joint: Joint, phase: float) -> None:
-        column, limits = self._model.columns[joint.name], joint.limits
+    def _set_swing(self, joint: Joint, column: int, phase: float) -> None:
+        limits = joint.limits
         swing = min(_LARGEST_SWING[joint.type], limits.velocity / self._omega)
         if joint.type == "planar":
             self._swing[column : column + 3] = swing
@@ -54,14 +51,8 @@ class SineSource:
 
     def read(self, stamp: int) -> JointReading:
         """Positions and velocities at ``stamp`` [ns]."""
-        # Reduced to one period in integers first: nanoseconds since 1970 have no room in a float.
+        # Reduced to one period as integers: nanoseconds since 1970 exceed the precision of a float.
         angle = self._phase + math.tau * (stamp % self._period_ns) / self._period_ns
         positions = self._center + self._swing * np.sin(angle)
         rates = self._swing * self._omega * np.cos(angle)
         return JointReading(positions, rates[self._rates])
-
-
-def _rate_columns(model: RobotModel, joint: Joint) -> range:
-    start = model.columns[joint.name]
-    count = {"floating": 6, "planar": 3}.get(joint.type, 1)
-    return range(start, start + count)

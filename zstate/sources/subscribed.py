@@ -1,7 +1,4 @@
-"""Joint states of another publisher.
-
-Robot models from descriptions on the network.
-"""
+"""Joint states and robot models received from other publishers."""
 
 from __future__ import annotations
 
@@ -19,19 +16,19 @@ from zstate.net.presence import announce_reader
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
 from zstate.sources.joint_source import JointReading, JointStateValidator
-from zstate.wire.messages import JointState, Message, RobotDescription
+from zstate.wire.messages import JointState, RobotDescription
 from zstate.wire.registry import get_wire
 
-# Readings that wait for a slow reader; of more the oldest are dropped.
+# Readings queued for a slow reader; the oldest of more are dropped.
 _CAPACITY = 1024
 
 
 class SubscribedSource(Closeable):
-    """The ``joint_states`` of ``robot`` as they arrive: ``for reading in source: ...``
+    """Joint source that receives the ``joint_states`` of ``robot``: ``for reading in source: ...``
 
-    ``read`` returns the newest one that has not been read. Iteration ends with ``close()``. Samples that
-    cannot be used are counted in ``refused``, by reason; the first of each is also logged. ``on_readings()``
-    is called, from one thread, after each batch of samples.
+    ``read`` returns the newest unread reading. Iteration ends with ``close()``. ``refused`` counts unusable
+    samples by reason; the first of each reason is also logged. ``on_readings()`` is called, from one thread,
+    after each batch of samples.
     """
 
     def __init__(
@@ -45,35 +42,37 @@ class SubscribedSource(Closeable):
     ) -> None:
         self._refusals = Refusals("joint_states")
         self.refused: dict[str, int] = self._refusals.counts
-        self._states = JointStateValidator(model)
+        self._validator = JointStateValidator(model)
         self._robot = robot or model.name
-        named = get_wire(wire)
+        wire_format = get_wire(wire)
         self._readings: deque[JointReading] = deque(maxlen=_CAPACITY)
         self._changed = threading.Condition()
         self._closed = False
         self._on_readings = on_readings
         self._subscriber = subscribe(
-            session, named, self._robot, "joint_states", self._on_messages, on_error=self._refusals.count
+            session,
+            wire_format,
+            self._robot,
+            "joint_states",
+            self._on_messages,
+            on_error=self._refusals.count,
         )
-        self._announcements = announce_reader(session, named, self._robot, ["joint_states"])
+        self._announcements = announce_reader(session, wire_format, self._robot, ["joint_states"])
 
     def _on_messages(self, received: list[Received]) -> None:
-        readings = [reading for one in received if (reading := self._read(one.message)) is not None]
+        readings: list[JointReading] = []
+        for _, _, state in received:
+            assert isinstance(state, JointState)
+            try:
+                readings.append(JointReading(*self._validator.read(state), stamp=state.stamp))
+            except (MessageError, InvalidInput) as error:
+                reason = error.reason if isinstance(error, MessageError) else "bad numbers"
+                self._refusals.count(reason, error)
         with self._changed:
             self._readings.extend(readings)
             self._changed.notify_all()
         if self._on_readings is not None:
             self._on_readings()
-
-    def _read(self, state: Message) -> JointReading | None:
-        assert isinstance(state, JointState)
-        try:
-            numbers = self._states.read(state)
-        except (MessageError, InvalidInput) as error:
-            reason = error.reason if isinstance(error, MessageError) else "bad numbers"
-            self._refusals.count(reason, error)
-            return None
-        return JointReading(*numbers, stamp=state.stamp)
 
     def read(self, stamp: int) -> JointReading | None:
         """The newest reading, independent of ``stamp``; None if none arrived since the last call."""
@@ -93,7 +92,7 @@ class SubscribedSource(Closeable):
             yield reading
 
     def close(self) -> None:
-        """Stop listening; iterations end."""
+        """Unsubscribe; iterations end."""
         for announcement in self._announcements:
             announcement.close()
         self._subscriber.close()
@@ -103,11 +102,11 @@ class SubscribedSource(Closeable):
 
 
 class DescriptionSubscriber(Closeable):
-    """Subscribes to the ``robot_description`` of ``robot`` ("*": of all robots), earlier ones included.
+    """Subscriber of the ``robot_description`` of ``robot`` ("*": of all robots), earlier ones included.
 
     ``on_description(robot, model)`` is called from one thread with the first model of a robot, and
-    with each one that replaces it. Descriptions that cannot be used are counted in ``refused``, by
-    reason; the first of each is also logged.
+    with each replacement. ``refused`` counts unusable descriptions by reason; the first of each reason is
+    also logged.
     """
 
     def __init__(
@@ -145,5 +144,5 @@ class DescriptionSubscriber(Closeable):
             self._on_description(robot, model)
 
     def close(self) -> None:
-        """Stop listening within a second. A second call does nothing."""
+        """Unsubscribe within a second. A second call does nothing."""
         self._subscriber.close()

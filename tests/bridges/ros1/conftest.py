@@ -1,4 +1,4 @@
-"""What the tests with ROS 1 have: a master for each file, and processes that find it."""
+"""Fixtures for tests with ROS 1: a master for each file, and processes that use it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def namespace(
 
 
 def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
-    """A node that runs ``code`` with Debian's Python, once it says so."""
+    """A node that runs ``code`` with Debian's Python, once it is ready."""
     child = spawn(IN_DEBIAN, DEBIAN_PYTHON, textwrap.dedent(code), *arguments)
     assert child.line() == "ready", child.stderr
     return child
@@ -50,7 +50,7 @@ def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
 
 @pytest.fixture
 def peer(namespace: str, spawn: Spawn) -> Callable[..., Peer]:
-    """``peer()`` is a node that talks, ``peer("hear")`` one that also listens."""
+    """``peer()`` is a publisher node, ``peer("hear")`` also subscribes."""
     return lambda *arguments: Peer(ready(spawn, ROS_PEER, *arguments))
 
 

@@ -47,8 +47,8 @@ def swing(stamp: int) -> list[float]:
     return [0.5 * math.sin(1.5 * t), -0.3 + 0.4 * math.cos(t)]
 
 
-def say_joints(speaking: Peer, stamp: int) -> None:
-    speaking.ask("joints", stamp, JOINTS, swing(stamp))
+def publish_joints(talker: Peer, stamp: int) -> None:
+    talker.ask("joints", stamp, JOINTS, swing(stamp))
 
 
 def answer(listener: TransformListener, target: str, source: str) -> Transform | None:
@@ -87,7 +87,7 @@ def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_liste
             publisher.publish(swing(stamp), stamp=stamp)
             return stamp
 
-        # Until a sample has come through, nobody is sure to hear the next ones.
+        # Only after the first sample the connection is complete.
         until(lambda: isinstance(listening.ask("base", "probe", goes_on(), 0.02), list))
         begin = stamp
         end = [goes_on() for _ in range(50)][-1]
@@ -104,12 +104,12 @@ def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_liste
         assert carrying.line().endswith(" samples to ROS, 0 from there")
 
 
-def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
+def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
     bridge: Bridge, peer: Callable[..., Peer], program: Bridge, namespace: str
 ):
     Master().set_parameter(f"{namespace}/robot_description", RRBOT.read_text())
     program(str(STATE_PUBLISHER), "_publish_frequency:=1000", "_ignore_timestamp:=true")
-    speaking, hearing = peer(), peer("hear")
+    talker, listening = peer(), peer("hear")
     carrying = bridge("--from-ros")
     probe = Transform.from_rpy("tool", "probe", (0.1, 0.0, 0.05), (0.2, -0.3, 0.4))
     identity = [0.0] * 6 + [1.0]
@@ -117,30 +117,30 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
         lookup = listener.buffer.lookup
         # In ROS the newest parent of a child counts, and its newest pose.
         for parent, pose in (("lower", identity), ("tool", identity), ("tool", probe.pose7.tolist())):
-            speaking.ask("edge", "/tf_static", parent, "probe", pose)
+            talker.ask("edge", "/tf_static", parent, "probe", pose)
             placed = Transform.from_pose7(parent, "probe", pose)
             until(lambda placed=placed: answer(listener, placed.target, "probe") == placed)
-        speaking.ask("edge", "/tf", "odom", "world", identity)
-        until(lambda: speaking.ask("readers") == 3)  # the state publisher, the other node, and the bridge
+        talker.ask("edge", "/tf", "odom", "world", identity)
+        until(lambda: talker.ask("readers") == 3)  # the state publisher, the other node, and the bridge
         stamps: list[int] = []
 
         def have_met() -> bool:
             stamps.append(time.time_ns())
-            say_joints(speaking, stamps[-1])
+            publish_joints(talker, stamps[-1])
             return listener.buffer.can_lookup("world", "probe") and len(stamps) > 50
 
         until(have_met)
-        until(lambda: hearing.listen() or ("upper", "lower", stamps[-1]) in hearing.edges)
+        until(lambda: listening.listen() or ("upper", "lower", stamps[-1]) in listening.edges)
         listener.buffer.wait("world", "tool", stamps[-1], 5.0)
-        compared = [key for key in hearing.edges if listener.buffer.can_lookup(*key)]
+        compared = [key for key in listening.edges if listener.buffer.can_lookup(*key)]
         assert len(compared) >= 20
         for parent, child, stamp in compared:
-            writer, theirs = hearing.edges[parent, child, stamp]
+            writer, theirs = listening.edges[parent, child, stamp]
             assert "state_publisher" in writer
             ours = lookup(parent, child, stamp)
             assert ours.kind == "exact"  # the very sample of that stamp
             assert_same_pose(ours.pose7.tolist(), theirs, 1e-12)
-        # What the model fixes, the static writer does not say again.
+        # The static writer does not repeat the fixed edges of the model.
         kinds = {frame.name: (frame.kind, frame.writer) for frame in listener.buffer.frames()}
         assert [name for name, (_, writer) in kinds.items() if writer == kinds["rrbot/probe"][1]] == [
             "rrbot/probe"
@@ -150,8 +150,8 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
     assert carrying.stderr.count("odom") == 1
 
 
-def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[..., Peer]):
-    hearing, speaking = peer("hear"), peer()
+def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., Peer]):
+    listening, talker = peer("hear"), peer()
     carrying = bridge("--to-ros", "--from-ros")
     in_zstate: Counter[int] = Counter()
 
@@ -168,37 +168,37 @@ def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[...,
         counting = threading.Thread(target=count)
         counting.start()
 
-        def say(ours: int, theirs: int) -> None:
+        def publish_pair(ours: int, theirs: int) -> None:
             publisher.publish(swing(ours), stamp=ours)
-            say_joints(speaking, theirs)
+            publish_joints(talker, theirs)
 
         def have_been_everywhere(*stamps: int) -> bool:
-            in_ros = hearing.counts()
+            in_ros = listening.counts()
             return all(in_ros[stamp] and in_zstate[stamp] for stamp in stamps)
 
         first = iter(range(S, 2 * S, 2))
 
         def have_met() -> bool:
             stamp = next(first)
-            say(stamp, stamp + 1)
+            publish_pair(stamp, stamp + 1)
             return have_been_everywhere(stamp - 2, stamp - 1)
 
         until(have_met)
         ours, theirs = range(2 * S, 2 * S + 100), range(3 * S, 3 * S + 100)
         for pair in zip(ours, theirs, strict=True):
-            say(*pair)
+            publish_pair(*pair)
         # Once the last of each has been everywhere, what goes round in circles has come by again.
         until(lambda: have_been_everywhere(ours[-1], theirs[-1]))
-        for heard in (hearing.counts(), in_zstate):
-            assert [heard[stamp] for stamp in (*ours, *theirs)] == [1] * 200
+        for counts in (listening.counts(), in_zstate):
+            assert [counts[stamp] for stamp in (*ours, *theirs)] == [1] * 200
         source.close()
         counting.join(1.0)
     interrupted(carrying)
     assert "refused" not in carrying.stderr
 
 
-def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callable[..., Peer]):
-    hearing = peer("hear")
+def test_two_bridges_of_one_robot_make_no_loop(bridge: Bridge, peer: Callable[..., Peer]):
+    listening = peer("hear")
     bridge("--to-ros")
     back = bridge("--from-ros", "--model", str(RRBOT))
     with connect() as session, StatePublisher(session, MODEL, "rrbot", takeover=True) as publisher:
@@ -206,52 +206,52 @@ def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callabl
 
         def refused() -> bool:
             publisher.publish([0.0, 0.0], stamp=next(stamps))
-            return "(another bridge)" in back.stderr and len(hearing.counts()) > 10
+            return "(another bridge)" in back.stderr and len(listening.counts()) > 10
 
         until(refused)
-        assert set(hearing.counts().values()) == {1}
+        assert set(listening.counts().values()) == {1}
 
 
 def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
     bridge: Bridge, peer: Callable[..., Peer], namespace: str
 ):
-    hearing = peer("hear")
+    listening = peer("hear")
     bridge("--to-ros", "--frame-prefix", "left_")
     stamps = iter(range(1_700_000_000_123_456_789, 2**62))
     sent: set[int] = set()
     with connect() as session, StatePublisher(session, MODEL, "rrbot") as publisher:
 
-        def heard() -> bool:
+        def is_complete() -> bool:
             sent.add(stamp := next(stamps))
             publisher.publish([0.25, -1.5], [0.5, 1.0], [7.0, -8.0], stamp)
-            hearing.listen()
-            return bool(hearing.joints and hearing.edges)
+            listening.listen()
+            return bool(listening.joints and listening.edges)
 
-        until(heard)
-    stamp, names, numbers = hearing.joints[0]
+        until(is_complete)
+    stamp, names, numbers = listening.joints[0]
     assert stamp in sent
     assert (names, numbers) == (list(JOINTS), [[0.25, -1.5], [0.5, 1.0], [7.0, -8.0]])
-    edges = {(parent, child) for parent, child, _ in hearing.edges}
+    edges = {(parent, child) for parent, child, _ in listening.edges}
     assert edges == {("left_base", "left_upper"), ("left_upper", "left_lower")}
-    # It is set by the thread that hears of the model, not by the one that carries samples.
-    until(lambda: hearing.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
+    # Set by the thread that receives the model, not by the one that carries samples.
+    until(lambda: listening.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
 
 
-def test_what_cannot_be_used_is_counted_and_said_once(bridge: Bridge, peer: Callable[..., Peer]):
-    speaking = peer()
+def test_unusable_messages_are_counted_and_logged_once(bridge: Bridge, peer: Callable[..., Peer]):
+    talker = peer()
     carrying = bridge("--from-ros", "--model", str(RRBOT))
-    until(lambda: speaking.ask("readers") == 1)
+    until(lambda: talker.ask("readers") == 1)
     with connect() as session, TransformListener(session, "rrbot") as listener:
         for _ in range(2):
-            speaking.ask("joints", 0, JOINTS, [0.0, 0.0])
-            speaking.ask("joints", S, JOINTS, [0.0, math.nan])
-            speaking.ask("joints", S, ["shoulder"], [0.0])
-            speaking.ask("joints", S, JOINTS, [0.0])
-        # It goes on; joints beside those of the model are left out.
+            talker.ask("joints", 0, JOINTS, [0.0, 0.0])
+            talker.ask("joints", S, JOINTS, [0.0, math.nan])
+            talker.ask("joints", S, ["shoulder"], [0.0])
+            talker.ask("joints", S, JOINTS, [0.0])
+        # It continues; joints that are not in the model are left out.
         stamps = iter(range(2 * S, 3 * S))
 
         def is_carried() -> bool:
-            speaking.ask("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
+            talker.ask("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
             return listener.buffer.can_lookup("world", "tool")
 
         until(is_carried)
@@ -264,7 +264,7 @@ def test_what_cannot_be_used_is_counted_and_said_once(bridge: Bridge, peer: Call
         assert carrying.stderr.count(advice) == 1, carrying.stderr
 
 
-def test_a_node_that_is_killed_ends_with_a_word(namespace: str, spawn: Spawn):
+def test_a_killed_node_ends_the_bridge_with_an_error(namespace: str, spawn: Spawn):
     carrying = spawn(BRIDGE, "ros1", "rrbot", "--to-ros")
     name = carrying.line().rpartition(" ")[2]
     with ServerProxy(os.environ["ROS_MASTER_URI"]) as master:
@@ -291,7 +291,7 @@ def test_rospy_leaves_the_logging_of_others_alone(namespace: str, spawn: Spawn):
     assert child.wait() == 0
 
 
-def test_a_master_that_goes_is_told_and_another_one_ends_it(
+def test_a_lost_master_is_logged_and_a_new_one_ends_the_bridge(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spawn: Spawn
 ):
     environment = ros_environment(tmp_path)
@@ -307,12 +307,12 @@ def test_a_master_that_goes_is_told_and_another_one_ends_it(
         assert child.wait() == 1
     finally:
         second.close()
-    assert "the ROS master was started anew" in child.stderr
+    assert "the ROS master was restarted" in child.stderr
     assert child.stderr.count("no ROS master answers") == 1
     assert "Traceback" not in child.stderr
 
 
-def test_without_a_master_the_bridge_says_what_to_start(
+def test_without_a_master_the_error_names_the_command_to_start_one(
     monkeypatch: pytest.MonkeyPatch, spawn: Spawn, free_port: int
 ):
     monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{free_port}")

@@ -50,8 +50,8 @@ def test_a_stamp_goes_to_ros_and_back_to_the_nanosecond(stamp: int):
 
 
 @pytest.mark.parametrize("stamp", [0, -1, 2**32 * 10**9])
-def test_a_stamp_that_ros_cannot_say_is_refused(stamp: int):
-    with pytest.raises(MessageError, match=f"stamp {stamp} cannot be said"):
+def test_a_stamp_outside_the_range_of_ros_is_refused(stamp: int):
+    with pytest.raises(MessageError, match=f"stamp {stamp} is not a time of ROS 1"):
         set_stamp(header(), stamp)
 
 
@@ -118,9 +118,9 @@ def test_each_number_of_a_floating_joint_has_a_name_in_ros():
         </robot>
     """)
     positions, velocities = np.array([1, 2, 3, 0, 0, 0, 1, 9.0]), np.arange(7.0)
-    said = JointStateWriter(ROS, model).message(1, JointNumbers(positions, velocities, None))
-    assert said.name == [*(f"flight.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")), "spin"]
-    read = JointStateReader(model).read(said)
+    message = JointStateWriter(ROS, model).message(1, JointNumbers(positions, velocities, None))
+    assert message.name == [*(f"flight.{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")), "spin"]
+    read = JointStateReader(model).read(message)
     assert np.array_equal(read.positions, positions)
     assert read.velocities is not None
     assert np.array_equal(read.velocities, velocities)
@@ -128,7 +128,7 @@ def test_each_number_of_a_floating_joint_has_a_name_in_ros():
 
 
 @pytest.mark.processes
-def test_without_rospy_the_command_says_what_to_install(spawn: Spawn):
+def test_without_rospy_the_error_names_the_packages_to_install(spawn: Spawn):
     child = spawn(
         "import sys; sys.modules['rospy'] = None; from zstate.cli.main import main; main()",
         *("ros1", "rrbot", "--to-ros"),

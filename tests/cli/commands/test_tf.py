@@ -146,11 +146,14 @@ def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
         seconds = failure("tf", "base", "lower", "--at", str(soon // 10**9))
     assert re.search("before the (oldest|only) sample of 'rrbot/base' -> 'rrbot/upper'", message)
     assert "leave --at out for the newest pose, or name an instant to come" in message
-    assert "that instant, 250.655 s, is simulated time or one since a machine was switched on, and" in other
-    assert "those samples keep wall-clock time" in other
+    assert (
+        "the requested stamp, 250.655 s, is simulated time or time since a machine was switched on, but"
+        in other
+    )
+    assert "the samples have wall-clock stamps" in other
     assert re.search("after the (newest|only) sample of 'rrbot/base' -> 'rrbot/upper'", late)
     assert "wait longer (--timeout), or leave --at out" in late
-    assert "looks like seconds: stamps are nanoseconds" in seconds
+    assert "looks like seconds, but stamps are nanoseconds" in seconds
     assert not any(word in message + other + late + seconds for word in ("timeout_s", "at=None", "history_s"))
 
 

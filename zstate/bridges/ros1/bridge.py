@@ -1,32 +1,69 @@
-"""Ros1Bridge: one robot, in zstate and in ROS 1."""
+"""Bridge of one robot between zstate and ROS 1: joint states, transforms and the model.
+
+``NativeToRos1`` and ``Ros1ToNative`` are the two directions, ``Ros1Bridge`` opens one or both.
+"""
 
 from __future__ import annotations
 
 import logging
-from contextlib import ExitStack
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.bridges.ros1.from_ros import Ros1ToNative
-from zstate.bridges.ros1.messages import Ros1FrameNames
-from zstate.bridges.ros1.node import Node
-from zstate.bridges.ros1.to_ros import NativeToRos1
-from zstate.errors import InvalidInput, NetworkError, Unreachable
+from zstate.bridges.ros1.messages import (
+    JointStateReader,
+    JointStateWriter,
+    Ros1FrameNames,
+    TransformsWriter,
+    get_stamp,
+    pose_from_ros,
+)
+from zstate.bridges.ros1.node import NAME, Node, RospyModules, sender
+from zstate.errors import (
+    Closed,
+    InsertRefused,
+    InvalidInput,
+    MessageError,
+    ModelError,
+    NetworkError,
+    SecondWriter,
+    Unreachable,
+)
+from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
-from zstate.wire.keys import check_robot
+from zstate.net.subscription import Received, subscribe
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.sources.joint_source import JointStateValidator
+from zstate.transform import Transform
+from zstate.wire.keys import MODEL_WRITER, check_robot
+from zstate.wire.messages import JointState, RobotDescription, StaticTransforms, poses_from_block
+from zstate.wire.native import NativeWire
 
 _LOG = logging.getLogger("zstate")
+
+# Each node's /tf may come a thousand times a second; one message per period is decoded.
+_TF_CHECK_PERIOD_S = 1.0
+
+Edge = tuple[str, str]
 
 
 class Ros1Bridge(Closeable):
     """Carries the joint states and transforms of ``robot`` between zstate and the ROS 1 of ``node``.
 
-    ``to_ros`` and ``from_ros`` say which way. The robot that comes from ROS is ``model``, or what the
-    parameter ``robot_description`` says as soon as it is set; ``with_description`` sets it for a robot that
-    goes there. ``frame_prefix`` is put before the robot's own frames in ROS, and taken off on the way back.
-    Call ``check`` now and then. A context manager.
+    ``to_ros`` and ``from_ros`` select the directions. The model of a robot from ROS is ``model``, or the
+    parameter ``robot_description`` as soon as it is set; ``with_description`` sets it for a robot of
+    zstate. ``frame_prefix`` precedes the robot's own frames in ROS, and is removed on the way back.
+    Call ``check`` regularly. A context manager.
     """
 
     def __init__(
@@ -49,34 +86,31 @@ class Ros1Bridge(Closeable):
         self._model = model
         self._names = Ros1FrameNames(robot, frame_prefix)
         self._refusals = Refusals()
-        self._wants_from_ros = from_ros
+        self._needs_from_ros = from_ros
         self._lost_master = False
         self._from_ros: Ros1ToNative | None = None
         self._to_ros: NativeToRos1 | None = None
         self._opened = ExitStack()
         try:
             if to_ros:
-                self._open_to_ros(with_description)
-            self._find_model()
+                self._to_ros = self._opened.enter_context(
+                    NativeToRos1(
+                        session,
+                        node,
+                        self._names,
+                        self._refusals,
+                        is_own=self._is_own,
+                        with_description=with_description,
+                    )
+                )
+            self._open_from_ros()
         except BaseException:
             self.close()
             raise
 
-    def _open_to_ros(self, with_description: bool) -> None:
-        self._to_ros = self._opened.enter_context(
-            NativeToRos1(
-                self._session,
-                self._node,
-                self._names,
-                self._refusals,
-                is_ours=self._is_ours,
-                with_description=with_description,
-            )
-        )
-
     @property
     def carried(self) -> tuple[int, int]:
-        """How many samples went to ROS, and how many came from there."""
+        """The count of samples to ROS, and from ROS."""
         return (
             0 if self._to_ros is None else self._to_ros.carried,
             0 if self._from_ros is None else self._from_ros.carried,
@@ -84,63 +118,345 @@ class Ros1Bridge(Closeable):
 
     @property
     def refused(self) -> dict[str, int]:
-        """What was not carried, by reason; the first of each is also logged."""
+        """Counts of refused messages by reason; the first of each is also logged."""
         return dict(self._refusals.counts)
 
     def waits_for(self) -> str:
-        """What must come before anything is carried; empty when nothing is missing."""
+        """The message or parameter that is still missing; empty once samples are carried."""
         if self._to_ros is not None and self._to_ros.robot is None:
             return f"the robot_description of {self.robot!r} in zstate"
-        if self._wants_from_ros and self._from_ros is None:
+        if self._needs_from_ros and self._from_ros is None:
             return f"the parameter {self._node.resolved('robot_description')} in ROS"
         if any(self.carried):
             return ""
-        places = ["in zstate"] * (self._to_ros is not None) + ["in ROS"] * self._wants_from_ros
+        places = ["in zstate"] * (self._to_ros is not None) + ["in ROS"] * self._needs_from_ros
         return f"joint_states of {self.robot!r} {' or '.join(places)}"
 
     def check(self) -> None:
-        """See whether ROS is still there. Raises NetworkError once this bridge is of no use any more."""
+        """Check the connection to ROS. Raises NetworkError if this bridge must be restarted."""
         if self._node.has_ended:
             raise NetworkError("ROS has ended the node of this bridge (`rosnode kill` does that)")
         try:
-            self._check_master()
-            self._find_model()
+            if self._node.master.pid() != self._node.master_pid:
+                raise NetworkError(
+                    "the ROS master was restarted and does not know this bridge; start the bridge again"
+                )
+            self._lost_master = False
+            self._open_from_ros()
         except Unreachable as error:
             if not self._lost_master:
                 self._lost_master = True
-                _LOG.warning("%s. What is connected goes on; nobody new finds this bridge", error)
+                _LOG.warning("%s. Existing connections continue; new nodes do not find this bridge", error)
 
-    def _check_master(self) -> None:
-        if self._node.master.pid() != self._node.master_pid:
-            raise NetworkError(
-                "the ROS master was started anew and does not know this bridge; start the bridge again"
-            )
-        self._lost_master = False
-
-    def _find_model(self) -> None:
-        if not self._wants_from_ros or self._from_ros is not None:
+    def _open_from_ros(self) -> None:
+        if not self._needs_from_ros or self._from_ros is not None:
             return
-        model = self._model or self._described_in_ros()
-        if model is not None:
-            self._from_ros = self._opened.enter_context(
-                Ros1ToNative(
-                    self._session,
-                    self._node,
-                    model,
-                    self._names,
-                    self._refusals,
-                    at_once=self._to_ros is None,
-                )
-            )
+        model = self._model
+        if model is None:
+            name = self._node.resolved("robot_description")
+            urdf = self._node.master.parameter(name)
+            if urdf is None:
+                return
+            model = parse_urdf(str(urdf), f"the ROS parameter {name}")
+        at_once = self._to_ros is None
+        self._from_ros = self._opened.enter_context(
+            Ros1ToNative(self._session, self._node, model, self._names, self._refusals, at_once=at_once)
+        )
 
-    def _described_in_ros(self) -> RobotModel | None:
-        name = self._node.resolved("robot_description")
-        urdf = self._node.master.parameter(name)
-        return None if urdf is None else parse_urdf(str(urdf), f"the ROS parameter {name}")
-
-    def _is_ours(self, session: int, writer: str) -> bool:
+    def _is_own(self, session: int, writer: str) -> bool:
         return self._from_ros is not None and self._from_ros.wrote(session, writer)
 
     def close(self) -> None:
         """Stop carrying; the node stays. A second call does nothing."""
         self._opened.close()
+
+
+class NativeToRos1(Closeable):
+    """Publishes a robot of zstate in ROS, every sample at its own stamp.
+
+    Joints go to ``joint_states``, moving edges to ``/tf``, and all static edges together, latched, to
+    ``/tf_static``; ``with_description`` sets the parameter ``robot_description`` if it is not set. Messages
+    for which ``is_own(session, writer)`` holds came from ROS and are skipped. ``carried`` counts samples.
+    Each stream has a thread of its own.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        node: Node,
+        names: Ros1FrameNames,
+        refusals: Refusals,
+        *,
+        is_own: Callable[[int, str], bool],
+        with_description: bool = True,
+    ) -> None:
+        self.carried = 0
+        self.robot: _Ros1Encoder | None = None
+        self._node = node
+        self._names = names
+        self._is_own = is_own
+        self._with_description = with_description
+        self._refusals = refusals
+        self._wire = NativeWire()
+        self._statics: dict[str, dict[Edge, NDArray[np.float64]]] = {}
+        self._joints = node.publisher("joint_states", node.ros.JointState)
+        self._moving = node.publisher("/tf", node.ros.TFMessage)
+        self._fixed = node.publisher("/tf_static", node.ros.TFMessage, latch=True)
+        with ExitStack() as opening:
+            for stream in ("robot_description", "tf_static", "joint_states"):
+                opening.enter_context(
+                    subscribe(
+                        session,
+                        self._wire,
+                        names.robot,
+                        stream,
+                        self._on_messages,
+                        on_error=refusals.count,
+                        on_withdrawn=self._on_withdrawn if stream == "tf_static" else None,
+                    )
+                )
+            self._opened = opening.pop_all()
+
+    def _on_messages(self, received: list[Received]) -> None:
+        for _, key, message in received:
+            try:
+                if isinstance(message, JointState):
+                    self._publish_joints(message)
+                elif isinstance(message, StaticTransforms):
+                    self._publish_statics(self._wire.static_writer_name(key), message)
+                elif isinstance(message, RobotDescription):
+                    self._set_model(message)
+            except (MessageError, InvalidInput) as error:  # noqa: PERF203 - the other messages may be good
+                self._refusals.count(_reason(error), f"{key}: {error}")
+
+    def _on_withdrawn(self, key: str) -> None:
+        with suppress(InvalidInput):  # a key without a writer's name
+            self._publish_statics(self._wire.static_writer_name(key), None)
+
+    def _set_model(self, description: RobotDescription) -> None:
+        """Use the newest model, and set the ROS parameter."""
+        robot = self.robot
+        is_known = robot is not None and robot.digest == description.digest
+        if is_known or self._is_own(description.session, MODEL_WRITER):
+            return
+        try:
+            model = parse_urdf(description.urdf, f"the URDF of {self._names.robot!r}")
+        except ModelError as error:
+            self._refusals.count("robot description", str(error))
+            return
+        self.robot = _Ros1Encoder(model, self._node.ros, self._names)
+        if not self._with_description:
+            return
+        name, master = self._node.resolved("robot_description"), self._node.master
+        try:
+            urdf = master.parameter(name)
+            if urdf is None:
+                master.set_parameter(name, model.urdf)
+            elif urdf != model.urdf:
+                _LOG.warning("the ROS parameter %s has another robot; it is left unchanged", name)
+        except Unreachable as error:
+            _LOG.warning("the parameter %s is not set: %s", name, error)
+
+    def _publish_statics(self, writer: str, statics: StaticTransforms | None) -> None:
+        """Replace the static edges of one writer (None: withdrawn; ROS nodes keep withdrawn edges)."""
+        if statics is not None and self._is_own(statics.session, writer):
+            return
+        edges: dict[Edge, NDArray[np.float64]] = {}
+        if statics is not None:
+            poses = poses_from_block(statics.poses)
+            if not np.isfinite(poses).all():
+                raise InvalidInput("a static edge is NaN or infinite")
+            in_ros = self._names.in_ros
+            names = ((in_ros(parent), in_ros(child)) for parent, child in statics.edges)
+            edges = dict(zip(names, poses, strict=True))
+        self._statics[writer] = edges
+        merged = {edge: pose for placed in self._statics.values() for edge, pose in placed.items()}
+        message = TransformsWriter(self._node.ros, list(merged))
+        self._fixed.publish(message.message(None, np.array(list(merged.values())).reshape(-1, 7)))
+
+    def _publish_joints(self, state: JointState) -> None:
+        """Publish one sample. Samples before the description are skipped."""
+        robot = self.robot
+        if robot is None or self._is_own(state.session, ""):
+            return
+        numbers = robot.validator.read(state)
+        if self._joints.has_readers:
+            self._joints.publish(robot.joints.message(state.stamp, numbers))
+        if self._moving.has_readers and robot.has_moving_edges:
+            self._moving.publish(robot.transforms(state.stamp, numbers.positions))
+        self.carried += 1
+
+    def close(self) -> None:
+        """Stop. A second call does nothing."""
+        self._opened.close()
+
+
+class _Ros1Encoder:
+    """Encodes samples of one model as ROS 1 messages."""
+
+    def __init__(self, model: RobotModel, ros: RospyModules, names: Ros1FrameNames) -> None:
+        self.digest = model.digest
+        self.joints = JointStateWriter(ros, model)
+        self.validator = JointStateValidator(model)
+        self._table = JointTransforms(model)
+        forms = self._table.forms
+        self._rows = [row for row, form in enumerate(forms) if form.kind != "fixed"]
+        edges = [(names.prefix + forms[row].parent, names.prefix + forms[row].child) for row in self._rows]
+        self._transforms = TransformsWriter(ros, edges)
+
+    @property
+    def has_moving_edges(self) -> bool:
+        return bool(self._rows)
+
+    def transforms(self, stamp: int, positions: NDArray[np.float64]) -> Any:
+        return self._transforms.message(stamp, self._table.poses(positions).take(self._rows, axis=0))
+
+
+class Ros1ToNative(Closeable):
+    """Publishes a robot of ROS 1, whose ``model`` is known, in zstate.
+
+    ``joint_states`` become joint states at their own stamps, and zstate computes the kinematics; the edges
+    on ``/tf_static`` that are not the model's become static edges. Moving edges on ``/tf`` that are not the
+    model's are only logged. ``at_once`` publishes the model at once, not with the first joint state.
+    ``carried`` counts samples. Messages of bridges are skipped.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        node: Node,
+        model: RobotModel,
+        names: Ros1FrameNames,
+        refusals: Refusals,
+        *,
+        at_once: bool,
+    ) -> None:
+        self.carried = 0
+        self._session = session
+        self._node = node
+        self._model = model
+        self._names = names
+        self._refusals = refusals
+        # With both directions the user expects writers on both sides.
+        self._takeover = not at_once
+        self._links = frozenset(model.links)
+        self._model_children = frozenset(joint.child for joint in model.joints)
+        self._reader = JointStateReader(model)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._opened = ExitStack()
+        self._states: StatePublisher | None = None
+        self._statics: StaticPublisher | None = None
+        self._edges: dict[str, tuple[str, tuple[float, ...]]] = {}
+        self._joint_names: list[str] = []
+        self._tf_checked_at: dict[str, float] = {}
+        self._not_carried: set[Edge] = set()
+        if at_once:
+            self._publisher()
+        node.subscribe("joint_states", node.ros.JointState, self._on_joints)
+        node.subscribe("/tf_static", node.ros.TFMessage, self._on_statics)
+        node.subscribe("/tf", node.ros.rospy.AnyMsg, self._on_transforms)
+
+    def wrote(self, session: int, writer: str) -> bool:
+        """Whether a zstate message of this session, or static edges of this writer, came from here."""
+        states, statics = self._states, self._statics
+        if states is not None and session == states.description().session:
+            return True
+        return statics is not None and writer == statics.writer
+
+    def _publisher(self) -> StatePublisher:
+        with self._lock:
+            if self._closed:
+                raise Closed("the bridge is closed")
+            if self._states is None:
+                self._states = self._opened.enter_context(
+                    StatePublisher(self._session, self._model, self._names.robot, takeover=self._takeover)
+                )
+            return self._states
+
+    def _is_of_a_bridge(self, message: Any) -> bool:
+        writer = sender(message)
+        if writer == self._node.name:
+            return True
+        if writer.rpartition("/")[2].startswith(f"{NAME}_"):
+            self._refusals.count("another bridge", f"{writer!r} is a bridge too; its messages are zstate's")
+            return True
+        return False
+
+    def _on_joints(self, message: Any) -> None:
+        if self._is_of_a_bridge(message):
+            return
+        try:
+            stamp = get_stamp(message.header)
+            if message.name != self._joint_names:
+                self._joint_names = message.name
+                if unknown := ", ".join(map(repr, self._reader.unknown(message))):
+                    self._refusals.count("unknown joints", f"{self._model.name!r} has no {unknown}, left out")
+            self._publisher().publish(*self._reader.read(message), stamp)
+            self.carried += 1
+        except (MessageError, InvalidInput, SecondWriter) as error:
+            self._refusals.count(_reason(error), f"joint_states of {sender(message)!r}: {error}")
+        except Closed:
+            pass  # received while closing
+
+    def _on_statics(self, message: Any) -> None:
+        if self._is_of_a_bridge(message):
+            return
+        for transform in message.transforms:
+            if self._names.bare(transform.child_frame_id) not in self._model_children:
+                try:
+                    self._publish_static(transform)
+                except (InvalidInput, SecondWriter) as error:
+                    self._refusals.count(_reason(error), f"/tf_static of {sender(message)!r}: {error}")
+                except Closed:
+                    return
+
+    def _publish_static(self, transform: Any) -> None:
+        parent = self._names.in_zstate(transform.header.frame_id, self._links)
+        child = self._names.in_zstate(transform.child_frame_id, self._links)
+        edge = (parent, pose_from_ros(transform.transform))
+        with self._lock:
+            before = self._edges.get(child)
+            if before == edge:
+                return
+            if self._closed:
+                raise Closed("the bridge is closed")
+            if self._statics is None:
+                self._statics = self._opened.enter_context(StaticPublisher(self._session, self._names.robot))
+            if before is not None and before[0] != parent:
+                # In ROS the newest parent wins.
+                self._statics.withdraw(child)
+                del self._edges[child]
+            self._statics.set(Transform.from_pose7(parent, child, edge[1]))
+            self._edges[child] = edge
+
+    def _on_transforms(self, raw: Any) -> None:
+        """Decode one /tf message per node and second, to log moving edges that are not carried."""
+        now, writer = time.monotonic(), sender(raw)
+        checked_at = self._tf_checked_at.get(writer, -_TF_CHECK_PERIOD_S)
+        if now - checked_at < _TF_CHECK_PERIOD_S or self._is_of_a_bridge(raw):
+            return
+        self._tf_checked_at[writer] = now
+        message = self._node.ros.TFMessage()
+        message.deserialize(raw._buff)  # rospy has no public name for the bytes
+        for transform in message.transforms:
+            edge = (transform.header.frame_id, transform.child_frame_id)
+            if edge not in self._not_carried and self._names.bare(edge[1]) not in self._model_children:
+                self._not_carried.add(edge)
+                self._refusals.count(
+                    "not carried",
+                    f"{edge[0]!r} -> {edge[1]!r} of {writer!r} moves on /tf and is not a joint of the model",
+                )
+
+    def close(self) -> None:
+        """Stop, and withdraw what was published in zstate. A second call does nothing."""
+        with self._lock:
+            self._closed = True
+            self._opened.close()
+
+
+def _reason(error: Exception) -> str:
+    """The counter of a refusal."""
+    if isinstance(error, MessageError | InsertRefused):
+        return error.reason
+    return "second writer" if isinstance(error, SecondWriter) else "bad numbers"

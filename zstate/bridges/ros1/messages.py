@@ -1,6 +1,6 @@
-"""What ROS 1 says, and what of it can be said: stamps, JointState, TFMessage.
+"""Conversion between zstate and ROS 1: stamps, JointState, TFMessage, frame names.
 
-Frame names: ROS 1 has one name space for all robots, zstate has one for each.
+ROS 1 has one name space of frames for all robots, zstate has one for each.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _END_OF_TIME = 2**32 * _SECOND
 
 
 def set_stamp(header: Any, stamp: int) -> None:
-    """Write a stamp [ns] into a ROS header, exactly. Raises MessageError for what a ROS time cannot be."""
+    """Write a stamp [ns] into a ROS header, exactly. Raises MessageError if it exceeds a ROS time."""
     if not 0 < stamp < _END_OF_TIME:
         raise MessageError(
-            f"the stamp {stamp} cannot be said in ROS 1: its times begin after 1970, end in 2106, and zero "
-            "means that there is none",
+            f"the stamp {stamp} is not a time of ROS 1: these are after the start of 1970 and before "
+            "2106, and zero means no stamp",
             reason="stamp",
         )
     header.stamp.secs, header.stamp.nsecs = divmod(stamp, _SECOND)
@@ -41,29 +41,29 @@ def get_stamp(header: Any) -> int:
     stamp = header.stamp.secs * _SECOND + header.stamp.nsecs
     if not stamp:
         raise MessageError(
-            "a JointState without a stamp; when was it? Set header.stamp where it is published, for "
-            "instance to rospy.Time.now()",
+            "a JointState without a stamp; set header.stamp where it is published, for instance to "
+            "rospy.Time.now()",
             reason="zero stamp",
         )
     return stamp
 
 
 class JointStateWriter:
-    """Writes the joints of ``model`` into one JointState, again and again.
+    """Encodes joints of ``model`` in one JointState, which is reused.
 
-    ROS has one number for each name: planar and floating joints stand there as "base.x", "base.y" ...
+    ROS has one number for each name: planar and floating joints become "base.x", "base.y" ...
     """
 
     def __init__(self, ros: RospyModules, model: RobotModel) -> None:
         names = coordinate_names(model)
         self._count = len(names)
-        # None where the velocities stand under the positions one by one, which is nearly always.
+        # None if velocities match positions one by one, which is nearly always so.
         slots = velocity_columns_by_position(model)
         self._slots = None if slots == tuple(range(self._count)) else list(slots)
         self._message = ros.JointState(name=list(names))
 
     def message(self, stamp: int, numbers: JointNumbers) -> Any:
-        """The message; the next one takes its place. Raises MessageError as ``set_stamp``."""
+        """The message, valid until the next call. Raises MessageError as ``set_stamp``."""
         message = self._message
         set_stamp(message.header, stamp)
         message.position = numbers.positions.tolist()
@@ -82,7 +82,7 @@ class JointStateWriter:
 
 
 class TransformsWriter:
-    """Writes the poses of ``edges`` (parent and child, as ROS calls them) into one TFMessage."""
+    """Encodes the poses of ``edges`` (parent and child, by their ROS names) in one TFMessage."""
 
     def __init__(self, ros: RospyModules, edges: Sequence[tuple[str, str]]) -> None:
         self._message = ros.TFMessage()
@@ -92,7 +92,7 @@ class TransformsWriter:
             self._message.transforms.append(transform)
 
     def message(self, stamp: int | None, poses: Floats) -> Any:
-        """The message; the next one takes its place. Raises MessageError as ``set_stamp``.
+        """The message, valid until the next call. Raises MessageError as ``set_stamp``.
 
         Row i of ``poses`` (n, 7) is ``parent_from_child``. Static edges have no stamp.
         """
@@ -111,44 +111,43 @@ def pose_from_ros(transform: Any) -> tuple[float, ...]:
 
 
 class JointStateReader:
-    """Reads the JointState of ROS in the order of ``model``, whatever order they come in."""
+    """Decodes JointState messages with names in any order into the order of ``model``."""
 
     def __init__(self, model: RobotModel) -> None:
-        self._wanted = coordinate_names(model)
+        self._coordinates = coordinate_names(model)
         self._slots = np.array(velocity_columns_by_position(model), dtype=np.intp)
-        self._known = frozenset(self._wanted) | {joint.name for joint in model.joints}
+        self._names = frozenset(self._coordinates) | {joint.name for joint in model.joints}
         self._picks: dict[tuple[str, ...], NDArray[np.intp]] = {}
 
     def read(self, message: Any) -> JointNumbers:
-        """The numbers of all joints of the model. Raises MessageError when they are not all there."""
+        """The numbers of all joints of the model. Raises MessageError if one is missing."""
         pick = self._pick(tuple(message.name))
         count = len(message.name)
+        rates = pick[self._slots]
         positions = _picked("position", message.position, count, pick)
         if positions is None:
             raise MessageError("a JointState without positions", reason="sizes")
-        velocities = _picked("velocity", message.velocity, count, pick[self._slots])
-        return JointNumbers(
-            positions, velocities, _picked("effort", message.effort, count, pick[self._slots])
-        )
+        velocities = _picked("velocity", message.velocity, count, rates)
+        return JointNumbers(positions, velocities, _picked("effort", message.effort, count, rates))
 
     def unknown(self, message: Any) -> tuple[str, ...]:
         """The joints in ``message`` that the model does not have."""
-        return tuple(name for name in message.name if name not in self._known)
+        return tuple(name for name in message.name if name not in self._names)
 
     def _pick(self, names: tuple[str, ...]) -> NDArray[np.intp]:
         pick = self._picks.get(names)
         if pick is None:
             if len(set(names)) < len(names):
                 raise MessageError(f"a JointState that names a joint twice: {names}", reason="names")
-            missing = [name for name in self._wanted if name not in names]
+            missing = [name for name in self._coordinates if name not in names]
             if missing:
                 raise MessageError(
                     f"a JointState without {', '.join(map(repr, missing))}, and a sample of zstate is the "
                     "whole robot; let joint_state_publisher merge the parts (its parameter source_list)",
                     reason="missing joints",
                 )
-            pick = np.array([names.index(name) for name in self._wanted], dtype=np.intp)
-            # One order per writer is usual; a writer that shuffles must not fill the memory.
+            pick = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
+            # Only the last order, so that a writer with changing orders does not fill the memory.
             self._picks = {names: pick}
         return pick
 
@@ -165,7 +164,7 @@ def _picked(what: str, values: Sequence[float], count: int, pick: NDArray[np.int
 
 @dataclass(frozen=True, slots=True)
 class Ros1FrameNames:
-    """How the frames of ``robot`` are called in ROS: ``prefix`` and the bare name.
+    """ROS names of the frames of ``robot``: ``prefix`` and the bare name.
 
     Frames of other robots have their full name, ``robot/frame``, on both sides.
     """
@@ -174,15 +173,15 @@ class Ros1FrameNames:
     prefix: str = ""
 
     def in_ros(self, frame: str) -> str:
-        """What ROS calls a frame of a message of this robot."""
+        """The ROS name of a frame in a message of this robot."""
         bare = frame.removeprefix(f"{self.robot}/")
         return frame if bare == frame and "/" in frame else f"{self.prefix}{bare}"
 
     def bare(self, frame_id: str) -> str:
-        """A ``frame_id`` without the prefix, and without the slash that old programs put before it."""
+        """A ``frame_id`` without the prefix, and without the leading slash of old programs."""
         return frame_id.removeprefix("/").removeprefix(self.prefix)
 
     def in_zstate(self, frame_id: str, links: frozenset[str]) -> str:
-        """What zstate calls a ``frame_id`` in messages of this robot, whose model has ``links``."""
+        """The zstate name of a ``frame_id`` in messages of this robot, whose model has ``links``."""
         bare = self.bare(frame_id)
         return wire_name(self.robot, bare) if bare in links else bare

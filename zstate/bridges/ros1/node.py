@@ -1,6 +1,6 @@
-"""Node: this process as a node of ROS 1, by rospy.
+"""ROS 1 node of this process (rospy), and a client of the ROS 1 master with a timeout.
 
-The ROS 1 master, asked with a deadline: rospy itself would wait for one for ever.
+rospy itself would wait for a master for ever.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SUCCESS = 1
 
 
 class Master:
-    """The master at ``uri``, which is that of ROS_MASTER_URI unless given. Any thread may ask."""
+    """Client of the master at ``uri`` (default: ROS_MASTER_URI). Thread-safe."""
 
     def __init__(self, uri: str | None = None) -> None:
         self._lock = threading.Lock()
@@ -40,7 +40,7 @@ class Master:
             raise NetworkError(f"{URI_VARIABLE} is {self.uri!r}, not http://HOST:PORT ({error})") from None
 
     def pid(self) -> int:
-        """The process it is: another one knows nothing of what this one was told. Raises Unreachable."""
+        """The process id of the master; a restarted one has lost its registrations. Raises Unreachable."""
         return int(self._ask("getPid")[1])
 
     def parameter(self, name: str) -> Any:
@@ -58,8 +58,8 @@ class Master:
                 code, _, value = getattr(self._proxy, method)(_CALLER, *arguments)  # type: ignore[misc]
         except (OSError, http.client.HTTPException, xmlrpc.client.Error, ValueError, TypeError) as error:
             raise Unreachable(
-                f"no ROS master answers at {self.uri!r} ({error}); start one with `roscore`, or say where it "
-                f"is: export {URI_VARIABLE}={DEFAULT_URI}",
+                f"no ROS master answers at {self.uri!r} ({error}); start one with `roscore`, or set its "
+                f"address: export {URI_VARIABLE}={DEFAULT_URI}",
                 endpoints=[self.uri],
             ) from None
         return code == _SUCCESS, value
@@ -74,7 +74,7 @@ class _TimeoutTransport(xmlrpc.client.Transport):
 
 NAME = "zstate_ros1"
 
-# What ROS 1 programs use for /tf.
+# As usual for /tf in ROS 1.
 _QUEUE_SIZE = 100
 _CLOSE_WITHIN_S = 0.7
 _LOG_VARIABLE = "ROS_PYTHON_LOG_CONFIG_FILE"
@@ -82,7 +82,7 @@ _LOG_VARIABLE = "ROS_PYTHON_LOG_CONFIG_FILE"
 
 @dataclass(frozen=True)
 class RospyModules:
-    """What of ROS 1 is used here: rospy, and the classes of the messages. None of it has types."""
+    """rospy and its message classes. They have no types."""
 
     rospy: Any
     JointState: Any
@@ -91,7 +91,7 @@ class RospyModules:
 
 
 def load_ros() -> RospyModules:
-    """Import rospy and its messages. Raises LibraryMissing saying what to install."""
+    """Import rospy and its messages. Raises LibraryMissing, which names the packages to install."""
     logger_class = logging.getLoggerClass()
     try:
         return RospyModules(
@@ -102,17 +102,17 @@ def load_ros() -> RospyModules:
         )
     except ImportError as error:
         raise LibraryMissing(
-            f"ROS 1 is not to be found from this Python ({error}). On Debian 12: `apt-get install "
-            "python3-rospy python3-sensor-msgs python3-tf2-msgs`, and install zstate where these are seen: "
+            f"this Python does not find ROS 1 ({error}). On Debian 12: `apt-get install "
+            "python3-rospy python3-sensor-msgs python3-tf2-msgs`, and install zstate where they are visible: "
             "`/usr/bin/python3 -m venv --system-site-packages .venv`"
         ) from None
     finally:
-        # rospy puts a class of its own behind every logger that is made from now on.
+        # rospy sets a class of its own for all new loggers.
         logging.setLoggerClass(logger_class)
 
 
 class Node(Closeable):
-    """A node of ROS 1, there until closed; one in the life of a process, for rospy cannot begin again.
+    """A node of ROS 1; a process can have one in its lifetime, because rospy cannot be restarted.
 
     Raises LibraryMissing without rospy, Unreachable without a master.
     """
@@ -121,8 +121,8 @@ class Node(Closeable):
         self.ros = load_ros()
         self.master = Master()
         self.master_pid = self.master.pid()
-        with _logging_untouched():
-            # Without its own handling of signals, of time and of log messages, all of which are ours.
+        with _keep_logging():
+            # Signals, time and log messages are handled by this process, not by rospy.
             self.ros.rospy.init_node(
                 NAME, anonymous=True, disable_signals=True, disable_rostime=True, disable_rosout=True
             )
@@ -130,7 +130,7 @@ class Node(Closeable):
 
     @property
     def has_ended(self) -> bool:
-        """Whether it is closed, or was ended from outside (``rosnode kill``)."""
+        """Whether the node is closed, or was killed (``rosnode kill``)."""
         return bool(self.ros.rospy.is_shutdown())
 
     def resolved(self, name: str) -> str:
@@ -138,7 +138,7 @@ class Node(Closeable):
         return str(self.ros.rospy.resolve_name(name))
 
     def publisher(self, topic: str, kind: Any, *, latch: bool = False) -> Publisher:
-        """A publisher of messages of class ``kind``; a latched one keeps its last for late joiners."""
+        """A publisher of messages of class ``kind``; latched ones keep the last for late joiners."""
         return Publisher(self.ros.rospy, topic, kind, latch)
 
     def subscribe(self, topic: str, kind: Any, callback: Callable[[Any], None]) -> None:
@@ -147,7 +147,7 @@ class Node(Closeable):
 
     def close(self) -> None:
         """Leave ROS within a second. A second call does nothing."""
-        # A master that is gone, or a frozen subscriber, would hold it up.
+        # In a thread, because a missing master or a frozen subscriber would block it.
         leaving = threading.Thread(
             target=self.ros.rospy.signal_shutdown, args=("closed",), name="zstate ros1 close", daemon=True
         )
@@ -164,11 +164,11 @@ class Publisher:
 
     @property
     def has_readers(self) -> bool:
-        """Whether anybody subscribes now."""
+        """Whether there is a subscriber."""
         return bool(self._publisher.get_num_connections())
 
     def publish(self, message: Any) -> None:
-        """Send ``message``, which may be changed afterwards unless it is latched. Nothing after the end."""
+        """Send ``message``, which may be changed afterwards unless latched. No effect after shutdown."""
         try:
             self._publisher.publish(message)
         except self._rospy.ROSException:
@@ -178,12 +178,12 @@ class Publisher:
 
 def sender(message: Any) -> str:
     """The name of the node that sent ``message``."""
-    return str(message._connection_header["callerid"])  # rospy tells it nowhere else
+    return str(message._connection_header["callerid"])  # rospy has no public name for it
 
 
 @contextmanager
-def _logging_untouched() -> Generator[None]:
-    """Give rospy the configuration of logging that changes nothing: its own replaces everybody's handlers."""
+def _keep_logging() -> Generator[None]:
+    """Give rospy a logging configuration that changes nothing: its default replaces all handlers."""
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
         file.write("{version: 1, incremental: true}")
         file.flush()

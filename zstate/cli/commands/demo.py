@@ -72,7 +72,7 @@ def demo_command(
     """
     from zstate.cli.processes import ChildProcess
     from zstate.model.catalog import example_name
-    from zstate.model.representative_links import representative_links
+    from zstate.model.robot import representative_links
 
     if robot and robot_option and robot != robot_option:
         raise click.UsageError(f"two robots are named, {robot!r} and {robot_option!r}; give one")

@@ -13,10 +13,9 @@ from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
 from zstate.errors import LookupFailed, ModelError, format_duration
-from zstate.model.representative_links import representative_links
-from zstate.model.robot import RobotModel
+from zstate.model.joint_limits import JointLimits
+from zstate.model.robot import RobotModel, representative_links
 from zstate.model.urdf import parse_urdf
-from zstate.model.urdf_joint import JointLimits
 from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE

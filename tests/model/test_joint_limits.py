@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from zstate.model.joint_limits import JointLimits
 from zstate.model.load import load_model
-from zstate.model.urdf_joint import JointLimits
 
 
 def limits_of(*joints: str) -> JointLimits:
@@ -49,7 +49,7 @@ def test_a_joint_beyond_its_limits_is_named_with_its_value_and_unit(
     assert limits.are_exceeded(rows).tolist() == [bool(explanation)]
 
 
-def test_of_several_samples_each_joint_is_named_once_with_its_worst_value():
+def test_each_joint_is_named_once_with_its_worst_value_of_all_samples():
     rows = np.array([[2.5, 0.0, 0.0], [0.0, 1.2, 0.0], [-4.0, 0.0, 0.1]])
     limits = limits_of(*ARM)
     assert limits.are_exceeded(rows).tolist() == [True, True, True]
@@ -58,7 +58,7 @@ def test_of_several_samples_each_joint_is_named_once_with_its_worst_value():
     )
 
 
-def test_an_angle_that_fits_once_converted_from_degrees_is_said_to_look_like_degrees():
+def test_an_angle_that_fits_once_converted_looks_like_degrees():
     assert limits_of(*ARM).explanation(np.array([[45.0, -90.0, 0.0]])) == (
         "'j0' at 45.0 rad is outside -2 to 2, 'j1' at -90.0 rad is outside -3 to 1; "
         "this looks like degrees: convert with math.radians"
@@ -72,7 +72,7 @@ def test_an_angle_within_a_turn_or_too_large_even_in_degrees_is_only_outside(ang
     assert "degrees" not in text
 
 
-def test_millimetres_of_a_slide_are_not_taken_for_degrees():
+def test_millimetres_of_a_prismatic_joint_are_not_taken_for_degrees():
     assert limits_of(*ARM).explanation(np.array([[0.0, 0.0, 20.0]])) == "'j2' at 20.0 m is outside 0 to 0.5"
 
 
@@ -82,18 +82,18 @@ def test_many_joints_are_counted_rather_than_listed():
     assert text.endswith("'j2' at 1.5 rad is outside -1 to 1, 3 more joints are outside theirs")
 
 
-def test_wheels_may_turn_as_often_as_they_like():
+def test_continuous_joints_have_no_limits():
     limits = limits_of("continuous 0 0", "continuous 0 0", "revolute -1 1")
     rows = np.array([[4000.0, -4000.0, 0.5]])
     assert limits.explanation(rows) == ""
     assert not limits.are_exceeded(rows).any()
 
 
-def test_limits_that_leave_no_room_are_not_stated():
+def test_equal_limits_count_as_none():
     assert not limits_of("continuous 0 0", "revolute 0 0")
     assert limits_of("revolute 0 0", "prismatic 0 1")
 
 
-def test_numbers_that_are_missing_are_not_outside():
+def test_nan_is_not_outside_the_limits():
     rows = np.array([[math.nan, 0.0, 0.0], [math.nan, 1.5, 0.0]])
     assert limits_of(*ARM).explanation(rows) == "'j1' at 1.5 rad is outside -3 to 1"
