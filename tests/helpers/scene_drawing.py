@@ -30,7 +30,7 @@ def tree(parents: Mapping[str, str | None]) -> FrameTable:
     return FrameTable(names, np.array(rows, dtype=np.intp), kinds, (None,) * len(names))
 
 
-def moment(
+def snapshot(
     of: FrameTable, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequence[str] = ()
 ) -> FramePoses:
     """Frames that are not named are where their parents are."""
@@ -40,7 +40,7 @@ def moment(
 
 
 def drawn(scene: Scene, shown) -> None:
-    """Show a moment until nothing is missing from the picture."""
+    """Show a snapshot until nothing is missing from the picture."""
 
     def complete() -> bool:
         scene.show(shown, "map")
@@ -68,7 +68,7 @@ def in_fixed(server: viser.ViserServer, path: str) -> tuple[float, ...]:
     return pose
 
 
-def is_seen(server: viser.ViserServer, path: str) -> bool:
+def is_visible(server: viser.ViserServer, path: str) -> bool:
     """Whether a node and all above it are visible."""
     parts = path.split("/")
     above = [server.scene.get_handle_by_name("/".join(parts[:k])) for k in range(2, len(parts) + 1)]

@@ -41,18 +41,18 @@ def test_every_pose_is_what_the_buffer_says_of_that_edge():
         world.buffer.insert_joints(track_of(world, "a"), stamp, [position, -position])
         world.buffer.insert(shifted("map", "marker", position, stamp))
     for at in (None, 1 * SECOND, 2 * SECOND, 1_300_000_000):
-        moment = world.moment(at)
-        assert moment.known.all()
-        assert moment.stamp == at or at is None
-        for row, name in enumerate(moment.tree.names):
-            parent = int(moment.tree.parents[row])
+        snapshot = world.snapshot(at)
+        assert snapshot.known.all()
+        assert snapshot.stamp == at or at is None
+        for row, name in enumerate(snapshot.tree.names):
+            parent = int(snapshot.tree.parents[row])
             if parent >= 0:
-                said = world.buffer.lookup(moment.tree.names[parent], name, at).matrix
-                drawn = Transform.from_pose7("p", "c", moment.poses[row]).matrix
+                said = world.buffer.lookup(snapshot.tree.names[parent], name, at).matrix
+                drawn = Transform.from_pose7("p", "c", snapshot.poses[row]).matrix
                 np.testing.assert_allclose(drawn, said, atol=1e-12)
             else:
-                assert moment.poses[row].tolist() == IDENTITY
-    assert world.moment().stamp == 2 * SECOND
+                assert snapshot.poses[row].tolist() == IDENTITY
+    assert world.snapshot().stamp == 2 * SECOND
 
 
 def test_frames_of_one_feed_are_read_together_between_its_samples():
@@ -61,8 +61,8 @@ def test_frames_of_one_feed_are_read_together_between_its_samples():
     half_turn_less = [1.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]
     world.buffer.insert_many(edges, 1 * SECOND, [IDENTITY, IDENTITY])
     world.buffer.insert_many(edges, 2 * SECOND, [half_turn_less, IDENTITY])
-    moment = world.moment(1_500_000_000)
-    base = moment.poses[moment.tree.row("base")]
+    snapshot = world.snapshot(1_500_000_000)
+    base = snapshot.poses[snapshot.tree.row("base")]
     assert base == pytest.approx([0.5, 0.0, 0.0, 0.0, 0.0, np.sin(0.25), np.cos(0.25)])
 
 
@@ -70,29 +70,29 @@ def test_parents_stand_before_children_whoever_was_named_first():
     world = ViewSource(None, buffer=TransformBuffer())
     world.buffer.insert_static(shifted("b", "c", 1.0))
     world.buffer.insert_static(shifted("a", "b", 1.0))
-    tree = world.moment().tree
+    tree = world.snapshot().tree
     assert tree.names == ("a", "b", "c")
     assert tree.parents.tolist() == [-1, 0, 1]
     assert tree.kinds == ("root", "static", "static")
 
 
 def test_an_edge_without_samples_says_so():
-    moment = world_of("a").moment()
-    unknown = {moment.tree.kinds[row] for row in np.flatnonzero(~moment.known)}
+    snapshot = world_of("a").snapshot()
+    unknown = {snapshot.tree.kinds[row] for row in np.flatnonzero(~snapshot.known)}
     assert unknown == {"joint"}
-    assert moment.stamp is None
-    row = moment.tree.row("a/upper")
-    assert moment.reasons[row] == "no joint sample of 'a' received (no writer)"
+    assert snapshot.stamp is None
+    row = snapshot.tree.row("a/upper")
+    assert snapshot.reasons[row] == "no joint sample of 'a' received (no writer)"
 
 
 def test_a_robot_that_ends_early_is_drawn_a_little_longer_and_then_no_more():
     world = world_of("a")
     world.buffer.insert_joints(track_of(world, "a"), 10 * SECOND, [0.0, 0.0])
     world.buffer.insert_joints(track_of(world, "a"), 11 * SECOND, [0.1, 0.1])
-    assert world.moment(11 * SECOND + 400_000_000).known.all()
-    late = world.moment(15 * SECOND)
+    assert world.snapshot(11 * SECOND + 400_000_000).known.all()
+    late = world.snapshot(15 * SECOND)
     assert set(late.reasons.values()) == {"4.0 s after the newest sample of 'a' (no writer)"}
-    early = world.moment(8 * SECOND)
+    early = world.snapshot(8 * SECOND)
     assert set(early.reasons.values()) == {"2.0 s before the oldest sample of 'a' (no writer)"}
 
 
@@ -100,14 +100,14 @@ def test_the_version_grows_when_there_is_something_else_to_see_and_not_with_samp
     world = world_of("a")
     before = world.version
     world.buffer.insert_joints(track_of(world, "a"), SECOND, [0.0, 0.0])
-    world.moment()
+    world.snapshot()
     assert world.version == before
     world.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
     assert world.version > before
     between = world.version
     track_of(world, "a").writer = "driver@here"
     assert world.version > between
-    assert "driver@here" in world.moment().tree.writers
+    assert "driver@here" in world.snapshot().tree.writers
 
 
 def test_only_the_chosen_robots_are_seen_with_what_they_stand_on():
@@ -115,7 +115,7 @@ def test_only_the_chosen_robots_are_seen_with_what_they_stand_on():
     world.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
     world.buffer.insert_static(shifted("map", "b/" + MODEL.root, 3.0))
     assert world.robots() == ("a",)
-    names = world.moment().tree.names
+    names = world.snapshot().tree.names
     assert "map" in names
     assert not [name for name in names if name.startswith("b/")]
 
@@ -127,7 +127,7 @@ def test_a_robot_on_the_network_is_found_and_its_silence_is_counted(sessions):
         assert world.robots() == ()
         with StatePublisher(writing, MODEL, "r1") as publisher:
             publisher.publish(source.read(SECOND).positions)
-            until(lambda: world.moment().stamp is not None and world.silent_s("r1") is not None)
+            until(lambda: world.snapshot().stamp is not None and world.silent_s("r1") is not None)
             assert world.models["r1"].digest == MODEL.digest
             assert world.robots() == ("r1",)
             first = world.silent_s("r1")
@@ -148,9 +148,9 @@ def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
         stamps = [publisher.publish(source.read(n * SECOND).positions) for n in range(3)]
         assert stamps
         until(lambda: sum(recorder.stats.messages.values()) >= 4)
-    with ViewSource.of_recording(file) as world:
+    with ViewSource.from_recording(file) as world:
         assert world.robots() == ("r1",)
-        assert world.moment().known.all()
+        assert world.snapshot().known.all()
         assert world.silent_s("r1") is None
 
 
@@ -162,6 +162,6 @@ def test_robots_that_speak_ros_are_seen_like_others(sessions, monkeypatch: pytes
     ):
         await_reader(sessions[0], key_of(JOINT_STATES))
         publisher.publish([0.5, -0.5])
-        until(lambda: world.moment().stamp is not None)
+        until(lambda: world.snapshot().stamp is not None)
         assert [model.digest for model in world.models.values()] == [MODEL.digest]
-        assert world.moment().known.all()
+        assert world.snapshot().known.all()

@@ -107,7 +107,7 @@ def test_a_description_that_was_received_gets_no_file_outside_packages_nor_learn
             file,
         ]
         found = [MeshPaths().find(uri) for uri in uris]
-        return [(one.reason, one.looked) if isinstance(one, MissingFile) else one for one in found]
+        return [(one.reason, one.searched) if isinstance(one, MissingFile) else one for one in found]
 
     present, absent = answers("secret.png"), answers("nothing.png")
     assert [one for one in present if isinstance(one, Path)] == []
@@ -148,8 +148,8 @@ def test_what_is_missing_says_where_it_was_looked_for(package, monkeypatch):
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
     missing = MeshPaths().find("package://arm/meshes/c.stl")
     assert isinstance(missing, MissingFile)
-    assert (missing.reason, missing.looked) == ("the package 'arm' has no such file", (str(package),))
+    assert (missing.reason, missing.searched) == ("the package 'arm' has no such file", (str(package),))
     unknown = MeshPaths().find("package://leg/meshes/c.stl")
     assert isinstance(unknown, MissingFile)
     assert "there is no package 'leg'; put the folder" in unknown.reason
-    assert str(package.parent) in unknown.looked
+    assert str(package.parent) in unknown.searched

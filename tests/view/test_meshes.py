@@ -197,7 +197,7 @@ def test_an_image_goes_over_a_primitive_too_and_a_missing_one_is_told(tmp_path):
     assert color_of(drawn(gone)) == as_read((1, 0, 0, 1))
     missing = Meshes().missing_texture(gone, HERE)
     assert missing is not None
-    assert missing.looked == (str(tmp_path),)
+    assert missing.searched == (str(tmp_path),)
 
 
 def test_large_images_are_made_smaller(tmp_path):

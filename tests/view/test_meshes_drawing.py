@@ -92,19 +92,19 @@ def test_a_robot_is_drawn_with_its_meshes_where_its_links_are(robot: str, look, 
         surface = changed(full, bare)
 
         assert shown.view.scene.missing_meshes(robot) == ()
-        moment = shown.world.moment()
+        snapshot = shown.world.snapshot()
         fixed = f"{robot}/{load_model(robot).root}"
-        placed = moment.poses_in(fixed)
-        framing = fit_camera(moment, placed, 1.0, shown.view.scene.corners(moment.tree, placed))
+        placed = snapshot.poses_in(fixed)
+        framing = fit_camera(snapshot, placed, 1.0, shown.view.scene.corners(snapshot.tree, placed))
         assert framing is not None
         height, width = surface.shape
         drawn = {shape.link for shape in parse_shapes(shown.world.models[robot]) if shape.role == "visual"}
-        rows = [row for row, name in enumerate(moment.tree.names) if name.partition("/")[2] in drawn]
+        rows = [row for row, name in enumerate(snapshot.tree.names) if name.partition("/")[2] in drawn]
         places = pixels_of(placed[rows, :3], framing, (width, height))
         # Every link that has a mesh is seen where its frame is ...
         for row, (x, y) in zip(rows, places.round().astype(int).tolist(), strict=True):
             near = surface[max(0, y - NEAR) : y + NEAR, max(0, x - NEAR) : x + NEAR]
-            assert near.any(), f"nothing is drawn at {moment.tree.names[row]}"
+            assert near.any(), f"nothing is drawn at {snapshot.tree.names[row]}"
         # ... nothing is drawn far from all of them, and there is light and dark in it.
         down, right = np.nonzero(surface)
         far = np.linalg.norm(np.stack((right, down), axis=1)[:, None] - places[None], axis=2).min(axis=1)
@@ -147,7 +147,7 @@ def test_beyond_loopback_a_browser_needs_the_address_with_the_token(browser, loo
         stranger.goto(f"http://127.0.0.1:{page.port}/")
         assert "asks for its token" in stranger.locator("body").inner_text()
         stranger.close()
-        looker = look(f"http://127.0.0.1:{page.port}/?token={page.door.token}", 640, 400)
+        looker = look(f"http://127.0.0.1:{page.port}/?token={page.access.token}", 640, 400)
         until(page.connected.is_set)
         view.draw()
         looker.text("No robot is announced")

@@ -16,7 +16,7 @@ pytest.importorskip("viser")
 from zstate import StatePublisher, StaticPublisher, Transform, load_model
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses
-from zstate.view.camera import Camera, Sight, fit_camera
+from zstate.view.camera import Camera, Visibility, fit_camera
 from zstate.view.data_source import ViewSource
 from zstate.view.server import ViewServer
 from zstate.view.view import View
@@ -46,11 +46,11 @@ class FailingWorld(ViewSource):
     fails = False
     tries = 0
 
-    def moment(self, at: int | None = None) -> FramePoses:
+    def snapshot(self, at: int | None = None) -> FramePoses:
         self.tries += 1
         if self.fails:
             raise ValueError(f"try number {self.tries}")
-        return super().moment(at)
+        return super().snapshot(at)
 
 
 def test_a_picture_that_fails_is_logged_once_shown_on_the_page_and_tried_again(page, caplog):
@@ -107,17 +107,17 @@ def test_a_picture_that_is_held_is_of_one_instant_with_the_camera_fitted_to_it(p
     with ViewSource(None, buffer=buffer) as world, View(world, page) as view:
         with drawing(view, page):
             assert view.hold(DEADLINE_S)
-        moment = view.draw()
+        snapshot = view.draw()
         camera = page.server.initial_camera
         before = np.array([camera.position, camera.look_at])
         for tick in range(1, 20):
             buffer.insert_joints(track, tick * 1_000_000_000, lowered)
-            assert view.draw() is moment
+            assert view.draw() is snapshot
         np.testing.assert_array_equal([camera.position, camera.look_at], before)
-        assert view.sights() == (Sight("r1", True, "", "r1/world"),)
-    placed = moment.poses_in("r1/world")
-    corners = view.scene.corners(moment.tree, placed)
-    framing = fit_camera(moment, placed, 1.0, corners)
+        assert view.visibility() == (Visibility("r1", True, "", "r1/world"),)
+    placed = snapshot.poses_in("r1/world")
+    corners = view.scene.corners(snapshot.tree, placed)
+    framing = fit_camera(snapshot, placed, 1.0, corners)
     assert framing is not None
     assert len(corners) > 8
     np.testing.assert_allclose(before, [framing.position, framing.look_at])
@@ -130,7 +130,7 @@ def test_a_page_begins_with_the_frame_and_the_camera_that_were_asked_for(page):
     with ViewSource(None, buffer=buffer) as world:
         with View(world, page, fixed_frame="r1/tool", camera=camera) as view:
             view.draw()
-        at_tool = world.moment().poses_in("r1/tool")
+        at_tool = world.snapshot().poses_in("r1/tool")
         handle = page.server.scene.get_handle_by_name("/frames/0")
         assert handle is not None
         np.testing.assert_allclose(handle.position, at_tool[0, :3], atol=1e-6)

@@ -74,16 +74,16 @@ def test_random_positions_are_within_the_limits(arm):
     generator = np.random.default_rng(1)
     for _ in range(50):
         arm.random(generator)
-        assert (arm.dials.lower <= arm.values).all()
-        assert (arm.values <= arm.dials.upper).all()
+        assert (arm.mapping.lower <= arm.values).all()
+        assert (arm.values <= arm.mapping.upper).all()
 
 
 def test_a_sine_moves_all_joints_until_one_is_turned_by_hand(arm):
-    arm.is_swinging = True
+    arm.sine_enabled = True
     before = arm.values
     until(lambda: not np.isclose(arm.values, before).any())
     arm.set("finger", 0.01)
-    assert not arm.is_swinging
+    assert not arm.sine_enabled
     bent = arm.values[0]
     arm.read(0)
     assert arm.values.tolist() == [bent, 0.01]
@@ -110,15 +110,15 @@ def test_where_somebody_else_writes_the_joints_nothing_is_published_and_it_is_sa
         driver.publish([0.0, 0.0])
         until(lambda: discover(sessions[0], 0.2))
         with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
-            until(lambda: sliders.refusal)
+            until(lambda: sliders.conflict)
             assert sliders.achieved_hz is None
-            assert f"pid {os.getpid()}" in sliders.refusal
-            assert "driver@" in sliders.refusal
-            assert "joint_states of 'r1'" in sliders.refusal
+            assert f"pid {os.getpid()}" in sliders.conflict
+            assert "driver@" in sliders.conflict
+            assert "joint_states of 'r1'" in sliders.conflict
             assert not sliders.open()
             driver.close()
             until(sliders.open)
-            assert sliders.refusal == ""
+            assert sliders.conflict == ""
             until(lambda: sliders.achieved_hz)
 
 
@@ -127,7 +127,7 @@ def test_they_move_the_joints_of_a_robot_whose_model_another_program_tells(sessi
     with StatePublisher(sessions[1], RRBOT, "r1", streams=streams, program="model"):
         until(lambda: discover(sessions[0], 0.2))
         with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
-            assert sliders.refusal == ""
+            assert sliders.conflict == ""
             (robot,) = discover(sessions[1])
             writers = {(stream, writer.program) for stream, writer in robot.writers}
             mine = {stream for stream, program in writers if program != "model"}

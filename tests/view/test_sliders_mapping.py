@@ -34,16 +34,16 @@ def cart() -> RobotModel:
 
 
 def test_every_driven_joint_has_its_dials_within_its_limits(cart):
-    names = [dial.name for dial in SliderMapping(cart).dials]
+    names = [dial.name for dial in SliderMapping(cart).specs]
     floating = [f"float.{part}" for part in ("x", "y", "z", "roll", "pitch", "yaw")]
     assert names == [*floating, "drive.x", "drive.y", "drive.yaw", "swing", "rise", "roll"]
-    by_name = {dial.name: dial for dial in SliderMapping(cart).dials}
+    by_name = {dial.name: dial for dial in SliderMapping(cart).specs}
     assert by_name["swing"] == SliderSpec("swing", "rad", -0.5, 1.5)
     assert by_name["rise"] == SliderSpec("rise", "m", 0.0, 0.25)
 
 
 def test_what_has_no_limits_moves_a_turn_or_two_metres(cart):
-    by_name = {dial.name: dial for dial in SliderMapping(cart).dials}
+    by_name = {dial.name: dial for dial in SliderMapping(cart).specs}
     assert by_name["roll"] == SliderSpec("roll", "rad", -math.pi, math.pi)
     assert by_name["drive.yaw"] == SliderSpec("drive.yaw", "rad", -math.pi, math.pi)
     assert by_name["drive.x"] == SliderSpec("drive.x", "m", -2.0, 2.0)
@@ -57,20 +57,20 @@ def test_positions_are_those_of_the_dials_in_the_order_of_the_model(cart):
 
 
 def test_values_are_the_way_back(cart):
-    dials, generator = SliderMapping(cart), np.random.default_rng(3)
+    mapping, generator = SliderMapping(cart), np.random.default_rng(3)
     for _ in range(20):
-        values = generator.uniform(dials.lower, dials.upper)
-        np.testing.assert_allclose(dials.values(dials.positions(values)), values, atol=1e-9)
+        values = generator.uniform(mapping.lower, mapping.upper)
+        np.testing.assert_allclose(mapping.values(mapping.positions(values)), values, atol=1e-9)
 
 
 def test_a_robot_that_cannot_move_has_no_dials():
     fixed = parse_urdf('<robot name="rock"><link name="rock"/></robot>', "rock.urdf")
-    dials = SliderMapping(fixed)
-    assert dials.dials == ()
-    assert dials.positions(np.empty(0)).shape == (0,)
+    mapping = SliderMapping(fixed)
+    assert mapping.specs == ()
+    assert mapping.positions(np.empty(0)).shape == (0,)
 
 
 @pytest.mark.robots
 def test_pandas_dials_are_its_joints():
     panda = load_model("panda")
-    assert tuple(dial.name for dial in SliderMapping(panda).dials) == panda.joint_names
+    assert tuple(dial.name for dial in SliderMapping(panda).specs) == panda.joint_names

@@ -75,7 +75,7 @@ def test_with_sliders_it_does_not_fight_and_says_with_whom(spawn):
         (["a.mcap", "--sliders"], 2, "--sliders moves robots that are here"),
         (["nowhere.mcap"], 1, "nowhere.mcap"),
         (["--rate", "0"], 2, "a rate is above 0"),
-        (["--host", "nowhere.invalid"], 1, "nobody can listen at 'nowhere.invalid'"),
+        (["--host", "nowhere.invalid"], 1, "cannot listen at 'nowhere.invalid'"),
         (["pandda", "--sliders"], 1, "panda"),
         (["--port", "99999"], 2, "99999"),
         (["--camera", "1,2"], 2, "'1,2' is not three numbers with commas between"),

@@ -11,8 +11,8 @@ import pytest
 from zstate.buffer.snapshot import FramePoses, FrameTable
 from zstate.net.graph import Graph, StreamUse, WriterState
 from zstate.view.panels import html
+from zstate.view.panels.display_panel import disconnected_html, stale_text, unplaced_html
 from zstate.view.panels.graph_panel import graph_html
-from zstate.view.panels.robots_panel import disconnected_html, silence_text, unplaced_html
 from zstate.wire.messages import Level, Status
 
 SCRIPT = "<img src=x onerror=alert(1)>\"'&"
@@ -34,7 +34,7 @@ def test_names_out_of_the_network_are_text_and_nothing_else():
         assert "&lt;img" in made
 
 
-def moment(names: tuple[str, ...], reasons: dict[int, str]) -> FramePoses:
+def snapshot(names: tuple[str, ...], reasons: dict[int, str]) -> FramePoses:
     count = len(names)
     tree = FrameTable(names, np.full(count, -1, dtype=np.intp), ("root",) * count, (None,) * count)
     known = np.array([row not in reasons for row in range(count)])
@@ -43,13 +43,13 @@ def moment(names: tuple[str, ...], reasons: dict[int, str]) -> FramePoses:
 
 def test_frames_that_have_no_pose_for_one_reason_are_told_of_together():
     names = tuple(f"r/link{number}" for number in range(6))
-    text = plain(unplaced_html(moment(names, dict.fromkeys(range(1, 6), "no joint sample"))))
+    text = plain(unplaced_html(snapshot(names, dict.fromkeys(range(1, 6), "no joint sample"))))
     assert "5 frames have no pose" in text
     assert "r/link1, r/link2 and 3 more: no joint sample" in text
 
 
 def test_one_frame_without_a_pose_is_told_of_in_the_singular():
-    text = plain(unplaced_html(moment(("r/a", "r/b"), {1: "silent"})))
+    text = plain(unplaced_html(snapshot(("r/a", "r/b"), {1: "silent"})))
     assert "1 frame has no pose" in text
     assert "r/b: silent" in text
 
@@ -67,7 +67,7 @@ def test_robots_that_stand_on_nothing_in_common_are_told_of_with_what_joins_them
 
 
 def test_nothing_is_said_where_every_frame_has_its_pose():
-    assert not unplaced_html(moment(("r/a",), {}))
+    assert not unplaced_html(snapshot(("r/a",), {}))
 
 
 def status(level: Level, text: str = "") -> Status:
@@ -105,4 +105,4 @@ def test_streams_with_the_same_ends_stand_together_and_what_nobody_writes_stands
 def test_a_silence_is_said_with_how_long_and_since_when(silent_s: float, lasting: str):
     now = datetime(2026, 3, 4, 15, 6, 7).astimezone()
     since = datetime.fromtimestamp(now.timestamp() - silent_s).astimezone()
-    assert silence_text(silent_s, now.timestamp()) == f"silent for {lasting}, since {since:%H:%M:%S}"
+    assert stale_text(silent_s, now.timestamp()) == f"silent for {lasting}, since {since:%H:%M:%S}"

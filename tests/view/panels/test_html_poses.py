@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from zstate.se3 import quaternion_from_rpy
-from zstate.view.panels.html import digits, listed, pose_rows
+from zstate.view.panels.html import format_number, format_row, pose_rows
 
 
 def test_a_pose_is_told_in_every_way_that_people_ask_for():
@@ -19,9 +19,9 @@ def test_a_pose_is_told_in_every_way_that_people_ask_for():
 
 
 def test_numbers_stand_still_when_their_signs_change():
-    assert len(listed((0.1, 0.2, 0.3), 4)) == len(listed((-0.1, 0.2, -0.3), 4))
-    assert len(listed((1.0, 2.0, 3.0), 2, width=7)) == len(listed((-179.99, 2.0, 3.0), 2, width=7))
+    assert len(format_row((0.1, 0.2, 0.3), 4)) == len(format_row((-0.1, 0.2, -0.3), 4))
+    assert len(format_row((1.0, 2.0, 3.0), 2, width=7)) == len(format_row((-179.99, 2.0, 3.0), 2, width=7))
 
 
 def test_there_is_no_negative_zero():
-    assert digits(-0.00001, 3) == "0.000"
+    assert format_number(-0.00001, 3) == "0.000"

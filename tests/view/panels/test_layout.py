@@ -1,4 +1,4 @@
-"""The board without a browser: what a person chose is done once, and what is drawn follows."""
+"""The layout without a browser: what a person chose is done once, and what is drawn follows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from zstate.clock import ManualClock
 from zstate.transform import Transform
 from zstate.view.data_source import ViewSource
 from zstate.view.panels.layout import PanelLayout
-from zstate.view.panels.widgets import BoundWidget, FrameChoice
+from zstate.view.panels.panel import BoundWidget, FrameDropdown
 from zstate.view.scene.scene import Scene
 
 
@@ -45,12 +45,12 @@ def test_what_a_person_chose_is_not_overwritten_by_what_was_shown_before(page):
 
 
 def test_a_frame_stays_chosen_while_others_come(page):
-    choice = FrameChoice(page.server.gui, "frame", "(none)")
+    choice = FrameDropdown(page.server.gui, "frame", "(none)")
     assert choice.frame is None
-    choice.offer(("a", "b"), "b")
-    choice.offer(("c", "a", "b"), "b")
+    choice.set_options(("a", "b"), "b")
+    choice.set_options(("c", "a", "b"), "b")
     assert choice.frame == "b"
-    choice.offer(("c", "a"), None)
+    choice.set_options(("c", "a"), None)
     assert choice.frame is None
     assert choice.poll_change() is None
 
@@ -59,46 +59,46 @@ def test_a_board_of_nothing_waits_for_the_first_robot(page):
     buffer = TransformBuffer()
     with (
         ViewSource(None, buffer=buffer) as world,
-        PanelLayout(page.server, world, Scene(page.server)) as board,
+        PanelLayout(page.server, world, Scene(page.server)) as layout,
     ):
-        moment = world.moment(board.stamp)
-        board.update(moment)
-        assert board.fixed(moment) == ""
+        snapshot = world.snapshot(layout.stamp)
+        layout.update(snapshot)
+        assert layout.fixed_frame(snapshot) == ""
         buffer.insert_static(Transform("map", "camera", [1, 0, 0], [0, 0, 0, 1]))
-        moment = world.moment(board.stamp)
-        board.update(moment)
-        assert board.fixed(moment) == "map"
+        snapshot = world.snapshot(layout.stamp)
+        layout.update(snapshot)
+        assert layout.fixed_frame(snapshot) == "map"
 
 
 def test_a_recording_is_shown_at_an_instant_of_its_own_and_not_at_its_end(page, buffer):
     with (
         ViewSource(None, buffer=buffer) as world,
-        PanelLayout(page.server, world, Scene(page.server)) as board,
+        PanelLayout(page.server, world, Scene(page.server)) as layout,
     ):
-        board.clock.pause()
-        assert board.stamp == 0
-        board.clock.seek(4 * SECOND)
-        stamp = board.stamp
+        layout.cursor.pause()
+        assert layout.stamp == 0
+        layout.cursor.seek(4 * SECOND)
+        stamp = layout.stamp
         assert stamp == 4 * SECOND
-        moment = world.moment(stamp)
-        board.update(moment)
-        assert board.stamp == 4 * SECOND
+        snapshot = world.snapshot(stamp)
+        layout.update(snapshot)
+        assert layout.stamp == 4 * SECOND
 
 
 def test_where_nothing_is_new_nothing_is_sent(page, buffer, monkeypatch):
     sent: list[object] = []
     with (
         ViewSource(None, buffer=buffer) as world,
-        PanelLayout(page.server, world, Scene(page.server)) as board,
+        PanelLayout(page.server, world, Scene(page.server)) as layout,
     ):
-        board.clock.pause()
-        board.update(world.moment(board.stamp))
+        layout.cursor.pause()
+        layout.update(world.snapshot(layout.stamp))
         pipe = page.server.gui._websock_interface
         queue = pipe.queue_message
         monkeypatch.setattr(pipe, "queue_message", lambda message: (sent.append(message), queue(message)))
-        board.update(world.moment(board.stamp))
-        board.update(world.moment(board.stamp))
+        layout.update(world.snapshot(layout.stamp))
+        layout.update(world.snapshot(layout.stamp))
         assert sent == []
-        board.clock.seek(2 * SECOND)
-        board.update(world.moment(board.stamp))
+        layout.cursor.seek(2 * SECOND)
+        layout.update(world.snapshot(layout.stamp))
         assert sent

@@ -7,7 +7,7 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
-from helpers.scene_drawing import at, drawn, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
+from helpers.scene_drawing import at, drawn, handles, in_fixed, is_visible, snapshot, told, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
 from zstate.model.geometry import Box, MeshFile, Shape, Sphere  # noqa: E402
@@ -26,7 +26,7 @@ def fleet_of(server, names, shapes=SHAPES, base=None) -> Scene:
     scene = Scene(server)
     for name in names:
         scene.set_robot(name, CART, shapes, base)
-    drawn(scene, moment(TREE, POSES))
+    drawn(scene, snapshot(TREE, POSES))
     return scene
 
 
@@ -70,7 +70,7 @@ def test_many_robots_are_one_node_for_each_shape(server):
 def test_robots_that_look_different_are_no_fleet(server):
     scene = fleet_of(server, NAMES[:3])
     scene.set_robot("r3", CART, SHAPES[:1])
-    drawn(scene, moment(TREE, POSES))
+    drawn(scene, snapshot(TREE, POSES))
     assert nodes(server) == []
 
 
@@ -86,64 +86,64 @@ def test_a_mirrored_mesh_is_mirrored_in_a_fleet_too(server, tmp_path):
 def test_one_message_moves_a_shape_of_all_robots(server):
     scene = fleet_of(server, NAMES)
     scene.axes = False
-    scene.show(moment(TREE, POSES), "map")
+    scene.show(snapshot(TREE, POSES), "map")
     with told(server) as messages:
-        scene.show(moment(TREE, POSES), "map")
+        scene.show(snapshot(TREE, POSES), "map")
         assert messages == []
-        scene.show(moment(TREE, POSES | {f"{name}/base": at(5, 5, 5, 1) for name in NAMES}), "map")
+        scene.show(snapshot(TREE, POSES | {f"{name}/base": at(5, 5, 5, 1) for name in NAMES}), "map")
     assert len(messages) == 1
 
 
 def test_robots_come_to_a_fleet_and_leave_it(server):
     scene = fleet_of(server, NAMES[:4])
     scene.set_robot("r4", CART, SHAPES)
-    drawn(scene, moment(TREE, POSES))
+    drawn(scene, snapshot(TREE, POSES))
     assert seen(server) == corners_of(NAMES)
     for name in NAMES[:4]:
         scene.remove_robot(name)
-    drawn(scene, moment(TREE, POSES))
+    drawn(scene, snapshot(TREE, POSES))
     assert seen(server) == corners_of(["r4"])
     scene.remove_robot("r4")
-    scene.show(moment(TREE, POSES), "map")
+    scene.show(snapshot(TREE, POSES), "map")
     assert nodes(server) == []
 
 
 def test_a_silent_robot_of_a_fleet_is_drawn_in_grey(server):
     scene = fleet_of(server, NAMES)
     (own,) = nodes(server)
-    scene.grey("r2", "silent for 3 s")
-    drawn(scene, moment(TREE, POSES))
+    scene.set_stale("r2", "silent for 3 s")
+    drawn(scene, snapshot(TREE, POSES))
     assert np.count_nonzero(own.batched_scales.any(axis=1)) == 4
     assert seen(server) == corners_of(NAMES)
     assert [label.text for label in handles(server, viser.LabelHandle).values()] == ["r2: silent for 3 s"]
-    scene.grey("r2", None)
-    scene.show(moment(TREE, POSES), "map")
+    scene.set_stale("r2", None)
+    scene.show(snapshot(TREE, POSES), "map")
     assert np.count_nonzero(own.batched_scales.any(axis=1)) == 5
 
 
 def test_a_robot_without_a_place_is_not_drawn(server):
     scene = fleet_of(server, NAMES)
-    scene.show(moment(TREE, POSES, unknown=["r1/base"]), "map")
+    scene.show(snapshot(TREE, POSES, unknown=["r1/base"]), "map")
     assert seen(server) == corners_of([name for name in NAMES if name != "r1"])
 
 
 def test_a_robot_whose_frames_are_not_there_yet_is_not_drawn(server):
     scene = fleet_of(server, NAMES)
     few = tree({"map": None, "r0/base": "map"})
-    scene.show(moment(few, POSES), "map")
+    scene.show(snapshot(few, POSES), "map")
     assert seen(server) == corners_of(["r0"])
-    scene.show(moment(TREE, POSES), "map")
+    scene.show(snapshot(TREE, POSES), "map")
     assert seen(server) == corners_of(NAMES)
 
 
 def test_collisions_of_a_fleet_are_drawn_when_they_are_asked_for(server):
     scene = fleet_of(server, NAMES)
     scene.visuals, scene.collisions = False, True
-    drawn(scene, moment(TREE, POSES))
+    drawn(scene, snapshot(TREE, POSES))
     assert len(nodes(server)) == 2
     assert seen(server) == corners_of(NAMES)
     scene.collisions = False
-    scene.show(moment(TREE, POSES), "map")
+    scene.show(snapshot(TREE, POSES), "map")
     assert seen(server) == set()
 
 
@@ -162,7 +162,7 @@ def test_a_sixth_robot_joins_five_of_a_fleet(server):
     grown = tree({"map": None} | {f"{name}/base": "map" for name in names})
     scene = fleet_of(server, NAMES)
     scene.set_robot("r5", CART, SHAPES)
-    drawn(scene, moment(grown, POSES | {"r5/base": at(9, 9)}))
+    drawn(scene, snapshot(grown, POSES | {"r5/base": at(9, 9)}))
     place = se3.compose(se3.compose(at(9, 9), ORIGIN), (1, 1, 1, 0, 0, 0, 1))[:3]
     assert seen(server) == corners_of(NAMES) | {tuple(np.round(place, 4).tolist())}
 
@@ -171,7 +171,7 @@ def test_a_fleet_survives_another_tree_of_the_same_frames(server):
     """As after a restart of one publisher, or a static edge that is set again."""
     scene = fleet_of(server, NAMES)
     again = tree({"map": None} | {f"{name}/base": "map" for name in NAMES})
-    scene.show(moment(again, POSES), "map")
+    scene.show(snapshot(again, POSES), "map")
     assert seen(server) == corners_of(NAMES)
 
 
@@ -200,12 +200,12 @@ class Hall:
         actions = [self._come, self._come, self._go, self._renew, self._move, self._stand_elsewhere]
         actions += [self._lose_frames, self._lose_samples, self._fall_silent, self._switch, self._follow]
         actions[self.random.integers(len(actions))](name)
-        drawn(self.scene, self.moment())
-        self.placed = self.scene.show(self.moment(), "map")
+        drawn(self.scene, self.snapshot())
+        self.placed = self.scene.show(self.snapshot(), "map")
 
-    def moment(self):
+    def snapshot(self):
         stamp = int(self.random.integers(3)) * 400_000_000
-        return moment(self.tree, self.poses, stamp, [f"{name}/base" for name in self.unknown])
+        return snapshot(self.tree, self.poses, stamp, [f"{name}/base" for name in self.unknown])
 
     def expected(self) -> list[tuple[float, ...]]:
         """The pose of every visual, by the definition of the poses."""
@@ -226,7 +226,7 @@ class Hall:
         alone = [
             in_fixed(self.server, path)
             for path in handles(self.server, viser.GlbHandle)
-            if not path.rpartition("/")[2].startswith("c") and is_seen(self.server, path)
+            if not path.rpartition("/")[2].startswith("c") and is_visible(self.server, path)
         ]
         batches = handles(self.server, viser.BatchedGlbHandle).items()
         for node in [node for path, node in batches if not path.rpartition("/")[2].startswith("c")]:
@@ -267,14 +267,14 @@ class Hall:
         self.unknown ^= {name}
 
     def _fall_silent(self, name: str) -> None:
-        self.scene.grey(name, "silent" if self.random.random() < 0.5 else None)
+        self.scene.set_stale(name, "silent" if self.random.random() < 0.5 else None)
 
     def _switch(self, _: str) -> None:
         for what in ("visuals", "collisions", "axes", "names", "parent_lines"):
             setattr(self.scene, what, bool(self.random.random() < 0.7))
 
     def _follow(self, name: str) -> None:
-        self.scene.trail(f"{name}/base", bool(self.random.random() < 0.5))
+        self.scene.set_trail(f"{name}/base", bool(self.random.random() < 0.5))
 
 
 def corner_of(pose) -> tuple[float, ...]:

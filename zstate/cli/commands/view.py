@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -36,7 +35,7 @@ from zstate.model.robot import RobotModel
 from zstate.net.presence import discover
 from zstate.net.session import Session
 from zstate.view.access import is_loopback
-from zstate.view.camera import Sight
+from zstate.view.camera import Visibility
 from zstate.view.data_source import ViewSource
 from zstate.view.screenshot import save_screenshot
 from zstate.view.server import ViewServer
@@ -157,8 +156,6 @@ def view_command(
     zstate view urdf/arm.urdf               # 'arm' on the network, with the meshes beside this file
     zstate view --host 0.0.0.0 --port 9000
     """
-    import_module("zstate.view.library")  # told before anything is heard when it is missing
-
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
@@ -182,7 +179,7 @@ def view_command(
                 ViewSource(session, [one.robot for one in named], wire=wire, clock=kept)
             )
         else:
-            world = opened.enter_context(ViewSource.of_recording(recording))
+            world = opened.enter_context(ViewSource.from_recording(recording))
         page = opened.enter_context(ViewServer(port=0) if snapshot else ViewServer(host, port))
         view = opened.enter_context(
             View(
@@ -268,8 +265,8 @@ def chosen_sliders(
         elif model is None:
             chosen, model = _local(one.robot)
         sliders = SliderPublisher(session, model, chosen.robot, wires=(wire,))
-        if sliders.refusal:
-            print_status(f"{chosen.robot!r} is not moved: {sliders.refusal}", robot=chosen.robot)
+        if sliders.conflict:
+            print_status(f"{chosen.robot!r} is not moved: {sliders.conflict}", robot=chosen.robot)
         yield chosen, sliders
 
 
@@ -318,27 +315,27 @@ def take_snapshot(
         whom = " and ".join(map(repr, robots)) or "any robot"
         fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {whom}; robots that were heard: {there}")
     if fixed_frame and not _wait_for(
-        world, lambda: fixed_frame in world.moment().tree.index, _ANNOUNCED_WITHIN_S
+        world, lambda: fixed_frame in world.snapshot().tree.index, _ANNOUNCED_WITHIN_S
     ):
-        world.moment().tree.row(fixed_frame)  # raises, with near misses
+        world.snapshot().tree.row(fixed_frame)  # raises, with near misses
     if not robots and world.session is not None:
         time.sleep(_OTHERS_WITHIN_S)
-    _wait_for(world, lambda: not world.moment().reasons, _SAMPLES_WITHIN_S)
+    _wait_for(world, lambda: not world.snapshot().reasons, _SAMPLES_WITHIN_S)
     width, height = size
     save_screenshot(page, path, width=width, height=height, hold=view.hold)
-    sights = view.sights()
-    seen = ", ".join(one.robot for one in sights if one.is_seen) or "no robot"
+    sights = view.visibility()
+    seen = ", ".join(one.robot for one in sights if one.is_visible) or "no robot"
     print_result(f"wrote {path}: {seen}, {width} x {height} pixels")
     _note_what_is_missing(view, sights)
 
 
-def _note_what_is_missing(view: View, sights: Sequence[Sight]) -> None:
+def _note_what_is_missing(view: View, sights: Sequence[Visibility]) -> None:
     """Notes on robots that are not in a picture, on those without a place of their own, and on meshes."""
     for one in sights:
         if one.reason:
-            part = "in the picture in part" if one.is_seen else "not in the picture"
+            part = "in the picture in part" if one.is_visible else "not in the picture"
             print_status(f"{one.robot!r} is {part}: {one.reason}", robot=one.robot)
-    roots = sorted({one.root for one in sights if one.is_seen})
+    roots = sorted({one.root for one in sights if one.is_visible})
     if len(roots) > 1:
         joined = f"zstate static {roots[0]} {roots[1]} --xyz 1 0 0"
         print_status(

@@ -6,7 +6,7 @@ import pytest
 
 from zstate.buffer.snapshot import TimeSpan
 from zstate.errors import InvalidInput
-from zstate.view.time_cursor import TimeCursor
+from zstate.view.panels.time_panel import TimeCursor
 
 SECOND = 1_000_000_000
 
@@ -42,7 +42,7 @@ def span(oldest_s: float, newest_s: float) -> TimeSpan:
 
 def test_it_begins_in_the_present(live):
     assert live.stamp(span(0, 10)) is None
-    assert live.is_present
+    assert live.is_live
     assert live.is_playing
 
 
@@ -66,7 +66,7 @@ def test_played_on_it_goes_as_fast_as_time_and_never_catches_up(live, time):
     live.play()
     time.now_s += 2.0
     assert live.stamp(span(2, 12)) == 6 * SECOND
-    assert not live.is_present
+    assert not live.is_live
 
 
 def test_played_faster_it_comes_back_to_the_present(live, time):
@@ -76,7 +76,7 @@ def test_played_faster_it_comes_back_to_the_present(live, time):
     live.play()
     time.now_s += 1.0
     assert live.stamp(span(1, 11)) is None
-    assert live.is_present
+    assert live.is_live
 
 
 def test_a_change_of_speed_holds_from_then_on(live, time):
@@ -114,7 +114,7 @@ def test_seeking_out_of_the_present_stands_still_there(live, time):
 def test_it_returns_to_the_present_when_told_to(live):
     live.stamp(span(0, 10))
     live.pause()
-    live.return_to_present()
+    live.go_live()
     assert live.stamp(span(0, 10)) is None
 
 
@@ -125,7 +125,7 @@ def test_a_recording_plays_at_once_and_stops_at_its_end(recorded, time):
     time.now_s += 40.0
     assert recorded.stamp(span(20, 30)) == 30 * SECOND
     assert not recorded.is_playing
-    assert not recorded.is_present
+    assert not recorded.is_live
 
 
 def test_a_recording_that_has_ended_is_played_anew(recorded, time):
