@@ -1,4 +1,4 @@
-"""Apart: robots that share no frame are all drawn, beside each other, each with a label that says so."""
+"""TreeLayout: unconnected robots are drawn next to each other, with labels that mark them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def middles(placed) -> dict[str, np.ndarray]:
     return {name: placed[BOTS.index[f"{name}/base"], :3] for name in NAMES}
 
 
-def test_robots_without_a_common_frame_are_all_drawn_and_none_reaches_into_another(scene, server):
+def test_unconnected_robots_are_drawn_out_of_reach_of_each_other(scene, server):
     shown = snapshot(BOTS, REACH)
     placed = scene.show(shown, "bot1/base")
     assert np.isfinite(placed).all()
@@ -50,17 +50,17 @@ def test_robots_without_a_common_frame_are_all_drawn_and_none_reaches_into_anoth
             assert apart > reach[one] + reach[other]
     expected = {f"{name} (position unknown)" for name in NAMES[1:]} | {"bot1"}
     assert labels(server) == expected
-    # What is known stays so: nothing is said of where they are.
+    # The snapshot is unchanged: their relative poses stay unknown.
     assert np.isnan(shown.poses_in("bot1/base")[2:]).all()
 
 
-def test_names_with_numbers_stand_in_their_order(scene):
+def test_trees_are_ordered_by_the_numbers_in_their_names(scene):
     found = middles(scene.show(snapshot(BOTS, REACH), "bot1/base"))
     places = [(-round(x, 6), round(y, 6)) for x, y, _ in found.values()]
     assert places == sorted(places)
 
 
-def test_they_keep_their_places_while_robots_move_and_samples_are_missing(scene):
+def test_trees_keep_their_places_while_robots_move_and_samples_are_missing(scene):
     before = middles(scene.show(snapshot(BOTS, REACH), "bot1/base"))
     version = scene.layout_version
     moved = REACH | {"bot7/tool": at(9.0)}
@@ -84,15 +84,15 @@ def test_they_keep_their_places_while_robots_move_and_samples_are_missing(scene)
     assert scene.layout_version == version
 
 
-def test_all_stand_on_the_floor_of_the_fixed_one(scene):
-    """A walker that is placed by its hip, beside an arm that is placed by its foot."""
+def test_trees_stand_on_the_floor_of_the_fixed_frame(scene):
+    """A walker with its root at the hip next to an arm with its root at the floor."""
     two = tree({"arm/base": None, "arm/tip": "arm/base", "walker/hip": None, "walker/foot": "walker/hip"})
     shown = snapshot(two, {"arm/tip": at(z=1.0), "walker/foot": at(z=-0.9)})
     assert scene.show(shown, "arm/base")[3, 2] == pytest.approx(0.0)
     assert scene.show(shown, "walker/hip")[0, 2] == pytest.approx(-0.9)
 
 
-def test_they_are_placed_from_a_frame_that_moves_as_well(scene):
+def test_trees_are_placed_for_a_moving_fixed_frame(scene):
     two = tree({"a/base": None, "a/tool": "a/base", "b/base": None})
     at_base = scene.show(snapshot(two, {}), "a/base")[2, :3]
     seen = scene.show(snapshot(two, {"a/tool": at(1.0, 0.0, 0.0, np.pi / 2)}), "a/tool")[2, :3]
@@ -100,7 +100,7 @@ def test_they_are_placed_from_a_frame_that_moves_as_well(scene):
     assert seen == pytest.approx((y, -(x - 1.0), z))
 
 
-def test_a_robot_that_is_joined_stands_where_it_is_and_has_no_label_any_more(scene, server):
+def test_connected_robot_is_at_its_pose_without_a_label(scene, server):
     apart = tree({"a/base": None, "b/base": None})
     scene.show(snapshot(apart, {}), "a/base")
     assert labels(server) == {"a", "b (position unknown)"}
