@@ -65,7 +65,7 @@ class BrowserTab:
         shot = self.tab.screenshot(timeout=TIMEOUT_MS)
         return imageio.v3.imread(shot, extension=".png")[:, :, :3]
 
-    def keep(self, name: str) -> None:
+    def save_screenshot(self, name: str) -> None:
         """Save a screenshot in the folder ZSTATE_SCREENSHOTS, for inspection by a person."""
         folder = os.environ.get("ZSTATE_SCREENSHOTS")
         if folder:
