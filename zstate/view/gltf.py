@@ -130,12 +130,7 @@ class Glb:
 
     def _array(self, array: NDArray[Any], target: Literal[34962, 34963], *, bounded: bool = False) -> int:
         data = array if array.dtype.name in _COMPONENTS else array.astype(np.float32)
-        view = {
-            "buffer": 0,
-            "byteOffset": len(self._binary),
-            "byteLength": data.nbytes,
-            "target": target,
-        }
+        view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": data.nbytes, "target": target}
         accessor: dict[str, Any] = {
             "bufferView": len(self._views),
             "componentType": _COMPONENTS[data.dtype.name],

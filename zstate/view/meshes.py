@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 from collections import OrderedDict, deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
@@ -23,6 +24,7 @@ from zstate.view.gltf import GREY, Corner, Glb, MaterialOverride
 from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
 from zstate.view.mesh_paths import MeshPaths, MissingFile
 
+_T = TypeVar("_T")
 _Source = Path | tuple[Box | Cylinder | Sphere, bool]
 
 FORMATS = {".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl"}
@@ -107,13 +109,10 @@ class Meshes:
             if self._pack(source).triangle_count:
                 return self._colored(source, shape, over, base, name)
             return MissingFile(name, "nothing can be drawn: its size is zero, or not finite")
-        found = self._find(geometry.uri, base)
-        if isinstance(found, MissingFile):
-            return found
-        try:
-            return replace(self._colored(found, shape, over, base, geometry.uri), scale=geometry.scale)
-        except (OSError, UnreadableFile) as error:
-            return MissingFile(geometry.uri, str(error), (str(found.parent),))
+        uri, scale = geometry.uri, geometry.scale
+        return self._read(
+            uri, base, lambda path: replace(self._colored(path, shape, over, base, uri), scale=scale)
+        )
 
     def missing_texture(self, shape: Shape, base: Path | None = None) -> MissingFile | None:
         """Why the texture of the shape cannot be loaded; None if it can, or if there is none."""
@@ -164,20 +163,19 @@ class Meshes:
 
     def _texture(self, shape: Shape, base: Path | None) -> bytes | MissingFile | None:
         """The image of the shape's texture; None without a texture."""
-        if shape.texture is None:
-            return None
-        found = self._find(shape.texture, base)
-        if isinstance(found, MissingFile):
-            return found
-        try:
-            return read_image(found)
-        except (OSError, UnreadableFile) as error:
-            return MissingFile(shape.texture, str(error), (str(found.parent),))
+        return None if shape.texture is None else self._read(shape.texture, base, read_image)
 
-    def _find(self, uri: str, base: Path | None) -> Path | MissingFile:
+    def _read(self, uri: str, base: Path | None, read: Callable[[Path], _T]) -> _T | MissingFile:
+        """The result of ``read`` for a file, or why it cannot be read."""
         if base not in self._paths:
             self._paths[base] = MeshPaths(base)
-        return self._paths[base].find(uri)
+        path = self._paths[base].find(uri)
+        if isinstance(path, MissingFile):
+            return path
+        try:
+            return read(path)
+        except (OSError, UnreadableFile) as error:
+            return MissingFile(uri, str(error), (str(path.parent),))
 
 
 class UnreadableFile(ValueError):

@@ -66,7 +66,11 @@ class HeadlessBrowser(Closeable):
     """
 
     def __init__(self, url: str, width: int, height: int) -> None:
-        program = installed_browser()
+        program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
+        if program is None:
+            raise LibraryMissing(
+                "a picture needs a Chromium-based browser, and none is installed: apt-get install chromium"
+            )
         self._profile = tempfile.TemporaryDirectory(prefix="zstate-view-", ignore_cleanup_errors=True)
         window = (f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}")
         command = [program, *_FLAGS, *window]
@@ -90,17 +94,6 @@ class HeadlessBrowser(Closeable):
         self._process.kill()
         self._process.wait()
         self._profile.cleanup()
-
-
-def installed_browser() -> str:
-    """The path of a Chromium-based browser. Raises LibraryMissing."""
-    for name in _PROGRAMS:
-        path = shutil.which(name)
-        if path is not None:
-            return path
-    raise LibraryMissing(
-        "a browser draws the picture, and no Chromium-based one is installed: apt-get install chromium"
-    )
 
 
 def save_screenshot(
@@ -133,16 +126,11 @@ def save_screenshot(
 
         pixels = _until_stable(draw)
     try:
-        path.write_bytes(encode_png(pixels))
+        out = BytesIO()
+        imageio.v3.imwrite(out, pixels, extension=".png")  # pyright: ignore[reportUnknownMemberType]
+        path.write_bytes(out.getvalue())
     except OSError as error:
         raise InvalidInput(f"the picture cannot be written: {error}") from None
-
-
-def encode_png(pixels: Pixels) -> bytes:
-    """(H, W, 3) as a PNG."""
-    out = BytesIO()
-    imageio.v3.imwrite(out, pixels, extension=".png")  # pyright: ignore[reportUnknownMemberType]
-    return out.getvalue()
 
 
 def _on_white(pixels: Pixels) -> Pixels:

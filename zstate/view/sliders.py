@@ -31,11 +31,6 @@ Values = NDArray[np.float64]
 _REACH_M = 2.0
 """Range of a coordinate without limits, each way."""
 
-_PLANAR: tuple[tuple[str, Unit, float], ...] = (
-    ("x", "m", _REACH_M),
-    ("y", "m", _REACH_M),
-    ("yaw", "rad", math.pi),
-)
 _FLOATING: tuple[tuple[str, Unit, float], ...] = (
     ("x", "m", _REACH_M),
     ("y", "m", _REACH_M),
@@ -44,6 +39,7 @@ _FLOATING: tuple[tuple[str, Unit, float], ...] = (
     ("pitch", "rad", math.pi / 2),
     ("yaw", "rad", math.pi),
 )
+_PLANAR = (*_FLOATING[:2], _FLOATING[5])
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +59,20 @@ class SliderMapping:
     """Maps slider values to joint positions; a floating joint has six sliders, three of them for its rpy."""
 
     def __init__(self, model: RobotModel) -> None:
-        self.specs = tuple(spec for joint in model.driven_joints for spec in _slider_specs(joint))
-        self.lower = np.array([spec.lower for spec in self.specs])
-        self.upper = np.array([spec.upper for spec in self.specs])
         self._model = model
+        specs: list[SliderSpec] = []
         plain: list[tuple[int, int]] = []
         self._floating: list[tuple[int, int]] = []
-        row = 0
         for joint in model.driven_joints:
-            column, count = model.columns[joint.name], len(list(_slider_specs(joint)))
+            row, column = len(specs), model.columns[joint.name]
+            specs += _slider_specs(joint)
             if joint.type == "floating":
                 self._floating.append((row, column))
             else:
-                plain += [(row + step, column + step) for step in range(count)]
-            row += count
+                plain += [(k, column + k - row) for k in range(row, len(specs))]
+        self.specs = tuple(specs)
+        self.lower = np.array([spec.lower for spec in specs])
+        self.upper = np.array([spec.upper for spec in specs])
         self._rows, self._columns = np.array(plain, dtype=np.intp).reshape(-1, 2).T
 
     def positions(self, values: Values) -> Values:

@@ -56,11 +56,7 @@ class Axes:
         if self._handle is None or len(self._drawn) != len(poses):
             self._drawn = poses
             self._handle = self._scene.add_batched_axes(
-                "/axes",
-                wxyzs(poses),
-                poses[:, :3],
-                axes_length=_AXIS_LENGTH_M,
-                axes_radius=_AXIS_RADIUS_M,
+                "/axes", wxyzs(poses), poses[:, :3], axes_length=_AXIS_LENGTH_M, axes_radius=_AXIS_RADIUS_M
             )
             return
         self._handle.visible = True

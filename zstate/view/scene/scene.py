@@ -66,11 +66,7 @@ class Scene:
         return self._layout.version
 
     def set_robot(
-        self,
-        name: str,
-        model: RobotModel,
-        shapes: Sequence[Shape] | None = None,
-        base: Path | None = None,
+        self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None, base: Path | None = None
     ) -> None:
         """Add or replace a robot; its links are the frames ``name/link``.
 

@@ -66,9 +66,9 @@ class TreeLayout:
         if tree is not self._tree or laid_out_for != self._laid_out_for:
             self._tree, self._laid_out_for = tree, laid_out_for
             self._lay_out(snapshot, root)
-        return (
-            snapshot.poses_side_by_side(fixed, self._offsets) if self._offsets else snapshot.poses_in(fixed)
-        )
+        if not self._offsets:
+            return snapshot.poses_in(fixed)
+        return snapshot.poses_side_by_side(fixed, self._offsets)
 
     def show(self, nodes: FrameNodes) -> None:
         """Draw the labels."""
