@@ -84,7 +84,7 @@ def test_invisible_robot_has_a_reason():
     assert [one.reason for one in found] == [
         "no joint sample of 'a'",
         "no sample of 'b'",
-        "it is outside of what the camera sees",
+        "it is outside the camera's view",
         "its description has not been received",
     ]
 

@@ -115,7 +115,7 @@ def robot_visibility(
             reason = snapshot.reasons.get(ancestor, "")
             ancestor = int(tree.parents[ancestor])
         if not is_visible:
-            reason = reason or "it is outside of what the camera sees"
+            reason = reason or "it is outside the camera's view"
         yield Visibility(robot, is_visible, reason, tree.names[int(tree.roots[links[0]])])
 
 

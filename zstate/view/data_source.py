@@ -26,8 +26,8 @@ class ViewSource(Closeable):
     """All announced robots, or only ``robots``, and their poses.
 
     With a ``session``, ``listener`` fills ``buffer`` from the wire format ``wire``; without one, ``buffer``
-    is complete, see ``from_recording``. Ages and stamps are those of ``clock``; by default, of the clock of
-    most robots. Methods may be called from any thread.
+    is complete, see ``from_recording``. Ages and stamps are those of ``clock``; by default, of the clock
+    that most robots use. Methods may be called from any thread.
     """
 
     def __init__(

@@ -51,10 +51,10 @@ class MeshPaths:
     """Finds the files that a URDF names.
 
     ``package://NAME/PATH`` and ``package:///NAME/PATH`` are searched in this order: the folders around
-    ``base``; ROS_PACKAGE_PATH; AMENT_PREFIX_PATH; and what example-robot-data and robot_descriptions have
-    installed. ``base`` is the folder of a URDF file that the user named: relative paths start there, and
-    every file can be found. With None, the description was received: only files in packages are found, and no
-    ``..`` or symbolic link leads out of one.
+    ``base``; ROS_PACKAGE_PATH; AMENT_PREFIX_PATH; and the installed files of example-robot-data and
+    robot_descriptions. ``base`` is the folder of a URDF file that the user named: relative paths start
+    there, and every file can be found. With None, the description was received: only files in packages are
+    found, and no ``..`` or symbolic link leads out of one.
     """
 
     def __init__(self, base: Path | None = None) -> None:

@@ -146,7 +146,7 @@ def test_a_snapshot_names_who_is_in_it_and_who_is_not_and_what_is_missing(tmp_pa
         assert "ROS_PACKAGE_PATH" in both.stderr
         one = snapshot("--fixed-frame", "mine/base", "--camera", "0,0,9:0,0,10")
         assert one.stdout == f"wrote {picture}: no robot, 320 x 240 pixels\n"
-        assert "'rrbot' is not in the picture: it is outside of what the camera sees" in one.stderr
+        assert "'rrbot' is not in the picture: it is outside the camera's view" in one.stderr
         # The file is named by a relative path, and its package is found around it.
         own = snapshot("urdf/mine.urdf")
         assert own.stdout == f"wrote {picture}: mine, 320 x 240 pixels\n"

@@ -1,4 +1,4 @@
-"""Tab View: the fixed frame, what is drawn, and the state of each robot."""
+"""Tab View: the fixed frame, the display options, and the state of each robot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MAX_LINES = 12
 
 
 class DisplayOptions(Protocol):
-    """What a scene draws."""
+    """Display options of a scene."""
 
     visuals: bool
     collisions: bool
@@ -71,7 +71,7 @@ class DisplayPanel:
 
 
 class RobotStyler(Protocol):
-    """What a scene shows of the state of robots."""
+    """Settings and results of a scene for each robot."""
 
     def set_stale(self, robot: str, text: str | None) -> None: ...
     def missing_meshes(self, robot: str) -> Sequence[tuple[str, str]]: ...

@@ -20,7 +20,7 @@ _MAX_LISTED = 10
 
 
 class TrailControls(Protocol):
-    """What a scene does with trails."""
+    """Trail settings of a scene."""
 
     def set_trail(self, frame: str, on: bool) -> None: ...
 

@@ -27,7 +27,7 @@ def paragraph(text: str, *, color: str = "", muted: bool = False) -> str:
 
 
 def heading(text: str, *, color: str = "") -> str:
-    """The heading of what follows."""
+    """A section heading."""
     style = "font-size:0.85em;font-weight:600" + f";color:{color}" * bool(color)
     return f'<div style="{_BOX};padding-bottom:0"><span style="{style}">{escape(text)}</span></div>'
 

@@ -23,7 +23,7 @@ from zstate.view.sliders import SliderPublisher
 
 
 class SceneControls(DisplayOptions, RobotStyler, TrailControls, Protocol):
-    """What the panels change in a scene."""
+    """The settings of a scene that the panels change."""
 
 
 class PanelLayout(Closeable):

@@ -1,4 +1,4 @@
-"""What every panel is made of: its interface, the context of an update, and widgets bound to values."""
+"""Panel interface, the context of an update, and widgets with two-way binding."""
 
 from __future__ import annotations
 
