@@ -1,4 +1,4 @@
-"""What tests of the scene draw with: moments made by hand, and what viser was told of them."""
+"""Helpers for tests of the scene: snapshots from given poses, and the nodes and messages of viser."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Pose
 
 
 def tree(parents: Mapping[str, str | None]) -> FrameTable:
-    """Frames by name with their parents, which stand before them."""
+    """A table of frames with their parents, which come before them."""
     names = tuple(parents)
     rows = [-1 if parent is None else names.index(parent) for parent in parents.values()]
     kinds = tuple("root" if parent is None else "joint" for parent in parents.values())
     return FrameTable(names, np.array(rows, dtype=np.intp), kinds, (None,) * len(names))
 
 
-def moment(
-    of: FrameTable, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequence[str] = ()
+def snapshot(
+    frames: FrameTable, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequence[str] = ()
 ) -> FramePoses:
-    """Frames that are not named are where their parents are."""
-    rows = np.array([poses.get(name, HERE) for name in of.names])
-    known = np.array([name not in unknown for name in of.names])
-    return FramePoses(stamp, of, rows, known)
+    """A snapshot; frames that are not in ``poses`` have the pose of their parent."""
+    rows = np.array([poses.get(name, HERE) for name in frames.names])
+    known = np.array([name not in unknown for name in frames.names])
+    return FramePoses(stamp, frames, rows, known)
 
 
 def drawn(scene: Scene, shown) -> None:
-    """Show a moment until nothing is missing from the picture."""
+    """Show a snapshot until all its meshes are loaded."""
 
     def complete() -> bool:
         scene.show(shown, "map")
@@ -51,13 +51,13 @@ def drawn(scene: Scene, shown) -> None:
 
 
 def handles(server: viser.ViserServer, kind: type[Any]) -> dict[str, Any]:
-    """Everything of a kind that is in the scene now, by its path."""
+    """The nodes of a type in the scene, by path."""
     every = server.scene._handle_from_node_name
     return {path: handle for path, handle in every.items() if isinstance(handle, kind)}
 
 
-def in_fixed(server: viser.ViserServer, path: str) -> tuple[float, ...]:
-    """Where a node is that viser was told of: the pose of all nodes above it, one on the other."""
+def pose_in_fixed(server: viser.ViserServer, path: str) -> tuple[float, ...]:
+    """The pose of a viser node in the fixed frame: the product of its own and its ancestors' poses."""
     pose = se3.IDENTITY
     parts = path.split("/")
     for k in range(2, len(parts) + 1):
@@ -68,16 +68,16 @@ def in_fixed(server: viser.ViserServer, path: str) -> tuple[float, ...]:
     return pose
 
 
-def is_seen(server: viser.ViserServer, path: str) -> bool:
-    """Whether a node and all above it are visible."""
+def is_visible(server: viser.ViserServer, path: str) -> bool:
+    """Whether a node and all its ancestors are visible."""
     parts = path.split("/")
     above = [server.scene.get_handle_by_name("/".join(parts[:k])) for k in range(2, len(parts) + 1)]
     return all(handle is not None and handle.visible for handle in above)
 
 
 @contextmanager
-def told(server: viser.ViserServer) -> Iterator[list[Any]]:
-    """What viser is told meanwhile, message by message."""
+def sent_messages(server: viser.ViserServer) -> Iterator[list[Any]]:
+    """The messages that viser sends inside."""
     messages: list[Any] = []
     scene = server.scene
     queue = scene._queue_scene_message

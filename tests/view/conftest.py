@@ -1,4 +1,4 @@
-"""A browser that looks at views, and sees to it that they have no errors and ask nobody outside."""
+"""Fixtures of the view: a page, a running view, and a browser that checks for errors and outside requests."""
 
 from __future__ import annotations
 
@@ -39,41 +39,41 @@ FLAGS = (
     "--ignore-gpu-blocklist",
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1 , EXCLUDE localhost",
 )
-SLOWLY_MS = 45_000.0
+TIMEOUT_MS = 45_000.0
 """A browser without a graphics card, on a busy machine."""
 LOOPBACK = ("127.0.0.1", "localhost")
 
 
 @dataclass
-class Looker:
-    """One tab of a browser, with all that went wrong in it and everything it asked for."""
+class BrowserTab:
+    """One tab of a browser, with its errors and the URLs it has requested."""
 
     tab: Tab
     errors: list[str] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)
+    requested_urls: list[str] = field(default_factory=list)
 
     def text(self, text: str, *, exact: bool = False) -> Locator:
-        """Where the page says something, once it does."""
+        """The first element with this text, when it has appeared."""
         found = self.tab.get_by_text(text, exact=exact).first
-        found.wait_for(timeout=SLOWLY_MS)
+        found.wait_for(timeout=TIMEOUT_MS)
         return found
 
     def pixels(self) -> NDArray[np.uint8]:
-        """The picture: (H, W, 3)."""
+        """A screenshot: (H, W, 3)."""
         import imageio.v3
 
-        shot = self.tab.screenshot(timeout=SLOWLY_MS)
+        shot = self.tab.screenshot(timeout=TIMEOUT_MS)
         return imageio.v3.imread(shot, extension=".png")[:, :, :3]
 
-    def keep(self, name: str) -> None:
-        """Leave a screenshot where ZSTATE_SCREENSHOTS says, for somebody to look at."""
+    def save_screenshot(self, name: str) -> None:
+        """Save a screenshot in the folder ZSTATE_SCREENSHOTS, for inspection by a person."""
         folder = os.environ.get("ZSTATE_SCREENSHOTS")
         if folder:
-            self.tab.screenshot(path=Path(folder, f"{name}.png"), timeout=SLOWLY_MS)
+            self.tab.screenshot(path=Path(folder, f"{name}.png"), timeout=TIMEOUT_MS)
 
     def outside(self) -> list[str]:
-        """What it asked for that is not on this machine."""
-        parts = [(urlsplit(url), url) for url in self.asked]
+        """The requested URLs that are not on this machine."""
+        parts = [(urlsplit(url), url) for url in self.requested_urls]
         return [
             url
             for part, url in parts
@@ -83,7 +83,7 @@ class Looker:
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[ViewServer]:
-    """A page that no browser shows."""
+    """A page without a browser."""
     pytest.importorskip("viser")
     from zstate.view.server import ViewServer
 
@@ -93,7 +93,7 @@ def page() -> Iterator[ViewServer]:
 
 @pytest.fixture
 def server(page: ViewServer) -> Iterator[ViserServer]:
-    """The server of that page, with nothing on it."""
+    """The viser server of that page, with an empty scene."""
     page.server.scene.reset()
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # viser warns of nodes that are removed twice
@@ -112,70 +112,72 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def look(browser: Browser) -> Iterator[Callable[..., Looker]]:
-    """``look(url)`` opens it; at the end no page has had an error, or asked for anything outside."""
-    lookers: list[Looker] = []
+def open_tab(browser: Browser) -> Iterator[Callable[..., BrowserTab]]:
+    """``open_tab(url)`` opens it; at the end, no page has had an error or requested anything outside."""
+    view_tabs: list[BrowserTab] = []
 
-    def opened(url: str, width: int = 800, height: int = 500) -> Looker:
+    def opened(url: str, width: int = 800, height: int = 500) -> BrowserTab:
         tab = browser.new_page(viewport={"width": width, "height": height})
-        looker = Looker(tab)
-        lookers.append(looker)
-        tab.on("pageerror", lambda error: looker.errors.append(str(error)))
-        tab.on("console", lambda said: looker.errors.append(said.text) if said.type == "error" else None)
-        tab.on("request", lambda request: looker.asked.append(request.url))
-        tab.on("websocket", lambda socket: looker.asked.append(socket.url))
-        tab.goto(url, timeout=SLOWLY_MS)
-        tab.locator("canvas").first.wait_for(timeout=SLOWLY_MS)
-        # It lies over the picture, and says that there is no graphics card.
-        tab.locator(".mantine-Notification-closeButton").first.click(timeout=SLOWLY_MS)
-        return looker
+        view_tab = BrowserTab(tab)
+        view_tabs.append(view_tab)
+        tab.on("pageerror", lambda error: view_tab.errors.append(str(error)))
+        tab.on("console", lambda line: view_tab.errors.append(line.text) if line.type == "error" else None)
+        tab.on("request", lambda request: view_tab.requested_urls.append(request.url))
+        tab.on("websocket", lambda socket: view_tab.requested_urls.append(socket.url))
+        tab.goto(url, timeout=TIMEOUT_MS)
+        tab.locator("canvas").first.wait_for(timeout=TIMEOUT_MS)
+        # Close the warning about a missing graphics card: it covers the picture.
+        tab.locator(".mantine-Notification-closeButton").first.click(timeout=TIMEOUT_MS)
+        return view_tab
 
     yield opened
-    for looker in lookers:
-        looker.tab.close()
-    assert [looker.errors for looker in lookers if looker.errors] == []
-    assert [looker.outside() for looker in lookers if looker.outside()] == []
-    assert all(url for looker in lookers for url in looker.asked)
+    for view_tab in view_tabs:
+        view_tab.tab.close()
+    assert [view_tab.errors for view_tab in view_tabs if view_tab.errors] == []
+    assert [view_tab.outside() for view_tab in view_tabs if view_tab.outside()] == []
+    assert all(url for view_tab in view_tabs for url in view_tab.requested_urls)
 
 
 @dataclass
-class Shown:
-    """A view at work."""
+class RunningView:
+    """A view with its draw loop running."""
 
-    world: ViewSource
+    source: ViewSource
     page: ViewServer
     view: View
 
 
 @pytest.fixture
-def show() -> Iterator[Callable[..., Shown]]:
-    """``show(session, *robots)`` draws them on a page, for as long as the test lasts."""
+def show_view() -> Iterator[Callable[..., RunningView]]:
+    """``show_view(session, *robots)`` draws them on a page until the end of the test."""
     from contextlib import ExitStack
 
     with ExitStack() as opened:
 
-        def shown(session: Session, *robots: str, sliders: Sequence[SliderPublisher] = ()) -> Shown:
+        def shown(session: Session, *robots: str, sliders: Sequence[SliderPublisher] = ()) -> RunningView:
             return opened.enter_context(_shown(session, robots, sliders))
 
         yield shown
 
 
 @contextmanager
-def _shown(session: Session, robots: Sequence[str], sliders: Sequence[SliderPublisher]) -> Generator[Shown]:
+def _shown(
+    session: Session, robots: Sequence[str], sliders: Sequence[SliderPublisher]
+) -> Generator[RunningView]:
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
 
     stop = threading.Event()
     with (
-        ViewSource(session, robots) as world,
+        ViewSource(session, robots) as source,
         ViewServer(port=0) as page,
-        View(world, page, sliders=sliders) as view,
+        View(source, page, sliders=sliders) as view,
     ):
         drawing = threading.Thread(target=view.run, args=(stop,), daemon=True)
         drawing.start()
         try:
-            yield Shown(world, page, view)
+            yield RunningView(source, page, view)
         finally:
             stop.set()
             drawing.join(5.0)

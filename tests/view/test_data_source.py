@@ -1,4 +1,4 @@
-"""The world is what a buffer holds, all of it at once."""
+"""ViewSource: snapshots of a buffer, live and recorded, and the fixed frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from helpers.robots import await_reader, settle
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
 from zstate.recording.recorder import Recorder
-from zstate.view.data_source import ViewSource
+from zstate.view.data_source import FixedFrame, ViewSource, default_fixed_frame
 
 MODEL = load_model("rrbot")
 SECOND = 1_000_000_000
@@ -23,145 +23,172 @@ def shifted(target: str, source: str, x: float, stamp: int | None = None) -> Tra
     return Transform(target, source, (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp=stamp)
 
 
-def world_of(*robots: str, shown: tuple[str, ...] = ()) -> ViewSource:
+def source_of(*robots: str, shown: tuple[str, ...] = ()) -> ViewSource:
     buffer = TransformBuffer()
     for robot in robots:
         buffer.add_robot(MODEL, robot)
     return ViewSource(None, shown, buffer=buffer)
 
 
-def track_of(world: ViewSource, robot: str):
-    return world.buffer.tree_snapshot().robots[robot]
+def track_of(source: ViewSource, robot: str):
+    return source.buffer.tree_snapshot().robots[robot]
 
 
-def test_every_pose_is_what_the_buffer_says_of_that_edge():
-    world = world_of("a")
-    world.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
+def test_snapshot_poses_equal_buffer_lookups():
+    source = source_of("a")
+    source.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
     for stamp, position in ((1 * SECOND, 0.25), (2 * SECOND, 0.75)):
-        world.buffer.insert_joints(track_of(world, "a"), stamp, [position, -position])
-        world.buffer.insert(shifted("map", "marker", position, stamp))
+        source.buffer.insert_joints(track_of(source, "a"), stamp, [position, -position])
+        source.buffer.insert(shifted("map", "marker", position, stamp))
     for at in (None, 1 * SECOND, 2 * SECOND, 1_300_000_000):
-        moment = world.moment(at)
-        assert moment.known.all()
-        assert moment.stamp == at or at is None
-        for row, name in enumerate(moment.tree.names):
-            parent = int(moment.tree.parents[row])
+        snapshot = source.snapshot(at)
+        assert snapshot.known.all()
+        assert snapshot.stamp == at or at is None
+        for row, name in enumerate(snapshot.tree.names):
+            parent = int(snapshot.tree.parents[row])
             if parent >= 0:
-                said = world.buffer.lookup(moment.tree.names[parent], name, at).matrix
-                drawn = Transform.from_pose7("p", "c", moment.poses[row]).matrix
-                np.testing.assert_allclose(drawn, said, atol=1e-12)
+                expected = source.buffer.lookup(snapshot.tree.names[parent], name, at).matrix
+                drawn = Transform.from_pose7("p", "c", snapshot.poses[row]).matrix
+                np.testing.assert_allclose(drawn, expected, atol=1e-12)
             else:
-                assert moment.poses[row].tolist() == IDENTITY
-    assert world.moment().stamp == 2 * SECOND
+                assert snapshot.poses[row].tolist() == IDENTITY
+    assert source.snapshot().stamp == 2 * SECOND
 
 
-def test_frames_of_one_feed_are_read_together_between_its_samples():
-    world = ViewSource(None, buffer=TransformBuffer())
+def test_edges_of_one_track_are_interpolated_together():
+    source = ViewSource(None, buffer=TransformBuffer())
     edges = [("odom", "base"), ("odom", "cart")]
     half_turn_less = [1.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]
-    world.buffer.insert_many(edges, 1 * SECOND, [IDENTITY, IDENTITY])
-    world.buffer.insert_many(edges, 2 * SECOND, [half_turn_less, IDENTITY])
-    moment = world.moment(1_500_000_000)
-    base = moment.poses[moment.tree.row("base")]
+    source.buffer.insert_many(edges, 1 * SECOND, [IDENTITY, IDENTITY])
+    source.buffer.insert_many(edges, 2 * SECOND, [half_turn_less, IDENTITY])
+    snapshot = source.snapshot(1_500_000_000)
+    base = snapshot.poses[snapshot.tree.row("base")]
     assert base == pytest.approx([0.5, 0.0, 0.0, 0.0, 0.0, np.sin(0.25), np.cos(0.25)])
 
 
-def test_parents_stand_before_children_whoever_was_named_first():
-    world = ViewSource(None, buffer=TransformBuffer())
-    world.buffer.insert_static(shifted("b", "c", 1.0))
-    world.buffer.insert_static(shifted("a", "b", 1.0))
-    tree = world.moment().tree
+def test_parents_come_before_children_in_any_insertion_order():
+    source = ViewSource(None, buffer=TransformBuffer())
+    source.buffer.insert_static(shifted("b", "c", 1.0))
+    source.buffer.insert_static(shifted("a", "b", 1.0))
+    tree = source.snapshot().tree
     assert tree.names == ("a", "b", "c")
     assert tree.parents.tolist() == [-1, 0, 1]
     assert tree.kinds == ("root", "static", "static")
 
 
-def test_an_edge_without_samples_says_so():
-    moment = world_of("a").moment()
-    unknown = {moment.tree.kinds[row] for row in np.flatnonzero(~moment.known)}
+def test_edge_without_samples_has_a_reason():
+    snapshot = source_of("a").snapshot()
+    unknown = {snapshot.tree.kinds[row] for row in np.flatnonzero(~snapshot.known)}
     assert unknown == {"joint"}
-    assert moment.stamp is None
-    row = moment.tree.row("a/upper")
-    assert moment.reasons[row] == "no joint sample of 'a' received (no writer)"
+    assert snapshot.stamp is None
+    row = snapshot.tree.row("a/upper")
+    assert snapshot.reasons[row] == "no joint sample of 'a' received (no writer)"
 
 
-def test_a_robot_that_ends_early_is_drawn_a_little_longer_and_then_no_more():
-    world = world_of("a")
-    world.buffer.insert_joints(track_of(world, "a"), 10 * SECOND, [0.0, 0.0])
-    world.buffer.insert_joints(track_of(world, "a"), 11 * SECOND, [0.1, 0.1])
-    assert world.moment(11 * SECOND + 400_000_000).known.all()
-    late = world.moment(15 * SECOND)
+def test_robot_keeps_its_pose_for_half_a_second_after_its_last_sample():
+    source = source_of("a")
+    source.buffer.insert_joints(track_of(source, "a"), 10 * SECOND, [0.0, 0.0])
+    source.buffer.insert_joints(track_of(source, "a"), 11 * SECOND, [0.1, 0.1])
+    assert source.snapshot(11 * SECOND + 400_000_000).known.all()
+    late = source.snapshot(15 * SECOND)
     assert set(late.reasons.values()) == {"4.0 s after the newest sample of 'a' (no writer)"}
-    early = world.moment(8 * SECOND)
+    early = source.snapshot(8 * SECOND)
     assert set(early.reasons.values()) == {"2.0 s before the oldest sample of 'a' (no writer)"}
 
 
-def test_the_version_grows_when_there_is_something_else_to_see_and_not_with_samples():
-    world = world_of("a")
-    before = world.version
-    world.buffer.insert_joints(track_of(world, "a"), SECOND, [0.0, 0.0])
-    world.moment()
-    assert world.version == before
-    world.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
-    assert world.version > before
-    between = world.version
-    track_of(world, "a").writer = "driver@here"
-    assert world.version > between
-    assert "driver@here" in world.moment().tree.writers
+def test_version_grows_with_frames_and_writers_but_not_with_samples():
+    source = source_of("a")
+    before = source.version
+    source.buffer.insert_joints(track_of(source, "a"), SECOND, [0.0, 0.0])
+    source.snapshot()
+    assert source.version == before
+    source.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
+    assert source.version > before
+    between = source.version
+    track_of(source, "a").writer = "driver@here"
+    assert source.version > between
+    assert "driver@here" in source.snapshot().tree.writers
 
 
-def test_only_the_chosen_robots_are_seen_with_what_they_stand_on():
-    world = world_of("a", "b", shown=("a",))
-    world.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
-    world.buffer.insert_static(shifted("map", "b/" + MODEL.root, 3.0))
-    assert world.robots() == ("a",)
-    names = world.moment().tree.names
+def test_only_selected_robots_and_their_ancestors_are_in_a_snapshot():
+    source = source_of("a", "b", shown=("a",))
+    source.buffer.insert_static(shifted("map", "a/" + MODEL.root, 2.0))
+    source.buffer.insert_static(shifted("map", "b/" + MODEL.root, 3.0))
+    assert source.robots() == ("a",)
+    names = source.snapshot().tree.names
     assert "map" in names
     assert not [name for name in names if name.startswith("b/")]
 
 
-def test_a_robot_on_the_network_is_found_and_its_silence_is_counted(sessions):
+def test_silent_time_of_a_robot_grows_until_its_next_sample(sessions):
     writing, reading = sessions
-    source = SineSource(MODEL)
-    with ViewSource(reading) as world:
-        assert world.robots() == ()
+    sine = SineSource(MODEL)
+    with ViewSource(reading) as source:
+        assert source.robots() == ()
         with StatePublisher(writing, MODEL, "r1") as publisher:
-            publisher.publish(source.read(SECOND).positions)
-            until(lambda: world.moment().stamp is not None and world.silent_s("r1") is not None)
-            assert world.models["r1"].digest == MODEL.digest
-            assert world.robots() == ("r1",)
-            first = world.silent_s("r1")
+            publisher.publish(sine.read(SECOND).positions)
+            until(lambda: source.snapshot().stamp is not None and source.silent_s("r1") is not None)
+            assert source.models["r1"].digest == MODEL.digest
+            assert source.robots() == ("r1",)
+            first = source.silent_s("r1")
             assert first is not None
-            until(lambda: (world.silent_s("r1") or 0.0) > first + 0.05)
-            publisher.publish(source.read(2 * SECOND).positions)
-            silent = world.silent_s("r1")
-            until(lambda: world.poll() or (world.silent_s("r1") or 0.0) < silent)
-        assert world.silent_s("nobody") is None
+            until(lambda: (source.silent_s("r1") or 0.0) > first + 0.05)
+            publisher.publish(sine.read(2 * SECOND).positions)
+            silent = source.silent_s("r1")
+            until(lambda: source.poll() or (source.silent_s("r1") or 0.0) < silent)
+        assert source.silent_s("unknown") is None
 
 
-def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
+def test_recording_is_a_source_without_a_session(sessions, tmp_path: Path):
     writing, reading = sessions
     file = tmp_path / "one.mcap"
     with Recorder(reading, file) as recorder, StatePublisher(writing, MODEL, "r1") as publisher:
         settle(writing, "r1")
-        source = SineSource(MODEL)
-        stamps = [publisher.publish(source.read(n * SECOND).positions) for n in range(3)]
+        sine = SineSource(MODEL)
+        stamps = [publisher.publish(sine.read(n * SECOND).positions) for n in range(3)]
         assert stamps
         until(lambda: sum(recorder.stats.messages.values()) >= 4)
-    with ViewSource.of_recording(file) as world:
-        assert world.robots() == ("r1",)
-        assert world.moment().known.all()
-        assert world.silent_s("r1") is None
+    with ViewSource.from_recording(file) as source:
+        assert source.robots() == ("r1",)
+        assert source.snapshot().known.all()
+        assert source.silent_s("r1") is None
 
 
-def test_robots_that_speak_ros_are_seen_like_others(sessions, monkeypatch: pytest.MonkeyPatch):
+def test_robots_of_the_ros2_wire_format_are_received(sessions, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     with (
         StatePublisher(sessions[0], MODEL, wires="ros2") as publisher,
-        ViewSource(sessions[1], wire="ros2") as world,
+        ViewSource(sessions[1], wire="ros2") as source,
     ):
         await_reader(sessions[0], key_of(JOINT_STATES))
         publisher.publish([0.5, -0.5])
-        until(lambda: world.moment().stamp is not None)
-        assert [model.digest for model in world.models.values()] == [MODEL.digest]
-        assert world.moment().known.all()
+        until(lambda: source.snapshot().stamp is not None)
+        assert [model.digest for model in source.models.values()] == [MODEL.digest]
+        assert source.snapshot().known.all()
+
+
+def rrbot_buffer() -> TransformBuffer:
+    buffer = TransformBuffer()
+    buffer.add_robot(MODEL, "r1")
+    return buffer
+
+
+def test_default_fixed_frame_is_the_root_with_the_most_frames():
+    buffer = rrbot_buffer()
+    buffer.insert_static(Transform("map", "odom", [0, 0, 0], [0, 0, 0, 1]))
+    with ViewSource(None, buffer=buffer) as source:
+        assert default_fixed_frame(source.snapshot().tree) == f"r1/{MODEL.root}"
+
+
+def test_requested_fixed_frame_is_used_while_it_exists():
+    with ViewSource(None, buffer=rrbot_buffer()) as source:
+        tree, fixed = source.snapshot().tree, FixedFrame()
+        fixed.requested = tree.names[2]
+        assert fixed.resolve(tree) == tree.names[2]
+        fixed.requested = "removed"
+        assert fixed.resolve(tree) == f"r1/{MODEL.root}"
+
+
+def test_fixed_frame_of_an_empty_tree_is_empty():
+    with ViewSource(None, buffer=TransformBuffer()) as source:
+        assert FixedFrame().resolve(source.snapshot().tree) == ""

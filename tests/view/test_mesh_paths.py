@@ -1,4 +1,4 @@
-"""MeshPaths: files are found where ROS has them, and what is missing says where it was looked for."""
+"""MeshPaths: files are found where ROS keeps them, and only files that the description may use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from zstate.view.mesh_paths import MeshPaths, MissingFile
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package ``arm`` two folders below the only one that is looked in, with one file."""
+    """A package ``arm`` with one file, two folders below the search path."""
     for name in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"):
         monkeypatch.delenv(name, raising=False)
     mesh = tmp_path / "src" / "repository" / "arm" / "meshes" / "a b.stl"
@@ -27,7 +27,7 @@ def test_packages_are_found_below_ros_package_path(package, monkeypatch):
     assert MeshPaths().find("package:///arm/meshes/a%20b.stl") == expected
 
 
-def test_packages_are_found_in_what_ros_2_has_installed(package, monkeypatch):
+def test_packages_are_found_in_ament_prefix_path(package, monkeypatch):
     share = package.parents[2] / "install" / "share"
     share.mkdir(parents=True)
     package.rename(share / "arm")
@@ -35,25 +35,25 @@ def test_packages_are_found_in_what_ros_2_has_installed(package, monkeypatch):
     assert MeshPaths().find("package://arm/meshes/a b.stl") == share / "arm" / "meshes" / "a b.stl"
 
 
-def test_packages_are_found_around_the_urdf(package):
+def test_packages_are_found_in_folders_above_the_urdf(package):
     found = MeshPaths(package / "urdf").find("package://arm/meshes/a b.stl")
     assert found == package / "meshes" / "a b.stl"
 
 
-def test_a_relative_name_starts_at_the_urdf(package):
+def test_relative_path_starts_at_the_urdf(package):
     assert MeshPaths(package).find("meshes/a b.stl") == package / "meshes" / "a b.stl"
     missing = MeshPaths().find("meshes/a b.stl")
     assert isinstance(missing, MissingFile)
     assert "means nothing without the folder of its URDF" in missing.reason
 
 
-def test_a_file_is_found_by_its_uri_and_by_its_path_for_a_urdf_that_the_user_named(package, tmp_path):
+def test_urdf_file_of_the_user_may_name_any_file(package, tmp_path):
     file = package / "meshes" / "a b.stl"
     for uri in (file.as_uri(), f"file://{file}", str(file)):
         assert MeshPaths(tmp_path / "urdf").find(uri) == file
 
 
-def test_a_relative_folder_of_a_urdf_has_the_folders_above_it(package, monkeypatch):
+def test_relative_base_folder_has_its_ancestors(package, monkeypatch):
     monkeypatch.chdir(package)
     file = package / "meshes" / "a b.stl"
     assert MeshPaths(Path("urdf")).find("package://arm/meshes/a b.stl") == file
@@ -65,7 +65,7 @@ def test_a_relative_folder_of_a_urdf_has_the_folders_above_it(package, monkeypat
 
 @pytest.fixture
 def outside(package: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file in none of the packages that the search path finds."""
+    """A file outside all packages on the search path."""
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
     share = package.parents[2] / "install" / "share"
     (share / "leg").mkdir(parents=True)
@@ -80,7 +80,7 @@ def outside(package: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return secret
 
 
-def test_a_description_that_was_received_gets_no_file_outside_packages_nor_learns_which_exist(outside):
+def test_received_description_gets_no_file_outside_packages_and_no_hint_that_it_exists(outside):
     private, package = outside.parent, outside.parents[1] / "src" / "repository" / "arm"
 
     def answers(file: str) -> list[Path | tuple[str, tuple[str, ...]]]:
@@ -107,7 +107,7 @@ def test_a_description_that_was_received_gets_no_file_outside_packages_nor_learn
             file,
         ]
         found = [MeshPaths().find(uri) for uri in uris]
-        return [(one.reason, one.looked) if isinstance(one, MissingFile) else one for one in found]
+        return [(one.reason, one.searched) if isinstance(one, MissingFile) else one for one in found]
 
     present, absent = answers("secret.png"), answers("nothing.png")
     assert [one for one in present if isinstance(one, Path)] == []
@@ -117,7 +117,7 @@ def test_a_description_that_was_received_gets_no_file_outside_packages_nor_learn
     assert linked.reason == "it leads out of the package 'arm'"
 
 
-def test_a_description_that_was_received_may_name_a_file_of_a_package_by_its_path(package, outside):
+def test_received_description_may_name_a_file_of_a_package_by_its_path(package, outside):
     file = package / "meshes" / "a b.stl"
     assert MeshPaths().find(str(file)) == file
     assert MeshPaths().find(file.as_uri()) == file
@@ -138,18 +138,18 @@ def test_links_to_the_sources_of_the_same_package_are_followed(package, monkeypa
     assert MeshPaths().find(str(installed)) == installed
 
 
-def test_nothing_is_fetched_from_elsewhere():
+def test_network_uris_are_not_fetched():
     missing = MeshPaths().find("https://example.org/arm.stl")
     assert isinstance(missing, MissingFile)
     assert missing.reason.startswith("https:// is not fetched")
 
 
-def test_what_is_missing_says_where_it_was_looked_for(package, monkeypatch):
+def test_missing_file_lists_the_searched_folders(package, monkeypatch):
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
     missing = MeshPaths().find("package://arm/meshes/c.stl")
     assert isinstance(missing, MissingFile)
-    assert (missing.reason, missing.looked) == ("the package 'arm' has no such file", (str(package),))
+    assert (missing.reason, missing.searched) == ("the package 'arm' has no such file", (str(package),))
     unknown = MeshPaths().find("package://leg/meshes/c.stl")
     assert isinstance(unknown, MissingFile)
     assert "there is no package 'leg'; put the folder" in unknown.reason
-    assert str(package.parent) in unknown.looked
+    assert str(package.parent) in unknown.searched

@@ -1,4 +1,4 @@
-"""The page is where it says, and shows itself through its door only."""
+"""ViewServer: its address, its access checks, and its ports."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def listens(host: str, port: int) -> bool:
 
 
 def another_address() -> str | None:
-    """One of this machine that is not loopback."""
+    """An address of this machine that is not loopback."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))
@@ -48,7 +48,7 @@ def another_address() -> str | None:
         return probe.getsockname()[0]
 
 
-def test_it_is_on_loopback_unless_somebody_says_otherwise():
+def test_server_listens_on_loopback_by_default():
     with ViewServer(port=0) as page:
         assert page.url == f"http://127.0.0.1:{page.port}"
         assert status(page.url) == 200
@@ -58,7 +58,7 @@ def test_it_is_on_loopback_unless_somebody_says_otherwise():
     assert not listens("127.0.0.1", page.port)
 
 
-def test_a_websocket_comes_through_the_same_door():
+def test_websocket_passes_the_same_access_check():
     with ViewServer(port=0) as page:
         address = f"ws://127.0.0.1:{page.port}"
         with connect(address, subprotocols=PROTOCOL, compression=None) as socket:
@@ -69,7 +69,7 @@ def test_a_websocket_comes_through_the_same_door():
 
 
 def raw_status(port: int, *headers: str) -> int:
-    """Of an answer to a request with just these headers."""
+    """The status of the response to a request with only these headers."""
     with socket.create_connection(("127.0.0.1", port), timeout=10.0) as connection:
         lines = ["GET / HTTP/1.1", *headers, "", ""]
         connection.sendall("\r\n".join(lines).encode())
@@ -86,7 +86,7 @@ WEBSOCKET = (
 
 
 @pytest.mark.parametrize("upgrade", [(), WEBSOCKET])
-def test_a_name_that_leads_to_loopback_is_not_answered_and_no_request_is_an_error_here(upgrade):
+def test_names_that_resolve_to_loopback_are_refused_and_no_request_raises(upgrade):
     with ViewServer(port=0) as page:
         here, evil = (f"{name}:{page.port}" for name in ("127.0.0.1", "127.0.0.1.evil.example"))
         expected = 101 if upgrade else 200
@@ -98,22 +98,22 @@ def test_a_name_that_leads_to_loopback_is_not_answered_and_no_request_is_an_erro
         assert raw_status(page.port, *upgrade) == 403
 
 
-def test_beyond_loopback_neither_page_nor_websocket_comes_without_the_token():
+def test_beyond_loopback_page_and_websocket_need_the_token():
     with ViewServer("0.0.0.0", 0) as page:
         here = f"127.0.0.1:{page.port}"
-        assert page.door.token is not None
-        assert page.url.endswith(f":{page.port}/?token={page.door.token}")
+        assert page.access.token is not None
+        assert page.url.endswith(f":{page.port}/?token={page.access.token}")
         assert status(f"http://{here}") == 401
-        assert status(f"http://{here}/?token={page.door.token}") == 200
+        assert status(f"http://{here}/?token={page.access.token}") == 200
         with pytest.raises(InvalidStatus) as caught:
             connect(f"ws://{here}", subprotocols=PROTOCOL)
         assert caught.value.response.status_code == 401
-        cookie = {"Cookie": f"zstate_view_{page.port}={page.door.token}"}
+        cookie = {"Cookie": f"zstate_view_{page.port}={page.access.token}"}
         with connect(f"ws://{here}", subprotocols=PROTOCOL, additional_headers=cookie) as socket:
             assert socket.recv(timeout=10)
 
 
-def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
+def test_server_closes_soon_with_an_unresponsive_browser():
     page = ViewServer(port=0)
     with socket.create_connection(("127.0.0.1", page.port), timeout=10.0) as vanished:
         host = f"Host: 127.0.0.1:{page.port}"
@@ -124,7 +124,7 @@ def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
         assert time.monotonic() - started < SOON_S
 
 
-def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
+def test_taken_port_is_an_error_and_the_default_is_the_next_free_one():
     with ViewServer(port=a_free_port()) as first:
         with pytest.raises(InvalidInput, match=f"port {first.port} is taken"):
             ViewServer(port=first.port)
@@ -134,18 +134,18 @@ def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
 
 
 @pytest.mark.parametrize(("host", "port"), [("nowhere.invalid", 0), ("127.0.0.1", 99999)])
-def test_what_cannot_be_listened_at_is_an_error_of_the_user(host: str, port: int):
-    with pytest.raises(InvalidInput, match="nobody can listen"):
+def test_unusable_host_or_port_raises_invalid_input(host: str, port: int):
+    with pytest.raises(InvalidInput, match="cannot listen"):
         ViewServer(host, port)
 
 
-def test_nobody_is_shown_the_way_to_the_internet():
+def test_share_url_is_never_requested():
     with ViewServer(port=0) as page:
         assert page.server.request_share_url() is None
 
 
-def test_it_prints_nothing(capsys: pytest.CaptureFixture[str]):
+def test_server_prints_nothing(capsys: pytest.CaptureFixture[str]):
     with ViewServer(port=0) as page:
         until(lambda: listens("127.0.0.1", page.port))
-    said = capsys.readouterr()
-    assert "viser" not in said.out + said.err
+    output = capsys.readouterr()
+    assert "viser" not in output.out + output.err

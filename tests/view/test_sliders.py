@@ -1,4 +1,4 @@
-"""Sliders: moved by hand, published at an exact rate, and never against somebody else."""
+"""SliderPublisher: published values, limits, rates and conflicts, and the mapping of its sliders."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from helpers.processes import SOON_S, until
 from helpers.robots import RRBOT, Tap
 
 from zstate.errors import InvalidInput
+from zstate.model.load import load_model
+from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
 from zstate.net.presence import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
-from zstate.view.sliders import SliderPublisher
+from zstate.se3 import quaternion_from_rpy
+from zstate.view.sliders import SliderMapping, SliderPublisher, SliderSpec
 from zstate.wire.messages import from_block
 
 ARM = parse_urdf(
@@ -37,18 +40,18 @@ def arm(sessions):
         yield sliders
 
 
-def test_they_begin_at_zero_or_where_zero_is_out_of_reach_in_the_middle(arm):
+def test_sliders_start_at_zero_or_in_the_middle_of_limits_without_zero(arm):
     assert arm.positions.tolist() == [1.0, 0.0]
 
 
-def test_a_dial_that_is_turned_is_what_is_published(arm, sessions):
+def test_slider_value_is_published(arm, sessions):
     tap = Tap(sessions[1], "zstate/arm1/joint_states")
     arm.set("bent", 1.25)
     until(lambda: any(from_block(state.positions)[0] == 1.25 for state in tap.joint_states(1)))
     tap.close()
 
 
-def test_a_follower_sees_the_link_move_and_the_mimic_with_it(arm, sessions):
+def test_listener_receives_link_and_mimic_joint_of_a_moved_slider(arm, sessions):
     with TransformListener(sessions[1], "arm1") as listener:
         listener.buffer.wait("base", "left", timeout_s=SOON_S)
         arm.set("finger", 0.03)
@@ -62,7 +65,7 @@ def test_a_follower_sees_the_link_move_and_the_mimic_with_it(arm, sessions):
     assert arm.mimics == {"other": pytest.approx(0.1 - 2 * 0.03)}
 
 
-def test_zero_is_the_nearest_limit_where_zero_is_out_of_reach(arm):
+def test_zero_uses_the_nearest_limit_if_zero_is_outside(arm):
     arm.set("finger", 0.02)
     arm.zero()
     assert arm.positions.tolist() == [0.5, 0.0]
@@ -74,22 +77,22 @@ def test_random_positions_are_within_the_limits(arm):
     generator = np.random.default_rng(1)
     for _ in range(50):
         arm.random(generator)
-        assert (arm.dials.lower <= arm.values).all()
-        assert (arm.values <= arm.dials.upper).all()
+        assert (arm.mapping.lower <= arm.values).all()
+        assert (arm.values <= arm.mapping.upper).all()
 
 
-def test_a_sine_moves_all_joints_until_one_is_turned_by_hand(arm):
-    arm.is_swinging = True
+def test_sine_moves_all_joints_until_a_slider_is_set(arm):
+    arm.sine_enabled = True
     before = arm.values
     until(lambda: not np.isclose(arm.values, before).any())
     arm.set("finger", 0.01)
-    assert not arm.is_swinging
+    assert not arm.sine_enabled
     bent = arm.values[0]
     arm.read(0)
     assert arm.values.tolist() == [bent, 0.01]
 
 
-def test_beyond_the_limits_nothing_moves_and_the_limits_are_said(arm):
+def test_value_beyond_the_limits_is_refused_with_the_limits(arm):
     with pytest.raises(InvalidInput, match=r"'bent' takes 0.5 to 1.5 rad, not 2"):
         arm.set("bent", 2.0)
     with pytest.raises(InvalidInput, match="did you mean 'finger'"):
@@ -97,7 +100,7 @@ def test_beyond_the_limits_nothing_moves_and_the_limits_are_said(arm):
     assert arm.positions.tolist() == [1.0, 0.0]
 
 
-def test_another_rate_is_kept_from_then_on(arm):
+def test_changed_rate_is_kept(arm):
     arm.rate_hz = 50.0
     until(lambda: arm.achieved_hz is not None and 49.0 < arm.achieved_hz < 51.0)
     with pytest.raises(InvalidInput, match="a rate is above 0"):
@@ -105,38 +108,101 @@ def test_another_rate_is_kept_from_then_on(arm):
     assert arm.rate_hz == 50.0
 
 
-def test_where_somebody_else_writes_the_joints_nothing_is_published_and_it_is_said_who(sessions):
+def test_nothing_is_published_while_another_program_writes_the_joints(sessions):
     with StatePublisher(sessions[1], RRBOT, "r1", program="driver") as driver:
         driver.publish([0.0, 0.0])
         until(lambda: discover(sessions[0], 0.2))
         with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
-            until(lambda: sliders.refusal)
+            until(lambda: sliders.conflict)
             assert sliders.achieved_hz is None
-            assert f"pid {os.getpid()}" in sliders.refusal
-            assert "driver@" in sliders.refusal
-            assert "joint_states of 'r1'" in sliders.refusal
+            assert f"pid {os.getpid()}" in sliders.conflict
+            assert "driver@" in sliders.conflict
+            assert "joint_states of 'r1'" in sliders.conflict
             assert not sliders.open()
             driver.close()
             until(sliders.open)
-            assert sliders.refusal == ""
+            assert sliders.conflict == ""
             until(lambda: sliders.achieved_hz)
 
 
-def test_they_move_the_joints_of_a_robot_whose_model_another_program_tells(sessions):
+def test_only_joint_states_are_published_if_another_program_publishes_the_model(sessions):
     streams = ("robot_description", "tf_static", "tf")
     with StatePublisher(sessions[1], RRBOT, "r1", streams=streams, program="model"):
         until(lambda: discover(sessions[0], 0.2))
         with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
-            assert sliders.refusal == ""
+            assert sliders.conflict == ""
             (robot,) = discover(sessions[1])
             writers = {(stream, writer.program) for stream, writer in robot.writers}
             mine = {stream for stream, program in writers if program != "model"}
             assert mine == {"joint_states"}
 
 
-def test_closed_sliders_are_gone_from_the_network_and_do_not_open_again(sessions):
+def test_closed_sliders_disappear_from_discovery_and_do_not_reopen(sessions):
     sliders = SliderPublisher(sessions[0], RRBOT, "r1")
     sliders.close()
     sliders.close()
     until(lambda: not discover(sessions[1], 0.2))
     assert not sliders.open()
+
+
+CART = """<robot name="cart">
+  <link name="world"/><link name="body"/><link name="deck"/><link name="arm"/><link name="lift"/>
+  <link name="wheel"/><link name="claw"/>
+  <joint name="float" type="floating"><parent link="world"/><child link="body"/></joint>
+  <joint name="drive" type="planar"><parent link="body"/><child link="deck"/><axis xyz="0 0 1"/></joint>
+  <joint name="swing" type="revolute"><parent link="deck"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-0.5" upper="1.5" velocity="1" effort="1"/></joint>
+  <joint name="rise" type="prismatic"><parent link="arm"/><child link="lift"/><axis xyz="0 0 1"/>
+    <limit lower="0" upper="0.25" velocity="1" effort="1"/></joint>
+  <joint name="roll" type="continuous"><parent link="lift"/><child link="wheel"/><axis xyz="1 0 0"/></joint>
+  <joint name="grip" type="prismatic"><parent link="lift"/><child link="claw"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="0.25" velocity="1" effort="1"/><mimic joint="rise" multiplier="2"/></joint>
+</robot>"""
+
+
+@pytest.fixture
+def cart() -> RobotModel:
+    return parse_urdf(CART, "cart.urdf")
+
+
+def test_every_driven_joint_has_sliders_within_its_limits(cart):
+    names = [spec.name for spec in SliderMapping(cart).specs]
+    floating = [f"float.{part}" for part in ("x", "y", "z", "roll", "pitch", "yaw")]
+    assert names == [*floating, "drive.x", "drive.y", "drive.yaw", "swing", "rise", "roll"]
+    by_name = {spec.name: spec for spec in SliderMapping(cart).specs}
+    assert by_name["swing"] == SliderSpec("swing", "rad", -0.5, 1.5)
+    assert by_name["rise"] == SliderSpec("rise", "m", 0.0, 0.25)
+
+
+def test_coordinates_without_limits_reach_half_a_turn_or_two_metres(cart):
+    by_name = {spec.name: spec for spec in SliderMapping(cart).specs}
+    assert by_name["roll"] == SliderSpec("roll", "rad", -math.pi, math.pi)
+    assert by_name["drive.yaw"] == SliderSpec("drive.yaw", "rad", -math.pi, math.pi)
+    assert by_name["drive.x"] == SliderSpec("drive.x", "m", -2.0, 2.0)
+
+
+def test_positions_follow_the_order_of_the_model(cart):
+    values = np.array([1.0, 2.0, 0.5, 0.1, -0.2, 0.3, -1.0, 0.25, 0.75, 1.25, 0.125, -3.0])
+    x, y, z, w = quaternion_from_rpy(0.1, -0.2, 0.3)
+    expected = [1.0, 2.0, 0.5, x, y, z, w, -1.0, 0.25, 0.75, 1.25, 0.125, -3.0]
+    np.testing.assert_allclose(SliderMapping(cart).positions(values), expected, atol=1e-15)
+
+
+def test_values_invert_positions(cart):
+    mapping, generator = SliderMapping(cart), np.random.default_rng(3)
+    for _ in range(20):
+        values = generator.uniform(mapping.lower, mapping.upper)
+        np.testing.assert_allclose(mapping.values(mapping.positions(values)), values, atol=1e-9)
+
+
+def test_robot_without_joints_has_no_sliders():
+    fixed = parse_urdf('<robot name="rock"><link name="rock"/></robot>', "rock.urdf")
+    mapping = SliderMapping(fixed)
+    assert mapping.specs == ()
+    assert mapping.positions(np.empty(0)).shape == (0,)
+
+
+@pytest.mark.robots
+def test_panda_has_one_slider_for_each_joint():
+    panda = load_model("panda")
+    assert tuple(spec.name for spec in SliderMapping(panda).specs) == panda.joint_names

@@ -1,1 +1,15 @@
-"""The browser view: what is drawn, the page it is drawn in, and what can be asked there."""
+"""Browser view of robots and frames, drawn with viser. Raises LibraryMissing on import if that is missing."""
+
+from __future__ import annotations
+
+from zstate.errors import LibraryMissing
+
+try:
+    import collada  # noqa: F401  # pyright: ignore[reportMissingTypeStubs, reportUnusedImport]
+    import trimesh  # noqa: F401  # pyright: ignore[reportMissingTypeStubs, reportUnusedImport]
+    import viser  # noqa: F401  # pyright: ignore[reportUnusedImport]
+except ImportError as error:
+    raise LibraryMissing(
+        f"the view needs viser, trimesh and pycollada, and one cannot be loaded ({error}): "
+        "pip install 'zstate[view]'"
+    ) from None

@@ -1,29 +1,30 @@
-"""Door: whom the page is shown to.
+"""Access checks for requests to the page.
 
 A browser lets any page on the internet open a websocket to a port of the machine it runs on. So:
 
-- a websocket is opened only for a page that came from here (its Origin is the Host it asks);
+- a websocket is opened only for a page from this server (its Origin equals its Host);
 - on loopback, Host must be a loopback address or ``localhost``, with the port of this server; otherwise
   another site could let its own name resolve to 127.0.0.1 (DNS rebinding);
-- a header that decides is refused if a request has it twice;
-- beyond loopback everything, the page as well as the websocket, wants the token.
+- a request with two of a header that decides is refused;
+- beyond loopback every request, for the page and for the websocket, needs the token.
 """
 
 from __future__ import annotations
 
-import http
 import ipaddress
 import secrets
 from dataclasses import dataclass
+from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
 
 _HTTP_PORT = 80
-_ONCE = ("Host", "Origin", "Upgrade", "Cookie")
+_UNIQUE = ("Host", "Origin", "Upgrade", "Cookie")
+_COOKIE = "zstate_view_"  # and the port, because a host has the same cookies at all its ports
 
-# The page is one file with everything in it: whatever it were made to ask for elsewhere, it does not get.
+# The page is one file with everything in it: requests to other servers are blocked.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval'; "
     "frame-ancestors 'self'; form-action 'none'; base-uri 'none'",
@@ -34,15 +35,15 @@ _HEADERS = {
 
 @dataclass(frozen=True, slots=True)
 class AccessDeniedResponse:
-    """Why somebody stays outside, for who reads it in a browser."""
+    """Why a request is refused, as text for the user of the browser."""
 
-    status: http.HTTPStatus
+    status: HTTPStatus
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class AccessCheck:
-    """Who may come in at ``host`` and ``port``; ``token`` is what they have to know, None where nothing."""
+    """Decides which requests a server at ``host`` and ``port`` answers; ``token`` is needed unless None."""
 
     host: str
     port: int
@@ -50,56 +51,57 @@ class AccessCheck:
 
     @classmethod
     def at(cls, host: str, port: int) -> AccessCheck:
-        """Open on loopback, else with a token that nobody guesses."""
+        """Without a token on loopback, elsewhere with a random one."""
         return cls(host, port, None if is_loopback(host) else secrets.token_urlsafe(16))
 
     def check(self, path: str, headers: Headers) -> AccessDeniedResponse | None:
-        """Why a request for ``path``, query included, stays outside; None when it may come in."""
-        repeated = [name for name in _ONCE if len(headers.get_all(name)) > 1]
+        """Why a request for ``path``, query included, is refused; None if it is answered."""
+        repeated = [name for name in _UNIQUE if len(headers.get_all(name)) > 1]
         if repeated:
             return AccessDeniedResponse(
-                http.HTTPStatus.BAD_REQUEST, f"a request has one {repeated[0]} header at most"
+                HTTPStatus.BAD_REQUEST, f"a request has at most one {repeated[0]} header"
             )
         host = headers.get("Host", "")
-        if is_loopback(self.host) and not self._is_here(host):
+        name, port = _name_and_port(host)
+        if is_loopback(self.host) and not (is_loopback(name) and port == self.port):
             return AccessDeniedResponse(
-                http.HTTPStatus.FORBIDDEN,
-                f"this view is for this machine only, at port {self.port}, and was asked for as {host!r}; "
+                HTTPStatus.FORBIDDEN,
+                f"this view is for this machine only, at port {self.port}, and was requested as {host!r}; "
                 f"forward the same port (ssh -L {self.port}:127.0.0.1:{self.port} HOST), or open the view to "
                 "others with `zstate view --host`",
             )
         origin = headers.get("Origin")
-        if is_websocket(headers) and origin is not None and not _is_same_place(origin, host):
+        if is_websocket(headers) and origin is not None and not _is_same_host(origin, host):
+            return AccessDeniedResponse(HTTPStatus.FORBIDDEN, f"a page of {origin!r} may not use this view")
+        if not self._has_token(path, headers):
             return AccessDeniedResponse(
-                http.HTTPStatus.FORBIDDEN, f"a page of {origin!r} may not use this view"
-            )
-        if not self._is_known(path, headers):
-            return AccessDeniedResponse(
-                http.HTTPStatus.UNAUTHORIZED,
+                HTTPStatus.UNAUTHORIZED,
                 "this view asks for its token; open the address that `zstate view` printed",
             )
         return None
 
     def headers(self) -> dict[str, str]:
-        """What every answer says besides itself: nothing from elsewhere, and the token kept for later."""
+        """Headers of every response: no requests to other servers, and the token as a cookie.
+
+        The page opens its websocket without the query of its own address; the browser adds the cookie.
+        """
         if self.token is None:
             return _HEADERS
-        # The page opens its websocket without the query it was asked with: a cookie goes along by itself.
-        # A host has the same cookies at all its ports.
-        cookie = f"{_cookie_name(self.port)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        cookie = f"{_COOKIE}{self.port}={self.token}; Path=/; HttpOnly; SameSite=Strict"
         return {**_HEADERS, "Set-Cookie": cookie}
 
-    def _is_here(self, host: str) -> bool:
-        """Whether a Host header names loopback and this server's port."""
-        name, port = _name_and_port(host)
-        return is_loopback(name) and port == self.port
-
-    def _is_known(self, path: str, headers: Headers) -> bool:
+    def _has_token(self, path: str, headers: Headers) -> bool:
+        """Whether the token is in the query, or in a cookie, whatever port that belongs to."""
         if self.token is None:
             return True
-        asked = parse_qs(path.partition("?")[2]).get("token", [])
-        said = [one.encode(errors="surrogateescape") for one in (*asked, *_cookies(headers))]
-        return any(secrets.compare_digest(self.token.encode(), one) for one in said)
+        tokens = parse_qs(path.partition("?")[2]).get("token", [])
+        try:
+            cookies = SimpleCookie(headers.get("Cookie", ""))
+        except CookieError:
+            cookies = SimpleCookie()
+        tokens += [morsel.value for name, morsel in cookies.items() if name.startswith(_COOKIE)]
+        token = self.token.encode()
+        return any(secrets.compare_digest(token, one.encode(errors="surrogateescape")) for one in tokens)
 
 
 def is_loopback(host: str) -> bool:
@@ -116,34 +118,21 @@ def is_websocket(headers: Headers) -> bool:
 
 
 def _name_and_port(host: str) -> tuple[str, int]:
-    """The parts of a Host header, in lower case; an empty name if it is none."""
+    """The parts of a Host header, in lower case; an empty name if it is invalid."""
     try:
         parts = urlsplit(f"//{host}")
         port = _HTTP_PORT if parts.port is None else parts.port
     except ValueError:
         return "", 0
-    # What else stands there (a user, a path) has no place in a Host header.
+    # A Host header has no user and no path.
     has_more = parts.netloc != host or "@" in host
     return "" if has_more or parts.hostname is None else parts.hostname, port
 
 
-def _is_same_place(origin: str, host: str) -> bool:
+def _is_same_host(origin: str, host: str) -> bool:
     """Whether an Origin header names the same host and port as a Host header."""
     try:
-        place = urlsplit(origin).netloc.lower()
+        netloc = urlsplit(origin).netloc.lower()
     except ValueError:
         return False
-    return place != "" and place == host.lower()
-
-
-def _cookie_name(port: int) -> str:
-    return f"zstate_view_{port}"
-
-
-def _cookies(headers: Headers) -> list[str]:
-    """The tokens that a browser kept, whichever port's they are."""
-    try:
-        jar = SimpleCookie(headers.get("Cookie", ""))
-    except CookieError:
-        return []
-    return [morsel.value for name, morsel in jar.items() if name.startswith(_cookie_name(0)[:-1])]
+    return netloc != "" and netloc == host.lower()

@@ -1,7 +1,4 @@
-"""World: what there is to be seen, of the network or of a recording.
-
-FixedFrame: the frame that everything is seen from.
-"""
+"""Robots and frames to draw, from the network or from a recording, and the fixed frame."""
 
 from __future__ import annotations
 
@@ -22,16 +19,15 @@ from zstate.recording.recording import Recording
 from zstate.wire.keys import ANY
 
 _HOLD_S = 0.5
-"""A robot is drawn for so long after its newest sample: robots end a recording one by one."""
+"""How long a robot is drawn after its newest sample: the robots of a recording end one by one."""
 
 
 class ViewSource(Closeable):
-    """Every robot that is announced, or those of ``robots``, with what is known of them.
+    """All announced robots, or only ``robots``, and their poses.
 
-    Where the ``session`` is None nothing is followed and ``buffer`` is all there is: a recording, see
-    ``of_recording``. Otherwise it is filled by ``listener``, which hears ``wire``. Ages, and the
-    time line, are those of ``clock``; without one, of the clock that most robots have. Methods may be called
-    from any thread.
+    With a ``session``, ``listener`` fills ``buffer`` from the wire format ``wire``; without one, ``buffer``
+    is complete, see ``from_recording``. Ages and stamps are those of ``clock``; by default, of the clock
+    that most robots use. Methods may be called from any thread.
     """
 
     def __init__(
@@ -48,76 +44,74 @@ class ViewSource(Closeable):
         self.buffer = TransformBuffer(history_s, clock) if buffer is None else buffer
         self.listener: TransformListener | None = None
         if session is not None:
-            followed = robots[0] if len(robots) == 1 else ANY
-            self.listener = TransformListener(session, followed, self.buffer, wire)
-        self._shown = frozenset(robots)
+            robot = robots[0] if len(robots) == 1 else ANY
+            self.listener = TransformListener(session, robot, self.buffer, wire)
+        self._selected = frozenset(robots)
         self._version = 0
         self._models: Mapping[str, RobotModel] = {}
         # By robot: its newest stamp [ns], and when that was first seen, by time.monotonic [s].
-        self._seen: dict[str, tuple[int, float]] = {}
+        self._newest: dict[str, tuple[int, float]] = {}
         self._table: FrameTable = FrameTable((), np.empty(0, np.intp), (), ())
         self._refresh()
 
     @classmethod
-    def of_recording(cls, path: str | Path) -> ViewSource:
+    def from_recording(cls, path: str | Path) -> ViewSource:
         """The robots of a recording, an MCAP file or a bag. Raises RecordingError."""
         with Recording(path) as recording:
             return cls(None, buffer=recording.buffer())
 
     def close(self) -> None:
-        """Follow nothing any more; the buffer keeps what it has. A second call does nothing."""
+        """Stop listening; the buffer keeps its samples. A second call does nothing."""
         if self.listener is not None:
             self.listener.close()
 
     @property
     def version(self) -> int:
-        """Grows whenever a robot, its model, a frame or what places one has changed."""
+        """Grows when a robot, a model, a frame or the writer of an edge changes."""
         self._refresh()
         return self._version
 
     @property
     def models(self) -> Mapping[str, RobotModel]:
-        """The robots whose model is known."""
+        """The robots with a known model."""
         self._refresh()
         return self._models
 
     def robots(self) -> tuple[str, ...]:
-        """Every robot that was heard, or whose model is known, sorted by name."""
-        heard = () if self.listener is None else self.listener.robots()
-        return tuple(sorted({*self.models, *filter(self._is_shown, heard)}))
+        """Every robot received or with a known model, sorted by name."""
+        received = () if self.listener is None else self.listener.robots()
+        selected = (robot for robot in received if not self._selected or robot in self._selected)
+        return tuple(sorted({*self.models, *selected}))
 
-    def moment(self, at: int | None = None) -> FramePoses:
-        """Where every frame was ``at`` a stamp [ns]; with None, at the newest sample of each robot.
+    def snapshot(self, at: int | None = None) -> FramePoses:
+        """The pose of every frame ``at`` a stamp [ns]; by default, at the newest sample of each robot.
 
-        A robot is still drawn at its newest sample half a second after that; later, as before its
-        oldest one, its poses are not known.
+        A robot keeps the pose of its newest sample for half a second; later, and before its oldest sample,
+        its poses are unknown.
         """
-        poses = self.buffer.snapshot(at, robots=self._shown, hold_s=_HOLD_S)
-        self._adopt(poses.tree)
+        poses = self.buffer.snapshot(at, robots=self._selected, hold_s=_HOLD_S)
+        self._set_table(poses.tree)
         self.poll()
         return poses
 
     def poll(self) -> None:
-        """See which robots have said something new. ``moment`` does; between moments, look often."""
+        """Look for new samples, to time them for ``silent_s``. ``snapshot`` does this too."""
         now = time.monotonic()
         for robot, track in self._table.robots.items():
             newest = track.newest
-            seen = self._seen.get(robot)
-            if newest is not None and (seen is None or seen[0] != newest):
-                self._seen[robot] = newest, now
+            known = self._newest.get(robot)
+            if newest is not None and (known is None or known[0] != newest):
+                self._newest[robot] = newest, now
 
     def silent_s(self, robot: str) -> float | None:
-        """How long no sample of a robot has been seen [s]; None where none ever was, and in a recording."""
-        seen = self._seen.get(robot)
-        return None if seen is None or self.session is None else time.monotonic() - seen[1]
-
-    def _is_shown(self, robot: str) -> bool:
-        return not self._shown or robot in self._shown
+        """The time since a new sample of a robot [s]; None without samples, and in a recording."""
+        known = self._newest.get(robot)
+        return None if known is None or self.session is None else time.monotonic() - known[1]
 
     def _refresh(self) -> None:
-        self._adopt(self.buffer.frame_table(self._shown))
+        self._set_table(self.buffer.frame_table(self._selected))
 
-    def _adopt(self, table: FrameTable) -> None:
+    def _set_table(self, table: FrameTable) -> None:
         if table is not self._table:
             self._table = table
             self._models = {name: track.model for name, track in table.robots.items()}
@@ -125,23 +119,22 @@ class ViewSource(Closeable):
 
 
 class FixedFrame:
-    """The frame that was chosen, while it is there; else the root that carries the most frames."""
+    """The fixed frame, as in rviz: the ``requested`` one if it exists, else the root of the largest tree."""
 
-    def __init__(self, chosen: str = "") -> None:
-        self.chosen = chosen
-        """What was asked for; empty for nothing in particular."""
+    def __init__(self, requested: str = "") -> None:
+        self.requested = requested
         self._tree: FrameTable | None = None
         self._default = ""
 
-    def choose(self, tree: FrameTable) -> str:
-        """Its name; empty where there is no frame at all."""
+    def resolve(self, tree: FrameTable) -> str:
+        """Its name; empty if there is no frame."""
         if tree is not self._tree:
             self._tree, self._default = tree, default_fixed_frame(tree)
-        return self.chosen if self.chosen in tree.index else self._default
+        return self.requested if self.requested in tree.index else self._default
 
 
 def default_fixed_frame(tree: FrameTable) -> str:
-    """The root with the most frames, of equal ones the first; empty where there is none."""
+    """The root of the most frames, the first of equal ones; empty if there is no frame."""
     if not tree.names:
         return ""
     return tree.names[int(np.bincount(tree.roots).argmax())]

@@ -25,8 +25,8 @@ _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123}
 _VERTICES, _INDICES = 34962, 34963
+_PNG = b"\x89PNG"
 _ROUGHNESS = 0.65
-
 
 _PLAIN = Material(GREY)
 Corner = tuple[float, float, float]
@@ -74,7 +74,12 @@ class Glb:
 
     def to_bytes(self, override: MaterialOverride) -> bytes:
         """The glTF file."""
-        materials = [_override(*own, override) for own in self._materials]
+        materials: list[Material] = []
+        for own, has_uv in self._materials:
+            material = override.missing if own is None else own
+            if override.over is not None:
+                material = Material(override.over)
+            materials.append(material if has_uv and override.over is None else Material(material.color))
         images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
         binary, views = bytearray(self._binary), list(self._views)
         for image in images:
@@ -94,10 +99,15 @@ class Glb:
         }
         if images:
             document["images"] = [
-                {"bufferView": first + k, "mimeType": _mime_type(image)} for k, image in enumerate(images)
+                {"bufferView": first + k, "mimeType": "image/png" if image.startswith(_PNG) else "image/jpeg"}
+                for k, image in enumerate(images)
             ]
             document["textures"] = [{"source": k} for k in range(len(images))]
-        return _packed(document, bytes(binary))
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + len(binary)
+        head = struct.pack("<III", _MAGIC, 2, size) + struct.pack("<II", len(text), _JSON)
+        return head + text + struct.pack("<II", len(binary), _BINARY) + bytes(binary)
 
     def _add(self, mesh: Mesh) -> None:
         attributes = {
@@ -108,7 +118,9 @@ class Glb:
             # glTF counts from the upper edge of an image.
             attributes["TEXCOORD_0"] = self._array(mesh.uv * (1, -1) + (0, 1), _VERTICES)
         if mesh.colors is not None:
-            attributes["COLOR_0"] = self._array(_linear_colors(mesh.colors), _VERTICES)
+            colors = mesh.colors / 255.0
+            colors[:, :3] = _linear(colors[:, :3])
+            attributes["COLOR_0"] = self._array(colors.astype(np.float32), _VERTICES)
         self._corner_count += mesh.triangles.size
         # The largest index of a type means primitive restart.
         narrow = np.uint16 if len(mesh.points) < 0xFFFF else np.uint32
@@ -118,12 +130,7 @@ class Glb:
 
     def _array(self, array: NDArray[Any], target: Literal[34962, 34963], *, bounded: bool = False) -> int:
         data = array if array.dtype.name in _COMPONENTS else array.astype(np.float32)
-        view = {
-            "buffer": 0,
-            "byteOffset": len(self._binary),
-            "byteLength": data.nbytes,
-            "target": target,
-        }
+        view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": data.nbytes, "target": target}
         accessor: dict[str, Any] = {
             "bufferView": len(self._views),
             "componentType": _COMPONENTS[data.dtype.name],
@@ -156,29 +163,16 @@ def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
 def _join(group: list[Mesh], has_uv: bool, has_colors: bool) -> Mesh:
     starts = np.cumsum([0, *(len(one.points) for one in group[:-1])])
     rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
+    uv = [np.zeros((len(one.points), 2), np.float32) if one.uv is None else one.uv for one in group]
+    white = np.full(4, 255, dtype=np.uint8)
+    colors = [np.tile(white, (len(one.points), 1)) if one.colors is None else one.colors for one in group]
     return Mesh(
         np.concatenate([one.points for one in group]),
         np.concatenate(rows).astype(np.uint32),
         group[0].material,
-        np.concatenate([_uv(one) for one in group]) if has_uv else None,
-        np.concatenate([_colors(one) for one in group]) if has_colors else None,
+        np.concatenate(uv) if has_uv else None,
+        np.concatenate(colors) if has_colors else None,
     )
-
-
-def _uv(mesh: Mesh) -> NDArray[np.float32]:
-    return np.zeros((len(mesh.points), 2), dtype=np.float32) if mesh.uv is None else mesh.uv
-
-
-def _colors(mesh: Mesh) -> NDArray[np.uint8]:
-    white = np.full((len(mesh.points), 4), 255, dtype=np.uint8)
-    return white if mesh.colors is None else mesh.colors
-
-
-def _override(own: Material | None, has_uv: bool, override: MaterialOverride) -> Material:
-    if override.over is not None:
-        return Material(override.over)
-    material = override.missing if own is None else own
-    return material if has_uv else Material(material.color)
 
 
 def _material(material: Material, images: list[bytes]) -> dict[str, Any]:
@@ -197,20 +191,3 @@ def _material(material: Material, images: list[bytes]) -> dict[str, Any]:
 def _linear(channels: NDArray[np.float64]) -> NDArray[np.float64]:
     """sRGB to linear light (IEC 61966-2-1)."""
     return np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
-
-
-def _linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    scaled = colors / 255.0
-    return np.concatenate([_linear(scaled[:, :3]), scaled[:, 3:]], axis=1).astype(np.float32)
-
-
-def _mime_type(image: bytes) -> str:
-    return "image/png" if image.startswith(b"\x89PNG") else "image/jpeg"
-
-
-def _packed(document: dict[str, Any], binary: bytes) -> bytes:
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + len(binary)
-    head = struct.pack("<III", _MAGIC, 2, size) + struct.pack("<II", len(text), _JSON)
-    return head + text + struct.pack("<II", len(binary), _BINARY) + binary

@@ -83,11 +83,16 @@ def smooth_normals(
     """
     with np.errstate(over="ignore"):
         points = points.astype(np.float32).astype(np.float64)  # as they will be drawn
-    triangles = triangles[_proper(points, triangles)]
+    with np.errstate(invalid="ignore"):
+        area = np.linalg.norm(_areas(points, triangles)[::3], axis=-1)
+    triangles = triangles[np.isfinite(area) & (area > 0.0)]
     rows = triangles.ravel()
     areas = _areas(points, triangles)
     facing = None if normals is None else directions(normals[rows])
-    if facing is None or _is_faceted(areas, facing):
+    if facing is not None:
+        flat = np.einsum("ij,ij->i", directions(areas), facing) > 0.999
+        facing = None if np.count_nonzero(flat) > 0.98 * len(flat) else facing
+    if facing is None:
         facing = _normals(points[rows], areas)
     features: list[NDArray[Any]] = [points[rows].astype(np.float32), np.rint(facing * _STEPS)]
     features += [] if uv is None else [uv[rows].astype(np.float32)]
@@ -103,21 +108,10 @@ def smooth_normals(
     )
 
 
-def _proper(points: Corners, triangles: NDArray[np.intp]) -> NDArray[np.bool_]:
-    with np.errstate(invalid="ignore"):
-        area = np.linalg.norm(_areas(points, triangles)[::3], axis=-1)
-    return np.isfinite(area) & (area > 0.0)
-
-
 def _areas(points: Corners, triangles: NDArray[np.intp]) -> Corners:
     """Twice the area of each corner's triangle (3 F, 3), along its normal."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     return np.repeat(np.cross(b - a, c - a), 3, axis=0)
-
-
-def _is_faceted(areas: Corners, facing: Corners) -> bool:
-    flat = np.einsum("ij,ij->i", directions(areas), facing) > 0.999
-    return int(np.count_nonzero(flat)) > 0.98 * len(flat)
 
 
 def _normals(corners: Corners, areas: Corners) -> Corners:
@@ -129,17 +123,14 @@ def _normals(corners: Corners, areas: Corners) -> Corners:
     sums = np.empty_like(areas)
     for count in np.unique(counts).tolist():
         around = order[starts[counts == count][:, None] + np.arange(count)]
-        sums[around] = _smooth_sums(areas[around])
+        parts = areas[around]  # (P, K, 3): P points with K triangles each
+        if count > _MAX_COMPARED:
+            sums[around] = parts.sum(axis=1, keepdims=True)
+        else:
+            units = directions(parts)
+            is_smooth = units @ units.transpose(0, 2, 1) > _SMOOTHEST_EDGE
+            sums[around] = is_smooth.astype(np.float64) @ parts
     return directions(sums)
-
-
-def _smooth_sums(areas: Corners) -> Corners:
-    """Sums for points with K triangles each: (P, K, 3) in and out."""
-    if areas.shape[1] > _MAX_COMPARED:
-        return np.broadcast_to(areas.sum(axis=1, keepdims=True), areas.shape)
-    units = directions(areas)
-    together = units @ units.transpose(0, 2, 1) > _SMOOTHEST_EDGE
-    return together.astype(np.float64) @ areas
 
 
 def _groups(features: list[NDArray[Any]]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

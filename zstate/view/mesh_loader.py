@@ -1,4 +1,4 @@
-"""Loads meshes on a background thread, so that reading files does not delay asset."""
+"""Loads meshes on a background thread, so that reading files does not delay the picture."""
 
 from __future__ import annotations
 
@@ -85,12 +85,10 @@ class MeshLoader:
     def _load(self, request: MeshRequest) -> LoadedMesh:
         try:
             asset = self._meshes.load(request.shape, request.over, request.base)
-            texture = (
-                self._meshes.missing_texture(request.shape, request.base) if request.over is None else None
-            )
+            defects = [asset.defect if isinstance(asset, MeshAsset) else None]
+            if request.over is None:
+                defects.insert(0, self._meshes.missing_texture(request.shape, request.base))
         except Exception as error:  # one unforeseen file must not stop the others
-            return LoadedMesh(
-                request, MissingFile(str(request.shape.geometry), f"{type(error).__name__}: {error}")
-            )
-        defect = asset.defect if isinstance(asset, MeshAsset) else None
-        return LoadedMesh(request, asset, tuple(one for one in (texture, defect) if one is not None))
+            reason = f"{type(error).__name__}: {error}"
+            return LoadedMesh(request, MissingFile(str(request.shape.geometry), reason))
+        return LoadedMesh(request, asset, tuple(one for one in defects if one is not None))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 from collections import OrderedDict, deque
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
@@ -24,6 +24,7 @@ from zstate.view.gltf import GREY, Corner, Glb, MaterialOverride
 from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
 from zstate.view.mesh_paths import MeshPaths, MissingFile
 
+_T = TypeVar("_T")
 _Source = Path | tuple[Box | Cylinder | Sphere, bool]
 
 FORMATS = {".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl"}
@@ -107,34 +108,38 @@ class Meshes:
             name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
             if self._pack(source).triangle_count:
                 return self._colored(source, shape, over, base, name)
-            return MissingFile(name, "there is nothing to see: it has no size, or one beyond all measure")
-        found = self._finder(base).find(geometry.uri)
-        if isinstance(found, MissingFile):
-            return found
-        try:
-            return replace(self._colored(found, shape, over, base, geometry.uri), scale=geometry.scale)
-        except (OSError, UnreadableFile) as error:
-            return MissingFile(geometry.uri, str(error), (str(found.parent),))
+            return MissingFile(name, "nothing can be drawn: its size is zero, or not finite")
+        uri, scale = geometry.uri, geometry.scale
+        return self._read(
+            uri, base, lambda path: replace(self._colored(path, shape, over, base, uri), scale=scale)
+        )
 
     def missing_texture(self, shape: Shape, base: Path | None = None) -> MissingFile | None:
         """Why the texture of the shape cannot be loaded; None if it can, or if there is none."""
-        image = None if shape.texture is None else self._image(shape.texture, base)
+        image = self._texture(shape, base)
         return image if isinstance(image, MissingFile) else None
 
     def _colored(
         self, source: _Source, shape: Shape, over: Color | None, base: Path | None, name: str
     ) -> MeshAsset:
-        override = (
-            MaterialOverride(over=over) if over is not None else MaterialOverride(self._material(shape, base))
-        )
+        if over is not None:
+            override = MaterialOverride(over=over)
+        else:
+            image = self._texture(shape, base)
+            if isinstance(image, bytes):
+                override = MaterialOverride(Material(shape.color or (1.0, 1.0, 1.0, 1.0), image))
+            else:
+                override = MaterialOverride(Material(shape.color or GREY))
         done = self._copies.get((source, override))
         if done is not None:
             return MeshAsset(done)
         packed = self._pack(source)
         another = self._firsts.get(source)
-        if another is not None and self._in_use() + packed.byte_count > self._max_copied_bytes:
+        while self._dropped:
+            self._copied_bytes -= self._dropped.popleft()
+        if another is not None and self._copied_bytes + packed.byte_count > self._max_copied_bytes:
             limit = f"{self._max_copied_bytes / 1e6:.0f} MB"
-            reason = f"in the colour of another: the meshes drawn take {limit} already"
+            reason = f"drawn in another colour: the meshes on the page have reached the limit of {limit}"
             return MeshAsset(another, defect=MissingFile(name, reason))
         done = self._copies[source, override] = Copy(packed.to_bytes(override), *packed.bounds)
         if another is None:
@@ -142,12 +147,6 @@ class Meshes:
         self._copied_bytes += len(done.glb)
         finalize(done, self._dropped.append, len(done.glb)).atexit = False
         return MeshAsset(done)
-
-    def _in_use(self) -> int:
-        """Size of all copies in use [bytes]."""
-        while self._dropped:
-            self._copied_bytes -= self._dropped.popleft()
-        return self._copied_bytes
 
     def _pack(self, source: _Source) -> Glb:
         done = self._packed.pop(source, None)
@@ -162,26 +161,21 @@ class Meshes:
             self.kept_byte_count -= self._packed.popitem(last=False)[1].byte_count
         return done
 
-    def _material(self, shape: Shape, base: Path | None) -> Material:
-        image = None if shape.texture is None else self._image(shape.texture, base)
-        if isinstance(image, bytes):
-            return Material(shape.color or (1.0, 1.0, 1.0, 1.0), image)
-        return Material(shape.color or GREY)
+    def _texture(self, shape: Shape, base: Path | None) -> bytes | MissingFile | None:
+        """The image of the shape's texture; None without a texture."""
+        return None if shape.texture is None else self._read(shape.texture, base, read_image)
 
-    def _image(self, uri: str, base: Path | None) -> bytes | MissingFile:
-        found = self._finder(base).find(uri)
-        if isinstance(found, MissingFile):
-            return found
+    def _read(self, uri: str, base: Path | None, read: Callable[[Path], _T]) -> _T | MissingFile:
+        """The result of ``read`` for a file, or why it cannot be read."""
+        if base not in self._paths:
+            self._paths[base] = MeshPaths(base)
+        path = self._paths[base].find(uri)
+        if isinstance(path, MissingFile):
+            return path
         try:
-            return read_image(found)
+            return read(path)
         except (OSError, UnreadableFile) as error:
-            return MissingFile(uri, str(error), (str(found.parent),))
-
-    def _finder(self, base: Path | None) -> MeshPaths:
-        finder = self._paths.get(base)
-        if finder is None:
-            finder = self._paths[base] = MeshPaths(base)
-        return finder
+            return MissingFile(uri, str(error), (str(path.parent),))
 
 
 class UnreadableFile(ValueError):
@@ -212,13 +206,13 @@ def read_image(path: Path) -> bytes:
         with Image.open(path) as image:
             return _encoded(image)
     except Exception as error:  # Pillow's readers raise exceptions of any type
-        raise UnreadableFile(f"it is no image: {str(error)[:200]}") from None
+        raise UnreadableFile(f"it is not an image: {str(error)[:200]}") from None
 
 
 def _check(path: Path, formats: set[str]) -> None:
     if path.suffix.lower() not in formats:
         known = ", ".join(sorted(formats))
-        raise UnreadableFile(f"files of the kind '{path.suffix}' are not read; {known} are")
+        raise UnreadableFile(f"the format '{path.suffix}' is not supported; supported are {known}")
     if (size := path.stat().st_size) > MAX_BYTES:
         raise UnreadableFile(f"it has {size} bytes; the limit is {MAX_BYTES}")
 
@@ -228,20 +222,15 @@ def _loaded(path: Path, data: Path | io.BytesIO) -> tuple[Mesh, ...]:
     kind = path.suffix.lower().removeprefix(".")
     resolver = FilePathResolver(str(path), allow_anywhere=True)
     scene: Any = _load(data, file_type=kind, resolver=resolver, process=kind == "stl")
-    return tuple(_meshes_in(scene))
-
-
-def _meshes_in(scene: Any) -> Iterator[Mesh]:
+    meshes: list[Mesh] = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         mesh = scene.geometry[name]
         if len(getattr(mesh, "faces", ())):
-            yield _mesh(mesh, np.asarray(matrix, dtype=np.float64) * _in_metres(mesh))
-
-
-def _in_metres(mesh: Any) -> NDArray[np.float64]:
-    scale = 1.0 if mesh.units is None else unit_conversion(mesh.units, "meters")
-    return np.array([[scale], [scale], [scale], [1.0]])
+            scale = 1.0 if mesh.units is None else unit_conversion(mesh.units, "meters")
+            metres = np.asarray(matrix, dtype=np.float64) * [[scale], [scale], [scale], [1.0]]
+            meshes.append(_mesh(mesh, metres))
+    return tuple(meshes)
 
 
 def _mesh(mesh: Any, matrix: NDArray[np.float64]) -> Mesh:

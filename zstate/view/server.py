@@ -1,4 +1,4 @@
-"""Page: a viser server that shows itself to whom it should, and asks nobody outside."""
+"""ViewServer: a viser server behind access checks, without connections to the internet."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import logging
 import socket
 import threading
 from collections.abc import Generator
-from typing import Any, NoReturn
+from typing import Any
 
 import viser
 import websockets.asyncio.server
@@ -23,86 +23,82 @@ from zstate.view.access import AccessCheck, is_websocket
 
 PORT = 8080
 _PORTS_TRIED = 100
-# A browser that has vanished (a laptop that sleeps, a network that is gone) does not say goodbye.
-_CLOSES_WITHIN_S = 0.3
+# A browser that has vanished (a suspended laptop, a lost network) does not answer the closing handshake.
+_CLOSE_TIMEOUT_S = 0.3
 
-# It tells of every browser that opens a connection and thinks better of it, with a traceback.
+# websockets logs a traceback for each connection that a browser opens and drops.
 _SILENT = logging.getLogger("zstate.view.http")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 
-# While one server opens, websockets' function that opens servers is not what it is for others.
+# Held while websockets.asyncio.server.serve is replaced.
 _opening = threading.Lock()
 
 
 class ViewServer(Closeable):
-    """A page at ``host``, and what is in it: ``server`` is viser's.
+    """The page at ``host``; ``server`` is the viser server behind it.
 
-    ``port`` None is the first free one from 8080 on; 0 is any. ``url`` is what to open, with the token
-    that is wanted beyond loopback. Raises InvalidInput for a host or a port that cannot be had.
+    ``port`` None is the first free one from 8080 on; 0 is any. ``url`` is the address to open, with the token
+    that is needed beyond loopback. Raises InvalidInput if ``host`` or ``port`` cannot be used.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int | None = None, *, title: str = "zstate") -> None:
         self.host = host
-        self._listening = _listen(host, port)
-        self.port: int = self._listening.getsockname()[1]
-        self.door = AccessCheck.at(host, self.port)
+        self._socket = _listen(host, port)
+        self.port: int = self._socket.getsockname()[1]
+        self.access = AccessCheck.at(host, self.port)
         self.connected = threading.Event()
         """Set while at least one browser shows the page."""
         try:
-            self.server = self._open(title)
+            with _opening, _no_output(), self._guarded_serve() as opened:
+                self.server = _Server(host, self.port, title, verbose=False)
         except BaseException:
-            self._listening.close()
+            self._socket.close()
             raise
-        self.server.on_client_connect(lambda _: self._count())
-        self.server.on_client_disconnect(lambda _: self._count())
+        if not opened:
+            self.close()
+            raise RuntimeError("this version of viser opens its server in a way that is not guarded")
+        self.server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
+        self.server.on_client_connect(lambda _: self._update_connected())
+        self.server.on_client_disconnect(lambda _: self._update_connected())
 
     @property
     def url(self) -> str:
         """The address to open in a browser."""
-        query = "" if self.door.token is None else f"/?token={self.door.token}"
-        return f"http://{_named(self.host)}:{self.port}{query}"
+        query = "" if self.access.token is None else f"/?token={self.access.token}"
+        is_any = self.host in ("", "0.0.0.0", "::")
+        return f"http://{socket.gethostname() if is_any else format_host(self.host)}:{self.port}{query}"
 
     def close(self) -> None:
-        """Show it to nobody any more. A second call does nothing."""
-        with _quiet():
+        """Stop the server. A second call does nothing."""
+        with _no_output():
             self.server.stop()
-        self._listening.close()
+        self._socket.close()
 
-    def _open(self, title: str) -> viser.ViserServer:
-        with _opening, _quiet(), self._opens_here() as opened:
-            server = _Server(self.host, self.port, title, verbose=False)
-            server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
-            server.gui.main_panel.dock_right()
-            if not opened:
-                server.stop()
-                raise RuntimeError("this version of viser opens its server in a way that is not guarded")
-            return server
-
-    def _count(self) -> None:
+    def _update_connected(self) -> None:
         (self.connected.set if self.server.get_clients() else self.connected.clear)()
 
     @contextlib.contextmanager
-    def _opens_here(self) -> Generator[list[int]]:
-        """The server that is opened meanwhile listens here, behind the door; its port is then in the list.
+    def _guarded_serve(self) -> Generator[list[int]]:
+        """Makes a websockets server that is opened inside use our socket and the access checks.
 
-        viser has no place to put a check in front of its own: it listens to a host and the next free
-        port, and answers whoever comes.
+        Yields a list that receives its port. viser has no option for this: it listens at a host and the next
+        free port, and answers every request.
         """
-        opens = websockets.asyncio.server.serve
+        original = websockets.asyncio.server.serve
         opened: list[int] = []
 
         def serve(
             handler: Any, host: str, port: int, *, process_request: Any, **options: Any
         ) -> websockets.asyncio.server.serve:
             opened.append(port)
-            guarded = functools.partial(self._answer, process_request)
-            return opens(
+            return original(
                 handler,
-                sock=self._listening,
-                process_request=guarded,
+                sock=self._socket,
+                process_request=functools.partial(self._process_request, process_request),
                 logger=_SILENT,
-                close_timeout=_CLOSES_WITHIN_S,
+                close_timeout=_CLOSE_TIMEOUT_S,
                 **options,
             )
 
@@ -110,63 +106,56 @@ class ViewServer(Closeable):
         try:
             yield opened
         finally:
-            websockets.asyncio.server.serve = opens
+            websockets.asyncio.server.serve = original
 
-    def _answer(
-        self, of_viser: Any, connection: websockets.asyncio.server.ServerConnection, request: Request
+    def _process_request(
+        self,
+        viser_process_request: Any,
+        connection: websockets.asyncio.server.ServerConnection,
+        request: Request,
     ) -> Response | None:
-        refused = self.door.check(request.path, request.headers)
-        if refused is not None:
-            response = connection.respond(refused.status, refused.text + "\n")
+        denied = self.access.check(request.path, request.headers)
+        if denied is not None:
+            response = connection.respond(denied.status, denied.text + "\n")
         elif is_websocket(request.headers):
             return None
         else:
-            response = of_viser(connection, request)
-            response.headers.update(self.door.headers())
+            response = viser_process_request(connection, request)
+            response.headers.update(self.access.headers())
         return response
 
 
 class _Server(viser.ViserServer):
-    """viser's server without its way to the internet: the page may ask for it, button or not."""
+    """viser's server without share URLs: a page may request one even without the button."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         return None
 
 
 def _listen(host: str, port: int | None) -> socket.socket:
-    if port is not None:
-        return _bound(host, port) or _refuse(f"port {port} is taken", host)
-    for tried in range(PORT, PORT + _PORTS_TRIED):
-        bound = _bound(host, tried)
+    """A socket that listens at ``port``, or at the first free one."""
+    ports = range(PORT, PORT + _PORTS_TRIED) if port is None else (port,)
+    for tried in ports:
+        bound = _bind(host, tried)
         if bound is not None:
             return bound
-    return _refuse(f"ports {PORT} to {PORT + _PORTS_TRIED - 1} are taken", host)
+    taken = f"port {port} is taken" if port is not None else f"ports {ports[0]} to {ports[-1]} are taken"
+    raise InvalidInput(f"{taken} at {host!r}; name a free one with --port, or 0 for any")
 
 
-def _refuse(what: str, host: str) -> NoReturn:
-    raise InvalidInput(f"{what} at {host!r}; name a free one with --port, or 0 for any")
-
-
-def _bound(host: str, port: int) -> socket.socket | None:
-    """A socket that listens there; None where somebody else does."""
+def _bind(host: str, port: int) -> socket.socket | None:
+    """A socket that listens at ``port``; None if the port is taken."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
         if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
             return None
-        raise InvalidInput(f"nobody can listen at {host!r}, port {port}: {error}") from None
-
-
-def _named(host: str) -> str:
-    """What others call this host."""
-    if host in ("", "0.0.0.0", "::"):
-        return socket.gethostname()
-    return format_host(host)
+        raise InvalidInput(f"cannot listen at {host!r}, port {port}: {error}") from None
 
 
 @contextlib.contextmanager
-def _quiet() -> Generator[None]:
-    """Where viser prints addresses that are not the ones to open."""
+def _no_output() -> Generator[None]:
+    """Hides what viser prints: addresses that are not the ones to open."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield

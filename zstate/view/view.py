@@ -1,4 +1,4 @@
-"""View: draws a world on a page, again and again."""
+"""View: the draw loop of the page."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import viser
 
 from zstate._util.closeable import Closeable
 from zstate.buffer.snapshot import FramePoses, Poses
 from zstate.clock import SystemClock, wait_interruptible
 from zstate.model.robot import RobotModel
 from zstate.rate import Rate
-from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Sight, fit_camera, sights
+from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Visibility, fit_camera, robot_visibility
 from zstate.view.data_source import ViewSource
 from zstate.view.panels.layout import PanelLayout
 from zstate.view.scene.scene import Scene
@@ -32,19 +31,19 @@ _IDLE_S = 0.5
 
 
 class View(Closeable):
-    """Draws ``world`` on ``page`` at most ``rate_hz`` times a second; twice a second while nobody looks.
+    """Draws ``source`` on ``page`` at most ``rate_hz`` times a second; twice a second without a browser.
 
-    ``sliders`` are of robots that are moved from the page; they and the world are the caller's to close.
-    ``folders`` are those of the URDF files that the user named, by the text of the URDF: a robot with
-    such a URDF is drawn with every file that it names, any other with files in packages only.
-    ``fixed_frame`` and ``camera`` are how a page begins: the frame that everything is seen from, if it is
-    there, and from where; None shows all robots, in a picture that is ``aspect`` times as wide as high.
-    One thread calls ``run`` or ``draw``; ``hold`` and what it leads to are for another.
+    ``sliders`` belong to robots that are moved from the page; the caller closes them and the source.
+    ``folders`` maps the text of each URDF file that the user named to its folder: a robot with such a URDF
+    is drawn with every file that it names, other robots with files in packages only.
+    ``fixed_frame`` and ``camera`` are the initial ones; the default camera shows all robots, in a picture
+    that is ``aspect`` times as wide as high. One thread calls ``run`` or ``draw``; ``hold`` and
+    ``visibility`` are for another.
     """
 
     def __init__(
         self,
-        world: ViewSource,
+        source: ViewSource,
         page: ViewServer,
         *,
         sliders: Sequence[SliderPublisher] = (),
@@ -54,31 +53,37 @@ class View(Closeable):
         camera: Camera | None = None,
         aspect: float = 1.0,
     ) -> None:
-        self._world = world
+        self._source = source
         self._page = page
         self._rate_hz = rate_hz
         self._folders = dict(folders or {})
         self.scene = Scene(page.server)
-        self._board = PanelLayout(page.server, world, self.scene, sliders, fixed_frame)
+        self._layout = PanelLayout(page.server, source, self.scene, sliders, fixed_frame)
         self._camera = camera
         self._aspect = aspect
         self._version = -1
         self._drawn: dict[str, RobotModel] = {}
-        self._framed: tuple[str, tuple[str, ...], int] | None = None
-        self._framed_without = 0  # so many frames had no pose then
-        self._framed_busy = False  # and meshes were still to come
-        self._framing: CameraPose | None = None
-        self._is_to_hold = False
+        self._fitted_to: tuple[str, tuple[str, ...], int] | None = None
+        self._fitted_unknown = 0  # number of frames without a pose then
+        self._fitted_busy = False  # whether meshes were still to come then
+        self._camera_pose: CameraPose | None = None
+        self._hold_requested = False
         self._held: FramePoses | None = None
-        self._placed: Poses | None = None
-        self._holds = threading.Event()
+        self._held_poses: Poses | None = None
+        self._hold_complete = threading.Event()
         self._panels_due_s = 0.0
         self._logged: set[str] = set()
-        server = page.server
-        server.initial_camera.fov = FIELD_OF_VIEW
-        _light(server.scene)
-        # One without an end, that fades, takes a browser without a graphics card a second for a picture.
-        self._floor = server.scene.add_grid(
+        page.server.initial_camera.fov = FIELD_OF_VIEW
+        scene = page.server.scene
+        # Without a graphics card a picture with shadows takes four times as long, one with an environment
+        # map that everything mirrors twice as long.
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(cast_shadow=False)
+        scene.add_light_hemisphere(
+            "/daylight", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=1.8
+        )
+        # An infinite grid, which fades, takes a browser without a graphics card a second for a picture.
+        self._floor = scene.add_grid(
             "/floor",
             width=0.0,
             height=0.0,
@@ -89,11 +94,10 @@ class View(Closeable):
         )
 
     def run(self, stop: threading.Event) -> None:
-        """Draw until ``stop`` is set. A picture that raises is logged, shown on the page and tried again."""
+        """Draw until ``stop`` is set. If drawing raises, the error is logged and shown on the page."""
         while not stop.is_set():
             if not self._page.connected.wait(_IDLE_S):
-                # Whoever opens the page next finds everything there.
-                self._try_to_draw()
+                self._try_to_draw()  # so that the next browser finds everything
                 continue
             for _ in Rate(self._rate_hz, SystemClock(), stop):
                 self._try_to_draw()
@@ -101,80 +105,74 @@ class View(Closeable):
                     break
 
     def draw(self) -> FramePoses:
-        """Show the world as it is now, or at the instant that was chosen on the page."""
-        moment = self._held
-        if moment is None:
-            version = self._world.version
+        """Draw the newest snapshot, or the one at the stamp selected on the page."""
+        snapshot = self._held
+        if snapshot is None:
+            version = self._source.version
             if self._version != version:
-                self._renew_robots()
+                self._update_robots()
                 self._version = version
-            moment = self._world.moment(self._board.stamp)
-            if self._is_to_hold:
-                self._held, self._framed = moment, None
-        fixed = self._board.fixed(moment)
+            snapshot = self._source.snapshot(self._layout.stamp)
+            if self._hold_requested:
+                self._held, self._fitted_to = snapshot, None
+        fixed = self._layout.fixed_frame(snapshot)
         with self._page.server.atomic():
             try:
                 if fixed:
-                    placed = self.scene.show(moment, fixed)
-                    self._frame(moment, fixed, placed)
+                    poses = self.scene.show(snapshot, fixed)
+                    self._fit_camera(snapshot, fixed, poses)
                     if self._held is not None:
-                        self._placed = placed
+                        self._held_poses = poses
                         if not self.scene.busy:
-                            self._holds.set()
+                            self._hold_complete.set()
             finally:
-                # Panels turn robots grey that have been silent since: not in a picture of an earlier instant.
+                # Panels mark robots that have become stale since: wrong in a picture of an earlier instant.
                 if self._held is None and time.monotonic() >= self._panels_due_s:
-                    self._board.update(moment)
+                    self._layout.update(snapshot)
                     self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
-        return moment
+        return snapshot
 
     def hold(self, timeout_s: float) -> bool:
-        """Draw one instant from now on, with the camera where it shows that.
+        """Draw only the current snapshot from now on, with the camera fitted to it.
 
-        Returns when all of it is drawn, or after ``timeout_s``; False if nothing of it is.
+        Returns when it is drawn completely, or after ``timeout_s``; False if nothing is drawn.
         """
-        self._is_to_hold = True
-        return wait_interruptible(self._holds, timeout_s) or self._placed is not None
+        self._hold_requested = True
+        return wait_interruptible(self._hold_complete, timeout_s) or self._held_poses is not None
 
-    def sights(self) -> tuple[Sight, ...]:
-        """Which robots are in the picture that is held, and why others are not."""
-        if self._held is None or self._placed is None or self._framing is None:
-            return tuple(Sight(robot, False, "no robot has a pose yet") for robot in self._world.robots())
-        robots = self._world.robots()
-        return tuple(sights(self._held, self._placed, self._framing, self._aspect, robots))
+    def visibility(self) -> tuple[Visibility, ...]:
+        """Which robots are in the held picture, and why others are not."""
+        robots = self._source.robots()
+        if self._held is None or self._held_poses is None or self._camera_pose is None:
+            return tuple(Visibility(robot, False, "no robot has a pose yet") for robot in robots)
+        return tuple(robot_visibility(self._held, self._held_poses, self._camera_pose, self._aspect, robots))
 
     @property
     def fault(self) -> str:
-        """Why the last picture could not be drawn; empty when it could."""
-        return self._board.fault
+        """Why the last picture could not be drawn; empty if it was drawn."""
+        return self._layout.fault
 
     def close(self) -> None:
-        """Draw no more. A second call does nothing."""
-        self._board.close()
+        """Close the panels. A second call does nothing."""
+        self._layout.close()
 
     def _try_to_draw(self) -> None:
+        """Draw, or show the error on the page and log it once for each line of code that raises it."""
         try:
             self.draw()
         except Exception as error:  # the next picture may succeed, and the other robots are still moving
-            self._report(error)
+            fault = self._layout.fault = f"{type(error).__name__}: {error}"
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(frame.filename).name}, line {frame.lineno}"
+            if where not in self._logged:
+                self._logged.add(where)
+                text = "the view failed to draw a picture (%s, in %s); it continues and tries again"
+                _LOG.warning(text, fault, where)
         else:
-            self._board.fault = ""
+            self._layout.fault = ""
 
-    def _report(self, error: Exception) -> None:
-        """Show the error on the page. Log it once for each line of code that raises it."""
-        self._board.fault = f"{type(error).__name__}: {error}"
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(place.filename).name}, line {place.lineno}"
-        if where not in self._logged:
-            self._logged.add(where)
-            _LOG.warning(
-                "the view failed to draw a picture (%s, in %s); it continues and tries again",
-                self._board.fault,
-                where,
-            )
-
-    def _renew_robots(self) -> None:
-        models = self._world.models
+    def _update_robots(self) -> None:
+        models = self._source.models
         for name in self._drawn.keys() - models.keys():
             self.scene.remove_robot(name)
             del self._drawn[name]
@@ -184,46 +182,27 @@ class View(Closeable):
                 self.scene.set_robot(name, model, base=self._folders.get(model.urdf))
                 self._drawn[name] = model
 
-    def _frame(self, moment: FramePoses, fixed: str, placed: Poses) -> None:
-        """Look at all robots when there are others than before, or when they stand or are seen otherwise."""
-        subject = fixed, tuple(self._drawn), self.scene.arrangement
-        unknown = int(np.count_nonzero(~moment.known))
-        had_less = unknown < self._framed_without or (self._framed_busy and not self.scene.busy)
-        if not self._drawn or (subject == self._framed and not had_less):
+    def _fit_camera(self, snapshot: FramePoses, fixed: str, poses: Poses) -> None:
+        """Fit camera and floor to all robots if robots, fixed frame, poses or meshes have been added."""
+        subject = fixed, tuple(self._drawn), self.scene.layout_version
+        unknown = int(np.count_nonzero(~snapshot.known))
+        has_more = unknown < self._fitted_unknown or (self._fitted_busy and not self.scene.busy)
+        if not self._drawn or (subject == self._fitted_to and not has_more):
             return
-        framing = fit_camera(moment, placed, self._aspect, self.scene.corners(moment.tree, placed))
-        if framing is None:
+        pose = fit_camera(snapshot, poses, self._aspect, self.scene.corners(snapshot.tree, poses))
+        if pose is None:
             return
-        self._framed, self._framed_without, self._framed_busy = subject, unknown, self.scene.busy
-        moves = self._camera is None or self._framing is None or self._held is not None
-        camera = self._camera
-        if camera is not None:
-            framing = framing._replace(position=camera.position, look_at=camera.look_at or framing.look_at)
-        self._framing = framing
-        self._aim(framing, moves=moves)
-
-    def _aim(self, framing: CameraPose, *, moves: bool) -> None:
-        """Put the floor, and unless the user has put it the camera, where the framing says."""
-        server = self._page.server
-        self._floor.position = (0.0, 0.0, framing.floor)
-        self._floor.width = self._floor.height = 2.0 * framing.reach
-        if not moves:
-            return
-        server.initial_camera.position = framing.position
-        server.initial_camera.look_at = framing.look_at
-        for client in server.get_clients().values():
-            client.camera.position = framing.position
-            client.camera.look_at = framing.look_at
-
-
-def _light(scene: viser.SceneApi) -> None:
-    """Daylight that costs little.
-
-    Without a graphics card a picture with shadows takes four times as long, one with surroundings that
-    are mirrored in everything twice as long.
-    """
-    scene.configure_environment_map(None)
-    scene.configure_default_lights(cast_shadow=False)
-    scene.add_light_hemisphere(
-        "/daylight", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=1.8
-    )
+        self._fitted_to, self._fitted_unknown, self._fitted_busy = subject, unknown, self.scene.busy
+        user = self._camera
+        # The user's camera is set once, and again for a held picture.
+        moves = user is None or self._camera_pose is None or self._held is not None
+        if user is not None:
+            pose = pose._replace(position=user.position, look_at=user.look_at or pose.look_at)
+        self._camera_pose = pose
+        self._floor.position = (0.0, 0.0, pose.floor)
+        self._floor.width = self._floor.height = 2.0 * pose.reach
+        if moves:
+            server = self._page.server
+            cameras = [server.initial_camera, *(client.camera for client in server.get_clients().values())]
+            for camera in cameras:
+                camera.position, camera.look_at = pose.position, pose.look_at

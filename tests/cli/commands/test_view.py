@@ -75,7 +75,7 @@ def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it(spawn):
         (["a.mcap", "--sliders"], 2, "--sliders moves live robots"),
         (["nowhere.mcap"], 1, "nowhere.mcap"),
         (["--rate", "0"], 2, "a rate is above 0"),
-        (["--host", "nowhere.invalid"], 1, "nobody can listen at 'nowhere.invalid'"),
+        (["--host", "nowhere.invalid"], 1, "cannot listen at 'nowhere.invalid'"),
         (["pandda", "--sliders"], 1, "panda"),
         (["--port", "99999"], 2, "99999"),
         (["--camera", "1,2"], 2, "'1,2' is not three numbers with commas between"),
@@ -146,7 +146,7 @@ def test_snapshot_names_visible_robots_hidden_robots_and_missing_meshes(tmp_path
         assert "ROS_PACKAGE_PATH" in both.stderr
         one = snapshot("--fixed-frame", "mine/base", "--camera", "0,0,9:0,0,10")
         assert one.stdout == f"wrote {picture}: no robot, 320 x 240 pixels\n"
-        assert "'rrbot' is not in the picture: it is outside of what the camera sees" in one.stderr
+        assert "'rrbot' is not in the picture: it is outside the camera's view" in one.stderr
         # The file is named by a relative path, and its package is found around it.
         own = snapshot("urdf/mine.urdf")
         assert own.stdout == f"wrote {picture}: mine, 320 x 240 pixels\n"

@@ -1,4 +1,4 @@
-"""The board without a browser: what a person chose is done once, and what is drawn follows."""
+"""PanelLayout without a browser: user input is applied once, and only changes are sent."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from zstate.clock import ManualClock
 from zstate.transform import Transform
 from zstate.view.data_source import ViewSource
 from zstate.view.panels.layout import PanelLayout
-from zstate.view.panels.widgets import BoundWidget, FrameChoice
 from zstate.view.scene.scene import Scene
 
 
 @pytest.fixture
 def buffer() -> TransformBuffer:
-    """rrbot for ten seconds, ten samples in each."""
+    """Ten seconds of rrbot, ten samples a second."""
     buffer = TransformBuffer(60.0, ManualClock(10 * SECOND))
     track = buffer.add_robot(RRBOT, "r1")
     for tick in range(101):
@@ -24,81 +23,50 @@ def buffer() -> TransformBuffer:
     return buffer
 
 
-def test_what_a_person_chose_is_taken_once(page):
-    box = page.server.gui.add_checkbox("box", False)
-    choice = BoundWidget[bool](box)
-    assert choice.poll_change() is None
-    box.value = True
-    assert choice.poll_change() is True
-    assert choice.poll_change() is None
-
-
-def test_what_a_person_chose_is_not_overwritten_by_what_was_shown_before(page):
-    number = page.server.gui.add_number("number", 1.0)
-    choice = BoundWidget[float](number)
-    number.value = 2.0
-    choice.show(1.0)
-    assert choice.poll_change() == 2.0
-    choice.show(3.0)
-    assert number.value == 3.0
-    assert choice.poll_change() is None
-
-
-def test_a_frame_stays_chosen_while_others_come(page):
-    choice = FrameChoice(page.server.gui, "frame", "(none)")
-    assert choice.frame is None
-    choice.offer(("a", "b"), "b")
-    choice.offer(("c", "a", "b"), "b")
-    assert choice.frame == "b"
-    choice.offer(("c", "a"), None)
-    assert choice.frame is None
-    assert choice.poll_change() is None
-
-
-def test_a_board_of_nothing_waits_for_the_first_robot(page):
+def test_empty_layout_gets_its_first_frame(page):
     buffer = TransformBuffer()
     with (
-        ViewSource(None, buffer=buffer) as world,
-        PanelLayout(page.server, world, Scene(page.server)) as board,
+        ViewSource(None, buffer=buffer) as source,
+        PanelLayout(page.server, source, Scene(page.server)) as layout,
     ):
-        moment = world.moment(board.stamp)
-        board.update(moment)
-        assert board.fixed(moment) == ""
+        snapshot = source.snapshot(layout.stamp)
+        layout.update(snapshot)
+        assert layout.fixed_frame(snapshot) == ""
         buffer.insert_static(Transform("map", "camera", [1, 0, 0], [0, 0, 0, 1]))
-        moment = world.moment(board.stamp)
-        board.update(moment)
-        assert board.fixed(moment) == "map"
+        snapshot = source.snapshot(layout.stamp)
+        layout.update(snapshot)
+        assert layout.fixed_frame(snapshot) == "map"
 
 
-def test_a_recording_is_shown_at_an_instant_of_its_own_and_not_at_its_end(page, buffer):
+def test_paused_recording_is_shown_at_the_cursor_and_not_at_its_end(page, buffer):
     with (
-        ViewSource(None, buffer=buffer) as world,
-        PanelLayout(page.server, world, Scene(page.server)) as board,
+        ViewSource(None, buffer=buffer) as source,
+        PanelLayout(page.server, source, Scene(page.server)) as layout,
     ):
-        board.clock.pause()
-        assert board.stamp == 0
-        board.clock.seek(4 * SECOND)
-        stamp = board.stamp
+        layout.cursor.pause()
+        assert layout.stamp == 0
+        layout.cursor.seek(4 * SECOND)
+        stamp = layout.stamp
         assert stamp == 4 * SECOND
-        moment = world.moment(stamp)
-        board.update(moment)
-        assert board.stamp == 4 * SECOND
+        snapshot = source.snapshot(stamp)
+        layout.update(snapshot)
+        assert layout.stamp == 4 * SECOND
 
 
-def test_where_nothing_is_new_nothing_is_sent(page, buffer, monkeypatch):
+def test_update_without_changes_sends_nothing(page, buffer, monkeypatch):
     sent: list[object] = []
     with (
-        ViewSource(None, buffer=buffer) as world,
-        PanelLayout(page.server, world, Scene(page.server)) as board,
+        ViewSource(None, buffer=buffer) as source,
+        PanelLayout(page.server, source, Scene(page.server)) as layout,
     ):
-        board.clock.pause()
-        board.update(world.moment(board.stamp))
+        layout.cursor.pause()
+        layout.update(source.snapshot(layout.stamp))
         pipe = page.server.gui._websock_interface
         queue = pipe.queue_message
         monkeypatch.setattr(pipe, "queue_message", lambda message: (sent.append(message), queue(message)))
-        board.update(world.moment(board.stamp))
-        board.update(world.moment(board.stamp))
+        layout.update(source.snapshot(layout.stamp))
+        layout.update(source.snapshot(layout.stamp))
         assert sent == []
-        board.clock.seek(2 * SECOND)
-        board.update(world.moment(board.stamp))
+        layout.cursor.seek(2 * SECOND)
+        layout.update(source.snapshot(layout.stamp))
         assert sent

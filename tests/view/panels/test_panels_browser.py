@@ -1,4 +1,4 @@
-"""The panels in a real browser: what a person types, drags and reads."""
+"""The panels in a real browser: typing, dragging and reading."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zstate.view.sliders import SliderPublisher
 
 pytestmark = [pytest.mark.browser, pytest.mark.processes]
 
-SLOWLY_S = 45.0
+TIMEOUT_S = 45.0
 """A browser without a graphics card, on a busy machine."""
 
 RRBOT = load_model("rrbot")
@@ -34,29 +34,29 @@ DRIVER = """
 
 
 def until(condition: Callable[[], object]) -> None:
-    until_then(condition, SLOWLY_S)
+    until_then(condition, TIMEOUT_S)
 
 
 class Panels:
-    """The panels of one page, by what stands beside their inputs."""
+    """The panels of one page; inputs are found by their labels."""
 
-    def __init__(self, looker) -> None:
-        self.looker = looker
-        self.tab = looker.tab
-        self.tab.set_default_timeout(SLOWLY_S * 1e3)
-        looker.text("Fixed frame")
+    def __init__(self, view_tab) -> None:
+        self.view_tab = view_tab
+        self.tab = view_tab.tab
+        self.tab.set_default_timeout(TIMEOUT_S * 1e3)
+        view_tab.text("Fixed frame")
 
     def open(self, name: str) -> None:
-        """One of the tabs."""
+        """Select a tab of the panels."""
         self.tab.get_by_text(name, exact=True).first.click()
 
     def field(self, label: str):
-        """The input with that label; of a slider the box with its number."""
-        beside = f'//label[normalize-space(.)="{label}"]/ancestor::div[2]//input[not(@type="hidden")]'
-        return self.tab.locator(f"xpath={beside}").last
+        """The input with this label; for a slider, its number box."""
+        path = f'//label[normalize-space(.)="{label}"]/ancestor::div[2]//input[not(@type="hidden")]'
+        return self.tab.locator(f"xpath={path}").last
 
     def choose(self, label: str, option: str) -> None:
-        """One of a list, by typing a part of it."""
+        """Select an option of a dropdown by typing it."""
         self.field(label).click()
         self.field(label).fill(option)
         self.tab.get_by_role("option", name=option, exact=True).click()
@@ -65,7 +65,7 @@ class Panels:
         self.tab.get_by_role("button", name=button, exact=True).click()
 
     def row(self, name: str, place: int = 0) -> str:
-        """The value beside a name in a table of the panels, or nothing."""
+        """The value next to a name in a table of the panels; empty if there is none."""
         cells = self.tab.locator(f'xpath=//td[normalize-space(.)="{name}"]/following-sibling::td[1]')
         return cells.nth(place).inner_text() if cells.count() > place else ""
 
@@ -74,14 +74,14 @@ class Panels:
 
 
 @pytest.fixture
-def panels(look, show) -> Callable[..., Panels]:
+def panels(open_tab, show_view) -> Callable[..., Panels]:
     def opened(session, *robots: str, sliders=()) -> Panels:
-        return Panels(look(show(session, *robots, sliders=sliders).page.url))
+        return Panels(open_tab(show_view(session, *robots, sliders=sliders).page.url))
 
     return opened
 
 
-def test_a_slider_moves_the_joint_and_what_is_read_of_the_link(panels, sessions):
+def test_slider_moves_the_joint_and_the_displayed_link_pose(panels, sessions):
     with SliderPublisher(sessions[0], RRBOT, "r1") as sliders:
         page = panels(sessions[1], "r1", sliders=[sliders])
         page.open("Joints")
@@ -91,9 +91,9 @@ def test_a_slider_moves_the_joint_and_what_is_read_of_the_link(panels, sessions)
         page.open("Frames")
         page.choose("Pose of", "r1/lower")
         page.choose("in frame", "r1/base")
-        # Both turn about y: the angles add up to the pitch.
+        # Both joints rotate about y: the angles add up to the pitch.
         until(lambda: page.numbers("rpy [rad]", 1) == [0.0, 0.5 - 0.25, 0.0])
-        page.looker.keep("panels_readout")
+        page.view_tab.save_screenshot("panels_readout")
         page.open("Joints")
         page.choose("Angles in", "deg")
         until(lambda: page.field(SHOULDER).input_value() == f"{math.degrees(0.5):.1f}")
@@ -101,13 +101,13 @@ def test_a_slider_moves_the_joint_and_what_is_read_of_the_link(panels, sessions)
         until(lambda: sliders.positions.tolist() == [0.0, 0.0])
         until(lambda: page.field(SHOULDER).input_value() == "0")
         page.press("Sine")
-        until(lambda: sliders.is_swinging)
+        until(lambda: sliders.sine_enabled)
         page.choose("Joint", SHOULDER)
         page.tab.locator(".uplot canvas").first.wait_for()
-        page.looker.keep("panels_joints")
+        page.view_tab.save_screenshot("panels_joints")
 
 
-def test_a_slider_that_would_fight_another_writer_says_who_that_is(panels, sessions):
+def test_slider_panel_names_the_conflicting_writer(panels, sessions):
     with (
         StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver,
         SliderPublisher(sessions[1], RRBOT, "r1") as sliders,
@@ -115,15 +115,15 @@ def test_a_slider_that_would_fight_another_writer_says_who_that_is(panels, sessi
         driver.publish([0.0, 0.0])
         page = panels(sessions[1], "r1", sliders=[sliders])
         page.open("Joints")
-        assert "driver@" in page.looker.text("r1 is not published").inner_text()
-        page.looker.keep("panels_refused")
+        assert "driver@" in page.view_tab.text("r1 is not published").inner_text()
+        page.view_tab.save_screenshot("panels_refused")
         driver.close()
         until(lambda: not discover(sessions[0], 0.2))
         page.press("Try again")
-        page.looker.text("Publishing r1 at 50 Hz")
+        page.view_tab.text("Publishing r1 at 50 Hz")
 
 
-def test_a_part_of_a_name_finds_the_frame_and_another_fixed_frame_shows_it_from_there(panels, sessions):
+def test_frame_search_selects_a_frame_and_its_pose_follows_the_fixed_frame(panels, sessions):
     panda = load_model("panda")
     with StatePublisher(sessions[0], panda, "panda", program="driver") as driver:
         driver.publish(panda.neutral)
@@ -140,34 +140,34 @@ def test_a_part_of_a_name_finds_the_frame_and_another_fixed_frame_shows_it_from_
         page.open("Frames")
         until(lambda: page.row("in") == "panda/panda_hand")
         (finger,) = [joint for joint in panda.joints if joint.child == "panda_leftfinger"]
-        # At home the finger has not left the place at which its joint puts it.
+        # At home the finger is at the origin of its joint.
         until(lambda: page.numbers("xyz [m]") == [round(value, 4) for value in finger.origin[:3]])
-        page.looker.keep("panels_frames")
+        page.view_tab.save_screenshot("panels_frames")
 
 
-def test_a_robot_whose_publisher_is_killed_is_said_to_be_silent(panels, sessions, spawn):
+def test_robot_of_a_killed_publisher_is_shown_as_silent(panels, sessions, spawn):
     driver = spawn(DRIVER)
     assert driver.line() == "writing"
     page = panels(sessions[1], "r1")
-    page.looker.text("live,")
+    page.view_tab.text("live,")
     driver.kill()
-    said = page.looker.text("silent for").inner_text()
-    assert re.search(r"silent for \d+ s, since \d\d:\d\d:\d\d", said)
-    page.looker.keep("panels_silent")
+    text = page.view_tab.text("silent for").inner_text()
+    assert re.search(r"silent for \d+ s, since \d\d:\d\d:\d\d", text)
+    page.view_tab.save_screenshot("panels_silent")
 
 
-def test_time_is_stopped_and_goes_on(panels, sessions, spawn):
+def test_time_is_paused_and_returns_to_live(panels, sessions, spawn):
     assert spawn(DRIVER).line() == "writing"
     page = panels(sessions[1], "r1")
     page.open("Time")
     page.press("Pause")
-    page.looker.text("Paused at")
+    page.view_tab.text("Paused at")
     page.open("Frames")
     page.field("Search").fill("lower")
     until(lambda: page.row("parent"))
 
     def still() -> bool:
-        # As long as the page takes to be told ten times of something new.
+        # The page is updated five times a second.
         before = page.row("quat xyzw")
         page.tab.wait_for_timeout(1000)
         return page.row("quat xyzw") == before
@@ -175,17 +175,17 @@ def test_time_is_stopped_and_goes_on(panels, sessions, spawn):
     until(still)
     page.open("Time")
     page.press("Live")
-    page.looker.text("Live", exact=True)
+    page.view_tab.text("Live", exact=True)
     page.open("Frames")
     before = page.row("quat xyzw")
     until(lambda: page.row("quat xyzw") != before)
 
 
-def test_what_is_ticked_in_one_browser_is_drawn_in_all(look, show, sessions):
+def test_display_options_are_shared_by_all_browsers(open_tab, show_view, sessions):
     with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver:
         driver.publish([0.0, 0.0])
-        shown = show(sessions[1], "r1")
-        mine, theirs = (Panels(look(shown.page.url, 640, 480)) for _ in range(2))
+        shown = show_view(sessions[1], "r1")
+        mine, theirs = (Panels(open_tab(shown.page.url, 640, 480)) for _ in range(2))
         assert not theirs.field("Names").is_checked()
         mine.field("Names").check()
         mine.choose("Fixed frame", "r1/tool")
@@ -194,7 +194,7 @@ def test_what_is_ticked_in_one_browser_is_drawn_in_all(look, show, sessions):
         until(lambda: theirs.field("Fixed frame").input_value() == "r1/tool")
 
 
-def test_a_name_out_of_the_network_is_shown_and_not_run(panels, sessions):
+def test_names_from_the_network_are_shown_and_not_executed(panels, sessions):
     name = "<img src=x onerror=document.title=1>"
     quoted = name.replace("<", "&lt;").replace(">", "&gt;")
     urdf = f"""<robot name="r1"><link name="base"/><link name="{quoted}"/>
@@ -210,10 +210,10 @@ def test_a_name_out_of_the_network_is_shown_and_not_run(panels, sessions):
         assert page.tab.title() != "1"
 
 
-def test_the_graph_names_who_writes_and_who_reads(panels, sessions):
+def test_graph_tab_lists_writers_of_streams(panels, sessions):
     with StatePublisher(sessions[0], RRBOT, "r1", program="driver") as driver:
         driver.publish([0.0, 0.0])
         page = panels(sessions[1], "r1")
         page.open("Graph")
         until(lambda: page.row("written by").startswith("driver@"))
-        page.looker.keep("panels_graph")
+        page.view_tab.save_screenshot("panels_graph")

@@ -25,6 +25,18 @@ from zstate.cli.options import (
 )
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
+from zstate.cli.waiting import ConditionWaiter
+from zstate.model.catalog import find_entry
+from zstate.model.load import is_path
+from zstate.model.robot import RobotModel
+from zstate.net.presence import discover
+from zstate.net.session import Session
+from zstate.view.access import is_loopback
+from zstate.view.data_source import ViewSource
+from zstate.view.screenshot import save_screenshot
+from zstate.view.server import ViewServer
+from zstate.view.sliders import SliderPublisher
+from zstate.view.view import View
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
@@ -151,9 +163,8 @@ def view_command(
     zstate view urdf/arm.urdf               # announced robot 'arm', with the meshes near this file
     zstate view --host 0.0.0.0 --port 9000
     """
-    import_module("zstate.view.library")  # reports a missing viser before anything starts
+    import_module("zstate.view")  # reports a missing viser before anything starts
 
-    from zstate.model.load import is_path
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
@@ -173,7 +184,7 @@ def view_command(
     with ExitStack() as opened:
         publishers: list[SliderPublisher] = []
         if files:
-            source = opened.enter_context(ViewSource.of_recording(files[0]))
+            source = opened.enter_context(ViewSource.from_recording(files[0]))
         else:
             session = opened.enter_context(open_session(network, (wire,)))
             if sliders:
@@ -214,7 +225,6 @@ class NamedRobot(NamedTuple):
 
 
 def _load_named(argument: str, xacro_args: Mapping[str, str] | None = None) -> tuple[NamedRobot, RobotModel]:
-    from zstate.model.catalog import find_entry
     from zstate.model.load import is_path
 
     model, robot = load_robot(argument, None, xacro_args)
@@ -229,7 +239,6 @@ def _open_sliders(
 
     A name is that of an announced robot; if no such robot is announced, that of a catalog model.
     """
-    from zstate.net.presence import discover
     from zstate.view.sliders import SliderPublisher
 
     within_s = _DISCOVERY_S if named else _ANNOUNCED_WITHIN_S
@@ -243,8 +252,8 @@ def _open_sliders(
         elif model is None:
             selected, model = _load_named(one.robot)
         sliders = SliderPublisher(session, model, selected.robot, wires=(wire,))
-        if sliders.refusal:
-            print_status(f"{selected.robot!r} is not moved: {sliders.refusal}", robot=selected.robot)
+        if sliders.conflict:
+            print_status(f"{selected.robot!r} is not moved: {sliders.conflict}", robot=selected.robot)
         yield selected, sliders
 
 
@@ -272,7 +281,6 @@ def _running(view: View) -> Generator[BackgroundCall[None]]:
 
 
 def _print_address(page: ViewServer) -> None:
-    from zstate.view.access import is_loopback
 
     print_result(f"the view is at {page.url}")
     if not is_loopback(page.host):
@@ -292,7 +300,6 @@ def _write_snapshot(
     fixed_frame: str,
 ) -> None:
     """Write a picture once ``robots`` have arrived, and print which robots and meshes are not in it."""
-    from zstate.view.screenshot import save_screenshot
 
     def has_models() -> bool:
         models = source.models
@@ -303,22 +310,22 @@ def _write_snapshot(
         expected = " and ".join(map(repr, robots)) or "any robot"
         fail(f"waited {_ANNOUNCED_WITHIN_S:g} s for {expected}; robots that were received: {received}")
     if fixed_frame and not _wait_for(
-        source, lambda: fixed_frame in source.moment().tree.index, _ANNOUNCED_WITHIN_S
+        source, lambda: fixed_frame in source.snapshot().tree.index, _ANNOUNCED_WITHIN_S
     ):
-        source.moment().tree.row(fixed_frame)  # raises, with near misses
+        source.snapshot().tree.row(fixed_frame)  # raises, with near misses
     if not robots and source.session is not None:
         time.sleep(_OTHERS_WITHIN_S)
-    _wait_for(source, lambda: not source.moment().reasons, _SAMPLES_WITHIN_S)
+    _wait_for(source, lambda: not source.snapshot().reasons, _SAMPLES_WITHIN_S)
     width, height = size
     save_screenshot(page, path, width=width, height=height, hold=view.hold)
-    sights = view.sights()
-    seen = ", ".join(one.robot for one in sights if one.is_seen) or "no robot"
+    sights = view.visibility()
+    seen = ", ".join(one.robot for one in sights if one.is_visible) or "no robot"
     print_result(f"wrote {path}: {seen}, {width} x {height} pixels")
     for one in sights:
         if one.reason:
-            part = "partly in the picture" if one.is_seen else "not in the picture"
+            part = "partly in the picture" if one.is_visible else "not in the picture"
             print_status(f"{one.robot!r} is {part}: {one.reason}", robot=one.robot)
-    roots = sorted({one.root for one in sights if one.is_seen})
+    roots = sorted({one.root for one in sights if one.is_visible})
     if len(roots) > 1:
         command = f"zstate static {roots[0]} {roots[1]} --xyz 1 0 0"
         print_status(
@@ -343,7 +350,6 @@ def _first_few(lines: Sequence[str]) -> str:
 
 def _wait_for(source: ViewSource, condition: Callable[[], bool], timeout_s: float) -> bool:
     """Wait until ``condition()``, on the contents of ``source``, is true; False after ``timeout_s``."""
-    from zstate.cli.waiting import ConditionWaiter
 
     waiter = ConditionWaiter()
     if source.listener is not None:

@@ -1,1 +1,1 @@
-"""Panels: what stands beside the picture, one class each, put together by the board."""
+"""Panels of the page, one module for each tab."""

@@ -1,4 +1,4 @@
-"""Panel of the graph: status of each publisher, and the writers and readers of each stream."""
+"""Tab Graph: the status of each publisher, and the writers and readers of each stream."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import viser
 
 from zstate.errors import format_duration
-from zstate.net.graph import Graph, GraphMonitor, StreamGroup, WriterState
+from zstate.net.graph import Graph, GraphMonitor, WriterState
 from zstate.view.panels import html
-from zstate.view.panels.context import PanelContext
+from zstate.view.panels.panel import PanelContext
 
-_LATE_S = 3.0
+_EXPIRED_S = 3.0
 """Publishers send a status once a second; an older one is not valid any more."""
 
 
@@ -22,34 +22,24 @@ class GraphPanel:
         self._monitor = monitor
         self._text = gui.add_html("")
 
-    def update(self, look: PanelContext) -> None:
+    def update(self, context: PanelContext) -> None:
         self._text.content = graph_html(self._monitor.states(), self._monitor.graph())
 
 
 def graph_html(states: Sequence[WriterState], graph: Graph) -> str:
     """Publishers and streams as HTML."""
-    if not states and not graph.streams:
-        return html.paragraph("Nobody writes or reads anything of a robot.", muted=True)
-    return "".join([*map(_state_html, states), *map(_group_html, graph.groups)])
-
-
-def _state_html(state: WriterState) -> str:
-    status = state.status
-    color = {"ok": "", "warn": html.WARNING}.get(status.level, html.ALARM)
-    text = status.text or status.level
-    if state.age_s >= _LATE_S:
-        color, text = html.ALARM, f"has said nothing for {format_duration(round(state.age_s * 1e9))}"
-    head = f"{state.robot} at {status.rate_hz:.1f} Hz"
-    return html.heading(head, color=color) + html.paragraph(f"{status.program} pid {status.pid}: {text}")
-
-
-def _group_html(group: StreamGroup) -> str:
-    names = ", ".join(stream.name for stream in group.streams)
-    ends = [("written by", _lines(group.writers)), ("read by", _lines(group.readers))]
-    return html.heading(f"{group.robot}: {names}", color="" if group.writers else html.ALARM) + html.pairs(
-        ends
-    )
-
-
-def _lines(programs: Sequence[str]) -> str:
-    return "\n".join(programs) or "nobody"
+    parts: list[str] = []
+    for state in states:
+        status = state.status
+        color = {"ok": "", "warn": html.WARNING}.get(status.level, html.ALARM)
+        text = status.text or status.level
+        if state.age_s >= _EXPIRED_S:
+            color, text = html.ALARM, f"no status for {format_duration(round(state.age_s * 1e9))}"
+        parts.append(html.heading(f"{state.robot} at {status.rate_hz:.1f} Hz", color=color))
+        parts.append(html.paragraph(f"{status.program} pid {status.pid}: {text}"))
+    for group in graph.groups:
+        names = ", ".join(stream.name for stream in group.streams)
+        parts.append(html.heading(f"{group.robot}: {names}", color="" if group.writers else html.ALARM))
+        ends = (("written by", group.writers), ("read by", group.readers))
+        parts.append(html.pairs((label, "\n".join(programs) or "none") for label, programs in ends))
+    return "".join(parts) or html.paragraph("No robot stream has a writer or a reader.", muted=True)

@@ -1,7 +1,4 @@
-"""Text of panels as HTML. What comes out of the network is escaped, for a browser would run it.
-
-Poses in numbers that a person reads.
-"""
+"""Panel text as HTML. Text from the network is escaped, because a browser would run it."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from html import escape
 
 from zstate.se3 import rpy_from_quaternion
 
-_BOX = "padding:0.1em 0.75em 0.4em 0.75em"  # as far from the edge as what the page itself puts there
+_BOX = "padding:0.1em 0.75em 0.4em 0.75em"  # the margin of the page's own widgets
 _TABLE = "width:100%;border-collapse:collapse;font-size:0.8em;line-height:1.45"
 _NUMBERS = "font-family:ui-monospace,Menlo,Consolas,monospace;white-space:pre-wrap;overflow-wrap:anywhere"
 _MUTED = "opacity:0.65"
@@ -19,22 +16,24 @@ _MUTED = "opacity:0.65"
 ALARM = "#c92a2a"
 WARNING = "#b35c00"
 
+Rows = list[tuple[str, str]]
+
 
 def paragraph(text: str, *, color: str = "", muted: bool = False) -> str:
-    """A few lines of plain text."""
+    """Lines of plain text."""
     style = "font-size:0.8em;line-height:1.4;white-space:pre-line;overflow-wrap:anywhere"
     style += f";color:{color}" * bool(color) + f";{_MUTED}" * muted
     return _boxed(f'<div style="{style}">{escape(text)}</div>')
 
 
 def heading(text: str, *, color: str = "") -> str:
-    """What the following is about."""
+    """A section heading."""
     style = "font-size:0.85em;font-weight:600" + f";color:{color}" * bool(color)
     return f'<div style="{_BOX};padding-bottom:0"><span style="{style}">{escape(text)}</span></div>'
 
 
 def pairs(rows: Iterable[tuple[str, str]]) -> str:
-    """Names on the left, values on the right."""
+    """A table of names and values."""
     lines = (
         f'<tr><td style="{_MUTED};white-space:nowrap;padding-right:0.8em;vertical-align:top">{escape(name)}'
         f'</td><td style="{_NUMBERS}">{escape(value)}</td></tr>'
@@ -44,7 +43,7 @@ def pairs(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]], colors: Sequence[str] = ()) -> str:
-    """A table of plain texts; row i is written in ``colors[i]``, unless that is empty or not there."""
+    """A table of plain texts; row i has the colour ``colors[i]``, unless it is empty or missing."""
     cell = "padding:0.1em 0.5em 0.1em 0;vertical-align:top;overflow-wrap:anywhere"
     head = "".join(f'<th style="{cell};{_MUTED};text-align:left">{escape(text)}</th>' for text in headings)
     lines: list[str] = []
@@ -60,27 +59,24 @@ def _boxed(text: str) -> str:
     return f'<div style="{_BOX}">{text}</div>'
 
 
-Rows = list[tuple[str, str]]
-
-
 def pose_rows(pose7: Sequence[float]) -> Rows:
-    """What there is to say of a pose, with the names of the numbers and their units."""
+    """Position, distance and rotation of a pose, with names and units."""
     x, y, z, qx, qy, qz, qw = pose7
     rpy = rpy_from_quaternion((qx, qy, qz, qw))
     return [
-        ("xyz [m]", listed((x, y, z), 4)),
-        ("distance [m]", digits(math.hypot(x, y, z), 4)),
-        ("rpy [deg]", listed([math.degrees(angle) for angle in rpy], 2, width=7)),
-        ("rpy [rad]", listed(rpy, 4)),
-        ("quat xyzw", listed((qx, qy, qz, qw), 3)),
+        ("xyz [m]", format_row((x, y, z), 4)),
+        ("distance [m]", format_number(math.hypot(x, y, z), 4)),
+        ("rpy [deg]", format_row([math.degrees(angle) for angle in rpy], 2, width=7)),
+        ("rpy [rad]", format_row(rpy, 4)),
+        ("quat xyzw", format_row((qx, qy, qz, qw), 3)),
     ]
 
 
-def listed(values: Sequence[float], precision: int, *, width: int = 0) -> str:
-    """Numbers side by side, as wide whether or not they are negative; ``width`` is for larger ones."""
-    return " ".join(f"{digits(value, precision):>{max(width, precision + 3)}}" for value in values)
+def format_row(values: Sequence[float], precision: int, *, width: int = 0) -> str:
+    """Numbers side by side, with room for a sign; ``width`` is the least width of each."""
+    return " ".join(f"{format_number(value, precision):>{max(width, precision + 3)}}" for value in values)
 
 
-def digits(value: float, precision: int) -> str:
-    """A number with so many digits behind the point, and no negative zero."""
+def format_number(value: float, precision: int) -> str:
+    """A number with ``precision`` decimals, and no negative zero."""
     return f"{round(value, precision) + 0.0:.{precision}f}"

@@ -1,4 +1,4 @@
-"""Board: all panels of the page."""
+"""Layout of the page: its tabs, and the panels in them."""
 
 from __future__ import annotations
 
@@ -13,101 +13,94 @@ from zstate.buffer.snapshot import FramePoses
 from zstate.net.graph import GraphMonitor
 from zstate.view.data_source import FixedFrame, ViewSource
 from zstate.view.panels import html
-from zstate.view.panels.context import Panel, PanelContext
-from zstate.view.panels.display_panel import DisplayOptions, DisplayPanel
-from zstate.view.panels.frames_panel import FramesPanel, TrailControls
+from zstate.view.panels.display_panel import DisplayOptions, DisplayPanel, RobotsPanel, RobotStyler
+from zstate.view.panels.frames_panel import FramesPanel, TrailControls, TransformPanel
 from zstate.view.panels.graph_panel import GraphPanel
-from zstate.view.panels.plots_panel import PlotsPanel
-from zstate.view.panels.robots_panel import RobotsPanel, RobotStyler
-from zstate.view.panels.sliders_panel import SlidersPanel
-from zstate.view.panels.time_panel import ReplayPanel
-from zstate.view.panels.transform_panel import TransformPanel
+from zstate.view.panels.joints_panel import PlotsPanel, SlidersPanel
+from zstate.view.panels.panel import Panel, PanelContext
+from zstate.view.panels.time_panel import TimeCursor, TimePanel
 from zstate.view.sliders import SliderPublisher
-from zstate.view.time_cursor import TimeCursor
 
 
 class SceneControls(DisplayOptions, RobotStyler, TrailControls, Protocol):
-    """What the panels want of a scene."""
+    """The settings of a scene that the panels change."""
 
 
 class PanelLayout(Closeable):
-    """Puts the panels on the page of ``server``; ``sliders`` are of the robots that are moved here.
-    ``fixed_frame`` is chosen at first.
+    """Adds the panels to the page of ``server``; ``sliders`` belong to the robots that are moved from it.
 
-    Whoever draws asks for each picture ``stamp``, the instant to show, and ``fixed``, the frame to see it
-    from; and tells it the moment that is shown, with ``update``, a few times a second. One thread does all
-    of this; closing is for the end.
+    ``fixed_frame`` is selected at first. The drawing thread reads ``stamp`` and ``fixed_frame`` for each
+    picture, and calls ``update`` with the snapshot on display a few times a second.
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        world: ViewSource,
+        source: ViewSource,
         scene: SceneControls,
         sliders: Sequence[SliderPublisher] = (),
         fixed_frame: str = "",
     ) -> None:
         gui = server.gui
-        self._world = world
+        self._source = source
         self._fixed = FixedFrame(fixed_frame)
-        self._opened = ExitStack()
-        self.clock = TimeCursor(live=world.session is not None)
+        self._resources = ExitStack()
+        self.cursor = TimeCursor(live=source.session is not None)
         self._fault = gui.add_html("")
         self._fault_text = ""
         tabs = gui.add_tab_group()
-        self._panels: list[Panel] = []
+        # The display panel is first: a fixed frame selected there applies to the other panels.
         with tabs.add_tab("View"):
-            self._panels += [DisplayPanel(gui, scene, self._fixed), RobotsPanel(gui, world, scene)]
+            self._panels: list[Panel] = [
+                DisplayPanel(gui, scene, self._fixed),
+                RobotsPanel(gui, source, scene),
+            ]
         with tabs.add_tab("Frames"):
-            self._panels.append(FramesPanel(gui, world, scene))
+            self._panels.append(FramesPanel(gui, scene))
             with gui.add_folder("Between two frames"):
-                self._panels.append(TransformPanel(gui, world))
+                self._panels.append(TransformPanel(gui))
         with tabs.add_tab("Joints"):
-            self._add_joints(gui, sliders)
+            for publisher in sliders:
+                with gui.add_folder(f"Move {publisher.robot}"):
+                    self._panels.append(SlidersPanel(gui, publisher))
+            with gui.add_folder("Plot"):
+                self._panels.append(PlotsPanel(gui, source))
         with tabs.add_tab("Time"):
-            self._panels.append(ReplayPanel(gui, self.clock))
-        if world.session is not None:
+            self._panels.append(TimePanel(gui, self.cursor))
+        if source.session is not None:
             with tabs.add_tab("Graph"):
-                monitor = self._opened.enter_context(GraphMonitor(world.session))
+                monitor = self._resources.enter_context(GraphMonitor(source.session))
                 self._panels.append(GraphPanel(gui, monitor))
-
-    def _add_joints(self, gui: viser.GuiApi, sliders: Sequence[SliderPublisher]) -> None:
-        for one in sliders:
-            with gui.add_folder(f"Move {one.robot}"):
-                self._panels.append(SlidersPanel(gui, one))
-        with gui.add_folder("Plot"):
-            self._panels.append(PlotsPanel(gui, self._world))
 
     @property
     def fault(self) -> str:
-        """Why the last picture could not be drawn; empty when it could."""
+        """Why the last picture could not be drawn; empty if it was drawn. May be set."""
         return self._fault_text
 
     @fault.setter
-    def fault(self, text: str) -> None:
-        if text != self._fault_text:
-            self._fault_text = text
-            said = f"The last picture could not be drawn, so what is shown is older: {text}"
-            self._fault.content = html.paragraph(said, color=html.ALARM) if text else ""
+    def fault(self, fault: str) -> None:
+        if fault != self._fault_text:
+            self._fault_text = fault
+            text = f"The last picture could not be drawn; an older one is shown: {fault}"
+            self._fault.content = html.paragraph(text, color=html.ALARM) if fault else ""
 
     @property
     def stamp(self) -> int | None:
-        """The instant to show [ns]; None for the newest of everything."""
-        return self.clock.stamp(self._world.buffer.span())
+        """The stamp to show [ns]; None for the newest samples."""
+        return self.cursor.stamp(self._source.buffer.span())
 
-    def fixed(self, moment: FramePoses) -> str:
-        """The frame to see ``moment`` from; empty where there is none."""
-        return self._fixed.choose(moment.tree)
+    def fixed_frame(self, snapshot: FramePoses) -> str:
+        """The fixed frame; empty if there is no frame."""
+        return self._fixed.resolve(snapshot.tree)
 
-    def update(self, moment: FramePoses) -> None:
-        """Do what was chosen on the page since the last time, and tell there what is new."""
-        buffer, is_present = self._world.buffer, self.clock.is_present
+    def update(self, snapshot: FramePoses) -> None:
+        """Apply the user's input, and show what has changed."""
+        buffer, is_live = self._source.buffer, self.cursor.is_live
         domain = buffer.domain.name
-        now = buffer.clock.now() if is_present and domain in (None, buffer.clock.domain) else None
+        now = buffer.clock.now() if is_live and domain in (None, buffer.clock.domain) else None
         for panel in self._panels:
-            # The panel of the fixed frame stands first: what was chosen there holds for the others.
-            panel.update(PanelContext(moment, self.fixed(moment), buffer, is_present, now, domain))
+            panel.update(PanelContext(snapshot, self.fixed_frame(snapshot), buffer, is_live, now, domain))
 
     def close(self) -> None:
-        """Look no more at who writes what. A second call does nothing."""
-        self._opened.close()
+        """Stop monitoring the graph. A second call does nothing."""
+        self._resources.close()

@@ -1,1 +1,1 @@
-"""What is drawn of the robots: their bodies, axes, names, lines and trails."""
+"""The 3D scene: robot meshes, frame axes, names, parent lines and trails."""

@@ -1,4 +1,4 @@
-"""Markers of frames: axes, lines to parents, and labels with names or with the age of stale robots."""
+"""Markers of frames: axes, lines to parents, labels with names or with the age of stale robots, trails."""
 
 from __future__ import annotations
 
@@ -22,6 +22,21 @@ _MAX_SCREEN_LABELS = 40
 _LABEL_HEIGHT_M = 0.028
 _SAME_PLACE_M = 0.004
 
+_TRAIL_SEGMENTS = 400
+_MIN_STEP_M = 0.002
+_TRAIL_PERIOD_NS = 50_000_000
+_MAX_GAP_NS = 1_000_000_000
+_TRAIL_WIDTH_PX = 3.0
+_BACKGROUND = np.array([244.0, 244.0, 246.0])
+_TRAIL_COLORS = (
+    (214, 39, 120),
+    (31, 119, 180),
+    (44, 140, 60),
+    (230, 120, 20),
+    (120, 80, 190),
+    (20, 150, 150),
+)
+
 
 class Axes:
     """Three short lines at each frame, red x, green y, blue z; one node of viser for all."""
@@ -39,22 +54,15 @@ class Axes:
             return
         poses = placed[shown].astype(np.float32)
         if self._handle is None or len(self._drawn) != len(poses):
-            self._draw(poses)
+            self._drawn = poses
+            self._handle = self._scene.add_batched_axes(
+                "/axes", wxyzs(poses), poses[:, :3], axes_length=_AXIS_LENGTH_M, axes_radius=_AXIS_RADIUS_M
+            )
             return
         self._handle.visible = True
         if not np.array_equal(poses, self._drawn):
             self._drawn = poses
             set_instances(self._handle, poses[:, :3], wxyzs(poses))
-
-    def _draw(self, poses: NDArray[np.float32]) -> None:
-        self._drawn = poses
-        self._handle = self._scene.add_batched_axes(
-            "/axes",
-            wxyzs(poses),
-            poses[:, :3],
-            axes_length=_AXIS_LENGTH_M,
-            axes_radius=_AXIS_RADIUS_M,
-        )
 
 
 class ParentLines:
@@ -130,42 +138,39 @@ class FrameLabels:
         )
         self._drawn: tuple[bool, int, bytes] | None = None
 
-    def show(self, on: bool, moment: FramePoses, nodes: FrameNodes) -> None:
+    def show(self, on: bool, snapshot: FramePoses, nodes: FrameNodes) -> None:
         """Label every shown frame, if ``on``."""
-        joined = _at_parents(moment, nodes.shown) if on else np.zeros(0, dtype=np.bool_)
+        joined = np.zeros(0, dtype=np.bool_)
+        if on:
+            parents, shown = snapshot.tree.parents, nodes.shown
+            at_parent = np.linalg.norm(snapshot.poses[:, :3], axis=1) < _SAME_PLACE_M
+            joined = at_parent & snapshot.known & (parents >= 0) & shown & shown[parents]
         drawn = (on, nodes.version, joined.tobytes())
         if drawn != self._drawn:
             self._drawn = drawn
-            texts = _texts(moment, nodes.shown, joined) if on else {}
+            texts = _texts(snapshot, nodes.shown, joined) if on else {}
             self._labels.show(texts, nodes, "scene" if len(texts) > _MAX_SCREEN_LABELS else "screen")
 
 
-def _at_parents(moment: FramePoses, shown: Mask) -> Mask:
-    """Which frames are at the same place as their parents."""
-    parents = moment.tree.parents
-    near: NDArray[np.bool_] = np.linalg.norm(moment.poses[:, :3], axis=1) < _SAME_PLACE_M
-    return near & moment.known & (parents >= 0) & shown & shown[parents]
-
-
-def _texts(moment: FramePoses, shown: Mask, joined: Mask) -> dict[str, str]:
-    """The text of each label, by its frame."""
-    names = moment.tree.names
+def _texts(snapshot: FramePoses, shown: Mask, joined: Mask) -> dict[str, str]:
+    """The text of each label, by its frame; ``joined`` frames share the label of their parent."""
+    names = snapshot.tree.names
     robots = {name.partition("/")[0] for name in names if "/" in name}
     lines: dict[int, list[str]] = {}
     hosts: list[int] = []
     for row, name in enumerate(names):
-        hosts.append(hosts[int(moment.tree.parents[row])] if joined[row] else row)
+        hosts.append(hosts[int(snapshot.tree.parents[row])] if joined[row] else row)
         if shown[row]:
             text = name if len(robots) > 1 else name.partition("/")[2] or name
             lines.setdefault(hosts[row], []).append(text)
-    return {names[row]: "\n".join(names_here) for row, names_here in lines.items()}
+    return {names[row]: "\n".join(texts) for row, texts in lines.items()}
 
 
 class StaleLabels:
     """The text of each stale robot, on a label at its first frame."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._labels = NodeLabels(scene, "silence", anchor="top-center")
+        self._labels = NodeLabels(scene, "stale", anchor="top-center")
         self._texts: dict[str, str] = {}
         self._tree: FrameTable | None = None
         self._first_frames: dict[str, str] = {}
@@ -194,3 +199,81 @@ class StaleLabels:
         first = self._first_frames
         texts = {first[robot]: f"{robot}: {text}" for robot, text in self._texts.items() if robot in first}
         self._labels.show(texts, nodes)
+
+
+class _Trail:
+    """The last positions of one frame, as a fixed number of segments that start at one point."""
+
+    def __init__(self, handle: viser.LineSegmentsHandle, position: NDArray[np.float64], stamp: int) -> None:
+        self.handle = handle
+        self._points = np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32)
+        self._stamp = stamp
+
+    def continues_at(self, stamp: int) -> bool:
+        """Whether a position at that stamp continues the trail: time has not jumped."""
+        return 0 <= stamp - self._stamp < _MAX_GAP_NS
+
+    def add(self, position: NDArray[np.float64], stamp: int) -> None:
+        """Append a position, unless it is too soon or too near."""
+        last = self._points[-1, 1]
+        near = float(np.linalg.norm(position - last)) < _MIN_STEP_M
+        if near or stamp - self._stamp < _TRAIL_PERIOD_NS:
+            self._stamp = stamp if near else self._stamp
+            return
+        self._points = np.roll(self._points, -1, axis=0)
+        self._points[-1] = (last, position)
+        self._stamp = stamp
+        self.handle.points = self._points
+
+
+class Trails:
+    """Draws the enabled trails. A trail restarts when time jumps or the fixed frame changes."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._trails: dict[str, _Trail | None] = {}
+        self._colors: dict[str, int] = {}
+        self._fixed = ""
+
+    def set_trail(self, frame: str, on: bool) -> None:
+        """Start or remove the trail of a frame."""
+        if on:
+            self._trails.setdefault(frame, None)
+        elif frame in self._trails:
+            self._clear(frame)
+            del self._trails[frame]
+
+    def show(self, snapshot: FramePoses, fixed: str, placed: Poses) -> None:
+        """Append the current positions."""
+        if fixed != self._fixed:
+            self._fixed = fixed
+            for frame in self._trails:
+                self._clear(frame)
+        for frame in self._trails:
+            row = snapshot.tree.index.get(frame)
+            if row is None or snapshot.stamp is None or not np.isfinite(placed[row, 0]):
+                continue
+            trail, position = self._trails[frame], placed[row, :3]
+            if trail is not None and trail.continues_at(snapshot.stamp):
+                trail.add(position, snapshot.stamp)
+            else:
+                line = self._add_line(frame, position)
+                self._trails[frame] = _Trail(line, position, snapshot.stamp)
+
+    def _add_line(self, frame: str, position: NDArray[np.float64]) -> viser.LineSegmentsHandle:
+        number = self._colors.setdefault(frame, len(self._colors))
+        fade = np.linspace(0.0, 1.0, 2 * _TRAIL_SEGMENTS)[:, None] ** 0.5
+        colors = (1.0 - fade) * _BACKGROUND + fade * np.array(_TRAIL_COLORS[number % len(_TRAIL_COLORS)])
+        return self._scene.add_line_segments(
+            f"/trails/{number}",
+            np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32),
+            colors.reshape(_TRAIL_SEGMENTS, 2, 3).astype(np.uint8),
+            thickness=_TRAIL_WIDTH_PX,
+            thickness_units="screen",
+        )
+
+    def _clear(self, frame: str) -> None:
+        trail = self._trails[frame]
+        if trail is not None:
+            trail.handle.remove()
+        self._trails[frame] = None

@@ -3,15 +3,15 @@
 A moving joint is one message, whatever its link carries; another fixed frame moves only the root.
 
 The setters here bypass those of viser, which compare each pose with numpy's ``allclose`` and check the types
-of arrays: that costs more than the rest of sending, and our callers have compared already. For talos at 30 Hz
-it is a third of the drawing.
+of arrays: that costs more than the rest of sending, and the callers here have compared already. For talos at
+30 Hz it is a third of the drawing.
 """
 
 # pyright: reportPrivateUsage=false
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -45,22 +45,27 @@ class FrameNodes:
         self._handles: dict[str, viser.FrameHandle] = {}
         self._rows: Rows = np.empty(0, dtype=np.intp)
         self._node_handles: list[viser.FrameHandle] = []
-        self._wanted: frozenset[str] = frozenset()
+        self._carriers: frozenset[str] = frozenset()
         self._poses: Poses = np.empty((0, 7))
         self.tree: FrameTable | None = None
         self.paths: dict[str, str] = {}
         self.shown: Mask = np.empty(0, dtype=np.bool_)
         self.version = 0
 
-    def show(self, moment: FramePoses, placed: Poses, wanted: frozenset[str]) -> None:
-        """Move every frame to its pose in the fixed one (N, 7); frames in ``wanted`` get nodes."""
-        if moment.tree is not self.tree or wanted != self._wanted:
-            self._wanted = wanted
-            self._rebuild(moment.tree)
+    def show(self, snapshot: FramePoses, placed: Poses, carriers: frozenset[str]) -> None:
+        """Move every frame to its pose in the fixed one (N, 7); ``carriers`` get nodes."""
+        if snapshot.tree is not self.tree or carriers != self._carriers:
+            self._carriers = carriers
+            self._rebuild(snapshot.tree)
         shown = np.isfinite(placed[:, 0])
         if not np.array_equal(shown, self.shown):
-            self._set_visible(moment.tree, shown)
-        self._move(_on_parents(moment, placed, shown)[self._rows])
+            self._set_visible(snapshot.tree, shown)
+        # Poses in the node of the parent, which is at the fixed frame if its own pose is unknown.
+        parents = snapshot.tree.parents
+        on_shown = (parents >= 0) & shown[parents]
+        in_fixed = np.where(shown[:, None], placed, IDENTITY)
+        poses = np.where((shown & on_shown)[:, None], snapshot.poses, in_fixed)
+        self._move(poses[self._rows])
 
     def is_shown(self, frame: str) -> bool:
         """Whether the pose of the frame in the fixed one is known."""
@@ -68,10 +73,11 @@ class FrameNodes:
 
     def _rebuild(self, tree: FrameTable) -> None:
         paths = self._paths(tree)
-        for path in self._outermost_without(set(paths.values())):
-            self._handles[path].remove()
-            for below in [one for one in self._handles if one == path or one.startswith(f"{path}/")]:
-                del self._handles[below]
+        removed = self._handles.keys() - set(paths.values())
+        for path in removed:
+            handle = self._handles.pop(path)
+            if path.rpartition("/")[0] not in removed:
+                handle.remove()  # with its descendants
         for path in paths.values():
             if path not in self._handles:
                 self._handles[path] = self._scene.add_frame(path, show_axes=False)
@@ -84,7 +90,7 @@ class FrameNodes:
 
     def _paths(self, tree: FrameTable) -> dict[str, str]:
         """Short names, because every message contains one; the number of a frame never changes."""
-        kept = np.array([name in self._wanted for name in tree.names], dtype=np.bool_)
+        kept = np.array([name in self._carriers for name in tree.names], dtype=np.bool_)
         for row in range(len(kept) - 1, -1, -1):
             kept[tree.parents[row]] |= kept[row] and tree.parents[row] >= 0
         paths: dict[str, str] = {}
@@ -93,11 +99,6 @@ class FrameNodes:
             above = _TOP if parent < 0 else paths[tree.names[parent]]
             paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
         return paths
-
-    def _outermost_without(self, kept: set[str]) -> Iterator[str]:
-        """The topmost nodes to remove; their descendants are removed with them."""
-        gone = self._handles.keys() - kept
-        return (path for path in gone if path.rpartition("/")[0] not in gone)
 
     def _set_visible(self, tree: FrameTable, shown: Mask) -> None:
         """Hide nodes without a pose, unless a descendant has one."""
@@ -134,14 +135,6 @@ def in_frame(pose: Sequence[float], points: NDArray[np.float64]) -> NDArray[np.f
     """Transform ``points`` (N, 3) by a pose."""
     matrix = to_matrix(pose)
     return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _on_parents(moment: FramePoses, placed: Poses, shown: Mask) -> Poses:
-    """The pose of each frame in the node of its parent, which is at the fixed frame if its own is unknown."""
-    parents = moment.tree.parents
-    on_shown = (parents >= 0) & shown[parents]
-    on_top = np.where(shown[:, None], placed, IDENTITY)
-    return np.where((shown & on_shown)[:, None], moment.poses, on_top)
 
 
 def set_position(handle: viser.SceneNodeHandle, position: Vector) -> None:

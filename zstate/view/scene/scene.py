@@ -18,11 +18,9 @@ from zstate.model.robot import RobotModel
 from zstate.view.mesh_loader import MeshLoader
 from zstate.view.mesh_paths import MissingFile
 from zstate.view.meshes import Meshes
-from zstate.view.scene.frame_markers import Axes, FrameLabels, ParentLines, StaleLabels
+from zstate.view.scene.frame_markers import Axes, FrameLabels, ParentLines, StaleLabels, Trails
 from zstate.view.scene.frame_nodes import FrameNodes, in_frame
-from zstate.view.scene.instanced_meshes import InstancedMeshes
-from zstate.view.scene.robot_meshes import RenderStyle, RobotMeshes
-from zstate.view.scene.trails import Trails
+from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotMeshes
 from zstate.view.scene.tree_layout import TreeLayout
 
 # Identical robots have the same shapes, and the same folder of the URDF file if the user named one.
@@ -63,16 +61,12 @@ class Scene:
         return self._loader.busy
 
     @property
-    def arrangement(self) -> int:
-        """A number that changes when trees that are not connected to the fixed frame get other places."""
+    def layout_version(self) -> int:
+        """Grows when trees that are not connected to the fixed frame are moved."""
         return self._layout.version
 
     def set_robot(
-        self,
-        name: str,
-        model: RobotModel,
-        shapes: Sequence[Shape] | None = None,
-        base: Path | None = None,
+        self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None, base: Path | None = None
     ) -> None:
         """Add or replace a robot; its links are the frames ``name/link``.
 
@@ -91,33 +85,34 @@ class Scene:
         self._faults.pop(name, None)
         self._stale_labels.set(name, None)
 
-    def grey(self, robot: str, since: str | None) -> None:
-        """Draw a stale robot in translucent grey, with the text ``since`` at its root; None: as usual."""
-        self._stale_labels.set(robot, since)
+    def set_stale(self, robot: str, text: str | None) -> None:
+        """Draw a stale robot in translucent grey, with ``text`` at its root; with None, as usual."""
+        self._stale_labels.set(robot, text)
 
-    def trail(self, frame: str, on: bool) -> None:
+    def set_trail(self, frame: str, on: bool) -> None:
         """Start or remove the trail of a frame."""
-        self._trails.switch(frame, on)
+        self._trails.set_trail(frame, on)
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
         """Files of a robot that cannot be drawn: the name in the URDF, and the reason."""
         missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
         return self._faults.get(robot, ()) + missing
 
-    def show(self, moment: FramePoses, fixed: str) -> Poses:
+    def show(self, snapshot: FramePoses, fixed: str) -> Poses:
         """Draw everything at one instant, relative to the frame ``fixed``.
 
-        Returns the pose of each frame, as ``moment.poses_in(fixed)``; trees that are not connected to the
+        Returns the pose of each frame, as ``snapshot.poses_in(fixed)``; trees that are not connected to the
         fixed frame have the poses at which they are drawn. Raises UnknownFrame.
         """
-        placed = self._layout.placed(moment, fixed)
-        self._nodes.show(moment, placed, self._wanted(moment.tree))
+        placed = self._layout.placed(snapshot, fixed)
+        frames = self._robots.frames | self._stale_labels.frames(snapshot.tree) | self._layout.frames
+        self._nodes.show(snapshot, placed, frozenset(snapshot.tree.names) if self.names else frames)
         shown = self._nodes.shown
-        self._robots.show(self._nodes, moment.tree, placed, self._styles)
+        self._robots.show(self._nodes, snapshot.tree, placed, self._styles)
         self._axes.show(self.axes, placed, shown)
-        self._lines.show(self.parent_lines, placed, shown, moment.tree.parents)
-        self._names.show(self.names, moment, self._nodes)
-        self._trails.show(moment, fixed, placed)
+        self._lines.show(self.parent_lines, placed, shown, snapshot.tree.parents)
+        self._names.show(self.names, snapshot, self._nodes)
+        self._trails.show(snapshot, fixed, placed)
         self._stale_labels.show(self._nodes)
         self._layout.show(self._nodes)
         return placed
@@ -130,12 +125,6 @@ class Scene:
             if row is not None and np.isfinite(placed[row, 0]):
                 boxes.append(in_frame(placed[row].tolist(), corners))
         return np.concatenate(boxes)
-
-    def _wanted(self, tree: FrameTable) -> frozenset[str]:
-        """The frames that carry something."""
-        if self.names:
-            return frozenset(tree.names)
-        return self._robots.frames | self._stale_labels.frames(tree) | self._layout.frames
 
     def _styles(self, robot: str) -> set[RenderStyle]:
         styles: set[RenderStyle] = {"collision"} if self.collisions else set()
@@ -163,7 +152,11 @@ class _Robots:
         if kind in self._instanced or len(alike) + 1 >= _MIN_INSTANCES:
             for robot in alike:
                 self._single.pop(robot).remove(nodes)
-            self._group(kind).robots |= dict.fromkeys([*alike, name])
+            if kind not in self._instanced:
+                self._instanced_count += 1
+                path = f"/instanced/{self._instanced_count}"
+                self._instanced[kind] = InstancedMeshes(self._scene, self._loader, shapes, path, base)
+            self._instanced[kind].robots |= dict.fromkeys([*alike, name])
         else:
             self._single[name] = RobotMeshes(self._scene, self._loader, name, shapes, base)
         self._find_frames()
@@ -203,17 +196,6 @@ class _Robots:
         return chain.from_iterable(
             one.corners() for one in (*self._single.values(), *self._instanced.values())
         )
-
-    def _group(self, kind: _Kind) -> InstancedMeshes:
-        group = self._instanced.get(kind)
-        if group is None:
-            self._instanced_count += 1
-            shapes, base = kind
-            group = InstancedMeshes(
-                self._scene, self._loader, shapes, f"/instanced/{self._instanced_count}", base
-            )
-            self._instanced[kind] = group
-        return group
 
     def _find_frames(self) -> None:
         self.frames = frozenset(chain.from_iterable(meshes.frames for meshes in self._single.values()))

@@ -1,7 +1,7 @@
 """Layout of frame trees that are not connected to the fixed frame.
 
 Their relative poses are unknown. They are placed in rows next to it, on one floor, as far apart as their
-robots reach, with labels that say so.
+robots reach, with labels that mark them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class TreeLayout:
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._node_labels = NodeLabels(scene, "apart", anchor="bottom-center")
+        self._node_labels = NodeLabels(scene, "tree", anchor="bottom-center")
         self._tree: FrameTable | None = None
         self._laid_out_for: tuple[int, int] | None = None
         self._boxes: dict[str, tuple[tuple[str, ...], int, _Box]] = {}
@@ -58,26 +58,28 @@ class TreeLayout:
         """The frames that carry labels."""
         return frozenset(self._texts)
 
-    def placed(self, moment: FramePoses, fixed: str) -> Poses:
-        """As ``moment.poses_in(fixed)``, with poses for every tree. Raises UnknownFrame."""
-        tree = moment.tree
+    def placed(self, snapshot: FramePoses, fixed: str) -> Poses:
+        """As ``snapshot.poses_in(fixed)``, with poses for every tree. Raises UnknownFrame."""
+        tree = snapshot.tree
         root = int(tree.roots[tree.row(fixed)])
-        laid_out_for = root, int(np.count_nonzero(moment.known))
+        laid_out_for = root, int(np.count_nonzero(snapshot.known))
         if tree is not self._tree or laid_out_for != self._laid_out_for:
             self._tree, self._laid_out_for = tree, laid_out_for
-            self._lay_out(moment, root)
-        return moment.poses_side_by_side(fixed, self._offsets) if self._offsets else moment.poses_in(fixed)
+            self._lay_out(snapshot, root)
+        if not self._offsets:
+            return snapshot.poses_in(fixed)
+        return snapshot.poses_side_by_side(fixed, self._offsets)
 
     def show(self, nodes: FrameNodes) -> None:
         """Draw the labels."""
         self._node_labels.show(self._texts, nodes)
 
-    def _lay_out(self, moment: FramePoses, first: int) -> None:
-        names = moment.tree.names
-        members = _members(moment.tree)
+    def _lay_out(self, snapshot: FramePoses, first: int) -> None:
+        names = snapshot.tree.names
+        members = _members(snapshot.tree)
         others = sorted((row for row in members if row != first), key=lambda row: _natural(names[row]))
         ordered = [first, *others]
-        boxes = [self._box(moment, row, members[row]) for row in ordered]
+        boxes = [self._box(snapshot, row, members[row]) for row in ordered]
         self._boxes = {name: self._boxes[name] for name in (names[row] for row in ordered)}
         offsets = _in_rows(boxes)
         self._offsets = {row: offset for row, offset in zip(ordered, offsets, strict=True) if row != first}
@@ -86,19 +88,20 @@ class TreeLayout:
         self._named_offsets = named
         self._texts = {}
         for row in ordered if others else ():
-            title = _title([names[member] for member in map(int, members[row])])
-            self._texts[names[row]] = title if row == first else f"{title} (place unknown)"
+            robots = {names[k].partition("/")[0] for k in map(int, members[row]) if "/" in names[k]}
+            title = robots.pop() if len(robots) == 1 else names[row]
+            self._texts[names[row]] = title if row == first else f"{title} (position unknown)"
 
-    def _box(self, moment: FramePoses, root: int, rows: Rows) -> _Box:
+    def _box(self, snapshot: FramePoses, root: int, rows: Rows) -> _Box:
         """The largest box of the tree so far: it does not shrink while samples are missing."""
-        tree = moment.tree
+        tree = snapshot.tree
         names = tuple(tree.names[row] for row in map(int, rows))
-        tops, poses = moment.tops
+        tops, poses = snapshot.tops
         known = rows[tops[rows] == root]
         before = self._boxes.get(names[0])
         if before is not None and before[0] == names and before[1] >= len(known):
             return before[2]
-        box = _box_of([tree.names[row] for row in map(int, known)], poses[known, :3])
+        box = _bounding_box([tree.names[row] for row in map(int, known)], poses[known, :3])
         self._boxes[names[0]] = names, len(known), box
         return box
 
@@ -112,7 +115,7 @@ def _members(tree: FrameTable) -> dict[int, Rows]:
     return {int(tree.roots[group[0]]): group for group in groups}
 
 
-def _box_of(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
+def _bounding_box(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
     """The box that the robots can reach in all directions; other frames count only without a robot."""
     robots: dict[str, list[int]] = {}
     for row, name in enumerate(names):
@@ -149,12 +152,6 @@ def _middles(halves: Sequence[float]) -> list[float]:
     for before, half in pairwise(halves):
         middles.append(middles[-1] + before + _GAP_M + half)
     return middles
-
-
-def _title(names: Sequence[str]) -> str:
-    """The robot of the tree; its root if it has several robots or none."""
-    robots = {name.partition("/")[0] for name in names if "/" in name}
-    return robots.pop() if len(robots) == 1 else names[0]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

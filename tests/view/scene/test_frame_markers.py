@@ -1,4 +1,4 @@
-"""Trails: lines through the places where frames have been."""
+"""Trails: lines through the recent positions of frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
-from helpers.scene_drawing import at, handles, moment, tree  # noqa: E402
+from helpers.scene_drawing import at, handles, snapshot, tree  # noqa: E402
 
 from zstate.view.scene.scene import Scene  # noqa: E402
 
@@ -20,7 +20,7 @@ def scene(server) -> Scene:
 
 
 def the_trail(server) -> list[list[float]]:
-    """The places that the trail goes through."""
+    """The positions along the trail."""
     (line,) = handles(server, viser.LineSegmentsHandle).values()
     begins, ends = line.points[:, 0], line.points[:, 1]
     long = np.linalg.norm(ends - begins, axis=1) > 0.0
@@ -29,28 +29,28 @@ def the_trail(server) -> list[list[float]]:
 
 
 def moved(x: float, seconds: float):
-    return moment(TREE, {"cart/base": at(x, 0, 0)}, stamp=round(seconds * 1e9))
+    return snapshot(TREE, {"cart/base": at(x, 0, 0)}, stamp=round(seconds * 1e9))
 
 
-def test_a_trail_goes_through_the_places_of_its_frame(scene, server):
-    scene.trail("cart/base", True)
+def test_trail_passes_through_the_positions_of_its_frame(scene, server):
+    scene.set_trail("cart/base", True)
     for k in range(4):
         scene.show(moved(k, 0.1 * k), "map")
     assert the_trail(server) == [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]
-    scene.trail("cart/base", False)
+    scene.set_trail("cart/base", False)
     assert handles(server, viser.LineSegmentsHandle) == {}
 
 
-def test_a_trail_does_not_grow_while_its_frame_rests(scene, server):
-    scene.trail("cart/base", True)
+def test_trail_does_not_grow_while_its_frame_rests(scene, server):
+    scene.set_trail("cart/base", True)
     for k in range(20):
         scene.show(moved(0.0, 0.1 * k), "map")
     assert the_trail(server) == []
 
 
 @pytest.mark.parametrize("jump_s", [-5.0, 60.0])
-def test_a_trail_begins_anew_when_time_jumps(scene, server, jump_s):
-    scene.trail("cart/base", True)
+def test_trail_restarts_when_time_jumps(scene, server, jump_s):
+    scene.set_trail("cart/base", True)
     for k in range(4):
         scene.show(moved(k, 100.0 + 0.1 * k), "map")
     scene.show(moved(7.0, 100.0 + jump_s), "map")
@@ -58,15 +58,15 @@ def test_a_trail_begins_anew_when_time_jumps(scene, server, jump_s):
     assert the_trail(server) == [[7, 0, 0], [8, 0, 0]]
 
 
-def test_a_trail_begins_anew_in_another_fixed_frame(scene, server):
-    scene.trail("cart/base", True)
+def test_trail_restarts_with_another_fixed_frame(scene, server):
+    scene.set_trail("cart/base", True)
     scene.show(moved(0.0, 0.0), "map")
     scene.show(moved(1.0, 0.1), "map")
     scene.show(moved(2.0, 0.2), "cart/wheel")
     assert the_trail(server) == []
 
 
-def test_a_trail_of_a_frame_that_nobody_knows_is_no_error(scene):
-    scene.trail("ghost", True)
+def test_trail_of_an_unknown_frame_is_not_an_error(scene):
+    scene.set_trail("ghost", True)
     scene.show(moved(0.0, 0.0), "map")
-    scene.trail("ghost", False)
+    scene.set_trail("ghost", False)
