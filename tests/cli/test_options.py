@@ -8,7 +8,7 @@ import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, started, zstate
 
 from zstate import TransformListener, connect
-from zstate.cli.options import load_robot, named_models
+from zstate.cli.options import load_robot, parse_models
 
 ARM = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
   <xacro:arg name="prefix" default=""/>
@@ -37,7 +37,7 @@ def test_a_robot_of_the_catalog_is_called_as_it_was_asked_for():
 
 def test_xacro_arguments_follow_the_model_they_are_for():
     words = ("left.xacro", "prefix:=l_", "z:=a:=b", "panda", "right.xacro", "prefix:=")
-    assert named_models(words) == {
+    assert parse_models(words) == {
         "left.xacro": {"prefix": "l_", "z": "a:=b"},
         "panda": {},
         "right.xacro": {"prefix": ""},

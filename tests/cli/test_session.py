@@ -15,8 +15,8 @@ def test_whoever_only_connects_is_a_client():
 
 
 def test_a_configuration_of_zenoh_is_a_word_about_the_network(monkeypatch: pytest.MonkeyPatch):
-    assert not SessionOptions().is_given
-    assert SessionOptions("peer").is_given
-    assert SessionOptions(listen=("tcp/127.0.0.1:0",)).is_given
+    assert not SessionOptions().is_explicit
+    assert SessionOptions("peer").is_explicit
+    assert SessionOptions(listen=("tcp/127.0.0.1:0",)).is_explicit
     monkeypatch.setenv("ZENOH_CONFIG", "file.json5")
-    assert SessionOptions().is_given
+    assert SessionOptions().is_explicit

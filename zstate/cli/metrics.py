@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def served(address: BindAddress | None, *collectors: Callable[[], MetricsCollector]) -> Generator[None]:
+def serve_metrics(
+    address: BindAddress | None, *collectors: Callable[[], MetricsCollector]
+) -> Generator[None]:
     """What ``collectors`` make is served at ``address`` meanwhile, and where is said; None serves nothing."""
     if address is None:
         yield
@@ -34,7 +36,7 @@ def served(address: BindAddress | None, *collectors: Callable[[], MetricsCollect
 # Each loads its library when something is served.
 
 
-def of_publishers(*publishers: StatePublisher) -> Callable[[], MetricsCollector]:
+def publisher_collector(*publishers: StatePublisher) -> Callable[[], MetricsCollector]:
     """What publishers say."""
 
     def make() -> MetricsCollector:
@@ -45,7 +47,7 @@ def of_publishers(*publishers: StatePublisher) -> Callable[[], MetricsCollector]
     return make
 
 
-def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], MetricsCollector]:
+def listener_collector(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], MetricsCollector]:
     """What the listeners that there are by then hear."""
 
     def make() -> MetricsCollector:
@@ -56,7 +58,7 @@ def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], Me
     return make
 
 
-def of_writers(roster: RobotDirectory) -> Callable[[], MetricsCollector]:
+def writer_collector(roster: RobotDirectory) -> Callable[[], MetricsCollector]:
     """Who writes."""
 
     def make() -> MetricsCollector:
@@ -67,7 +69,7 @@ def of_writers(roster: RobotDirectory) -> Callable[[], MetricsCollector]:
     return make
 
 
-def of_connections(session: Session) -> Callable[[], MetricsCollector]:
+def connection_collector(session: Session) -> Callable[[], MetricsCollector]:
     """Who is connected to a router."""
 
     def make() -> MetricsCollector:
@@ -78,7 +80,7 @@ def of_connections(session: Session) -> Callable[[], MetricsCollector]:
     return make
 
 
-def of_recorder(recorder: Recorder) -> Callable[[], MetricsCollector]:
+def recorder_collector(recorder: Recorder) -> Callable[[], MetricsCollector]:
     """What is recorded."""
 
     def make() -> MetricsCollector:
@@ -89,7 +91,7 @@ def of_recorder(recorder: Recorder) -> Callable[[], MetricsCollector]:
     return make
 
 
-def of_bridge(bridge: Bridge) -> Callable[[], MetricsCollector]:
+def bridge_collector(bridge: Bridge) -> Callable[[], MetricsCollector]:
     """What is carried."""
 
     def make() -> MetricsCollector:

@@ -135,7 +135,7 @@ _OFFSET_NS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class EdgeRow:
     """A frame on the path and the edge that leads to it, with what was measured; None for the first frame."""
 
     frame: str
@@ -162,20 +162,20 @@ class Row:
 Cells = list[tuple[str, ...]]
 
 
-def report_text(rows: Sequence[Row], *, width: int | None = None) -> str:
+def report_text(rows: Sequence[EdgeRow], *, width: int | None = None) -> str:
     """The table of a path, from its first frame to its last."""
     return table_text(rows, _cells(rows), _DISPENSABLE, width=width)
 
 
 def table_text(
-    rows: Sequence[Row], cells: Cells, optional: Sequence[str], *, width: int | None = None
+    rows: Sequence[EdgeRow], cells: Cells, optional: Sequence[str], *, width: int | None = None
 ) -> str:
     """The table of ``cells`` and notes on clocks; ``optional`` columns may be left out to fit ``width``."""
     lines = Table(_HEADINGS, cells, optional, abbreviate="writer").lines(width)
     return "\n".join([*lines, *_clock_notes(rows)])
 
 
-def _cells(rows: Sequence[Row]) -> Cells:
+def _cells(rows: Sequence[EdgeRow]) -> Cells:
     """Edges whose samples are those of the edge above have only their kind: one robot's joints, mostly."""
     cells: Cells = []
     said: set[str] = set()
@@ -195,7 +195,7 @@ def _cells(rows: Sequence[Row]) -> Cells:
     return cells
 
 
-def _names(rows: Sequence[Row]) -> list[str]:
+def _names(rows: Sequence[EdgeRow]) -> list[str]:
     """The frames, without their robot where there is one only."""
     robots = {row.frame.partition("/")[0] for row in rows if "/" in row.frame}
     full = [row.frame for row in rows]
@@ -229,7 +229,7 @@ def _ahead_text(offset: ClockOffset) -> str:
     return f"{'+' if offset.offset_ns > 0 else ''}{format_duration(offset.offset_ns)}"
 
 
-def _clock_notes(rows: Sequence[Row]) -> list[str]:
+def _clock_notes(rows: Sequence[EdgeRow]) -> list[str]:
     """Clocks that are off by more than the network alone explains."""
     notes: dict[str, str] = {}
     for row in rows:
@@ -246,12 +246,12 @@ def _clock_notes(rows: Sequence[Row]) -> list[str]:
     return list(notes.values())
 
 
-def overview_text(rows: Sequence[Row], *, width: int | None = None) -> str:
+def overview_text(rows: Sequence[EdgeRow], *, width: int | None = None) -> str:
     """The table of ``rows``, of which each has an edge: a robot's joints first, its fixed edges last."""
     return table_text(rows, _group_cells(rows), ("max", "clock", "jitter", "missed"), width=width)
 
 
-def _group_cells(rows: Sequence[Row]) -> Cells:
+def _group_cells(rows: Sequence[EdgeRow]) -> Cells:
     cells: Cells = []
     for (robot, kind, writer, _), group in groupby(sorted(rows, key=_place), key=_place):
         alike = list(group)
@@ -266,7 +266,7 @@ def _group_cells(rows: Sequence[Row]) -> Cells:
     return cells
 
 
-def _place(row: Row) -> tuple[str, str, str, str]:
+def _place(row: EdgeRow) -> tuple[str, str, str, str]:
     """Where a row stands; rows of one place are one line."""
     edge = row.edge
     assert edge is not None
@@ -306,7 +306,7 @@ def _upwards(frame: str, by_name: Mapping[str, FrameInfo]) -> list[FrameInfo]:
     return edges
 
 
-class Monitored(ABC):
+class MonitorView(ABC):
     """Edges that are heard, and what is measured of them."""
 
     def __init__(self, listener: TransformListener, meter: EdgeStatistics) -> None:
@@ -323,7 +323,7 @@ class Monitored(ABC):
     @abstractmethod
     def _text(self, width: int | None) -> str: ...
 
-    def say(self, *, as_json: bool) -> None:
+    def print_report(self, *, as_json: bool) -> None:
         """One report."""
         if as_json:
             print_json(self._facts())
@@ -334,12 +334,12 @@ class Monitored(ABC):
         """A report that keeps up to date."""
         keep_showing(lambda: self._text(terminal_width()))
 
-    def _row(self, frame: str, edge: FrameInfo) -> Row:
+    def _row(self, frame: str, edge: FrameInfo) -> EdgeRow:
         ask = self._listener.buffer.clock_offsets.get(edge.writer or "")
-        return Row(frame, edge, self._meter.measure(edge), None if ask is None else ask())
+        return EdgeRow(frame, edge, self._meter.measure(edge), None if ask is None else ask())
 
 
-class MonitoredEdges(Monitored):
+class AllEdgesView(MonitorView):
     """All edges."""
 
     def __init__(self, listener: TransformListener, meter: EdgeStatistics, roster: RobotDirectory) -> None:
@@ -354,22 +354,22 @@ class MonitoredEdges(Monitored):
 
     def _reason(self) -> str:
         roster = self._roster
-        return roster.words.missing_text(
+        return roster.messages.missing_text(
             self._listener.robot, "robot_description", roster.robots(), heard=False
         )
 
-    def _rows(self) -> list[Row]:
+    def _rows(self) -> list[EdgeRow]:
         frames = self._listener.buffer.frames()
         return [self._row(frame.name, frame) for frame in frames if frame.parent is not None]
 
     def _text(self, width: int | None) -> str:
-        return self._roster.words.translate(overview_text(self._rows(), width=width))
+        return self._roster.messages.translate(overview_text(self._rows(), width=width))
 
     def _facts(self) -> dict[str, Any]:
         return {"edges": [row.facts() for row in self._rows()]}
 
 
-class MonitoredPose(Monitored):
+class PoseView(MonitorView):
     """One pose, and the edges on its path."""
 
     def __init__(
@@ -384,15 +384,15 @@ class MonitoredPose(Monitored):
         self._awaited = PoseWaiter(listener, roster, *frames)
 
     def wait(self, timeout_s: float | None) -> None:
-        self._awaited.answer(timeout_s=timeout_s)
+        self._awaited.wait(timeout_s=timeout_s)
 
-    def _rows(self) -> list[Row]:
+    def _rows(self) -> list[EdgeRow]:
         begin, legs = path_between(self._listener.buffer.frames(), self._target, self._source)
-        return [Row(begin, None, None, None), *(self._row(leg.frame, leg.edge) for leg in legs)]
+        return [EdgeRow(begin, None, None, None), *(self._row(leg.frame, leg.edge) for leg in legs)]
 
     def _text(self, width: int | None) -> str:
-        head = f"pose of {self._source} in {self._target}: {self._newest(self._awaited.answer())}"
-        return self._awaited.explained(f"{head}\n{report_text(self._rows(), width=width)}")
+        head = f"pose of {self._source} in {self._target}: {self._newest(self._awaited.wait())}"
+        return self._awaited.translate(f"{head}\n{report_text(self._rows(), width=width)}")
 
     def _newest(self, transform: Transform) -> str:
         if transform.stamp is None:
@@ -401,7 +401,7 @@ class MonitoredPose(Monitored):
         return "there" if age_s is None else f"the newest is {format_duration(round(age_s * 1e9))} old"
 
     def _facts(self) -> dict[str, Any]:
-        transform = self._awaited.answer()
+        transform = self._awaited.wait()
         return {
             "target": self._target,
             "source": self._source,
@@ -466,7 +466,7 @@ class RobotMonitor(Closeable):
             listener, buffer = self._listeners.get(follow) or self._listen(follow)
             self._robots[robot] = MonitoredRobot(robot, listener, buffer)
             print_status(
-                f"following {self._roster.words.place(robot, (follow,))}", event="following", robot=robot
+                f"following {self._roster.messages.place(robot, (follow,))}", event="following", robot=robot
             )
 
     def _listen(self, follow: Follow) -> tuple[TransformListener, MeteredBuffer]:
@@ -491,9 +491,9 @@ class RobotMonitor(Closeable):
 
     def _reason(self) -> str:
         if self._robot is not None:
-            return self._roster.silence(self._robot, default_stream(self._wire))
+            return self._roster.no_sample_text(self._robot, default_stream(self._wire))
         robots = self._roster.robots()
-        return self._roster.words.announced(robots) + ", but nothing that moves" * bool(robots)
+        return self._roster.messages.announced(robots) + ", but nothing that moves" * bool(robots)
 
     def report(self, *, as_json: bool) -> None:
         """One line for each robot."""

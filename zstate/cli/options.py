@@ -90,7 +90,7 @@ def _with_credentials(command: Command, options: Sequence[Callable[[Any], Any]])
         users: str | None = None,
         **others: Any,
     ) -> Any:
-        credentials = credentials_of(certs, identity, user, password_file, users)
+        credentials = build_credentials(certs, identity, user, password_file, users)
         return command(credentials=credentials, **others)
 
     return _with_options(with_credentials, options)
@@ -102,7 +102,7 @@ def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
     return command
 
 
-def credentials_of(
+def build_credentials(
     certs: str | None,
     identity: str | None,
     user: str | None,
@@ -316,7 +316,7 @@ def refuse_topic(robot: str | None, wire: str) -> None:
         )
 
 
-def parsed_xacro_args(words: Iterable[str]) -> dict[str, str]:
+def parse_xacro_args(words: Iterable[str]) -> dict[str, str]:
     """``NAME:=VALUE`` arguments by name. Raises UsageError for any other."""
     arguments: dict[str, str] = {}
     for word in words:
@@ -328,7 +328,7 @@ def parsed_xacro_args(words: Iterable[str]) -> dict[str, str]:
 
 
 def _parsed_xacro_args(_: click.Context, __: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:
-    return parsed_xacro_args(words)
+    return parse_xacro_args(words)
 
 
 xacro_arguments = click.argument(
@@ -336,12 +336,12 @@ xacro_arguments = click.argument(
 )
 
 
-def named_models(words: Iterable[str]) -> dict[str, dict[str, str]]:
+def parse_models(words: Iterable[str]) -> dict[str, dict[str, str]]:
     """Models in their order, each with the xacro arguments that follow it."""
     models: dict[str, dict[str, str]] = {}
     for word in words:
         if ":=" in word and models:
-            models[next(reversed(models))].update(parsed_xacro_args([word]))
+            models[next(reversed(models))].update(parse_xacro_args([word]))
         else:
             models.setdefault(word, {})
     return models
@@ -413,7 +413,7 @@ rate_option = click.option(
 seconds_option = click.option(
     "--seconds", type=float, callback=checked_seconds, metavar="N", help="End after so long [s]."
 )
-heard_robot_option = click.option(
+robot_filter_option = click.option(
     "--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them."
 )
 name_option = click.option(

@@ -161,7 +161,7 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
             history_on_join=False,
         ) as listener,
     ):
-        PoseWaiter(listener, roster, *frames).answer(timeout_s=_WAIT_S)
+        PoseWaiter(listener, roster, *frames).wait(timeout_s=_WAIT_S)
         print_status(f"listening for {seconds:g} s ...")
         time.sleep(seconds)
         return path_series(listener.buffer, *frames)

@@ -55,7 +55,7 @@ class RobotDirectory(Closeable):
     ) -> None:
         from zstate.net.presence import watch
 
-        self.words = messages_for(wire)
+        self.messages = messages_for(wire)
         self._announced: set[Announcement] = set()
         self._on_change = on_change
         self._watch = watch(session, robot if is_ros(wire) else "*", self._update, wire)
@@ -78,6 +78,6 @@ class RobotDirectory(Closeable):
         """The streams of ``robot`` that have a writer."""
         return frozenset(one.stream for one in self._announced.copy() if one.robot == robot)
 
-    def silence(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
+    def no_sample_text(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
-        return self.words.no_sample_text(robot, stream, self.robots(), ended=ended)
+        return self.messages.no_sample_text(robot, stream, self.robots(), ended=ended)

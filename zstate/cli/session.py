@@ -37,7 +37,7 @@ class SessionOptions:
     credentials: Credentials | None = None
 
     @property
-    def is_given(self) -> bool:
+    def is_explicit(self) -> bool:
         """Whether the user has said anything about it."""
         said = (self.mode, self.connect, self.listen, self.config, self.credentials)
         return any(said) or bool(os.environ.get("ZENOH_CONFIG"))
@@ -73,7 +73,7 @@ def _connect_to_ros(network: SessionOptions, timeout_s: float | None) -> Session
     from zstate.net.config import ROUTER_ENDPOINT
 
     try:
-        if network.is_given:
+        if network.is_explicit:
             return _connect(network, timeout_s)
         return _connect(SessionOptions("client", (ROUTER_ENDPOINT,)), timeout_s or _ROS_ROUTER_WITHIN_S)
     except Unreachable as error:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class TimedSample(NamedTuple):
     """A sample, and its arrival ``came`` [ns] by the monotonic clock."""
 
-    came: int
+    arrival: int
     sample: Sample
 
 
@@ -86,13 +86,13 @@ class StreamReader(Closeable):
         waiter = self._waiter
         if not waiter.wait_for(self._samples.qsize, timeout_s, self._reason):
             fail(f"gave up after {timeout_s:g} s: {self._reason()}")
-        if waiter.noted:
-            print_status(f"heard {self._directory.words.place(self.robot, (self._stream,))}")
+        if waiter.last_reason:
+            print_status(f"heard {self._directory.messages.place(self.robot, (self._stream,))}")
         return self._samples.get_nowait()
 
-    def silence(self) -> str:
+    def no_sample_text(self) -> str:
         """Why no more samples arrive."""
-        return self._directory.silence(self.robot, self._stream, ended=True)
+        return self._directory.no_sample_text(self.robot, self._stream, ended=True)
 
     def _reason(self) -> str:
-        return self._directory.silence(self.robot, self._stream)
+        return self._directory.no_sample_text(self.robot, self._stream)

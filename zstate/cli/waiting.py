@@ -54,7 +54,7 @@ class ConditionWaiter:
     """
 
     def __init__(self) -> None:
-        self.noted = ""
+        self.last_reason = ""
         self._changed = threading.Event()
 
     def notify(self, *_: object) -> None:
@@ -82,7 +82,7 @@ class ConditionWaiter:
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         note_at: float | None = None
-        self.noted = ""
+        self.last_reason = ""
         while not condition():
             now = time.monotonic()
             if deadline is not None and now >= deadline:
@@ -92,8 +92,8 @@ class ConditionWaiter:
             elif reason is not None and note_at is not None and now >= note_at:
                 # Not every cause of a reason notifies, so it is evaluated twice a second as well.
                 note_at = now + GRACE_S
-                if (text := reason()) != self.noted:
-                    self.noted = text
+                if (text := reason()) != self.last_reason:
+                    self.last_reason = text
                     print_status(f"waiting: {text}", event="waiting")
             wake_at = min((one for one in (deadline, note_at) if one is not None), default=None)
             self.wait(None if wake_at is None else wake_at - now)
@@ -162,7 +162,7 @@ class RobotReadiness(Closeable):
         return not self._missing
 
     def _missing_of(self, robot: str) -> str:
-        streams, words = self._directory.streams(robot), self._directory.words
+        streams, words = self._directory.streams(robot), self._directory.messages
         if not streams:
             return words.unknown(robot, self._directory.robots())
         if robot not in self._listeners:
@@ -221,11 +221,11 @@ class PoseWaiter:
     ) -> None:
         self._listener = listener
         self._directory = directory
-        self._words = directory.words
+        self._words = directory.messages
         self._frames = (target, source)
         self._noted: tuple[object, ...] | None = None
 
-    def answer(self, at: int | None = None, *, timeout_s: float | None = None) -> Transform:
+    def wait(self, at: int | None = None, *, timeout_s: float | None = None) -> Transform:
         """The pose at ``at``, or the newest, as soon as it is known.
 
         Raises LookupFailed for what waiting cannot mend. Fails after ``timeout_s``.
@@ -245,7 +245,7 @@ class PoseWaiter:
                 self._note_end()
                 return transform
 
-    def silence(self) -> str:
+    def no_sample_text(self) -> str:
         """Why no newer pose arrives: the edge with the oldest samples."""
         transform = self._listener.buffer.lookup(*self._frames)
         assert transform.stamp is not None
@@ -256,7 +256,7 @@ class PoseWaiter:
             writer = "" if reason.writer is None else f", which {reason.writer} wrote"
         age_s = self.age_s(transform)
         old = "" if age_s is None else f": the newest is {format_duration(round(age_s * 1e9))} old"
-        return self.explained(f"no new sample{edge}{writer}{old}")
+        return self.translate(f"no new sample{edge}{writer}{old}")
 
     def age_s(self, transform: Transform) -> float | None:
         """Age of a pose [s]; None if it is static, or stamped by another clock than the buffer's."""
@@ -267,7 +267,7 @@ class PoseWaiter:
             return None
         return transform.age(buffer.clock)
 
-    def explained(self, text: str) -> str:
+    def translate(self, text: str) -> str:
         """A text of the library about these frames, with the names and commands of the wire."""
         return self._words.translate(text)
 
@@ -289,7 +289,7 @@ class PoseWaiter:
 
     def _fail_in_past(self, reason: InPast) -> NoReturn:
         advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED
-        fail(f"{self.explained(reason.what_happened)}; {advice}")
+        fail(f"{self.translate(reason.what_happened)}; {advice}")
 
     def _fail_after(self, timeout_s: float, reason: WaitTimeout) -> NoReturn:
         advice = ""
@@ -305,8 +305,8 @@ class PoseWaiter:
         if isinstance(reason, UnknownFrame) and not reason.frame_count:
             return hint  # no frame at all is known: that is not about this one
         if isinstance(reason, InFuture | InPast):
-            return self.explained(reason.what_happened)  # without the advice for programs
-        return f"{self.explained(reason.message())}{f' ({hint})' if hint else ''}"
+            return self.translate(reason.what_happened)  # without the advice for programs
+        return f"{self.translate(reason.message())}{f' ({hint})' if hint else ''}"
 
     def _hint(self, reason: LookupFailed) -> str:
         """What the directory of robots adds to the buffer's reason."""

@@ -9,7 +9,7 @@ from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, connect, load_model
 from zstate.buffer.frame_tree import FrameInfo
-from zstate.cli.monitor import EdgeMeasure, EdgeStatistics, Row, overview_text, path_between, report_text
+from zstate.cli.monitor import EdgeMeasure, EdgeRow, EdgeStatistics, overview_text, path_between, report_text
 from zstate.clock import ClockOffset, ManualClock
 from zstate.net.streams import StreamPublisher
 from zstate.wire.messages import JointState, order_digest, to_block
@@ -38,12 +38,12 @@ TREE = (
 MEASURE = EdgeMeasure(99.96, 0.0004, 0.0021, 0.00011, 3, 0.004)
 
 
-def rows(offset: ClockOffset | None = None) -> list[Row]:
+def rows(offset: ClockOffset | None = None) -> list[EdgeRow]:
     begin, legs = path_between(TREE, "base", "hand")
     measured = [
-        Row(leg.frame, leg.edge, MEASURE if leg.edge.kind == "joint" else None, offset) for leg in legs
+        EdgeRow(leg.frame, leg.edge, MEASURE if leg.edge.kind == "joint" else None, offset) for leg in legs
     ]
-    return [Row(begin, None, None, None), *measured]
+    return [EdgeRow(begin, None, None, None), *measured]
 
 
 def test_the_path_goes_up_and_down_over_the_frame_that_both_hang_on():
@@ -88,7 +88,7 @@ def test_a_narrow_terminal_has_fewer_columns_and_letters_for_the_writers():
 
 def test_silence_is_told_instead_of_a_rate():
     silent = EdgeMeasure(100.0, 0.0004, 0.0021, 0.00011, 0, 12.0, is_stale=True)
-    text = report_text([Row("r1/left", frame("r1/left", "r1/base"), silent, None)])
+    text = report_text([EdgeRow("r1/left", frame("r1/left", "r1/base"), silent, None)])
     assert "silent 12.0 s" in text
 
 
@@ -165,7 +165,7 @@ def test_on_ros_side_each_edge_is_measured(ros_router: str):
 
 def test_of_all_edges_the_joints_of_a_robot_are_one_line_and_its_fixed_edges_another():
     frames = (*TREE[1:], frame("r2/odom", "map", "pose", "odometry"), frame("r2/laser", "r2/odom", "static"))
-    heard = [Row(one.name, one, MEASURE if one.kind != "static" else None, None) for one in frames]
+    heard = [EdgeRow(one.name, one, MEASURE if one.kind != "static" else None, None) for one in frames]
     assert overview_text(heard).splitlines() == [
         "frame    edge      rate      latency   max     jitter    missed  clock  writer",
         f"r1/*     3 joints  100.0 Hz  400.0 us  2.1 ms  110.0 us  3              {DRIVER}",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_bridge, served
+from zstate.cli.metrics import bridge_collector, serve_metrics
 from zstate.cli.options import metrics_option, session_options
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
@@ -62,7 +62,7 @@ def bridge_command(
         robots = [robot] if robot else None if has_room else _announced(native)
         with (
             Bridge(native, session, wire, robots, on_change=_tell) as bridge,
-            served(metrics, of_bridge(bridge)),
+            serve_metrics(metrics, bridge_collector(bridge)),
         ):
             named = " and ".join(map(repr, robots)) if robots else "every robot"
             print_wrapped(f"bridging {named} between native and {wire} at {ros}")

@@ -99,7 +99,7 @@ class MessageStatistics:
         if self._gaps.add(sample.session, sample.seq):
             if sample.session != statistics.session and not self._of_all:
                 statistics.clear()
-            statistics.add(Received(tapped.came, sample.stamp, sample.seq, 0), sample.session)
+            statistics.add(Received(tapped.arrival, sample.stamp, sample.seq, 0), sample.session)
 
     def facts(self) -> dict[str, Any] | None:
         """What is printed; None before two messages. ``missed`` counts since the start."""
@@ -134,7 +134,7 @@ def _follow(tap: StreamReader, statistics: MessageStatistics, *, as_json: bool) 
         if count and facts is not None:
             _show(facts, as_json=as_json)
         elif not count and not silent:
-            print_status(tap.silence())
+            print_status(tap.no_sample_text())
         silent = not count
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_publishers, served
+from zstate.cli.metrics import publisher_collector, serve_metrics
 from zstate.cli.options import (
     checked_rate,
     clock_option,
@@ -131,7 +131,7 @@ def publish_command(
         StatePublisher(
             session, model, called, wires[len(followed) :], clock=time, takeover=takeover
         ) as whole,
-        served(metrics, of_publishers(derived, whole)),
+        serve_metrics(metrics, publisher_collector(derived, whole)),
     ):
         places = [messages_for(wire).place(called, _DERIVED) for wire in followed]
         places += [messages_for(wire).place(called, _EVERYTHING) for wire in wires[len(followed) :]]
@@ -153,7 +153,7 @@ def _introduce(publisher: StatePublisher, places: list[str]) -> None:
 
 
 def _mention_router(network: SessionOptions, wires: tuple[str, ...]) -> None:
-    if not network.is_given and len(set(map(is_ros, wires))) == 2:
+    if not network.is_explicit and len(set(map(is_ros, wires))) == 2:
         print_status("ROS 2 nodes are met at their router: say --connect, for instance tcp/127.0.0.1:7447")
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_recorder, of_writers, served
+from zstate.cli.metrics import recorder_collector, serve_metrics, writer_collector
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
 from zstate.cli.output.console import fail, is_terminal, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
@@ -97,7 +97,7 @@ def record_command(
         with (
             recorder,
             RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as roster,
-            served(metrics, of_recorder(recorder), of_writers(roster)),
+            serve_metrics(metrics, recorder_collector(recorder), writer_collector(roster)),
         ):
             _run(recorder, roster, robots, duration)
 

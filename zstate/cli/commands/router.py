@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_connections, of_writers, served
+from zstate.cli.metrics import connection_collector, serve_metrics, writer_collector
 from zstate.cli.options import config_option, metrics_option, router_identity_options
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
@@ -172,7 +172,7 @@ def _run(
     with (
         open_session(network) as session,
         RobotDirectory(session) as roster,
-        served(metrics, of_connections(session), of_writers(roster)),
+        serve_metrics(metrics, connection_collector(session), writer_collector(roster)),
     ):
         print_wrapped(f"router {session.zid} listens at {', '.join(listen) or f'what {file!r} says'}")
         if listen == (default := listen_endpoints("router", (), network.credentials)):

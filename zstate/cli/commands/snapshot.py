@@ -142,7 +142,7 @@ def _joining(
         if not saved.is_default:
             print_status(f"as saved on {saved.host!r}: {saved.options()}")
         return saved.network(network), wires if is_wire_given else (saved.wire,)
-    if not (saved.is_default or network.is_given or is_wire_given):
+    if not (saved.is_default or network.is_explicit or is_wire_given):
         print_status(f"it was saved on {saved.host!r} with {saved.options()}; --as-saved does the same here")
     return network, wires
 

@@ -11,10 +11,10 @@ import click
 
 from zstate.cli.options import (
     checked_rate,
-    heard_robot_option,
     json_option,
     open_clock,
     reading_clock_option,
+    robot_filter_option,
     session_options,
     timeout_option,
     wire_option,
@@ -77,7 +77,7 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
     show_default=True,
     help="Digits behind the point; JSON has them all.",
 )
-@heard_robot_option
+@robot_filter_option
 @json_option()
 @wire_option
 @reading_clock_option
@@ -135,7 +135,7 @@ def tf_command(
         if not as_json:
             print_result(f"pose of {source} in {target}")
         if ends:
-            show(waiter.answer(at, timeout_s=timeout))
+            show(waiter.wait(at, timeout_s=timeout))
         else:
             _follow(waiter, rate, show)
 
@@ -149,14 +149,14 @@ def _follow(waiter: PoseWaiter, rate_hz: float, show: Any) -> None:
     shown: Transform | None = None
     deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
     for _ in Rate(rate_hz, SystemClock(), Event()):
-        transform = waiter.answer()
+        transform = waiter.wait()
         if transform != shown:
             show(transform)
             deadline.on_sample(time.monotonic())
             shown, silent = transform, False
         elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
             silent = True
-            print_status(waiter.silence())
+            print_status(waiter.no_sample_text())
 
 
 def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:

@@ -20,8 +20,8 @@ import click
 from zstate.cli.options import (
     checked_rate,
     load_robot,
-    named_models,
     open_clock,
+    parse_models,
     reading_clock_option,
     session_options,
     wire_option,
@@ -163,7 +163,7 @@ def view_command(
     from zstate.view.server import ViewServer
     from zstate.view.view import View
 
-    models = named_models(robots)
+    models = parse_models(robots)
     recording = recording_among(tuple(models))
     if recording is not None and sliders:
         raise click.UsageError("--sliders moves robots that are here, not those of a recording")

@@ -71,7 +71,9 @@ def diagnosis(network: SessionOptions, robot: str, wire: str, timeout_s: float) 
 
 def effective_network(network: SessionOptions, wire: str) -> SessionOptions:
     """The options that ``open_session`` uses, with its default on a ROS wire."""
-    return SessionOptions("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_given else network
+    return (
+        SessionOptions("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_explicit else network
+    )
 
 
 def _after_connecting(

@@ -69,7 +69,7 @@ def refused_check(error: ZStateError, network: SessionOptions) -> Check:
 
 def network_check(session: Session, network: SessionOptions) -> Check:
     """Whom the session has links to."""
-    if not network.is_given:
+    if not network.is_explicit:
         return _host_check(session)
     met = connections(session)
     parts = [count_text(number, kind) for kind, number in met.sessions.items() if number]
@@ -149,7 +149,7 @@ def _names(network: SessionOptions) -> set[str]:
 def find_elsewhere(network: SessionOptions) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Options with which other robots than now would be seen, and which."""
     router = SessionOptions("client", (ROUTER_ENDPOINT,))
-    others = [("", SessionOptions())] if network.is_given else []
+    others = [("", SessionOptions())] if network.is_explicit else []
     if ROUTER_ENDPOINT not in network.connect and accepts_tcp(ROUTER_ENDPOINT):
         others.append((f" --connect {ROUTER_ENDPOINT}", router))
     for options, other in others:

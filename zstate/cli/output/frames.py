@@ -134,7 +134,7 @@ def collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameIn
             return nodes() - {one.writer for one in frames if one.kind == "pose" and one.count >= least}
 
         if not waiter.wait_for(lambda: listener.buffer.frames() or nodes(), _NODES_WITHIN_S):
-            fail(roster.words.no_sample_text(robot, "tf", roster.robots(), ended=False))
+            fail(roster.messages.no_sample_text(robot, "tf", roster.robots(), ended=False))
         waiter.wait_until_stable(
             lambda: len(listener.buffer.frames()),
             lambda stable: stable and not without_samples(listener.buffer.frames(), 2),
@@ -143,7 +143,7 @@ def collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameIn
         )
         frames = listener.buffer.frames()
         for node in sorted(without_samples(frames, 1)):
-            topic = roster.words.place(robot, ("tf",))
+            topic = roster.messages.place(robot, ("tf",))
             print_status(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
         return frames
 

@@ -77,10 +77,10 @@ class RecordProgress:
     def no_message_text(self) -> str:
         """The reason why nothing was recorded, as far as it can be determined here."""
         announced = self._roster.robots()
-        return self._missing(set()) or f"{self._roster.words.announced(announced)}, but no message came"
+        return self._missing(set()) or f"{self._roster.messages.announced(announced)}, but no message came"
 
     def _missing(self, recorded: set[str]) -> str:
-        announced, words = self._roster.robots(), self._roster.words
+        announced, words = self._roster.robots(), self._roster.messages
         if not self._robots:
             return "" if recorded or announced else words.announced(announced)
         missing = set(self._robots) - recorded - {info.name for info in announced}

@@ -12,7 +12,7 @@ from typing import Any
 
 from zstate._util.endpoint import format_host
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.options import load_robot, parsed_xacro_args
+from zstate.cli.options import load_robot, parse_xacro_args
 from zstate.cli.up.cell import Cell
 from zstate.cli.up.schema import (
     NetworkSection,
@@ -137,7 +137,7 @@ def _model_and_name(table: Located[RobotSection]) -> tuple[str, str]:
 
 @lru_cache(maxsize=256)
 def _default_name(model: str, name: str | None, xacro_words: tuple[str, ...]) -> str:
-    return load_robot(model, name, parsed_xacro_args(xacro_words))[1]
+    return load_robot(model, name, parse_xacro_args(xacro_words))[1]
 
 
 def _xacro_words(robot: RobotSection) -> tuple[str, ...]:

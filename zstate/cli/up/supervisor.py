@@ -142,7 +142,7 @@ class Supervisor:
             needed = {name for spec, _ in running.values() for name in spec.after}
             ending = [running[name] for name in running if name not in needed]
             for _, child in ending:
-                child.ask_to_end()
+                child.request_exit()
             deadline = time.monotonic() + END_WITHIN_S
             for spec, child in ending:
                 child.wait(deadline)
