@@ -141,7 +141,7 @@ def test_1_a_driver_that_died_is_missed(cell: Child, driver):
     process.wait()
     found = doctor(code=1)["first_broken"]
     assert (found["name"], found["robot"]) == ("joint_states", "arm")
-    assert "nobody writes joint_states of 'arm', for which zstate-publish@" in found["text"]
+    assert "'arm' has no writer of joint_states, which zstate-publish@" in found["text"]
     assert "its driver is not running" in found["text"]
 
 
