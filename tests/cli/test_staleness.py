@@ -9,7 +9,7 @@ import pytest
 from zstate import Transform, TransformBuffer, connect
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.robot_probe import StreamSamples
-from zstate.cli.monitor import EdgeRow, EdgeStatistics, report_text
+from zstate.cli.monitor import EdgeRow, EdgeStatistics, path_text
 from zstate.cli.output.drawing import ALARM, draw
 from zstate.cli.output.frames import tree_drawing
 from zstate.cli.output.robot_table import robots_text
@@ -55,7 +55,7 @@ def staleness(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
         (tool,) = [frame for frame in buffer.frames() if frame.name == "r1/tool"]
         found["events"] = bool(events.expired(now_s)[0])
         found["ls"] = "silent" in robots_text((RobotInfo("r1", (("joint_states", WRITER),)),), listed)
-        found["monitor"] = "silent" in report_text([EdgeRow("r1/tool", edge, edges.measure(edge), None)])
+        found["monitor"] = "silent" in path_text([EdgeRow("r1/tool", edge, edges.measure(edge), None)])
         found["monitor --robots, demo"] = metered.measure("r1").rate_hz == 0.0
         found["doctor"] = examined.statistics.is_stale()
         found["doctor, ROS"] = examined.writers[SESSION].statistics.is_stale()

@@ -112,12 +112,10 @@ def path_series(
     Begins ``start_s`` after the first instant and lasts ``seconds``, or to the end. Raises LookupFailed, and
     InvalidInput if nothing is left.
     """
-    from zstate.cli.monitor import path_between
-
     newest = buffer.latest(target, source)
-    _, legs = path_between(buffer.frames(), target, source)
+    edges = [edge for _, edge in buffer.path_frames(target, source)]
     # The first instant that every moving edge of the path covers.
-    oldest = max((leg.edge.oldest for leg in legs if leg.edge.oldest is not None), default=newest)
+    oldest = max((edge.oldest for edge in edges if edge and edge.oldest is not None), default=newest)
     begin = oldest + round(start_s * 1e9)
     end = newest if seconds is None else min(newest, begin + round(seconds * 1e9))
     if end <= begin:

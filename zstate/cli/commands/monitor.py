@@ -81,7 +81,7 @@ def monitor_command(
     zstate monitor --robots
     zstate monitor --robots --robot panda --json --metrics 9100
     """
-    from zstate.cli.monitor import AllEdgesView, EdgeStatistics, PoseView, RobotMonitor
+    from zstate.cli.monitor import AllEdgesView, EdgeStatistics, PathView, RobotMonitor
     from zstate.nodes.listener import TransformListener
 
     if robots and target is not None:
@@ -112,7 +112,7 @@ def monitor_command(
             _report_edges(AllEdgesView(listener, statistics, roster), once_s, as_json=as_json)
         else:
             frames = (target, source)
-            _report_edges(PoseView(listener, statistics, roster, frames), once_s, as_json=as_json)
+            _report_edges(PathView(listener, statistics, roster, frames), once_s, as_json=as_json)
 
 
 def _report_edges(monitored: MonitorView, once_s: float | None, *, as_json: bool) -> None:
