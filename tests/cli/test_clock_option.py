@@ -55,7 +55,7 @@ def test_who_tells_no_time_is_waited_for_with_a_word(spawn: Spawn):
     until(lambda: "waiting for the simulated time on zstate/clock" in child.stderr)
     with simulation():
         assert child.line().startswith("rrbot: a sine on 2 joints")
-        until(lambda: "heard zstate/clock: it is " in child.stderr)
+        until(lambda: "received zstate/clock: it is " in child.stderr)
         interrupted(child)
 
 

@@ -89,7 +89,7 @@ def test_what_zenoh_is_told_can_be_seen():
     [
         ("ZSTATE_CONECT", "tcp/10.0.0.1:7447", "nothing reads ZSTATE_CONECT; did you mean 'ZSTATE_CONNECT'?"),
         ("ZSTATE_RENDEZVOUS", "here", "ZSTATE_RENDEZVOUS is 'here'"),
-        ("ZSTATE_CERTS", "/", "--certs is of no use without --identity"),
+        ("ZSTATE_CERTS", "/", "--certs needs --identity"),
         ("ZSTATE_CONNECT", "10.0.0.1", "write 'tcp/10.0.0.1:7447'"),
         ("ZSTATE_MODE", "client", "mode 'client' needs --connect"),
     ],

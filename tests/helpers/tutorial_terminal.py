@@ -72,7 +72,7 @@ def masked(lines: list[str]) -> list[str]:
         for pattern, name in _MASKS.items():
             line = re.sub(pattern, name, line)  # noqa: PLW2901  # one after the other
         said.append(line.rstrip())
-    return [line for line in said if line and not line.startswith(("waiting: ", "heard "))]
+    return [line for line in said if line and not line.startswith(("waiting: ", "heard ", "received "))]
 
 
 class Terminal:

@@ -26,8 +26,8 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     robots = discover(session)
     selected = tuple(info for info in robots if robot in (ANY, info.name))
     if not selected:
-        words = messages_for("native")
-        fail(words.announced(robots) if robot == ANY else words.unknown(robot, robots))
+        messages = messages_for("native")
+        fail(messages.announced(robots) if robot == ANY else messages.unknown(robot, robots))
     return selected
 
 
@@ -56,17 +56,16 @@ class RobotDirectory(Closeable):
         from zstate.net.presence import watch
 
         self.messages = messages_for(wire)
-        self._announced: set[Announcement] = set()
-        self._on_change = on_change
-        self._watch = watch(session, robot if is_ros(wire) else "*", self._update, wire)
+        announced = self._announced = set[Announcement]()
+
+        def update(announcement: Announcement, alive: bool) -> None:
+            (announced.add if alive else announced.discard)(announcement)
+            on_change()
+
+        self._watch = watch(session, robot if is_ros(wire) else "*", update, wire)
 
     def close(self) -> None:
         self._watch.close()
-
-    def _update(self, announced: Announcement, alive: bool) -> None:
-        change = self._announced.add if alive else self._announced.discard
-        change(announced)
-        self._on_change()
 
     def robots(self) -> tuple[RobotInfo, ...]:
         """Robots with at least one writer, as ``discover`` returns them."""

@@ -140,7 +140,7 @@ def test_it_waits_for_a_robot_and_says_so(spawn: Spawn):
     until(lambda: "waiting: nobody announces the robot 'rrbot'" in command.stderr)
     with standing():
         assert command.line() == str(ELBOW)
-    assert "heard zstate/rrbot/joint_states" in command.stderr
+    assert "received zstate/rrbot/joint_states" in command.stderr
     interrupted(command)
 
 
