@@ -56,7 +56,8 @@ class RobotDirectory(Closeable):
         from zstate.net.presence import watch
 
         self.messages = messages_for(wire)
-        announced = self._announced = set[Announcement]()
+        announced: set[Announcement] = set()
+        self._announced = announced
 
         def update(announcement: Announcement, alive: bool) -> None:
             (announced.add if alive else announced.discard)(announcement)
