@@ -32,7 +32,7 @@ def test_samples_of_another_robot_do_not_count():
     assert metered(0.1).measure("r2") == MeteredBuffer().measure("r2")
 
 
-def test_nothing_measured_is_nothing_claimed():
+def test_without_samples_there_are_no_figures():
     buffer = metered()
     measure = buffer.measure("r1")
     assert (measure.rate_hz, measure.latency_s, measure.age_s) == (0.0, None, None)

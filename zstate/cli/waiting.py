@@ -50,7 +50,7 @@ class ConditionWaiter:
     """Wakes the waiting main thread when a condition may have become true.
 
     ``notify`` is a callback for subscriptions: any thread, any arguments. ``noted`` is the last reason that
-    the latest ``wait_for`` printed, empty if it ended without.
+    the latest ``wait_for`` printed, empty if it printed none.
     """
 
     def __init__(self) -> None:
