@@ -360,3 +360,17 @@ def test_frames_are_listed_in_order_of_first_mention_with_their_edges() -> None:
         4 * S,
         5,
     )
+
+
+def test_path_frames_lead_up_to_the_common_ancestor_and_down_again():
+    buffer = TransformBuffer()
+    for parent, child in (("base", "torso"), ("torso", "left"), ("left", "hand"), ("torso", "right")):
+        buffer.insert_static(static(f"r1/{parent}", f"r1/{child}"))
+    frames = buffer.path_frames("r1/hand", "right")
+    assert [(name, edge and edge.name) for name, edge in frames] == [
+        ("r1/hand", None),
+        ("r1/left", "r1/hand"),
+        ("r1/torso", "r1/left"),
+        ("r1/right", "r1/right"),
+    ]
+    assert buffer.path_frames("base", "base") == [("r1/base", None)]

@@ -35,7 +35,7 @@ def simulation(start: int = 5 * SECOND, speed: float = 10.0) -> Iterator[None]:
             yield
 
 
-def test_publish_stamps_and_paces_by_the_simulated_time():
+def test_publish_uses_the_simulated_time_for_stamps_and_rate():
     with simulation(), connect() as session, TransformListener(session, "rrbot") as listener:
         done = zstate(
             "publish", RRBOT, "--source", "sine", "--clock", "sim", "--rate", "50", "--seconds", "5"
@@ -50,12 +50,12 @@ def test_publish_stamps_and_paces_by_the_simulated_time():
         assert listener.stats.off_clock == 0
 
 
-def test_who_tells_no_time_is_waited_for_with_a_word(spawn: Spawn):
+def test_missing_simulated_time_is_waited_for_with_a_note(spawn: Spawn):
     child = started(spawn, "joints", RRBOT, "--clock", "sim")
     until(lambda: "waiting for the simulated time on zstate/clock" in child.stderr)
     with simulation():
         assert child.line().startswith("rrbot: a sine on 2 joints")
-        until(lambda: "heard zstate/clock: it is " in child.stderr)
+        until(lambda: "received zstate/clock: it is " in child.stderr)
         interrupted(child)
 
 
@@ -65,12 +65,12 @@ def test_a_wait_for_the_time_ends_with_ctrl_c(spawn: Spawn):
     interrupted(child)
 
 
-def test_tf_gives_up_when_nobody_tells_the_time():
+def test_tf_gives_up_without_a_publisher_of_the_time():
     message = failure("tf", "world", "tool", "--once", "--timeout", "0.7", "--clock", "sim")
     assert "no time was received on 'zstate/clock' for 0.7 s" in message
 
 
-def test_tf_tells_ages_by_the_time_of_the_robot():
+def test_tf_measures_ages_with_the_clock_of_the_robot():
     with (
         simulation(5 * SECOND, speed=0.0),
         connect() as session,
@@ -95,7 +95,7 @@ def test_tf_tells_ages_by_the_time_of_the_robot():
     assert known["age_s"] == pytest.approx(2.0)
 
 
-def test_a_reader_with_one_clock_follows_robots_of_the_other_and_gives_no_ages_of_them(spawn: Spawn):
+def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
     with simulation(), standing():
         listening = started(spawn, "monitor", "--robots", "--clock", "sim", "--json")
 
@@ -107,7 +107,7 @@ def test_a_reader_with_one_clock_follows_robots_of_the_other_and_gives_no_ages_o
         until(is_followed)
 
 
-def test_a_robot_of_another_clock_that_is_met_first_keeps_nobody_out():
+def test_first_robot_on_another_clock_does_not_exclude_others():
     with standing("a1", clock=ManualClock(5 * SECOND, "sim")), standing("b1"):
         for _ in range(3):
             assert json.loads(zstate("tf", "b1/world", "b1/tool", "--once", "--json").stdout)["age_s"] < 60.0
@@ -132,5 +132,5 @@ def test_listen_counts_stamps_that_are_off_the_clock(spawn: Spawn):
             thread.join()
 
 
-def test_another_time_is_wrong_usage():
+def test_unknown_clock_is_wrong_usage():
     assert "'noon' is not one of 'system', 'sim'" in failure("joints", RRBOT, "--clock", "noon", code=2)

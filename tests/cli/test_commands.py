@@ -33,7 +33,7 @@ def test_every_command_has_a_help(command: str, monkeypatch: pytest.MonkeyPatch)
     assert "--help" in outcome.output
 
 
-def test_the_options_of_the_network_stand_below_those_of_the_command():
+def test_network_options_follow_the_options_of_the_command():
     text = CliRunner().invoke(group, ["tf", "--help"]).output
     own, _, network = text.partition("Network, the same for every command:")
     assert "--once" in own

@@ -25,7 +25,7 @@ def told(*arguments: str, code: int = 0) -> tuple[dict[str, tuple[Any, str]], li
     return {one["name"]: (one["value"], one["origin"]) for one in said["settings"]}, said["problems"]
 
 
-def test_without_a_word_everything_is_default():
+def test_without_options_every_setting_is_a_default():
     settings, problems = told()
     assert settings["mode"] == ("peer", "default")
     addresses = "127.0.0.1:7450 127.0.0.1:7451 127.0.0.1:7452"
@@ -35,7 +35,7 @@ def test_without_a_word_everything_is_default():
     assert problems == []
 
 
-def test_options_come_before_the_environment(monkeypatch: pytest.MonkeyPatch):
+def test_options_precede_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_MODE", "lan")
     monkeypatch.setenv("ZSTATE_CLOCK", "sim")
     settings, _ = told("--mode", "peer")
@@ -43,16 +43,14 @@ def test_options_come_before_the_environment(monkeypatch: pytest.MonkeyPatch):
     assert settings["clock"] == ("sim", "environment ZSTATE_CLOCK")
 
 
-def test_what_follows_from_another_option_says_from_which():
+def test_implied_setting_names_the_option_that_implies_it():
     settings, _ = told("--connect", "tcp/10.0.0.1:7447")
     assert settings["mode"] == ("client", "option --connect, which alone means a router")
     assert settings["connect"] == (["tcp/10.0.0.1:7447"], "option --connect")
     assert "rendezvous" not in settings
 
 
-def test_a_configuration_of_zenoh_counts_where_nothing_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_zenoh_configuration_applies_without_options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     file = tmp_path / "zenoh.json5"
     file.write_text('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}}')
     monkeypatch.setenv("ZENOH_CONFIG", str(file))
@@ -63,7 +61,7 @@ def test_a_configuration_of_zenoh_counts_where_nothing_is_said(
     assert settings["listen"][1] == "default of Zenoh"
 
 
-def test_the_domain_of_ros_is_that_of_the_wire_before_that_of_the_environment(monkeypatch):
+def test_ros_domain_of_the_wire_precedes_the_environment(monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     assert told("--wire", "ros2")[0]["ros domain"] == (7, "environment ROS_DOMAIN_ID")
     assert told("--wire", "ros2:domain=3")[0]["ros domain"] == (3, "option --wire")
@@ -78,7 +76,7 @@ def test_a_password_is_never_shown(monkeypatch: pytest.MonkeyPatch):
         assert b"hunter2" not in ended.stdout + ended.stderr
 
 
-def test_what_zenoh_is_told_can_be_seen():
+def test_zenoh_settings_are_listed():
     said = json.loads(zstate("config", "--zenoh", "--json", "--connect", "tcp/10.0.0.1:7447").stdout)
     assert said["mode"] == "client"
     assert said["connect/endpoints"] == ["tcp/10.0.0.1:7447"]
@@ -89,12 +87,12 @@ def test_what_zenoh_is_told_can_be_seen():
     [
         ("ZSTATE_CONECT", "tcp/10.0.0.1:7447", "nothing reads ZSTATE_CONECT; did you mean 'ZSTATE_CONNECT'?"),
         ("ZSTATE_RENDEZVOUS", "here", "ZSTATE_RENDEZVOUS is 'here'"),
-        ("ZSTATE_CERTS", "/", "--certs is of no use without --identity"),
+        ("ZSTATE_CERTS", "/", "--certs needs --identity"),
         ("ZSTATE_CONNECT", "10.0.0.1", "write 'tcp/10.0.0.1:7447'"),
         ("ZSTATE_MODE", "client", "mode 'client' needs --connect"),
     ],
 )
-def test_what_is_wrong_with_the_environment_is_said(monkeypatch, variable: str, value: str, problem: str):
+def test_problems_of_the_environment_are_reported(monkeypatch, variable: str, value: str, problem: str):
     monkeypatch.setenv(variable, value)
     _, problems = told(code=1)
     assert len(problems) == 1
@@ -102,10 +100,10 @@ def test_what_is_wrong_with_the_environment_is_said(monkeypatch, variable: str, 
     assert problem in zstate("config").stderr.decode()
 
 
-def test_every_option_of_a_command_may_stand_in_the_environment(monkeypatch: pytest.MonkeyPatch):
+def test_every_option_can_be_set_in_the_environment(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_TF_RATE", "5")
     assert told()[1] == []
 
 
-def test_a_file_that_is_not_there_is_wrong_usage():
+def test_missing_file_is_wrong_usage():
     assert "'nowhere.json5' does not exist" in failure("config", "--config", "nowhere.json5", code=2)

@@ -78,7 +78,7 @@ def test_ctrl_c_ends_a_command(
 
 
 @pytest.mark.processes
-def test_doctor_of_all_robots_ends_and_counts_those_that_it_did_not_examine(fleet: None):
+def test_doctor_of_a_large_fleet_ends_and_counts_unexamined_robots(fleet: None):
     """Each group of 50 silent robots takes the timeout; six of them would take longer than it goes on for."""
     ended = zstate("doctor", "--timeout", "0.5")
     assert ended.returncode == 1, ended.stderr.decode()  # drivers are announced, and silent

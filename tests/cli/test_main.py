@@ -25,9 +25,7 @@ def await_samples() -> None:
         assert next(readings).stamp != next(readings).stamp
 
 
-def test_a_path_that_the_shell_has_torn_apart_is_put_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_unquoted_path_with_a_space_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "my arm").mkdir()
     (tmp_path / "my arm" / "arm.urdf").write_text(Path(RRBOT).read_text())
     monkeypatch.chdir(tmp_path)
@@ -42,7 +40,7 @@ def test_without_a_command_the_help_is_printed():
     assert zstate("snapshot").stdout.startswith(b"Usage: zstate snapshot")
 
 
-def test_a_mistyped_command_is_met_with_the_nearest():
+def test_mistyped_command_gets_the_nearest_one():
     message = failure("jonts", code=2)
     assert "there is no command 'jonts'; did you mean 'joints'?" in message
 
@@ -59,7 +57,7 @@ def test_a_mistyped_command_is_met_with_the_nearest():
         ("quxquux", "`zstate help` lists the commands"),
     ],
 )
-def test_words_of_ros_lead_to_the_command_that_does_the_same(word: str, hint: str):
+def test_commands_of_ros_lead_to_their_equivalents(word: str, hint: str):
     assert f"there is no command {word!r}; {hint}" in failure(word, code=2)
 
 
@@ -93,12 +91,12 @@ def test_the_forms_of_static_transform_publisher_are_translated(given: str, writ
     assert f"static_transform_publisher; here it is\n  zstate static {written}\n" in message
 
 
-def test_an_unknown_option_is_met_with_a_suggestion_only_where_one_is_near():
+def test_unknown_option_gets_a_suggestion_only_if_one_is_similar():
     assert "Did you mean '--connect'?" in failure("ls", "--conect", code=2)
     assert failure("ls", "--nonsense", code=2).startswith("zstate: No such option '--nonsense'.\n")
 
 
-def test_wrong_usage_is_told_in_words_with_code_2():
+def test_wrong_usage_exits_with_code_2_and_a_message():
     assert "--rate" in failure("joints", RRBOT, "--rate", "0", code=2)
     assert "nan" in failure("joints", RRBOT, "--rate", "nan", code=2)
     assert "-1" in failure("publish", RRBOT, "--rate", "-1", code=2)
@@ -106,23 +104,23 @@ def test_wrong_usage_is_told_in_words_with_code_2():
     assert "--connect" in failure("joints", RRBOT, "--mode", "client", code=2)
 
 
-def test_an_unknown_robot_is_told_with_near_misses():
+def test_unknown_robot_is_reported_with_near_misses():
     message = failure("joints", "rrbott")
     assert message.startswith("zstate: ")
     assert "did you mean 'rrbot'" in message
 
 
-def test_an_endpoint_that_is_none_is_told_with_the_right_form():
+def test_invalid_endpoint_is_reported_with_the_right_form():
     assert "tcp/10.0.0.1:7447" in failure("joints", RRBOT, "--connect", "10.0.0.1")
 
 
-def test_a_name_that_cannot_be_a_key_is_told_with_the_option_to_change_it():
+def test_invalid_robot_name_is_reported_with_the_name_option():
     message = failure("joints", RRBOT, "--name", "left/arm")
     assert "'/'" in message
     assert "--name" in message
 
 
-def test_a_router_that_does_not_answer_is_named(tmp_path: Path, free_port: int):
+def test_unreachable_router_is_reported(tmp_path: Path, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     impatient = tmp_path / "impatient.json5"
     impatient.write_text("{connect: {timeout_ms: 200, exit_on_failure: true}}")
@@ -132,7 +130,7 @@ def test_a_router_that_does_not_answer_is_named(tmp_path: Path, free_port: int):
     assert f"`zstate doctor --connect {endpoint}`" in message
 
 
-def test_ctrl_c_ends_also_the_wait_for_a_router(spawn: Spawn, free_port: int):
+def test_ctrl_c_interrupts_connecting_to_a_router(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = spawn(
         "import zstate.net.session as s\n"
@@ -149,7 +147,7 @@ def test_ctrl_c_ends_also_the_wait_for_a_router(spawn: Spawn, free_port: int):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_being_asked_to_end_is_in_order_too(spawn: Spawn, number: signal.Signals):
+def test_sigterm_ends_in_order(spawn: Spawn, number: signal.Signals):
     child = started(spawn, "joints", RRBOT)
     child.line()
     await_samples()
@@ -168,7 +166,7 @@ def test_the_session_options_are_read_from_the_environment(monkeypatch: pytest.M
     assert "'tcp/here'" in failure("joints", RRBOT)
 
 
-def test_a_reader_that_goes_away_ends_a_command_quietly():
+def test_closed_output_ends_a_command_quietly():
     command = [sys.executable, "-m", "zstate", "check", RRBOT]
     read_end, write_end = os.pipe()
     os.close(read_end)
@@ -177,13 +175,13 @@ def test_a_reader_that_goes_away_ends_a_command_quietly():
     assert ended.stderr == ""
 
 
-def test_the_version_is_the_packages_and_says_which_kernel_is_used():
+def test_version_names_the_kernel():
     from zstate import __version__, kernel
 
     assert zstate("--version").stdout.decode() == f"zstate {__version__} (kernel: {kernel})\n"
 
 
-def test_ctrl_c_while_joints_are_published_tells_what_was_achieved(spawn: Spawn):
+def test_ctrl_c_during_publishing_prints_the_achieved_rate(spawn: Spawn):
     child = started(spawn, "joints", RRBOT, "--rate", "50")
     assert child.line() == "rrbot: a sine on 2 joints, 50 Hz, on zstate/rrbot/joint_states"
     await_samples()

@@ -11,7 +11,7 @@ def arrival(came_ms: int, seq: int, session: int = 1) -> TimedSample:
     return TimedSample(came_ms * 1_000_000, JointState(0, seq, session, order_digest(()), b""))
 
 
-def test_rate_spread_and_gaps_are_those_of_the_arrivals():
+def test_rate_spread_and_gaps_follow_from_the_arrivals():
     statistics = MessageStatistics(10)
     assert statistics.facts() is None
     for tapped in (arrival(0, 5), arrival(100, 6), arrival(300, 9)):
@@ -24,7 +24,7 @@ def test_rate_spread_and_gaps_are_those_of_the_arrivals():
     assert (measured["window"], measured["missed"]) == (3, 2)  # 7 and 8 are missing
 
 
-def test_a_writer_that_starts_anew_begins_a_new_window():
+def test_restarted_writer_begins_a_new_window():
     statistics = MessageStatistics(10)
     statistics.add(arrival(0, 100))
     statistics.add(arrival(5000, 0, session=2))

@@ -29,7 +29,7 @@ def grown(url: str, grows: Row) -> dict[Row, float]:
     return scraped(url)
 
 
-def test_a_publisher_serves_what_it_does_and_what_it_costs(spawn: Spawn):
+def test_publisher_serves_its_metrics(spawn: Spawn):
     command = started(spawn, "publish", RRBOT, "--source", "sine", "--metrics", "0")
     labels = {"robot": "rrbot", "wire": "native"}
     url = url_of(command)
@@ -43,7 +43,7 @@ def test_a_publisher_serves_what_it_does_and_what_it_costs(spawn: Spawn):
     interrupted(command)
 
 
-def test_a_listener_serves_the_counts_that_it_shows(spawn: Spawn):
+def test_listener_serves_its_counts(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
     url = url_of(command)
     with standing():
@@ -60,7 +60,7 @@ def test_a_listener_serves_the_counts_that_it_shows(spawn: Spawn):
     interrupted(command)
 
 
-def test_a_router_serves_who_is_there(spawn: Spawn, free_port: int):
+def test_router_serves_its_connections_and_writers(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     command = started(spawn, "router", "--listen", endpoint, "--metrics", "0")
     url = url_of(command)
@@ -73,7 +73,7 @@ def test_a_router_serves_who_is_there(spawn: Spawn, free_port: int):
     interrupted(command)
 
 
-def test_a_recorder_serves_what_it_writes(spawn: Spawn, tmp_path: Path):
+def test_recorder_serves_its_metrics(spawn: Spawn, tmp_path: Path):
     with standing():
         command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
         url = url_of(command)
@@ -85,7 +85,7 @@ def test_a_recorder_serves_what_it_writes(spawn: Spawn, tmp_path: Path):
     interrupted(command)
 
 
-def test_a_bridge_serves_whom_it_carries(spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch):
+def test_bridge_serves_the_carried_robots(spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("ZSTATE_CONNECT")
     monkeypatch.delenv("ZSTATE_WIRE")
     command = started(spawn, "bridge", "rrbot", "--ros", ros_router, "--metrics", "0")
@@ -96,14 +96,14 @@ def test_a_bridge_serves_whom_it_carries(spawn: Spawn, ros_router: str, monkeypa
     interrupted(command)
 
 
-def test_a_busy_port_and_a_place_that_is_none_are_told(spawn: Spawn):
+def test_busy_port_and_invalid_address_are_reported(spawn: Spawn):
     command = started(spawn, "joints", RRBOT, "--metrics", "0")
     port = url_of(command).split(":")[2].split("/")[0]
     assert "or 0 for a free one" in failure("joints", RRBOT, "--name", "other", "--metrics", port)
     assert "for instance 9100" in failure("joints", RRBOT, "--metrics", "here", code=2)
 
 
-def test_without_the_library_a_command_says_what_to_install(spawn: Spawn):
+def test_missing_library_is_reported_with_the_package_to_install(spawn: Spawn):
     child = spawn(
         "import sys; sys.modules['prometheus_client'] = None\nfrom zstate.cli.main import main; main()",
         *("joints", RRBOT, "--metrics", "0"),

@@ -8,7 +8,7 @@ import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, started, zstate
 
 from zstate import TransformListener, connect
-from zstate.cli.options import load_robot, named_models
+from zstate.cli.options import load_robot, parse_models
 
 ARM = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
   <xacro:arg name="prefix" default=""/>
@@ -29,15 +29,15 @@ def arm(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_a_robot_of_the_catalog_is_called_as_it_was_asked_for():
+def test_catalog_robot_has_its_catalog_name():
     assert load_robot("RRbot", None)[1] == "rrbot"
     assert load_robot(RRBOT, None)[1] == load_robot(RRBOT, None)[0].name
     assert load_robot("rrbot", "left")[1] == "left"
 
 
-def test_xacro_arguments_follow_the_model_they_are_for():
+def test_xacro_arguments_belong_to_the_model_before_them():
     words = ("left.xacro", "prefix:=l_", "z:=a:=b", "panda", "right.xacro", "prefix:=")
-    assert named_models(words) == {
+    assert parse_models(words) == {
         "left.xacro": {"prefix": "l_", "z": "a:=b"},
         "panda": {},
         "right.xacro": {"prefix": ""},

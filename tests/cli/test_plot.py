@@ -48,7 +48,7 @@ def test_positions_become_curves_in_the_order_of_time_with_the_units_of_their_jo
     assert curves.with_unit("m").values.tolist() == [[0.5], [0.25]]
 
 
-def test_a_joint_that_there_is_not_is_refused_with_those_that_there_are():
+def test_unknown_joint_is_refused_with_the_known_ones():
     curves = joint_series(DOCUMENTS, None)
     with pytest.raises(InvalidInput, match=r"did you mean 'slide'.*joints: slide, turn"):
         curves.select(["slid"])
@@ -64,18 +64,18 @@ def circling() -> TransformBuffer:
     return buffer
 
 
-def test_a_path_is_asked_for_at_even_times_over_all_that_is_known():
+def test_path_is_sampled_evenly_over_its_history():
     curves = path_series(circling(), "map", "car")
     assert (curves.stamps[0], curves.stamps[-1]) == (0, 4 * SECOND)
     assert np.hypot(curves.values[:, 0], curves.values[:, 1]) == pytest.approx(2.0, abs=1e-3)
     part = path_series(circling(), "map", "car", start_s=1.0, seconds=2.0)
     assert (part.stamps[0], part.stamps[-1]) == (SECOND, 3 * SECOND)
-    with pytest.raises(InvalidInput, match=r"there are 4\.000 s; nothing is left after the first 9 s"):
+    with pytest.raises(InvalidInput, match=r"covers 4\.000 s; nothing is left after the first 9 s"):
         path_series(circling(), "map", "car", start_s=9.0)
 
 
 @pytest.mark.processes
-def test_what_a_robot_says_is_drawn(tmp_path: Path):
+def test_live_joint_states_are_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "joints.svg"
     with standing():
@@ -114,7 +114,7 @@ def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
 
 
 @pytest.mark.processes
-def test_mistakes_are_told(tmp_path: Path):
+def test_mistakes_are_reported(tmp_path: Path):
     needs_matplotlib()
     assert ".png, .svg, .pdf" in failure("plot", "rrbot", "--output", "plot.jpg", code=2)
     assert "two different pictures" in failure("plot", "--joint", "a", "--path", "a", "b", code=2)
@@ -130,7 +130,7 @@ def test_mistakes_are_told(tmp_path: Path):
         assert "static" in failure("plot", "--path", "floor", "table", "--seconds", "0.2")
 
 
-def test_without_matplotlib_it_says_what_to_install():
+def test_missing_matplotlib_is_reported_with_the_package_to_install():
     hidden = "import sys; sys.modules['matplotlib'] = None; from zstate.cli.main import main; main()"
     ended = subprocess.run([sys.executable, "-c", hidden, "plot", RRBOT], capture_output=True, check=False)
     assert ended.returncode == 1

@@ -12,7 +12,7 @@ def test_the_result_is_that_of_the_work():
     assert BackgroundCall("work", lambda: 6 * 7).result() == 42
 
 
-def test_an_error_of_the_work_is_raised_where_it_is_waited_for():
+def test_exception_of_the_work_is_raised_by_result():
     def work() -> None:
         raise InvalidInput("not so")
 
@@ -20,7 +20,7 @@ def test_an_error_of_the_work_is_raised_where_it_is_waited_for():
         BackgroundCall("work", work).result()
 
 
-def test_work_that_goes_on_is_not_waited_for_longer_than_asked():
+def test_result_raises_after_its_timeout():
     forever = threading.Event()
     worker = BackgroundCall("work", forever.wait)
     with pytest.raises(TimeoutError):

@@ -34,14 +34,14 @@ def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
     interrupted(command)
 
 
-def test_a_robot_that_writes_only_transforms_is_heard_all_the_same(spawn: Spawn):
+def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--json")
     with standing(streams=("tf", "tf_static", "robot_description")):
         until(lambda: json.loads(command.line())["received"] > 0)
     assert "following zstate/rrbot/tf" in command.stderr
 
 
-def test_it_says_what_it_waits_for(spawn: Spawn):
+def test_the_missing_robot_is_reported(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing():
@@ -53,7 +53,7 @@ def test_a_name_that_no_robot_can_have_is_refused():
     assert "'a/b'" in failure("monitor", "--robots", "--robot", "a/b")
 
 
-def test_many_robots_are_heard_by_one_listener(spawn: Spawn):
+def test_many_robots_share_one_listener(spawn: Spawn):
     def threads() -> int:
         return len(list(Path(f"/proc/{command.process.pid}/task").iterdir()))
 

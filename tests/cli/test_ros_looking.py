@@ -29,7 +29,7 @@ def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
     assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
 
 
-def test_tf_says_what_it_waits_for_in_the_words_of_ros(spawn: Spawn, ros_router: str):
+def test_tf_reports_missing_topics_in_ros_terms(spawn: Spawn, ros_router: str):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     until(lambda: "waiting: no node publishes /tf in domain 0" in command.stderr)
     assert "`zstate ls --wire ros2`" in command.stderr
@@ -43,7 +43,7 @@ def test_tf_says_what_it_waits_for_in_the_words_of_ros(spawn: Spawn, ros_router:
         assert unknown_to_ros not in command.stderr
 
 
-def test_tf_tells_two_trees_apart_with_the_command_that_joins_them(ros_router: str):
+def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str):
     with (
         standing(wire="ros2", router=ros_router),
         connect(mode="client", endpoints=ros_router) as session,
@@ -107,7 +107,7 @@ def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router
     assert document["efforts"] == {"a": None}
 
 
-def test_echo_hears_one_namespace_or_the_robot_that_is_named(ros_router: str):
+def test_echo_reads_one_namespace_or_the_selected_robot(ros_router: str):
     with (
         standing("r1", wire="ros2:namespace=*", router=ros_router),
         standing("r2", (0.0, 0.25), wire="ros2:namespace=*", router=ros_router),
@@ -118,7 +118,7 @@ def test_echo_hears_one_namespace_or_the_robot_that_is_named(ros_router: str):
     assert float(second.stdout) == 0.25
 
 
-def test_whoever_must_name_a_robot_is_told(ros_router: str):
+def test_missing_robot_argument_is_reported(ros_router: str):
     assert "no robot is announced" in failure("echo", "--wire", "native")
     message = failure("hz", "--wire", "ros2:namespace=*", code=2)
     assert "each robot has a namespace of its name" in message
@@ -134,7 +134,7 @@ def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
             assert measured["missed"] == 0
 
 
-def test_robots_are_monitored_by_tf_and_the_joints_of_a_robot_that_is_named(spawn: Spawn, ros_router: str):
+def test_robots_are_monitored_by_tf_and_a_selected_one_by_its_joints(spawn: Spawn, ros_router: str):
     with standing(wire="ros2", router=ros_router):
         monitor = ("monitor", "--robots", "--json")
         everybody, one = started(spawn, *monitor), started(spawn, *monitor, "--robot", "rrbot")
@@ -144,7 +144,7 @@ def test_robots_are_monitored_by_tf_and_the_joints_of_a_robot_that_is_named(spaw
     assert "following ROS 2 topic /joint_states (domain 0)" in one.stderr
 
 
-def test_a_wire_that_cannot_be_is_wrong_usage_in_its_own_words():
+def test_invalid_wire_is_wrong_usage_with_the_reason():
     message = failure("tf", "a", "b", "--wire", "ros2:domian=5", code=2)
     assert "no option 'domian'; did you mean 'domain'?" in message
     assert "'native'" in failure("ls", "--wire", "ros3", code=2)
@@ -160,7 +160,7 @@ main()
 """
 
 
-def test_who_speaks_to_ros_alone_joins_the_router_of_this_host(
+def test_ros_commands_join_the_router_of_this_host(
     spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("ZSTATE_CONNECT")
@@ -169,7 +169,7 @@ def test_who_speaks_to_ros_alone_joins_the_router_of_this_host(
         assert [command.line(), command.line()] == ["1 node in domain 0", "  /driver"]
 
 
-def test_a_router_that_is_not_there_is_told_with_those_that_could_be(spawn: Spawn, free_port: int):
+def test_missing_router_is_reported_with_the_commands_that_start_one(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     command = spawn(ELSEWHERE, endpoint, "ls", "--wire", "ros2")
     assert command.wait() == 1

@@ -45,7 +45,7 @@ def test_publish_takes_the_place_of_robot_state_publisher(spawn: Spawn, ros_rout
     interrupted(command)
 
 
-def test_beside_native_joint_states_ros_is_given_everything(spawn: Spawn, ros_router: str, client: Session):
+def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_router: str, client: Session):
     command = started(spawn, "publish", RRBOT, "--wire", "native", "--wire", "ros2")
     assert command.line() == (
         "publishing 'rrbot' (7 links, 2 joints) on zstate/rrbot/{robot_description,tf_static,tf} and on "
@@ -68,7 +68,7 @@ def test_a_sine_goes_out_on_all_wires(spawn: Spawn, ros_router: str, client: Ses
     assert streams(client, "ros2:namespace=r1") == EVERYTHING
 
 
-def test_beside_the_native_wire_the_way_to_a_ros_router_is_told():
+def test_native_and_ros_wires_together_report_the_router_option():
     said = zstate(
         *("publish", RRBOT, "--source", "sine", "--seconds", "0.1", "--wire", "native", "--wire", "ros2")
     )
@@ -90,7 +90,7 @@ def test_a_static_edge_of_two_ros_frames_needs_no_robot(spawn: Spawn, client: Se
     assert placed.translation.tolist() == [1.0, 0.0, 0.0]
 
 
-def test_what_is_written_on_topics_has_the_names_that_were_given(spawn: Spawn, client: Session):
+def test_topics_have_the_configured_names(spawn: Spawn, client: Session):
     heard: list[SerializedSample] = []
     started(spawn, "static", "r1/base", "laser", "--xyz", "1", "0", "0").line()
     with LatchedSubscriber(client, "0/tf_static/**", heard.append):

@@ -1,4 +1,4 @@
-"""Every command, the page and the events of a listener agree on which robot is stale."""
+"""All commands, the view and listener events agree on which robot is stale."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from zstate import Transform, TransformBuffer, connect
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.commands.ls import robots_text
 from zstate.cli.commands.tree import tree_drawing
-from zstate.cli.doctor.samples import StreamSamples
-from zstate.cli.monitor import EdgeStatistics, Row, report_text
+from zstate.cli.doctor.robot_probe import StreamSamples
+from zstate.cli.monitor import EdgeRow, EdgeStatistics, path_text
 from zstate.cli.output.drawing import ALARM, draw
 from zstate.clock import SystemClock
 from zstate.ingest.deadline import Deadline, DeadlineMonitor, is_stale
@@ -29,8 +29,8 @@ SESSION = 7
 WRITER = WriterId("driver", "jetson", 412, 0, SESSION)
 
 
-def answers(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
-    """Which consumers call the writer stale now, whose samples arrived then [ns, monotonic]."""
+def staleness(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
+    """By consumer, whether a writer is stale now; its samples arrived at ``arrivals`` [ns, monotonic]."""
     now_s = time.monotonic_ns() * 1e-9
     native, order = get_wire("native"), order_digest(())
     edge = FrameInfo("r1/tool", "r1/base", "joint", str(WRITER), None, None, None, 0)
@@ -55,7 +55,7 @@ def answers(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
         (tool,) = [frame for frame in buffer.frames() if frame.name == "r1/tool"]
         found["events"] = bool(events.expired(now_s)[0])
         found["ls"] = "silent" in robots_text((RobotInfo("r1", (("joint_states", WRITER),)),), listed)
-        found["monitor"] = "silent" in report_text([Row("r1/tool", edge, edges.measure(edge), None)])
+        found["monitor"] = "silent" in path_text([EdgeRow("r1/tool", edge, edges.measure(edge), None)])
         found["monitor --robots, demo"] = metered.measure("r1").rate_hz == 0.0
         found["doctor"] = examined.statistics.is_stale()
         found["doctor, ROS"] = examined.writers[SESSION].statistics.is_stale()
@@ -76,9 +76,9 @@ def answers(arrivals: list[int], stamps: list[int]) -> dict[str, bool]:
         (INTERVALS_2_HZ, 6.5, True),
     ],
 )
-def test_one_arrival_pattern_gets_one_answer(intervals: list[float], silent_s: float, expected: bool):
+def test_all_consumers_agree_on_staleness(intervals: list[float], silent_s: float, expected: bool):
     ages_s = [silent_s + sum(intervals[number:]) for number in range(len(intervals) + 1)]
     now, system = time.monotonic_ns(), time.time_ns()
     arrivals = [now - round(age_s * 1e9) for age_s in ages_s]
-    found = answers(arrivals, [system - round(age_s * 1e9) for age_s in ages_s])
+    found = staleness(arrivals, [system - round(age_s * 1e9) for age_s in ages_s])
     assert set(found.values()) == {expected}, found

@@ -29,7 +29,7 @@ def test_prose_is_folded_between_words_which_stay_whole():
     ]
 
 
-def test_letters_stand_for_names_in_their_order():
+def test_short_labels_follow_the_order_of_names():
     assert short_labels(["left", "right", "left"]) == {"left": "a", "right": "b"}
     assert list(short_labels(map(str, range(28))).values())[25:] == ["z", "27", "28"]
 

@@ -95,7 +95,7 @@ def test_the_driver_is_a_dozen_lines():
     assert len(SWING.splitlines()) <= 12
 
 
-def test_the_document_shows_the_files_beside_it():
+def test_the_document_shows_the_files_of_its_folder():
     for language, name in FILES.items():
         assert blocks(language) == [(FOLDER / name).read_text()]
 
@@ -105,7 +105,7 @@ def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
     assert masked([str(uptime_s * 1_000_000_000)]) == ["STAMP"]
 
 
-def test_the_documents_terminal_says_what_stands_there(folder: Path, without_xacro: None):
+def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
     with terminal(folder) as shell:
         for one in told():
             said, expected = masked(shell.does(one)), masked(one.lines)
@@ -134,18 +134,18 @@ def test_the_robot_runs_and_can_be_looked_at(cell: Child, driver):
     assert doctor("arm", code=0)["sound"]
 
 
-def test_1_a_driver_that_died_is_missed(cell: Child, driver):
+def test_1_dead_driver_is_reported(cell: Child, driver):
     process = driver()
     assert zstate("wait", "robot", "arm").returncode == 0
     process.kill()
     process.wait()
     found = doctor(code=1)["first_broken"]
     assert (found["name"], found["robot"]) == ("joint_states", "arm")
-    assert "nobody writes joint_states of 'arm', for which zstate-publish@" in found["text"]
+    assert "'arm' has no writer of joint_states, which zstate-publish@" in found["text"]
     assert "its driver is not running" in found["text"]
 
 
-def test_1_where_the_driver_was_all_there_was_the_robot_is_missed(folder: Path):
+def test_1_without_a_publisher_the_robot_is_missing(folder: Path):
     found = doctor("arm", code=1)["first_broken"]
     assert (found["name"], found["next"]) == ("robots", "zstate publish FILE --name arm")
     assert "its publisher is not running" in found["text"]
@@ -171,7 +171,7 @@ def test_2_a_path_with_a_space_works_and_is_named_where_the_quotes_are_forgotten
         (ARM, "", "the text is empty"),
     ],
 )
-def test_3_a_bad_urdf_is_refused_by_whoever_reads_it(folder: Path, driver, right: str, wrong: str, told: str):
+def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str, wrong: str, told: str):
     Path("arm.urdf").write_text(ARM.replace(right, wrong))
     assert told in zstate("check", "arm.urdf").stdout.decode()
     assert told in failure("publish", "arm.urdf")
@@ -204,7 +204,7 @@ def test_4_stamps_of_the_future_and_of_1970_are_used_and_named(cell: Child, driv
     assert [check["state"] for check in said["checks"] if check["name"] == "poses"] == ["ok"]
 
 
-def test_5_a_xacro_that_nobody_has_expanded_is_recognised(folder: Path, without_xacro: None):
+def test_5_unexpanded_xacro_is_recognised(folder: Path, without_xacro: None):
     Path("arm.urdf").write_text(XACRO)
     told = "this is a xacro file, which must be expanded: pip install 'zstate[xacro]'"
     assert told in zstate("check", "arm.urdf").stdout.decode()

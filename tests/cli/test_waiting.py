@@ -13,7 +13,7 @@ from zstate.cli.waiting import ConditionWaiter
 @pytest.fixture
 def notes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     texts: list[str] = []
-    monkeypatch.setattr(waiting, "note", lambda text, **_: texts.append(text))
+    monkeypatch.setattr(waiting, "print_status", lambda text, **_: texts.append(text))
     return texts
 
 
@@ -58,16 +58,16 @@ def test_a_burst_of_notifications_costs_few_checks():
     assert len(checks) <= 2 + (time.monotonic() - began) / 0.02
 
 
-def test_a_reason_is_noted_once_and_only_in_a_long_wait(notes: list[str]):
+def test_reason_is_printed_once_and_only_in_a_long_wait(notes: list[str]):
     waiter = ConditionWaiter()
     assert not waiter.wait_for(lambda: False, 0.1, lambda: "no robot")
-    assert (notes, waiter.noted) == ([], "")
+    assert (notes, waiter.last_reason) == ([], "")
     assert not waiter.wait_for(lambda: False, 1.2, lambda: "no robot")
     assert notes == ["waiting: no robot"]
-    assert waiter.noted == "no robot"
+    assert waiter.last_reason == "no robot"
 
 
-def test_a_reason_that_changes_is_noted_again(notes: list[str]):
+def test_changed_reason_is_printed_again(notes: list[str]):
     reasons = iter(["no robot", "no model", "no samples", "no samples", "no samples"])
     assert not ConditionWaiter().wait_for(lambda: False, 1.7, lambda: next(reasons))
     assert notes == ["waiting: no robot", "waiting: no model", "waiting: no samples"]

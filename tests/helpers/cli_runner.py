@@ -1,4 +1,4 @@
-"""What the tests of the looking commands share: commands as real processes, and a robot that stands still."""
+"""Helpers for tests of commands: commands as real processes, and a robot that stands still."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
 
 
 def started(spawn: Spawn, *arguments: str) -> Child:
-    """A command that goes on until it is told to end."""
+    """A command that runs until it is stopped."""
     return spawn("from zstate.cli.main import main; main()", *arguments)
 
 
 def interrupted(child: Child) -> None:
-    """Ctrl-C: it must end within a second, with code 130 and no traceback."""
+    """Send Ctrl-C: it must exit within a second, with code 130 and no traceback."""
     began = time.monotonic()
     child.process.send_signal(signal.SIGINT)
     assert child.wait() == 130
@@ -65,7 +65,7 @@ def standing(
     router: str = "",
     clock: Clock | None = None,
 ) -> Iterator[StatePublisher]:
-    """A robot that stands still and says so a hundred times a second, behind ``router`` if there is one."""
+    """Publishes a robot that stands still, a hundred times a second, behind ``router`` if that is set."""
     stop = threading.Event()
 
     def publish() -> None:

@@ -367,6 +367,20 @@ class BufferCore:
             names = known if among is None else [name for name in among if name in known]
             return tuple(map(self._tree.frame_info, names))
 
+    def path_frames(self, target: str, source: str) -> list[tuple[str, FrameInfo | None]]:
+        """The frames on the path from ``target`` to ``source``, each with the edge that leads to it.
+
+        An edge is described by the frame that it places; ``target`` has None. Raises as ``plan``.
+        """
+        with self._lock:
+            up, down, *_ = self._tree.path(target, source)
+            info = self._tree.frame_info
+            return [
+                (self._tree.resolve(target, target, source), None),
+                *((edge.parent, info(edge.child)) for edge in reversed(up)),
+                *((edge.child, info(edge.child)) for edge in down),
+            ]
+
     def tree_snapshot(self) -> TreeSnapshot:
         """All frames with their edges and all robots with their tracks."""
         with self._lock:

@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-# Robots of this host answer in a fraction of this; a longer delay is annoying at a prompt.
+# Robots on this host are discovered in a fraction of this; a longer delay is annoying at a prompt.
 _ROBOTS_WITHIN_S = 0.4
 
 _MODELS = {"check": "file", "demo": "robot", "init": "robot", "joints": "robot", "publish": "robot"}
@@ -46,7 +46,7 @@ class RobotName(click.types.StringParamType):
 
 
 class ParameterSetting(click.types.StringParamType):
-    """KEY=VALUE with the parameters of the file of `zstate up` and their present values."""
+    """KEY=VALUE with the parameters of the file of `zstate up` and their current values."""
 
     name = "setting"
 
@@ -89,8 +89,8 @@ def _announced(ctx: click.Context) -> Iterator[str]:
     from zstate.net.presence import discover
     from zstate.net.session import connect
 
-    given = {name: ctx.params.get(name) for name in ("mode", "connect", "listen", "config")}
-    network = SessionOptions(given["mode"], given["connect"] or (), given["listen"] or (), given["config"])
+    get = ctx.params.get
+    network = SessionOptions(get("mode"), get("connect") or (), get("listen") or (), get("config"))
     # Errors are left to the command itself.
     with (
         suppress(ZStateError),

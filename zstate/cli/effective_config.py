@@ -17,7 +17,7 @@ import click
 from click.core import ParameterSource
 
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.options import PASSWORD_VARIABLE, credentials_of
+from zstate.cli.options import PASSWORD_VARIABLE, build_credentials
 from zstate.cli.output.logs import FORMAT_VARIABLE, FORMATS
 from zstate.cli.output.wire_text import is_ros
 from zstate.cli.session import SessionOptions
@@ -133,7 +133,9 @@ def _config_file(context: click.Context) -> Setting:
 
 def _credentials(context: click.Context) -> Credentials | None:
     params = context.params
-    return credentials_of(params["certs"], params["identity"], params["user"], params["password_file"], None)
+    return build_credentials(
+        params["certs"], params["identity"], params["user"], params["password_file"], None
+    )
 
 
 def _network(context: click.Context) -> SessionOptions:

@@ -38,7 +38,10 @@ def unknown_target_warnings(
     """
     full = [
         Transform(
-            full_name(publisher.robot, edge.target), full_name(publisher.robot, edge.source), *_pose(edge)
+            full_name(publisher.robot, edge.target),
+            full_name(publisher.robot, edge.source),
+            edge.translation,
+            edge.rotation,
         )
         for edge in edges
     ]
@@ -46,13 +49,9 @@ def unknown_target_warnings(
     for robot in dict.fromkeys(edge.target.partition("/")[0] for edge in full):
         with suppress(ZStateError), KnownFrames(session, robot, publisher.writer) as frames:
             frames.wait_for_model()
-            own = [edge for edge in full if edge.target.startswith(f"{robot}/")]
-            warnings += frames.warnings(own, {edge.source for edge in full})
+            edges_on = [edge for edge in full if edge.target.startswith(f"{robot}/")]
+            warnings += frames.warnings(edges_on, {edge.source for edge in full})
     return warnings
-
-
-def _pose(edge: Transform) -> tuple[Sequence[float], Sequence[float]]:
-    return edge.translation.tolist(), edge.rotation.tolist()
 
 
 def similar_frames(name: str, known: Collection[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""zstate: one command for each thing to do, loaded when it is called for."""
+"""Entry point of the command line: loads the called command, handles signals and exit codes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from zstate.errors import ZStateError
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-# name: (section of the help, what it does); zstate.cli.commands.<name> holds the command <name>_command.
+# name: (section of the help, summary); zstate.cli.commands.<name> holds the command <name>_command.
 _COMMANDS = {
     "demo": ("Start here", "A robot that moves, its state over Zenoh, and a live table of it."),
     "publish": ("Write", "Publish a robot's state: its model, fixed edges, and transforms."),
@@ -31,35 +31,35 @@ _COMMANDS = {
     "tf": ("Look", "The pose of one frame in another."),
     "monitor": ("Look", "How samples come in, by edge or by robot: rates, latencies, losses."),
     "tree": ("Look", "The frames of the announced robots, as a tree."),
-    "ls": ("Look", "The announced robots and who writes for them."),
-    "graph": ("Look", "Who writes and reads what."),
+    "ls": ("Look", "The announced robots and their writers."),
+    "graph": ("Look", "The writers and readers of each stream."),
     "echo": ("Look", "Joint states, one document each."),
     "hz": ("Look", "The rate at which samples come in."),
     "doctor": ("Look", "What is wrong, and what to do next."),
     "wait": ("Look", "Wait until a robot, a pose or a router is there."),
-    "config": ("Look", "What commands go by here, and who said so."),
+    "config": ("Look", "The settings in effect, and where each comes from."),
     "view": ("Look", "The robots, drawn in a browser, and moved from there."),
     "plot": ("Look", "Joint positions, or the path of a frame, over time."),
-    "check": ("Look", "What is right and wrong with a robot model."),
+    "check": ("Look", "The contents and findings of a robot model."),
     "robots": ("Look", "The robots that are known by name, such as panda."),
-    "record": ("Record", "What robots say, into MCAP files."),
-    "replay": ("Record", "What was recorded, said again."),
+    "record": ("Record", "Record robots into MCAP files."),
+    "replay": ("Record", "Publish a recording again."),
     "recover": ("Record", "A complete file of a recording that was cut off."),
-    "info": ("Record", "What is in a recording."),
-    "snapshot": ("Record", "Robots as they are now, into a file and out of it again."),
+    "info": ("Record", "The contents of a recording."),
+    "snapshot": ("Record", "Save the state of robots to a file, and publish it again."),
     "bridge": ("Run", "Carry robots between zstate and ROS 2, both ways."),
     "router": ("Run", "A Zenoh router."),
-    "acl": ("Run", "Who may do what behind a router, for its configuration."),
+    "acl": ("Run", "Access control for the configuration of a router."),
     "certs": ("Run", "Certificates for tests: an authority and identities."),
     "ros1": ("Run", "A bridge to ROS 1, in either direction."),
-    "up": ("Run", "Start several of these from one file."),
-    "init": ("Run", "A commented file for `zstate up`, to begin with."),
-    "completion": ("Run", "What teaches a shell to complete all this."),
+    "up": ("Run", "Start several processes from one file."),
+    "init": ("Run", "Write a commented file for `zstate up`."),
+    "completion": ("Run", "Set up completion in a shell."),
 }
 
 
 COMPLETION_VARIABLE = "_ZSTATE_COMPLETE"
-"""Set by the function of a shell while it asks what to offer."""
+"""Set by the completion function of a shell."""
 
 
 # Columns that click leaves free at the right.
@@ -76,7 +76,7 @@ class HelpFormatter(click.HelpFormatter):
     """click's formatter with two changes.
 
     The network options, equal for every command, get a section of their own below the other options.
-    An example stays on one line; a comment that does not fit beside it goes above.
+    An example stays on one line; a comment that does not fit goes on the line above.
     """
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
@@ -161,8 +161,8 @@ class Commands(click.Group):
                 formatter.write_dl(rows)
 
 
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    if wanted:
+def _print_version(ctx: click.Context, _: click.Parameter, is_set: bool) -> None:
+    if is_set:
         from zstate import __version__, kernel
 
         click.echo(f"zstate {__version__} (kernel: {kernel})")
@@ -179,7 +179,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 @click.pass_context
 def group(ctx: click.Context, until_eof: bool) -> None:
     """A robot's state wherever Zenoh reaches, without ROS."""
-    # The name under which others see what this process writes.
+    # The program name in announcements of this process.
     sys.argv[0] = f"zstate-{ctx.invoked_subcommand}"
     if until_eof:
         from zstate.cli.processes import end_with_parent
@@ -188,14 +188,21 @@ def group(ctx: click.Context, until_eof: bool) -> None:
 
 
 def main() -> NoReturn:
-    """Run the command line and exit: 0, 1 for what failed, 2 for wrong usage, 130 after Ctrl-C."""
+    """Run the command line and exit: 0, 1 for a failure, 2 for wrong usage, 130 after Ctrl-C."""
     logs.use_environment_format()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _end)
     try:
         code = group.main(prog_name="zstate", standalone_mode=False)
+    except getattr(click.exceptions, "NoArgsIsHelpError", ()) as error:
+        click.echo(error.format_message())  # click before 8.2 prints the help itself
+        code = 0
     except click.UsageError as error:
-        code = _end_of_wrong_usage(error)
+        from zstate.cli.usage_hints import usage_hint
+
+        text = usage_hint(sys.argv[1:], error) or error.format_message()
+        _report_error(f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text)
+        code = error.exit_code
     except click.ClickException as error:
         _report_error(error.format_message())
         code = error.exit_code
@@ -207,49 +214,25 @@ def main() -> NoReturn:
     _exit(code)
 
 
-def _end_of_wrong_usage(error: click.UsageError) -> int:
-    """Print what is wrong, or the help where only a command was missing; the exit code."""
-    # Click before 8.2 prints the help by itself.
-    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):
-        click.echo(error.format_message())
-        return 0
-    _report_error(_usage_text(error))
-    return error.exit_code
-
-
 def _exit(code: str | int | None) -> NoReturn:
-    # A thread that is inside Zenoh as Python shuts down, such as one that still connects, aborts the process.
     code = code or 0
-    if isinstance(code, int) and any(map(_is_at_work, threading.enumerate())):
+    # A thread inside Zenoh during Python's shutdown, such as one still connecting, aborts the process. The
+    # thread "zstate exit" is idle if all sessions are closed.
+    is_busy = any(thread.daemon and thread.name != "zstate exit" for thread in threading.enumerate())
+    if isinstance(code, int) and is_busy:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
         os._exit(code)
-    # Python looks for garbage as it ends, a tenth of a second long where it has heard a fleet.
+    # Python's garbage collection at exit takes 0.1 s after receiving a large fleet.
     gc.freeze()
     sys.exit(code)
 
 
-def _is_at_work(thread: threading.Thread) -> bool:
-    # The thread that closes sessions at the end has nothing to close where all are closed.
-    return thread.daemon and thread.name != "zstate exit"
-
-
 def _end(number: int, _: FrameType | None) -> None:
-    # Leaving takes well under a second; whoever asks a second time does not wait for it.
-    signal.signal(number, _end_at_once)
+    # An orderly exit takes well under a second; a second signal ends it at once.
+    signal.signal(number, lambda number, _: os._exit(128 + number))
     raise SystemExit(128 + number)
-
-
-def _end_at_once(number: int, _: FrameType | None) -> None:
-    os._exit(128 + number)
-
-
-def _usage_text(error: click.UsageError) -> str:
-    from zstate.cli.usage_hints import usage_hint
-
-    text = usage_hint(sys.argv[1:], error) or error.format_message()
-    return f"{text}\nSee `{error.ctx.command_path} --help`." if error.ctx else text
 
 
 def _report_error(text: str) -> None:

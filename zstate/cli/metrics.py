@@ -1,4 +1,4 @@
-"""--metrics: what a command serves for Prometheus while it runs."""
+"""--metrics: serves Prometheus metrics while a command runs. Libraries load when something is served."""
 
 from __future__ import annotations
 
@@ -17,84 +17,53 @@ if TYPE_CHECKING:
     from zstate.nodes.publisher import StatePublisher
     from zstate.recording.recorder import Recorder
 
+Factory = Callable[[], "MetricsCollector"]
+
 
 @contextmanager
-def served(address: BindAddress | None, *collectors: Callable[[], MetricsCollector]) -> Generator[None]:
-    """What ``collectors`` make is served at ``address`` meanwhile, and where is said; None serves nothing."""
+def serve_metrics(address: BindAddress | None, *factories: Factory) -> Generator[None]:
+    """Serve the collectors that ``factories`` make at ``address``, which is printed; nothing for None."""
     if address is None:
         yield
         return
     from zstate.metrics.endpoint import MetricsEndpoint
 
-    with MetricsEndpoint([make() for make in collectors], *address) as endpoint:
+    with MetricsEndpoint([factory() for factory in factories], *address) as endpoint:
         print_status(f"metrics at {endpoint.url}", event="metrics")
         yield
 
 
-# Each loads its library when something is served.
+def publisher_collector(*publishers: StatePublisher) -> Factory:
+    """Metrics of publishers."""
+    return lambda: _collectors().PublisherMetrics(publishers)
 
 
-def of_publishers(*publishers: StatePublisher) -> Callable[[], MetricsCollector]:
-    """What publishers say."""
-
-    def make() -> MetricsCollector:
-        from zstate.metrics.collectors import PublisherMetrics
-
-        return PublisherMetrics(publishers)
-
-    return make
+def listener_collector(listeners: Callable[[], Sequence[Listened]]) -> Factory:
+    """Metrics of the listeners that exist at each scrape."""
+    return lambda: _collectors().ListenerMetrics(listeners)
 
 
-def of_listeners(listeners: Callable[[], Sequence[Listened]]) -> Callable[[], MetricsCollector]:
-    """What the listeners that there are by then hear."""
-
-    def make() -> MetricsCollector:
-        from zstate.metrics.collectors import ListenerMetrics
-
-        return ListenerMetrics(listeners)
-
-    return make
+def writer_collector(directory: RobotDirectory) -> Factory:
+    """Metrics of the announced writers."""
+    return lambda: _collectors().WriterMetrics(directory.robots)
 
 
-def of_writers(roster: RobotDirectory) -> Callable[[], MetricsCollector]:
-    """Who writes."""
-
-    def make() -> MetricsCollector:
-        from zstate.metrics.collectors import WriterMetrics
-
-        return WriterMetrics(roster.robots)
-
-    return make
+def connection_collector(session: Session) -> Factory:
+    """Metrics of the connections of a router."""
+    return lambda: _collectors().ConnectionMetrics(session)
 
 
-def of_connections(session: Session) -> Callable[[], MetricsCollector]:
-    """Who is connected to a router."""
-
-    def make() -> MetricsCollector:
-        from zstate.metrics.collectors import ConnectionMetrics
-
-        return ConnectionMetrics(session)
-
-    return make
+def recorder_collector(recorder: Recorder) -> Factory:
+    """Metrics of a recorder."""
+    return lambda: _collectors().RecorderMetrics(recorder)
 
 
-def of_recorder(recorder: Recorder) -> Callable[[], MetricsCollector]:
-    """What is recorded."""
-
-    def make() -> MetricsCollector:
-        from zstate.metrics.collectors import RecorderMetrics
-
-        return RecorderMetrics(recorder)
-
-    return make
+def bridge_collector(bridge: Bridge) -> Factory:
+    """Metrics of a bridge."""
+    return lambda: _collectors().BridgeMetrics(bridge)
 
 
-def of_bridge(bridge: Bridge) -> Callable[[], MetricsCollector]:
-    """What is carried."""
+def _collectors():
+    from zstate.metrics import collectors
 
-    def make() -> MetricsCollector:
-        from zstate.metrics.collectors import BridgeMetrics
-
-        return BridgeMetrics(bridge)
-
-    return make
+    return collectors

@@ -33,19 +33,19 @@ _IDENTITY_OPTIONS = (
         type=click.Path(exists=True, file_okay=False),
         metavar="DIR",
         envvar="ZSTATE_CERTS",
-        help="Encrypt, with the ca.pem, NAME.pem and NAME.key of this folder (`zstate certs` makes such).",
+        help="Encrypt with ca.pem, NAME.pem and NAME.key of this folder (`zstate certs` makes them).",
     ),
     click.option(
         "--identity",
         metavar="NAME",
         envvar="ZSTATE_IDENTITY",
-        help="Which certificate of --certs to show; access control knows this command by it.",
+        help="The certificate in --certs to use; access control identifies this command by it.",
     ),
     click.option(
         "--user",
         metavar="NAME",
         envvar="ZSTATE_USER",
-        help=f"For a router that asks; its password is in {PASSWORD_VARIABLE}, or in --password-file.",
+        help=f"User name for a router; its password is in {PASSWORD_VARIABLE}, or in --password-file.",
     ),
     click.option(
         "--password-file",
@@ -60,7 +60,7 @@ _USERS = click.option(
     type=click.Path(exists=True, dir_okay=False),
     metavar="FILE",
     envvar="ZSTATE_USERS",
-    help="Who may connect: user:password lines, in a file that only you can read; default: everybody.",
+    help="The users that may connect: user:password lines in a file that only you can read; default: all.",
 )
 
 
@@ -70,77 +70,12 @@ def identity_options(command: Command) -> Command:
 
 
 def router_identity_options(command: Command) -> Command:
-    """The same, with ``--users``."""
+    """The credential options with ``--users``."""
     return _with_credentials(command, (*_IDENTITY_OPTIONS, _USERS))
 
 
-def plain_identity_options(command: Command) -> Command:
-    """The same options, passed on unchanged."""
-    return _with_options(command, _IDENTITY_OPTIONS)
-
-
-def _with_credentials(command: Command, options: Sequence[Callable[[Any], Any]]) -> Command:
-    @functools.wraps(command)
-    def with_credentials(
-        *,
-        certs: str | None,
-        identity: str | None,
-        user: str | None,
-        password_file: str | None,
-        users: str | None = None,
-        **others: Any,
-    ) -> Any:
-        credentials = credentials_of(certs, identity, user, password_file, users)
-        return command(credentials=credentials, **others)
-
-    return _with_options(with_credentials, options)
-
-
-def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-def credentials_of(
-    certs: str | None,
-    identity: str | None,
-    user: str | None,
-    password_file: str | None,
-    users: str | None,
-) -> Credentials | None:
-    """Credentials of these options. Raises UsageError for half a pair, ConfigError for unusable files."""
-    if (certs is None) != (identity is None):
-        given, lacking = ("--certs", "--identity NAME") if identity is None else ("--identity", "--certs DIR")
-        raise click.UsageError(f"{given} is of no use without {lacking}")
-    if password_file is not None and user is None:
-        raise click.UsageError("--password-file is of no use without --user NAME")
-    if certs is None and user is None and users is None:
-        return None
-    from zstate.net.security.credentials import Credentials
-
-    password = None if user is None else _password(user, password_file)
-    if certs is None or identity is None:
-        return Credentials(user=user, password=password, users=users)
-    return Credentials.from_folder(certs, identity, user=user, password=password, users=users)
-
-
-def _password(user: str, file: str | None) -> str:
-    # Never on the command line, which every user of the machine can read.
-    if file is None:
-        password = os.environ.get(PASSWORD_VARIABLE)
-        if not password:
-            raise click.UsageError(
-                f"the password of {user!r} is missing; put it into {PASSWORD_VARIABLE} or a --password-file"
-            )
-        return password
-    from zstate.net.security.credential_files import password_in
-
-    return password_in(file)
-
-
 def session_options(command: Command) -> Command:
-    """Give a command the session options; it gets them as ``network``, a Network."""
+    """Add the session and credential options to a command, which receives ``network``, a SessionOptions."""
 
     @functools.wraps(command)
     def with_network(
@@ -154,16 +89,72 @@ def session_options(command: Command) -> Command:
     ) -> Any:
         return command(network=SessionOptions(mode, connect, listen, config, credentials), **options)
 
-    for option in reversed((*_HOW_TO_JOIN, identity_options)):
-        with_network = option(with_network)
-    return with_network  # type: ignore[return-value]
+    return _with_options(_with_credentials(with_network, _IDENTITY_OPTIONS), _SESSION_OPTIONS)
 
 
 def plain_session_options(command: Command) -> Command:
-    """The same options as they are said, and nothing made of them."""
-    for option in reversed((*_HOW_TO_JOIN, plain_identity_options)):
+    """The session and credential options, each passed on unchanged."""
+    return _with_options(command, (*_SESSION_OPTIONS, *_IDENTITY_OPTIONS))
+
+
+def _with_credentials(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
+    @functools.wraps(command)
+    def with_credentials(
+        *,
+        certs: str | None,
+        identity: str | None,
+        user: str | None,
+        password_file: str | None,
+        users: str | None = None,
+        **others: Any,
+    ) -> Any:
+        credentials = build_credentials(certs, identity, user, password_file, users)
+        return command(credentials=credentials, **others)
+
+    return _with_options(with_credentials, options)
+
+
+def _with_options(command: Any, options: Sequence[Callable[[Any], Any]]) -> Any:
+    for option in reversed(options):
         command = option(command)
     return command
+
+
+def build_credentials(
+    certs: str | None,
+    identity: str | None,
+    user: str | None,
+    password_file: str | None,
+    users: str | None,
+) -> Credentials | None:
+    """Credentials from options. Raises UsageError for half a pair, ConfigError for unusable files."""
+    if (certs is None) != (identity is None):
+        has, lacks = ("--certs", "--identity NAME") if identity is None else ("--identity", "--certs DIR")
+        raise click.UsageError(f"{has} needs {lacks}")
+    if password_file is not None and user is None:
+        raise click.UsageError("--password-file needs --user NAME")
+    if certs is None and user is None and users is None:
+        return None
+    from zstate.net.security.credentials import Credentials
+
+    password = None if user is None else _password(user, password_file)
+    if certs is None or identity is None:
+        return Credentials(user=user, password=password, users=users)
+    return Credentials.from_folder(certs, identity, user=user, password=password, users=users)
+
+
+def _password(user: str, file: str | None) -> str:
+    # Never from the command line, which every user of the machine can read.
+    if file is not None:
+        from zstate.net.security.credential_files import password_in
+
+        return password_in(file)
+    password = os.environ.get(PASSWORD_VARIABLE)
+    if not password:
+        raise click.UsageError(
+            f"the password of {user!r} is missing; put it into {PASSWORD_VARIABLE} or a --password-file"
+        )
+    return password
 
 
 config_option = click.option(
@@ -174,7 +165,7 @@ config_option = click.option(
     help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
 )
 
-_HOW_TO_JOIN = (
+_SESSION_OPTIONS = (
     click.option(
         "--mode",
         type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
@@ -188,14 +179,14 @@ _HOW_TO_JOIN = (
         multiple=True,
         metavar="ENDPOINT",
         envvar="ZSTATE_CONNECT",
-        help="Where somebody listens, such as tcp/192.168.1.10:7447; may be repeated.",
+        help="An endpoint to connect to, such as tcp/192.168.1.10:7447; may be repeated.",
     ),
     click.option(
         "--listen",
         multiple=True,
         metavar="ENDPOINT",
         envvar="ZSTATE_LISTEN",
-        help="Where to listen, such as tcp/0.0.0.0:7448; may be repeated.",
+        help="An endpoint to listen on, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
     config_option,
 )
@@ -219,7 +210,7 @@ wire_option = click.option(
     callback=_checked_wire,
     metavar="WIRE",
     envvar="ZSTATE_WIRE",
-    help="What is spoken: native, ros2 (with rmw_zenoh nodes) or ros2dds (through its bridge); with "
+    help="The wire format: native, ros2 (for rmw_zenoh nodes) or ros2dds (through its bridge); with "
     "options, such as ros2:domain=5,namespace=r1.",
 )
 wires_option = click.option(
@@ -231,7 +222,7 @@ wires_option = click.option(
     callback=_checked_wire,
     metavar="WIRE",
     envvar="ZSTATE_WIRE",
-    help="What is spoken, as in `--wire native --wire ros2:domain=5,namespace=r1`; may be repeated.",
+    help="The wire format, as in `--wire native --wire ros2:domain=5,namespace=r1`; may be repeated.",
 )
 
 
@@ -251,24 +242,23 @@ def _checked_address(_: click.Context, __: click.Parameter, text: str | None) ->
 takeover_option = click.option(
     "--takeover",
     is_flag=True,
-    help="Write also what somebody else writes already; readers follow whoever came last.",
+    help="Publish even if another writer is active; listeners use the newest writer.",
 )
 metrics_option = click.option(
     "--metrics",
     callback=_checked_address,
     metavar="[HOST:]PORT",
-    help="Serve metrics for Prometheus over HTTP, on this host alone unless HOST says otherwise; 0 is a "
-    "free port.",
+    help="Serve metrics for Prometheus over HTTP, by default on this host only; 0 is a free port.",
 )
 
 
 def json_option(what: str = "One JSON object a line.") -> Callable[[Command], Command]:
-    """``--json``, as ``as_json``; ``what`` says what is printed."""
+    """``--json``, as ``as_json``; ``what`` describes the output."""
     return click.option("--json", "as_json", is_flag=True, help=what)
 
 
 def form_options(json: str, svg: str) -> Callable[[Command], Command]:
-    """``--json`` and the forms of a picture, as ``form``: None for text. The texts say what is printed."""
+    """``--json`` and picture formats, as ``form``: None for text. The texts describe the output."""
 
     def with_forms(command: Command) -> Command:
         helps = {"json": json, "svg": svg, "dot": "For Graphviz.", "mermaid": "For Markdown."}
@@ -280,7 +270,7 @@ def form_options(json: str, svg: str) -> Callable[[Command], Command]:
 
 
 def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Command]:
-    """``--timeout``, in seconds; ``what`` says what for."""
+    """``--timeout`` [s]; ``what`` is its help."""
     return click.option(
         "--timeout",
         type=float,
@@ -293,13 +283,13 @@ def timeout_option(what: str, default_s: float = 10.0) -> Callable[[Command], Co
 
 
 def named_robot(session: Session, robot: str | None, wire: str) -> str:
-    """The robot that a command was given, or the only one there is or that ``wire`` can mean."""
+    """``robot`` if set, else the only one that ``wire`` can mean or that is announced."""
     from zstate.cli.output.wire_text import is_ros, messages_for
     from zstate.cli.robot_directory import only_robot
 
-    meant = robot or messages_for(wire).robot
-    if meant is not None:
-        return meant
+    name = robot or messages_for(wire).robot
+    if name is not None:
+        return name
     if is_ros(wire):
         raise click.UsageError(
             "Missing argument 'ROBOT'; on this wire each robot has a namespace of its name."
@@ -308,27 +298,27 @@ def named_robot(session: Session, robot: str | None, wire: str) -> str:
 
 
 def refuse_topic(robot: str | None, wire: str) -> None:
-    """Raise UsageError where a topic of ROS is given for a robot of the native wire."""
+    """Raise UsageError if ``robot`` is a ROS topic on the native wire."""
     if robot is not None and robot.startswith("/") and wire == "native":
         command = click.get_current_context().command_path
         raise click.UsageError(
-            f"{robot!r} is a topic of ROS, not a robot; `{command} --wire ros2` reads /joint_states"
+            f"{robot!r} is a ROS topic, not a robot; `{command} --wire ros2` reads /joint_states"
         )
 
 
-def parsed_xacro_args(words: Iterable[str]) -> dict[str, str]:
+def parse_xacro_args(texts: Iterable[str]) -> dict[str, str]:
     """``NAME:=VALUE`` arguments by name. Raises UsageError for any other."""
     arguments: dict[str, str] = {}
-    for word in words:
-        name, sign, value = word.partition(":=")
+    for text in texts:
+        name, sign, value = text.partition(":=")
         if not (name and sign):
-            raise click.UsageError(f"Got unexpected extra argument ({word}).", click.get_current_context())
+            raise click.UsageError(f"Got unexpected extra argument ({text}).", click.get_current_context())
         arguments[name] = value
     return arguments
 
 
-def _parsed_xacro_args(_: click.Context, __: click.Parameter, words: tuple[str, ...]) -> dict[str, str]:
-    return parsed_xacro_args(words)
+def _parsed_xacro_args(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
+    return parse_xacro_args(texts)
 
 
 xacro_arguments = click.argument(
@@ -336,14 +326,14 @@ xacro_arguments = click.argument(
 )
 
 
-def named_models(words: Iterable[str]) -> dict[str, dict[str, str]]:
+def parse_models(texts: Iterable[str]) -> dict[str, dict[str, str]]:
     """Models in their order, each with the xacro arguments that follow it."""
     models: dict[str, dict[str, str]] = {}
-    for word in words:
-        if ":=" in word and models:
-            models[next(reversed(models))].update(parsed_xacro_args([word]))
+    for text in texts:
+        if ":=" in text and models:
+            models[next(reversed(models))].update(parse_xacro_args([text]))
         else:
-            models.setdefault(word, {})
+            models.setdefault(text, {})
     return models
 
 
@@ -352,7 +342,7 @@ def load_robot(
 ) -> tuple[RobotModel, str]:
     """The model behind a ROBOT argument, and the robot's name on the network.
 
-    The name is ``name`` if given, else the catalog name that was asked for, else the model's own.
+    The name is ``name`` if set, else the catalog name, else the model's own name.
     """
     from zstate.model.catalog import find_entry
     from zstate.model.load import is_path, load_model
@@ -369,7 +359,7 @@ def load_robot(
 
 
 def checked_rate(_: click.Context, __: click.Parameter, rate_hz: float | None) -> float | None:
-    """The callback of a ``--rate`` option: one that can be kept, or wrong usage."""
+    """The callback of a ``--rate`` option; refuses rates that cannot be achieved."""
     from zstate.rate import check_rate
 
     try:
@@ -379,7 +369,7 @@ def checked_rate(_: click.Context, __: click.Parameter, rate_hz: float | None) -
 
 
 def checked_seconds(_: click.Context, __: click.Parameter, seconds: float | None) -> float | None:
-    """The callback of an option that is a duration: positive and finite, or wrong usage."""
+    """The callback of a duration option: positive and finite."""
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise click.BadParameter(f"a duration is a positive number of seconds; got {seconds}")
     return seconds
@@ -393,13 +383,13 @@ clock_option = click.option(
     default="system",
     show_default=True,
     envvar="ZSTATE_CLOCK",
-    help="What stamps and paces: the system's time, or the simulated time told on zstate/clock or /clock.",
+    help="The clock for stamps and rates: the system's, or the simulated time on zstate/clock or /clock.",
 )
 reading_clock_option = click.option(
     "--clock",
     type=_CLOCKS,
     envvar="ZSTATE_CLOCK",
-    help="Which clock ages are measured with, and which robots' time is used where one must be chosen.",
+    help="The clock that ages are measured with, and that is preferred if robots have different clocks.",
 )
 rate_option = click.option(
     "--rate",
@@ -411,13 +401,13 @@ rate_option = click.option(
     help="Samples a second.",
 )
 seconds_option = click.option(
-    "--seconds", type=float, callback=checked_seconds, metavar="N", help="End after so long [s]."
+    "--seconds", type=float, callback=checked_seconds, metavar="N", help="End after N seconds."
 )
-heard_robot_option = click.option(
-    "--robot", default="*", metavar="NAME", help="Hear only this robot; default: all of them."
+robot_filter_option = click.option(
+    "--robot", default="*", metavar="NAME", help="Subscribe to this robot only; default: all robots."
 )
 name_option = click.option(
-    "--name", metavar="NAME", help="The robot's name on the network; default: as it is called here."
+    "--name", metavar="NAME", help="The robot's name on the network; default: the model's name."
 )
 
 
@@ -425,12 +415,12 @@ name_option = click.option(
 def open_clock(
     session: Session, kind: str | None, wire: str, *, timeout_s: float | None = None
 ) -> Generator[Clock | None]:
-    """The clock that ``--clock`` selects; None if the option was not given.
+    """The clock that ``--clock`` selects; None without the option.
 
     A simulated clock subscribes on ``wire`` and is yielded once it has received its first message.
     Raises NoClock if none arrives within ``timeout_s``.
     """
-    from zstate.clock import SYSTEM, SystemClock, format_stamp  # loads numpy, which helps do without
+    from zstate.clock import SYSTEM, SystemClock, format_stamp  # loads numpy, which --help does not need
 
     if kind is None or kind == SYSTEM:
         yield None if kind is None else SystemClock()
@@ -443,5 +433,5 @@ def open_clock(
         except NoClock:
             print_status(f"waiting for the simulated time on {clock.key} ...")
             clock.wait(timeout_s)
-            print_status(f"heard {clock.key}: it is {format_stamp(clock.now())}")
+            print_status(f"received {clock.key}: it is {format_stamp(clock.now())}")
         yield clock

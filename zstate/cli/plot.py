@@ -72,19 +72,19 @@ class TimeSeries:
 
     def with_unit(self, unit: str) -> TimeSeries:
         """The columns with this unit."""
-        return self._columns([column for column, own in enumerate(self.units) if own == unit])
+        return self._columns([column for column, one in enumerate(self.units) if one == unit])
 
     def select(self, joints: Sequence[str]) -> TimeSeries:
         """The columns of these joints, in that order; all for none. Raises InvalidInput if one is unknown."""
         columns: list[int] = []
         for joint in joints:
-            own = [n for n, name in enumerate(self.names) if name == joint or name.startswith(f"{joint}.")]
-            if not own:
+            found = [n for n, name in enumerate(self.names) if name == joint or name.startswith(f"{joint}.")]
+            if not found:
                 hint = did_you_mean(joint, self.names)
                 raise InvalidInput(
                     f"this robot has no joint {joint!r}{hint} (joints: {', '.join(self.names)})"
                 )
-            columns += own
+            columns += found
         return self._columns(columns) if joints else self
 
     def _columns(self, columns: Sequence[int]) -> TimeSeries:
@@ -112,18 +112,16 @@ def path_series(
     Begins ``start_s`` after the first instant and lasts ``seconds``, or to the end. Raises LookupFailed, and
     InvalidInput if nothing is left.
     """
-    from zstate.cli.monitor import path_between
-
     newest = buffer.latest(target, source)
-    _, legs = path_between(buffer.frames(), target, source)
+    edges = [edge for _, edge in buffer.path_frames(target, source)]
     # The first instant that every moving edge of the path covers.
-    oldest = max((leg.edge.oldest for leg in legs if leg.edge.oldest is not None), default=newest)
+    oldest = max((edge.oldest for edge in edges if edge and edge.oldest is not None), default=newest)
     begin = oldest + round(start_s * 1e9)
     end = newest if seconds is None else min(newest, begin + round(seconds * 1e9))
     if end <= begin:
+        length_s = (newest - oldest) * 1e-9
         raise InvalidInput(
-            f"of {source!r} in {target!r} there are {(newest - oldest) * 1e-9:.3f} s; nothing is left after "
-            f"the first {start_s:g} s"
+            f"{source!r} in {target!r} covers {length_s:.3f} s; nothing is left after the first {start_s:g} s"
         )
     count = int(np.clip((end - begin) * 1e-9 * _POSES_PER_S, _MIN_POSES, _MAX_POSES))
     stamps = np.linspace(begin, end, count).astype(np.int64)
@@ -135,23 +133,23 @@ def live_joints(session: Session, robot: str, wire: str, seconds: float) -> Time
     """The joints of ``robot`` for ``seconds`` from now on. Fails if no sample arrives within 10 s."""
     with (
         DescribedJointStates(session, robot, wire) as states,
-        StreamReader(session, robot, "joint_states", wire) as tap,
+        StreamReader(session, robot, "joint_states", wire) as reader,
     ):
-        samples = [tap.first(_WAIT_S).sample]
+        samples = [reader.first(_WAIT_S).sample]
         documents = [states.document(sample) for sample in samples if isinstance(sample, JointState)]
         print_status(f"listening to {robot} for {seconds:g} s ...")
         deadline = time.monotonic() + seconds
         while (left_s := deadline - time.monotonic()) > 0.0:
-            tapped = tap.next(left_s)
-            if tapped is not None and isinstance(tapped.sample, JointState):
-                documents.append(states.document(tapped.sample))
+            timed = reader.next(left_s)
+            if timed is not None and isinstance(timed.sample, JointState):
+                documents.append(states.document(timed.sample))
         return joint_series(documents, states.model)
 
 
 def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], seconds: float) -> TimeSeries:
     """The path of frame B in frame A for ``seconds`` from now on. Fails if no pose is known within 10 s."""
     with (
-        RobotDirectory(session, robot, wire) as roster,
+        RobotDirectory(session, robot, wire) as directory,
         TransformListener(
             session,
             robot,
@@ -161,7 +159,7 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
             history_on_join=False,
         ) as listener,
     ):
-        PoseWaiter(listener, roster, *frames).answer(timeout_s=_WAIT_S)
+        PoseWaiter(listener, directory, *frames).wait(timeout_s=_WAIT_S)
         print_status(f"listening for {seconds:g} s ...")
         time.sleep(seconds)
         return path_series(listener.buffer, *frames)
@@ -170,25 +168,25 @@ def live_path(session: Session, robot: str, wire: str, frames: tuple[str, str], 
 def recorded_joints(path: str, robot: str | None, start_s: float, seconds: float | None) -> TimeSeries:
     """The joints of ``robot``, or of the only robot, in a recording. Raises RecordingError, InvalidInput."""
     with RecordingReader(path) as reader:
-        transcript = DecodedRecording(
+        decoded = DecodedRecording(
             reader, lambda reason, text: _LOG.warning("left out (%s): %s", reason, text)
         )
-        robots = transcript.robots
+        robots = decoded.robots
         if robot is None and len(robots) != 1:
-            there = f"robots {', '.join(robots)}: name one of them" if robots else "no robot"
-            fail(f"the recording has {there}")
-        name = robots[0] if robot is None else check_has_robot(transcript, robot)
+            content = f"robots {', '.join(robots)}: name one of them" if robots else "no robot"
+            fail(f"the recording has {content}")
+        name = robots[0] if robot is None else check_has_robot(decoded, robot)
         formatter = JointStateFormatter()
-        for described in first_descriptions(transcript, (name,)).values():
+        for described in first_descriptions(decoded, (name,)).values():
             if isinstance(described.message, RobotDescription):
                 formatter.set_description(described.message)
         first, _ = reader.span or (0, 0)
         begin = first + round(start_s * 1e9)
         end = None if seconds is None else begin + round(seconds * 1e9)
         documents = [
-            formatter.document(said.message)
-            for said in transcript.messages((name,), ("joint_states",), begin, end)
-            if isinstance(said.message, JointState)
+            formatter.document(one.message)
+            for one in decoded.messages((name,), ("joint_states",), begin, end)
+            if isinstance(one.message, JointState)
         ]
     if not documents:
         fail(f"{path}: no joint state of {name!r}{' in that time' if start_s or seconds else ''}")

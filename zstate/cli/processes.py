@@ -143,10 +143,10 @@ class ChildProcess(Closeable):
 
     def close(self) -> None:
         """Stop it and wait, less than 1 s; a user's program gets 3 s more."""
-        self.ask_to_end()
+        self.request_exit()
         self.wait(time.monotonic() + END_WITHIN_S)
 
-    def ask_to_end(self) -> None:
+    def request_exit(self) -> None:
         """Request its exit without waiting: SIGTERM, or SIGINT for a user's program."""
         if self._process.poll() is None:
             self._signal(signal.SIGINT if self._is_program else signal.SIGTERM)

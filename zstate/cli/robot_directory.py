@@ -26,8 +26,8 @@ def announced_robots(session: Session, robot: str) -> tuple[RobotInfo, ...]:
     robots = discover(session)
     selected = tuple(info for info in robots if robot in (ANY, info.name))
     if not selected:
-        words = messages_for("native")
-        fail(words.announced(robots) if robot == ANY else words.unknown(robot, robots))
+        messages = messages_for("native")
+        fail(messages.announced(robots) if robot == ANY else messages.unknown(robot, robots))
     return selected
 
 
@@ -55,18 +55,18 @@ class RobotDirectory(Closeable):
     ) -> None:
         from zstate.net.presence import watch
 
-        self.words = messages_for(wire)
-        self._announced: set[Announcement] = set()
-        self._on_change = on_change
-        self._watch = watch(session, robot if is_ros(wire) else "*", self._update, wire)
+        self.messages = messages_for(wire)
+        announced: set[Announcement] = set()
+        self._announced = announced
+
+        def update(announcement: Announcement, alive: bool) -> None:
+            (announced.add if alive else announced.discard)(announcement)
+            on_change()
+
+        self._watch = watch(session, robot if is_ros(wire) else "*", update, wire)
 
     def close(self) -> None:
         self._watch.close()
-
-    def _update(self, announced: Announcement, alive: bool) -> None:
-        change = self._announced.add if alive else self._announced.discard
-        change(announced)
-        self._on_change()
 
     def robots(self) -> tuple[RobotInfo, ...]:
         """Robots with at least one writer, as ``discover`` returns them."""
@@ -78,6 +78,6 @@ class RobotDirectory(Closeable):
         """The streams of ``robot`` that have a writer."""
         return frozenset(one.stream for one in self._announced.copy() if one.robot == robot)
 
-    def silence(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
+    def no_sample_text(self, robot: str, stream: Stream, *, ended: bool = False) -> str:
         """Why no sample of ``stream`` arrives (any more, if ``ended``)."""
-        return self.words.no_sample_text(robot, stream, self.robots(), ended=ended)
+        return self.messages.no_sample_text(robot, stream, self.robots(), ended=ended)

@@ -1,4 +1,4 @@
-"""How a command joins the network: a session that Ctrl-C does not have to wait for."""
+"""The session of a command, from its options. Ctrl-C interrupts connecting."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 NATIVE = ("native",)
 
-# A router of this host answers in milliseconds; one elsewhere is given the library's time.
+# A router on this host answers in milliseconds; a remote one gets the library's default.
 _ROS_ROUTER_WITHIN_S = 2.0
 _ROUTER_WITHIN_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """How to join the network: the session options of one command line, as far as they were given."""
+    """The session options of a command line; None or empty if not set."""
 
     mode: str | None = None
     connect: tuple[str, ...] = ()
@@ -37,14 +37,14 @@ class SessionOptions:
     credentials: Credentials | None = None
 
     @property
-    def is_given(self) -> bool:
-        """Whether the user has said anything about it."""
-        said = (self.mode, self.connect, self.listen, self.config, self.credentials)
-        return any(said) or bool(os.environ.get("ZENOH_CONFIG"))
+    def is_explicit(self) -> bool:
+        """Whether any option or ZENOH_CONFIG is set."""
+        values = (self.mode, self.connect, self.listen, self.config, self.credentials)
+        return any(values) or bool(os.environ.get("ZENOH_CONFIG"))
 
     @property
     def joins_as(self) -> str:
-        """The mode, or what the other options mean without one."""
+        """The mode, or the one that the other options imply."""
         from zstate.net.config import implied_mode
 
         return self.mode or implied_mode(self.connect, self.listen, self.config)
@@ -54,18 +54,17 @@ class SessionOptions:
 def open_session(
     network: SessionOptions, wires: tuple[str, ...] = NATIVE, *, timeout_s: float | None = None
 ) -> Generator[Session]:
-    """A session as the options say, for commands that speak ``wires``.
+    """A session for commands on ``wires``; connecting to a router may take ``timeout_s``, or a few seconds.
 
-    Where all of these are ROS's and the options say nothing, it is a client of the router of this
-    host, where ROS nodes are. A router is given ``timeout_s`` to answer, or a few seconds. Warnings of the
-    library go to standard error from now on.
+    If all of ``wires`` are ROS wires and no option is set, it is a client of the router on this host, which
+    ROS nodes use. From now on, warnings of the library go to standard error.
     """
     configured = network.config or os.environ.get("ZENOH_CONFIG")
     if network.mode == "client" and not network.connect and not configured:
         raise click.UsageError("--mode client needs --connect, for instance tcp/192.168.1.10:7447")
     warn_on_standard_error()
-    joined = _connect_to_ros if all(map(is_ros, wires)) else _connect
-    with joined(network, timeout_s) as session:
+    connect = _connect_to_ros if all(map(is_ros, wires)) else _connect
+    with connect(network, timeout_s) as session:
         yield session
 
 
@@ -73,14 +72,14 @@ def _connect_to_ros(network: SessionOptions, timeout_s: float | None) -> Session
     from zstate.net.config import ROUTER_ENDPOINT
 
     try:
-        if network.is_given:
+        if network.is_explicit:
             return _connect(network, timeout_s)
         return _connect(SessionOptions("client", (ROUTER_ENDPOINT,)), timeout_s or _ROS_ROUTER_WITHIN_S)
     except Unreachable as error:
         where = " or ".join(map(repr, error.endpoints)) or "the configured endpoints"
         fail(
             f"nothing answers at {where}, where the router of the ROS 2 nodes should be; start one "
-            "(`ros2 run rmw_zenoh_cpp rmw_zenohd`, or `zstate router --ros2`), or say where it is: "
+            "(`ros2 run rmw_zenoh_cpp rmw_zenohd`, or `zstate router --ros2`), or set its address: "
             "--connect tcp/HOST:7447"
         )
 
@@ -89,8 +88,8 @@ def _connect(network: SessionOptions, timeout_s: float | None) -> Session:
     from zstate.cli.processes import BackgroundCall
     from zstate.net.session import connect
 
-    # In a thread of its own: a signal ends the wait for it, which Zenoh's would not.
-    worker = BackgroundCall(
+    # In a background thread: a signal interrupts waiting for it, but not Zenoh's own wait.
+    call = BackgroundCall(
         "zstate connect",
         lambda: connect(
             network.config,
@@ -102,21 +101,18 @@ def _connect(network: SessionOptions, timeout_s: float | None) -> Session:
         ),
     )
     try:
-        return worker.result()
+        return call.result()
     except Unreachable as error:
         raise _with_advice(error) from None
 
 
 def _with_advice(error: Unreachable) -> Unreachable:
-    from zstate.net.security.connection_check import check_all_tcp  # loads ssl, which few need
+    from zstate.net.security.connection_check import check_all_tcp  # loads ssl, which few commands need
 
     if not error.endpoints:
         return error
     text, then = check_all_tcp(error.endpoints)
     options = "".join(f" --connect {endpoint}" for endpoint in error.endpoints)
-    advice = (
-        f"try `{then.partition('  #')[0]}`, or `zstate doctor{options}`"
-        if then
-        else f"`zstate doctor{options}`"
-    )
+    doctor, command = f"`zstate doctor{options}`", then.partition("  #")[0]
+    advice = f"try `{command}`, or {doctor}" if then else doctor
     return Unreachable(f"{text}; {advice}", endpoints=error.endpoints)

@@ -70,14 +70,14 @@ class Configuration(_Table, frozen=True):
     def options(self) -> str:
         """The same configuration as options of a command."""
         has_endpoints = bool(self.connect or self.listen or self.config)
-        words = [
+        parts = [
             *(("--mode", self.mode) if self.mode != "peer" or has_endpoints else ()),
-            *(word for endpoint in self.connect for word in ("--connect", endpoint)),
-            *(word for endpoint in self.listen for word in ("--listen", endpoint)),
+            *(part for endpoint in self.connect for part in ("--connect", endpoint)),
+            *(part for endpoint in self.listen for part in ("--listen", endpoint)),
             *(("--config", self.config) if self.config else ()),
             *(("--wire", self.wire) if self.wire != "native" else ()),
         ]
-        return shlex.join(words)
+        return shlex.join(parts)
 
     def network(self, options: SessionOptions) -> SessionOptions:
         """The saved session options; those in ``options`` take precedence."""
@@ -212,14 +212,14 @@ def capture(
 
     Fails if a robot is not announced; logs what does not arrive within ``timeout_s``.
     """
-    words = messages_for(wire)
+    messages = messages_for(wire)
     announced = discover(session, wire=wire)
     selected = [info for info in announced if info.name in robots or not robots]
     for name in robots:
         if name not in [info.name for info in selected]:
-            fail(words.unknown(name, announced))
+            fail(messages.unknown(name, announced))
     if not selected:
-        fail(words.announced(announced))
+        fail(messages.announced(announced))
     with ExitStack() as opened:
         waiter = ConditionWaiter()
         captures = [opened.enter_context(_RobotCapture(session, info, wire, waiter)) for info in selected]
@@ -277,21 +277,18 @@ class _RobotCapture(Closeable):
         self._waiter.notify()
 
     def _on_statics(self, arrival: SerializedSample) -> None:
-        self._insert_statics(arrival)
-        self._waiter.notify()
-
-    def _insert_statics(self, arrival: SerializedSample) -> None:
         try:
             writer = self._wire.static_writer_name(arrival.key) or arrival.key
             if not arrival.payload or writer == MODEL_WRITER:
                 self._statics.pop(writer, None)  # the model has the same edges
-                return
-            for message in self._wire.decode("tf_static", arrival, self.info.name):
-                if isinstance(message, StaticTransforms):
-                    name = f"{writer}.{message.session:08x}" if self._wire.shared else writer
-                    self._statics[name] = message
+            else:
+                for message in self._wire.decode("tf_static", arrival, self.info.name):
+                    if isinstance(message, StaticTransforms):
+                        name = f"{writer}.{message.session:08x}" if self._wire.shared else writer
+                        self._statics[name] = message
         except (InvalidInput, MessageError) as error:
             print_status(f"{arrival.key}: {error}")
+        self._waiter.notify()
 
     def missing(self) -> list[str]:
         """What is announced and has not arrived."""
@@ -301,8 +298,8 @@ class _RobotCapture(Closeable):
         static_names = {name for name, _ in self.info.static_names} - {MODEL_WRITER}
         conditions = {
             "its model has not arrived": "robot_description" in streams and self._model is None,
-            "no joint states came": "joint_states" in streams and self._reading is None,
-            "not all of its static edges arrived": bool(static_names - self._statics.keys()),
+            "no joint states have arrived": "joint_states" in streams and self._reading is None,
+            "not all of its static edges have arrived": bool(static_names - self._statics.keys()),
         }
         return [text for text, is_missing in conditions.items() if is_missing]
 
@@ -347,8 +344,8 @@ def _by_joint(model: RobotModel, numbers: Any, counts: Mapping[JointType, int]) 
     if numbers is not None:
         rest = [float(number) for number in numbers]
         for joint in model.driven_joints:
-            own, rest = rest[: counts[joint.type]], rest[counts[joint.type] :]
-            named[joint.name] = own[0] if len(own) == 1 else tuple(own)
+            values, rest = rest[: counts[joint.type]], rest[counts[joint.type] :]
+            named[joint.name] = values[0] if len(values) == 1 else tuple(values)
     return named
 
 
@@ -381,15 +378,15 @@ class SnapshotPublisher(Closeable):
                 if robot.positions:
                     self._publishers.append((publisher, robot))
                 else:
-                    print_status(f"{robot.name}: the snapshot has no joint states of it", robot=robot.name)
+                    print_status(f"{robot.name}: the snapshot has no joint states for it", robot=robot.name)
             for name, writer in dict.fromkeys((edge.robot, edge.writer) for edge in edges):
-                own = [edge for edge in edges if (edge.robot, edge.writer) == (name, writer)]
+                written = [edge for edge in edges if (edge.robot, edge.writer) == (name, writer)]
                 static = opening.enter_context(
                     StaticPublisher(session, name, writer, wires, takeover=takeover)
                 )
-                for edge in own:
+                for edge in written:
                     static.set(edge.transform())
-                print_result(f"{name}: {count_text(len(own), 'static edge')} of {writer}")
+                print_result(f"{name}: {count_text(len(written), 'static edge')} of {writer}")
             self._opened = opening.pop_all()
 
     def close(self) -> None:
@@ -401,15 +398,16 @@ class SnapshotPublisher(Closeable):
 
         A signal interrupts only the calling thread, which waits, so that the loop ends in order.
         """
-        worker = BackgroundCall("zstate snapshot", lambda: self._publish(rate_hz, seconds))
+
+        def publish() -> None:
+            for now in Rate(rate_hz, SystemClock(), self._stop, seconds):
+                for publisher, robot in self._publishers:
+                    publisher.publish(robot.positions, stamp=now)
+
+        call = BackgroundCall("zstate snapshot", publish)
         try:
-            worker.result()
+            call.result()
         except SystemExit:
             self._stop.set()
-            worker.result(1.0)
+            call.result(1.0)
             raise
-
-    def _publish(self, rate_hz: float, seconds: float | None) -> None:
-        for now in Rate(rate_hz, SystemClock(), self._stop, seconds):
-            for publisher, robot in self._publishers:
-                publisher.publish(robot.positions, stamp=now)

@@ -1,10 +1,9 @@
-"""Reader of one stream of one robot, sample by sample."""
+"""Reader of the samples of one stream of one robot."""
 
 from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from zstate._util.closeable import Closeable
@@ -16,7 +15,7 @@ from zstate.errors import MessageError
 from zstate.net.presence import announce_reader
 from zstate.net.streams import CAPACITY, StreamSubscriber
 from zstate.wire.keys import Stream, check_robot
-from zstate.wire.messages import Message, Sample
+from zstate.wire.messages import Sample
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
 
@@ -25,16 +24,16 @@ if TYPE_CHECKING:
 
 
 class TimedSample(NamedTuple):
-    """A sample, and its arrival ``came`` [ns] by the monotonic clock."""
+    """A sample and its ``arrival`` [ns] by the monotonic clock."""
 
-    came: int
+    arrival: int
     sample: Sample
 
 
 class StreamReader(Closeable):
     """Samples of ``stream`` of ``robot`` in order of arrival, for one reading thread.
 
-    Messages that cannot be decoded are skipped; the first of each kind is noted.
+    Messages that cannot be decoded are skipped; the first of each kind is reported.
     """
 
     def __init__(self, session: Session, robot: str, stream: Stream, wire: str = "native") -> None:
@@ -56,23 +55,21 @@ class StreamReader(Closeable):
         self._directory.close()
 
     def _on_samples(self, arrivals: list[SerializedSample]) -> None:
-        came = time.monotonic_ns()
+        now = time.monotonic_ns()
         for arrival in arrivals:
-            for sample in self._decode(arrival):
+            try:
+                samples = self._wire.decode(self._stream, arrival, self.robot)
+            except MessageError as error:
+                if error.reason not in self._refused:
+                    self._refused.add(error.reason)
+                    print_status(f"{arrival.key}: {error}; further ones are not reported")
+                continue
+            for sample in samples:
                 assert isinstance(sample, Sample)
                 # If the queue is not read, as on a stopped terminal, the newest samples are dropped.
                 if self._samples.qsize() < CAPACITY:
-                    self._samples.put(TimedSample(came, sample))
+                    self._samples.put(TimedSample(now, sample))
         self._waiter.notify()
-
-    def _decode(self, arrival: SerializedSample) -> Sequence[Message]:
-        try:
-            return self._wire.decode(self._stream, arrival, self.robot)
-        except MessageError as error:
-            if error.reason not in self._refused:
-                self._refused.add(error.reason)
-                print_status(f"{arrival.key}: {error}; further ones are passed over in silence")
-            return ()
 
     def next(self, timeout_s: float) -> TimedSample | None:
         """The next sample, or None if none arrives within ``timeout_s``, at most 0.5 s."""
@@ -82,17 +79,17 @@ class StreamReader(Closeable):
             return None
 
     def first(self, timeout_s: float | None = None) -> TimedSample:
-        """The first sample. Notes what it waits for; fails after ``timeout_s``."""
+        """The first sample. Prints what it waits for; fails after ``timeout_s``."""
         waiter = self._waiter
         if not waiter.wait_for(self._samples.qsize, timeout_s, self._reason):
             fail(f"gave up after {timeout_s:g} s: {self._reason()}")
-        if waiter.noted:
-            print_status(f"heard {self._directory.words.place(self.robot, (self._stream,))}")
+        if waiter.last_reason:
+            print_status(f"received {self._directory.messages.place(self.robot, (self._stream,))}")
         return self._samples.get_nowait()
 
-    def silence(self) -> str:
+    def no_sample_text(self) -> str:
         """Why no more samples arrive."""
-        return self._directory.silence(self.robot, self._stream, ended=True)
+        return self._directory.no_sample_text(self.robot, self._stream, ended=True)
 
     def _reason(self) -> str:
-        return self._directory.silence(self.robot, self._stream)
+        return self._directory.no_sample_text(self.robot, self._stream)

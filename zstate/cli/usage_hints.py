@@ -1,4 +1,4 @@
-"""What to write instead of a command line that cannot be used: ROS's words and forms, torn paths, typos."""
+"""Hints for invalid command lines: names and forms of ROS tools, unquoted paths, misspelled options."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-# The words of other tools, and the commands that do the same, separated by bars.
+# Commands of other tools, and the equivalent ones of zstate, separated by bars.
 _SYNONYMS = {
     "bag": "record | replay | info",
     "ros2_bag": "record | replay | info",
@@ -60,7 +60,7 @@ _SYNONYMS = {
     "zenohd": "router",
 }
 
-# An option is suggested only where most of its letters are the same: click's own limit is 0.6.
+# The least similarity of a suggested option; click's own limit is 0.6.
 _NEAR = 0.75
 
 _XYZ = ("--x", "--y", "--z")
@@ -69,22 +69,22 @@ _QUATERNION = ("--qx", "--qy", "--qz", "--qw")
 _FRAMES = ("--frame-id", "--child-frame-id")
 
 
-def command_hint(word: str, commands: Iterable[str]) -> str:
-    """The command that was probably meant by ``word``, which is none of ``commands``."""
-    same = _SYNONYMS.get(word.lower().replace("-", "_"))
+def command_hint(name: str, commands: Iterable[str]) -> str:
+    """A suggestion for ``name``, which is none of ``commands``."""
+    same = _SYNONYMS.get(name.lower().replace("-", "_"))
     if same:
         return "use " + " or ".join(f"`zstate {command}`" for command in same.split(" | "))
-    near = get_close_matches(word, list(commands), n=1)
+    near = get_close_matches(name, list(commands), n=1)
     return f"did you mean {near[0]!r}?" if near else "`zstate help` lists the commands"
 
 
 def usage_hint(arguments: Sequence[str], error: click.UsageError) -> str:
-    """The cause of ``error`` and the mend, where they are better known than click knows them; else empty."""
-    return _torn_path(arguments) or _ros_static(arguments) or _unknown_option(error)
+    """The cause of ``error`` and the correction; empty if click's own message is as good."""
+    return _unquoted_path(arguments) or _ros_static_hint(arguments) or _unknown_option_hint(error)
 
 
-def _torn_path(arguments: Sequence[str]) -> str:
-    """A path with a space in it, which the shell has made several arguments of."""
+def _unquoted_path(arguments: Sequence[str]) -> str:
+    """A hint for a path with a space, which the shell has split into several arguments."""
     for first, end in combinations(range(len(arguments) + 1), 2):
         path = " ".join(arguments[first:end])
         if end - first > 1 and not path.startswith("-") and _exists(path):
@@ -99,20 +99,19 @@ def _exists(path: str) -> bool:
         return False
 
 
-def _ros_static(arguments: Sequence[str]) -> str:
-    """Both forms of ROS's static_transform_publisher after ``static``, in the form of `zstate static`."""
+def _ros_static_hint(arguments: Sequence[str]) -> str:
+    """Arguments of ROS's static_transform_publisher, in either form, as arguments of `zstate static`."""
     if not arguments or arguments[0] != "static":
         return ""
-    given = arguments[1:]
-    written = _from_options(given) or _from_positions(given)
-    if not written:
+    static = _from_options(arguments[1:]) or _from_positions(arguments[1:])
+    if not static:
         return ""
-    return f"that is the form of ROS's static_transform_publisher; here it is\n  zstate static {written}"
+    return f"that is the form of ROS's static_transform_publisher; here it is\n  zstate static {static}"
 
 
-def _from_positions(given: Sequence[str]) -> str:
+def _from_positions(arguments: Sequence[str]) -> str:
     """``x y z yaw pitch roll parent child``, or with ``qx qy qz qw`` for the angles."""
-    numbers, frames = given[:-2], given[-2:]
+    numbers, frames = arguments[:-2], arguments[-2:]
     if len(numbers) not in (6, 7) or not all(map(_is_number, numbers)) or any(map(_is_number, frames)):
         return ""
     if len(numbers) == 7:
@@ -122,17 +121,17 @@ def _from_positions(given: Sequence[str]) -> str:
     return f"{shlex.join(frames)} --xyz {' '.join(numbers[:3])} {rotation}"
 
 
-def _from_options(given: Sequence[str]) -> str:
+def _from_options(arguments: Sequence[str]) -> str:
     """``--x 1 ... --frame-id parent --child-frame-id child``."""
-    known = {*_XYZ, *_RPY, *_QUATERNION, *_FRAMES}
-    words = [part for word in given for part in word.split("=", 1)]
-    values = {name: value for name, value in zip(words[::2], words[1::2], strict=False) if name in known}
-    if not values or 2 * len(values) != len(words):
+    options = {*_XYZ, *_RPY, *_QUATERNION, *_FRAMES}
+    parts = [part for argument in arguments for part in argument.split("=", 1)]
+    values = {name: value for name, value in zip(parts[::2], parts[1::2], strict=False) if name in options}
+    if not values or 2 * len(values) != len(parts):
         return ""
     frames = [
         values.get(name, placeholder) for name, placeholder in zip(_FRAMES, ("TARGET", "SOURCE"), strict=True)
     ]
-    written = [shlex.join(frames)]
+    static = [shlex.join(frames)]
     for option, names, default in (
         ("--xyz", _XYZ, "0 0 0"),
         ("--rpy", _RPY, "0 0 0"),
@@ -140,8 +139,8 @@ def _from_options(given: Sequence[str]) -> str:
     ):
         if any(name in values for name in names):
             numbers = [values.get(name, zero) for name, zero in zip(names, default.split(), strict=True)]
-            written.append(f"{option} {' '.join(numbers)}")
-    return " ".join(written)
+            static.append(f"{option} {' '.join(numbers)}")
+    return " ".join(static)
 
 
 def _is_number(text: str) -> bool:
@@ -151,8 +150,8 @@ def _is_number(text: str) -> bool:
     return False
 
 
-def _unknown_option(error: click.UsageError) -> str:
-    """An option that does not exist, with a suggestion only where it is near."""
+def _unknown_option_hint(error: click.UsageError) -> str:
+    """An unknown option, with suggestions only if they are similar."""
     if not isinstance(error, click.NoSuchOption) or not error.possibilities:
         return ""
     name = error.option_name

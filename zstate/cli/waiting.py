@@ -1,4 +1,4 @@
-"""Waiting for robots, poses and other conditions, with a note about what is missing.
+"""Waiting for robots, poses and other conditions; prints what is missing.
 
 Callbacks of subscriptions wake the waiting main thread; no state is polled. Ctrl-C ends every wait at once.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, NoReturn
 
@@ -41,8 +41,8 @@ _CHECK_INTERVAL_S = 0.02
 
 _LEAVE_OUT = "leave --at out for the newest pose"
 _NOT_RECEIVED = (
-    "this command knows what it receives while it runs, and what publishers still have of the last seconds: "
-    f"{_LEAVE_OUT}, or name an instant to come"
+    "this command has only the samples received while it runs, and the last seconds that publishers keep: "
+    f"{_LEAVE_OUT}, or give a later instant"
 )
 
 
@@ -50,11 +50,11 @@ class ConditionWaiter:
     """Wakes the waiting main thread when a condition may have become true.
 
     ``notify`` is a callback for subscriptions: any thread, any arguments. ``noted`` is the last reason that
-    the latest ``wait_for`` printed, empty if it ended without.
+    the latest ``wait_for`` printed, empty if it printed none.
     """
 
     def __init__(self) -> None:
-        self.noted = ""
+        self.last_reason = ""
         self._changed = threading.Event()
 
     def notify(self, *_: object) -> None:
@@ -78,24 +78,24 @@ class ConditionWaiter:
     ) -> bool:
         """Wait until ``condition()`` is true; False after ``timeout_s``.
 
-        A wait of more than 0.5 s prints ``reason()`` as a note, again whenever it changes.
+        A wait of more than 0.5 s prints ``reason()``, again whenever it changes.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        note_at: float | None = None
-        self.noted = ""
+        report_at: float | None = None
+        self.last_reason = ""
         while not condition():
             now = time.monotonic()
             if deadline is not None and now >= deadline:
                 return False
-            if reason is not None and note_at is None:
-                note_at = now + GRACE_S  # from the first check on, which may have loaded modules
-            elif reason is not None and note_at is not None and now >= note_at:
-                # Not every cause of a reason notifies, so it is evaluated twice a second as well.
-                note_at = now + GRACE_S
-                if (text := reason()) != self.noted:
-                    self.noted = text
+            if reason is not None and report_at is None:
+                report_at = now + GRACE_S  # from the first check on, which may have loaded modules
+            elif reason is not None and report_at is not None and now >= report_at:
+                # Not every change of a reason notifies, so it is evaluated twice a second as well.
+                report_at = now + GRACE_S
+                if (text := reason()) != self.last_reason:
+                    self.last_reason = text
                     print_status(f"waiting: {text}", event="waiting")
-            wake_at = min((one for one in (deadline, note_at) if one is not None), default=None)
+            wake_at = min((one for one in (deadline, report_at) if one is not None), default=None)
             self.wait(None if wake_at is None else wake_at - now)
         return True
 
@@ -154,54 +154,42 @@ class RobotReadiness(Closeable):
 
     def wait(self, timeout_s: float) -> str:
         """Wait until all robots are ready; what is missing after ``timeout_s``, empty if nothing is."""
-        self._waiter.wait_for(self._are_ready, timeout_s, lambda: self._missing)
+
+        def are_ready() -> bool:
+            self._missing = next((text for robot in self._robots if (text := self._missing_text(robot))), "")
+            return not self._missing
+
+        self._waiter.wait_for(are_ready, timeout_s, lambda: self._missing)
         return self._missing
 
-    def _are_ready(self) -> bool:
-        self._missing = next((text for robot in self._robots if (text := self._missing_of(robot))), "")
-        return not self._missing
-
-    def _missing_of(self, robot: str) -> str:
-        streams, words = self._directory.streams(robot), self._directory.words
+    def _missing_text(self, robot: str) -> str:
+        streams, directory = self._directory.streams(robot), self._directory
         if not streams:
-            return words.unknown(robot, self._directory.robots())
+            return directory.messages.unknown(robot, directory.robots())
+        stream: Stream = "joint_states" if "robot_description" in streams else "robot_description"
+        # Without a writer of joint states, transforms may be published instead.
+        follows: list[Follow] = ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
+        if is_ros(self._wire):
+            stream, follows = "tf", ["tf"]
         if robot not in self._listeners:
-            self._listeners[robot] = [self._listen(robot, follow) for follow in self._followed(streams)]
-        if self._is_ready(robot):
-            return ""
-        refused = "; ".join(text for one in self._listeners[robot] for text in one.refusals.values())
-        stream = self._first_missing(streams)
-        return refused or words.no_sample_text(robot, stream, self._directory.robots(), ended=False)
-
-    def _is_ready(self, robot: str) -> bool:
+            self._listeners[robot] = [self._listen(robot, follow) for follow in follows]
         for listener in self._listeners[robot]:
             moving = [frame for frame in listener.buffer.frames() if frame.kind in ("joint", "pose")]
             if (moving or robot in self._rigid) and all(frame.count for frame in moving):
-                return True
-        return False
+                return ""
+        refused = "; ".join(text for one in self._listeners[robot] for text in one.refusals.values())
+        return refused or directory.no_sample_text(robot, stream)
 
     def _on_description(self, arrival: SerializedSample) -> None:
         """Register robots without moving joints: they publish no samples."""
         from zstate.wire.messages import RobotDescription
 
-        with suppress(MessageError, InvalidInput):  # withdrawn; or broken, which the listener reports
+        with suppress(MessageError, InvalidInput):  # withdrawn; or invalid, which the listener reports
             robot = self._format.robot_from_key(arrival.key)
             for message in self._format.decode("robot_description", arrival, robot):
                 if isinstance(message, RobotDescription) and not message.moving_edges:
                     self._rigid.add(robot)
                     self._waiter.notify()
-
-    def _first_missing(self, streams: Collection[Stream]) -> Stream:
-        """The missing stream on which the others depend."""
-        if is_ros(self._wire):
-            return "tf"
-        return "joint_states" if "robot_description" in streams else "robot_description"
-
-    def _followed(self, streams: Collection[Stream]) -> list[Follow]:
-        if is_ros(self._wire):
-            return ["tf"]
-        # Without a writer of joint states, transforms may be published instead.
-        return ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
 
     def _listen(self, robot: str, follow: Follow) -> TransformListener:
         from zstate.nodes.listener import TransformListener
@@ -214,21 +202,21 @@ class RobotReadiness(Closeable):
 
 
 class PoseWaiter:
-    """Waits for poses of ``source`` in ``target``, and notes on standard error what is missing."""
+    """Waits for poses of ``source`` in ``target``, and prints on standard error what is missing."""
 
     def __init__(
         self, listener: TransformListener, directory: RobotDirectory, target: str, source: str
     ) -> None:
         self._listener = listener
         self._directory = directory
-        self._words = directory.words
+        self._messages = directory.messages
         self._frames = (target, source)
-        self._noted: tuple[object, ...] | None = None
+        self._reported: tuple[object, ...] | None = None
 
-    def answer(self, at: int | None = None, *, timeout_s: float | None = None) -> Transform:
+    def wait(self, at: int | None = None, *, timeout_s: float | None = None) -> Transform:
         """The pose at ``at``, or the newest, as soon as it is known.
 
-        Raises LookupFailed for what waiting cannot mend. Fails after ``timeout_s``.
+        Raises LookupFailed if waiting cannot help. Fails after ``timeout_s``.
         """
         began = time.monotonic()
         while True:
@@ -238,14 +226,23 @@ class PoseWaiter:
             except WaitTimeout as reason:
                 if timeout_s is not None and left_s <= GRACE_S:
                     self._fail_after(timeout_s, reason)
-                self._note_once(reason)
+                hint = self._hint(reason)
+                key = (type(reason), reason.edge, getattr(reason, "name", ""), hint)
+                if key != self._reported:
+                    self._reported = key
+                    print_status(f"waiting: {self._reason_text(reason, hint)}")
             except InPast as reason:
-                self._fail_in_past(reason)
+                advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED
+                fail(f"{self.translate(reason.what_happened)}; {advice}")
             else:
-                self._note_end()
+                if self._reported is not None:
+                    self._reported = None
+                    frames = self._listener.buffer.frames()
+                    for robot in self._listener.robots():
+                        print_status(self._messages.received_text(robot, frames))
                 return transform
 
-    def silence(self) -> str:
+    def no_sample_text(self) -> str:
         """Why no newer pose arrives: the edge with the oldest samples."""
         transform = self._listener.buffer.lookup(*self._frames)
         assert transform.stamp is not None
@@ -256,7 +253,7 @@ class PoseWaiter:
             writer = "" if reason.writer is None else f", which {reason.writer} wrote"
         age_s = self.age_s(transform)
         old = "" if age_s is None else f": the newest is {format_duration(round(age_s * 1e9))} old"
-        return self.explained(f"no new sample{edge}{writer}{old}")
+        return self.translate(f"no new sample{edge}{writer}{old}")
 
     def age_s(self, transform: Transform) -> float | None:
         """Age of a pose [s]; None if it is static, or stamped by another clock than the buffer's."""
@@ -267,29 +264,9 @@ class PoseWaiter:
             return None
         return transform.age(buffer.clock)
 
-    def explained(self, text: str) -> str:
+    def translate(self, text: str) -> str:
         """A text of the library about these frames, with the names and commands of the wire."""
-        return self._words.translate(text)
-
-    def _note_once(self, reason: LookupFailed) -> None:
-        hint = self._hint(reason)
-        key = (type(reason), reason.edge, getattr(reason, "name", ""), hint)
-        if key != self._noted:
-            self._noted = key
-            print_status(f"waiting: {self._reason_text(reason, hint)}")
-
-    def _note_end(self) -> None:
-        """Note that the robots are received, if a wait for them was noted."""
-        if self._noted is None:
-            return
-        self._noted = None
-        frames = self._listener.buffer.frames()
-        for robot in self._listener.robots():
-            print_status(self._words.received_text(robot, frames))
-
-    def _fail_in_past(self, reason: InPast) -> NoReturn:
-        advice = _LEAVE_OUT if reason.is_of_another_time else _NOT_RECEIVED
-        fail(f"{self.explained(reason.what_happened)}; {advice}")
+        return self._messages.translate(text)
 
     def _fail_after(self, timeout_s: float, reason: WaitTimeout) -> NoReturn:
         advice = ""
@@ -303,18 +280,18 @@ class PoseWaiter:
 
     def _reason_text(self, reason: LookupFailed, hint: str) -> str:
         if isinstance(reason, UnknownFrame) and not reason.frame_count:
-            return hint  # no frame at all is known: that is not about this one
+            return hint  # no frame is known at all, not only this one
         if isinstance(reason, InFuture | InPast):
-            return self.explained(reason.what_happened)  # without the advice for programs
-        return f"{self.explained(reason.message())}{f' ({hint})' if hint else ''}"
+            return self.translate(reason.what_happened)  # without the advice for programs
+        return f"{self.translate(reason.message())}{f' ({hint})' if hint else ''}"
 
     def _hint(self, reason: LookupFailed) -> str:
-        """What the directory of robots adds to the buffer's reason."""
+        """What the directory of robots adds to the reason of the buffer."""
         robot, robots = self._listener.robot, self._directory.robots()
         if isinstance(reason, UnknownFrame) and not reason.near_misses:
-            return self._words.missing_text(
+            return self._messages.missing_text(
                 robot, "robot_description", robots, has_frames=bool(reason.frame_count)
             )
         if isinstance(reason, NoData):
-            return self._words.missing_text(robot, "joint_states", robots, has_frames=True)
+            return self._messages.missing_text(robot, "joint_states", robots, has_frames=True)
         return ""

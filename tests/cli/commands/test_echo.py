@@ -142,7 +142,7 @@ def test_echo_waits_for_a_robot_and_prints_the_reason(spawn: Spawn):
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
     with standing():
         assert command.line() == str(ELBOW)
-    assert "heard zstate/rrbot/joint_states" in command.stderr
+    assert "received zstate/rrbot/joint_states" in command.stderr
     interrupted(command)
 
 
@@ -203,4 +203,4 @@ def test_with_several_robots_the_candidates_are_named(command: str):
 @pytest.mark.parametrize("command", ["echo", "hz"])
 def test_a_topic_of_ros_leads_to_its_wire(command: str):
     message = failure(command, "/joint_states", code=2)
-    assert f"a topic of ROS, not a robot; `zstate {command} --wire ros2` reads /joint_states" in message
+    assert f"is a ROS topic, not a robot; `zstate {command} --wire ros2` reads /joint_states" in message

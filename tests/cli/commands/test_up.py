@@ -145,7 +145,7 @@ def test_a_part_that_may_starts_again_and_the_others_live_on(up):
     os.kill(first, signal.SIGKILL)
     assert printed_pid(child, "at") != first
     interrupted(child)
-    assert "'shell' ended with exit code -9: it said nothing; it starts again in 0.5 s" in child.stderr
+    assert "'shell' ended with exit code -9: it printed no error; it starts again in 0.5 s" in child.stderr
 
 
 def test_last_error_of_a_process_is_reported_as_the_cause(up, free_port: int):
@@ -292,21 +292,21 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         (robot(source="file"), "cell.toml:3: robot[0].source: 'file' is neither 'joints' nor"),
         (robot(names=["a"], name="b"), "robot[0]: a loop is names = ['left', 'right'], or count"),
         (robot(count=2), "robot[0]: a loop is names"),
-        (robot(count="few", name="a${number}"), "cell.toml:4: robot[0].count: 'few' is not how often"),
+        (robot(count="few", name="a${number}"), "cell.toml:4: robot[0].count: 'few' is not a count"),
         (robot(when="maybe"), "robot[0].when: 'maybe' is neither true nor false"),
         (
             robot(rate="${sped}") + "[parameters]\nspeed = 1\n",
             "robot[0].rate: ${sped} is neither a parameter",
         ),
-        (robot(after="x"), "robot[0].after: nothing here is called 'x'; there are rrbot"),
+        (robot(after="x"), "robot[0].after: no process is called 'x'; there are rrbot"),
         (
             robot(name="a", after="b") + robot(name="b", after="a"),
-            "robot[0].after: 'a' would wait for itself",
+            "robot[0].after: 'a' waits for itself",
         ),
-        (robot(identity="a"), "robot[0].identity: is of no use without certs"),
+        (robot(identity="a"), "robot[0].identity: needs certs"),
         (
             "[network]\ncerts = '.'\n" + robot(),
-            "robot[0]: the certs of [network] are of no use without identity",
+            "robot[0]: the certs of [network] need an identity",
         ),
         ("include = 'cell.toml'\n", "cell.toml:1: include: 'cell.toml' includes this file again"),
         ("include = 'gone.toml'\n", "include: there is no file"),
@@ -319,7 +319,7 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
             table("program", run="./gone"),
             "'gone' ended with exit code 1: './gone' cannot be started: No such file",
         ),
-        (STATIC, "static[0]: whose edge is this?"),
+        (STATIC, "static[0]: the robot of this edge is unknown"),
         (
             robot() + STATIC.replace("rpy_deg", "rpy_rad"),
             "static[0].rpy_rad: there is no such key; did you mean",
@@ -329,7 +329,7 @@ def test_the_file_in_its_help_is_one_that_it_reads(tmp_path: Path, monkeypatch: 
         (robot() + STATIC.partition("xyz")[0], "'flange' in 'lower' has 0 rotations and no xyz"),
         (
             robot() + STATIC + "robot = 'x*'\n",
-            "static[0].robot: no robot is called like 'x*'; in this file: 'rrbot'",
+            "static[0].robot: no robot matches 'x*'; in this file: 'rrbot'",
         ),
         (robot() + table("static", file="gone.yaml"), "static[0].file: "),
         (
@@ -349,7 +349,7 @@ def test_invalid_file_error_names_the_place(tmp_path: Path, text: str, error: st
         ("sped=2", "has no parameter 'sped'; did you mean 'speed'?; its [parameters]: speed"),
         (
             "speed=fast",
-            "cell.toml:2: parameters.speed: it is 1.0 in the file, and 'fast' is nothing of that kind",
+            "cell.toml:2: parameters.speed: it is 1.0 in the file, and 'fast' is not of that type",
         ),
         ("speed:=2", "'speed:=2' is written as for ROS; here it is speed=2"),
         ("speed", "'speed' is not a parameter; write KEY=VALUE"),

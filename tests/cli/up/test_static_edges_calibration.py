@@ -49,7 +49,7 @@ def file_of(folder: Path, text: str, name: str = "eye.yaml") -> Path:
     ],
     ids=["in hand", "on base", "in hand 2", "on base 2", "ros", "ours"],
 )
-def test_a_calibration_says_where_the_camera_is(tmp_path: Path, text: str, target: str):
+def test_calibration_has_the_pose_of_the_camera(tmp_path: Path, text: str, target: str):
     (edge,) = read_calibration(file_of(tmp_path, text))
     assert (edge.target, edge.source) == (target, "camera")
     assert edge.pose7 == pytest.approx((0.1, 0.2, -0.3, *TURN_ABOUT_Z))
@@ -60,7 +60,7 @@ def test_json_is_read_as_well_and_may_hold_several(tmp_path: Path):
     assert len(edges) == 2
 
 
-def test_the_frames_may_be_called_otherwise_here(tmp_path: Path):
+def test_frames_can_be_renamed(tmp_path: Path):
     (edge,) = read_calibration(file_of(tmp_path, OURS, "eye.json"))
     other = with_frames(edge, None, "eye")
     assert (other.target, other.source, other.pose7) == ("tool0", "eye", pytest.approx(edge.pose7))
@@ -88,14 +88,14 @@ def test_a_file_without_one_is_refused_with_what_it_lacks(tmp_path: Path, text: 
 
 
 @pytest.mark.processes
-def test_a_calibration_is_published_with_frames_called_otherwise(spawn: Spawn, tmp_path: Path):
+def test_calibration_is_published_with_renamed_frames(spawn: Spawn, tmp_path: Path):
     file = file_of(tmp_path, HANDEYE % "true")
     child = started(spawn, "static", "flange", "eye", "--file", str(file), "--robot", "arm")
     assert child.line().startswith("pose of eye in flange: xyz [0.1, 0.2, -0.3] m")
 
 
 @pytest.mark.processes
-def test_static_says_what_its_file_cannot_be(tmp_path: Path):
+def test_static_reports_an_invalid_file(tmp_path: Path):
     several = file_of(tmp_path, f"[{OURS}, {OURS}]", "eyes.json")
     assert "has 2 transforms" in failure("static", "a", "b", "--file", str(several), code=2)
     assert "--set is for parameters" in failure("static", "--file", str(several), "--set", "a=1", code=2)

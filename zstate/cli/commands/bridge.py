@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_bridge, served
+from zstate.cli.metrics import bridge_collector, serve_metrics
 from zstate.cli.options import metrics_option, session_options
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
@@ -68,7 +68,7 @@ def bridge_command(
             robots = [info.name for info in discover(native)] or None
         with (
             Bridge(native, session, wire, robots, on_change=_print_change) as bridge,
-            served(metrics, of_bridge(bridge)),
+            serve_metrics(metrics, bridge_collector(bridge)),
         ):
             names = " and ".join(map(repr, robots)) if robots else "every robot"
             print_wrapped(f"bridging {names} between native and {wire} at {ros}")

@@ -86,7 +86,7 @@ def hz_command(
             elif once and time.monotonic() > deadline:
                 fail(f"gave up after {timeout:g} s: fewer than two samples arrived, so there is no rate")
             elif not once and not count and not silent:
-                print_status(reader.silence())
+                print_status(reader.no_sample_text())
             silent = not count
 
 
@@ -107,7 +107,7 @@ class MessageStatistics:
         if self._gaps.add(sample.session, sample.seq):
             if sample.session != statistics.session and not self._of_all:
                 statistics.clear()
-            statistics.add(Received(received.came, sample.stamp, sample.seq, 0), sample.session)
+            statistics.add(Received(received.arrival, sample.stamp, sample.seq, 0), sample.session)
 
     def facts(self) -> dict[str, Any] | None:
         """The printed figures; None before two messages. ``missed`` counts since the start."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_publishers, served
+from zstate.cli.metrics import publisher_collector, serve_metrics
 from zstate.cli.options import (
     clock_option,
     load_robot,
@@ -73,7 +73,7 @@ def joints_command(
         StatePublisher(
             session, model, robot_name, (wire,), streams=("joint_states",), clock=time, takeover=takeover
         ) as publisher,
-        served(metrics, of_publishers(publisher)),
+        serve_metrics(metrics, publisher_collector(publisher)),
     ):
         joints = count_text(len(model.joint_names), "joint")
         place = messages_for(wire).place(robot_name, ("joint_states",))

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_listeners, of_writers, served
+from zstate.cli.metrics import listener_collector, serve_metrics, writer_collector
 from zstate.cli.options import (
-    heard_robot_option,
     json_option,
     metrics_option,
     open_clock,
     reading_clock_option,
+    robot_filter_option,
     session_options,
     timeout_option,
     wire_option,
@@ -26,7 +26,7 @@ from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
-    from zstate.cli.monitor import Monitored, RobotMonitor
+    from zstate.cli.monitor import MonitorView, RobotMonitor
     from zstate.metrics.endpoint import BindAddress
 
 _FIRST_AFTER_S = 1.0
@@ -37,10 +37,10 @@ _DISCOVERY_S = 0.3
 @click.command("monitor")
 @click.argument("target", metavar="[A]", required=False)
 @click.argument("source", metavar="B", required=False)
-@click.option("--robots", is_flag=True, help="Monitor robots instead of edges: one line for each.")
-@click.option("--once", is_flag=True, help="Print one report, of the first second; fail after --timeout.")
-@timeout_option("How long --once waits for the pose, or for a robot [s].")
-@heard_robot_option
+@click.option("--robots", is_flag=True, help="Monitor robots rather than edges: one line for each.")
+@click.option("--once", is_flag=True, help="Print one report, of the first second; give up after --timeout.")
+@timeout_option("How long --once waits for the pose, or for a robot.")
+@robot_filter_option
 @json_option()
 @wire_option
 @reading_clock_option
@@ -81,10 +81,13 @@ def monitor_command(
     zstate monitor --robots
     zstate monitor --robots --robot panda --json --metrics 9100
     """
-    from zstate.cli.monitor import EdgeStatistics, MonitoredEdges, MonitoredPose, RobotMonitor
-    from zstate.clock import SystemClock
+    from zstate.cli.monitor import (
+        AllEdgesView,
+        EdgeStatistics,
+        PathView,
+        RobotMonitor,
+    )
     from zstate.nodes.listener import TransformListener
-    from zstate.rate import Rate
 
     if robots and target is not None:
         raise click.UsageError("--robots takes no frames; --robot NAME selects a robot")
@@ -101,7 +104,9 @@ def monitor_command(
     ):
         if robots:
             monitor = opened.enter_context(RobotMonitor(session, directory, robot, wire, selected_clock))
-            opened.enter_context(served(metrics, of_listeners(monitor.robots), of_writers(directory)))
+            opened.enter_context(
+                serve_metrics(metrics, listener_collector(monitor.robots), writer_collector(directory))
+            )
             _report_robots(monitor, once_s, as_json=as_json)
             return
         listener = opened.enter_context(
@@ -111,18 +116,25 @@ def monitor_command(
         )
         statistics = opened.enter_context(EdgeStatistics(session, robot, wire, follow, listener.buffer.clock))
         if target is None or source is None:
-            edges: Monitored = MonitoredEdges(listener, statistics, directory)
+            _report_edges(AllEdgesView(listener, statistics, directory), once_s, as_json=as_json)
         else:
-            edges = MonitoredPose(listener, statistics, directory, (target, source))
-        edges.wait(once_s)
-        Event().wait(_FIRST_AFTER_S)
-        if once_s is not None:
-            edges.say(as_json=as_json)
-        elif as_json or not is_terminal():
-            for _ in Rate(1.0, SystemClock(), Event()):
-                edges.say(as_json=as_json)
-        else:
-            edges.show()
+            frames = (target, source)
+            _report_edges(PathView(listener, statistics, directory, frames), once_s, as_json=as_json)
+
+
+def _report_edges(monitored: MonitorView, once_s: float | None, *, as_json: bool) -> None:
+    from zstate.clock import SystemClock
+    from zstate.rate import Rate
+
+    monitored.wait(once_s)
+    Event().wait(_FIRST_AFTER_S)
+    if once_s is not None:
+        monitored.print_report(as_json=as_json)
+    elif as_json or not is_terminal():
+        for _ in Rate(1.0, SystemClock(), Event()):
+            monitored.print_report(as_json=as_json)
+    else:
+        monitored.show()
 
 
 def _report_robots(monitor: RobotMonitor, once_s: float | None, *, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_publishers, served
+from zstate.cli.metrics import publisher_collector, serve_metrics
 from zstate.cli.options import (
     checked_rate,
     clock_option,
@@ -122,7 +122,7 @@ def publish_command(
             session, model, robot_name, derived_wires, streams=_DERIVED, clock=time, takeover=takeover
         ) as derived,
         StatePublisher(session, model, robot_name, whole_wires, clock=time, takeover=takeover) as whole,
-        served(metrics, of_publishers(derived, whole)),
+        serve_metrics(metrics, publisher_collector(derived, whole)),
     ):
         places = [messages_for(wire).place(robot_name, _DERIVED) for wire in derived_wires]
         places += [messages_for(wire).place(robot_name, _EVERYTHING) for wire in whole_wires]
@@ -132,7 +132,7 @@ def publish_command(
             print_status(
                 f"{count_text(len(model.findings), 'warning')} about the model; `zstate check` shows them"
             )
-        if not network.is_given and len(set(map(is_ros, wires))) == 2:
+        if not network.is_explicit and len(set(map(is_ros, wires))) == 2:
             print_status("ROS 2 nodes are behind their router; pass --connect, such as tcp/127.0.0.1:7447")
         if derived_wires:
             _publish_joint_states(session, derived_wires[0], derived, whole, rate, seconds)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_recorder, of_writers, served
+from zstate.cli.metrics import recorder_collector, serve_metrics, writer_collector
 from zstate.cli.options import checked_seconds, metrics_option, session_options, wire_option
 from zstate.cli.output.console import (
     count_text,
@@ -107,7 +107,7 @@ def record_command(
         with (
             recorder,
             RobotDirectory(session, robots[0] if len(robots) == 1 else "*", wire) as directory,
-            served(metrics, of_recorder(recorder), of_writers(directory)),
+            serve_metrics(metrics, recorder_collector(recorder), writer_collector(directory)),
         ):
             progress = RecordProgress(recorder, directory, robots)
             try:
@@ -185,10 +185,10 @@ class RecordProgress:
     def no_message_text(self) -> str:
         """The reason why nothing was recorded, as far as it can be determined here."""
         announced = self._directory.robots()
-        return self._missing(set()) or f"{self._directory.words.announced(announced)}, but no message came"
+        return self._missing(set()) or f"{self._directory.messages.announced(announced)}, but no message came"
 
     def _missing(self, recorded: set[str]) -> str:
-        announced, messages = self._directory.robots(), self._directory.words
+        announced, messages = self._directory.robots(), self._directory.messages
         if not self._robots:
             return "" if recorded or announced else messages.announced(announced)
         missing = set(self._robots) - recorded - {info.name for info in announced}

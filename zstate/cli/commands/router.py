@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.metrics import of_connections, of_writers, served
+from zstate.cli.metrics import connection_collector, serve_metrics, writer_collector
 from zstate.cli.options import config_option, metrics_option, router_identity_options
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
@@ -148,7 +148,7 @@ def _run(
     with (
         open_session(network) as session,
         RobotDirectory(session) as directory,
-        served(metrics, of_connections(session), of_writers(directory)),
+        serve_metrics(metrics, connection_collector(session), writer_collector(directory)),
     ):
         place = ", ".join(listen) or f"the endpoints in {file!r}"
         print_wrapped(f"router {session.zid} listens at {place}")

@@ -142,7 +142,7 @@ def _session_options(
         if not saved.is_default:
             print_status(f"as saved on {saved.host!r}: {saved.options()}")
         return saved.network(network), wires if has_wire_option else (saved.wire,)
-    if not (saved.is_default or network.is_given or has_wire_option):
+    if not (saved.is_default or network.is_explicit or has_wire_option):
         print_status(f"saved on {saved.host!r} with {saved.options()}; --as-saved uses the same options")
     return network, wires
 

@@ -12,10 +12,10 @@ import click
 
 from zstate.cli.options import (
     checked_rate,
-    heard_robot_option,
     json_option,
     open_clock,
     reading_clock_option,
+    robot_filter_option,
     session_options,
     timeout_option,
     wire_option,
@@ -76,7 +76,7 @@ def _stamp(_: click.Context, __: click.Parameter, text: str | None) -> int | Non
     show_default=True,
     help="Number of decimals; JSON has all digits.",
 )
-@heard_robot_option
+@robot_filter_option
 @json_option()
 @wire_option
 @reading_clock_option
@@ -141,19 +141,19 @@ def tf_command(
         if not as_json:
             print_result(f"pose of {source} in {target}")
         if ends:
-            show(waiter.answer(at, timeout_s=timeout))
+            show(waiter.wait(at, timeout_s=timeout))
             return
         shown: Transform | None = None
         deadline, silent = Deadline(unknown_s=_UNKNOWN_S), False
         for _ in Rate(rate, SystemClock(), Event()):
-            transform = waiter.answer()
+            transform = waiter.wait()
             if transform != shown:
                 show(transform)
                 deadline.on_sample(time.monotonic())
                 shown, silent = transform, False
             elif not silent and transform.stamp is not None and deadline.is_missed(time.monotonic()):
                 silent = True
-                print_status(waiter.silence())
+                print_status(waiter.no_sample_text())
 
 
 def _wait_for_twist(listener: TransformListener, transform: Transform) -> Twist | None:

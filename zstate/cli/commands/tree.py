@@ -188,7 +188,7 @@ def _collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
             return nodes() - {one.writer for one in frames if one.kind == "pose" and one.count >= least}
 
         if not waiter.wait_for(lambda: listener.buffer.frames() or nodes(), _NODES_WITHIN_S):
-            fail(directory.words.no_sample_text(robot, "tf", directory.robots(), ended=False))
+            fail(directory.messages.no_sample_text(robot, "tf", directory.robots(), ended=False))
         waiter.wait_until_stable(
             lambda: len(listener.buffer.frames()),
             lambda stable: stable and not without_samples(listener.buffer.frames(), 2),
@@ -197,7 +197,7 @@ def _collect_ros_frames(session: Session, robot: str, wire: str) -> tuple[FrameI
         )
         frames = listener.buffer.frames()
         for node in sorted(without_samples(frames, 1)):
-            topic = directory.words.place(robot, ("tf",))
+            topic = directory.messages.place(robot, ("tf",))
             print_status(f"{node} announces {topic}, but has sent nothing for {_MESSAGES_WITHIN_S:g} s")
         return frames
 

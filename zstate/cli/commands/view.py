@@ -17,26 +17,14 @@ import click
 from zstate.cli.options import (
     checked_rate,
     load_robot,
-    named_models,
     open_clock,
+    parse_models,
     reading_clock_option,
     session_options,
     wire_option,
 )
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
-from zstate.cli.waiting import ConditionWaiter
-from zstate.model.catalog import find_entry
-from zstate.model.load import is_path
-from zstate.model.robot import RobotModel
-from zstate.net.presence import discover
-from zstate.net.session import Session
-from zstate.view.access import is_loopback
-from zstate.view.data_source import ViewSource
-from zstate.view.screenshot import save_screenshot
-from zstate.view.server import ViewServer
-from zstate.view.sliders import SliderPublisher
-from zstate.view.view import View
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
@@ -165,11 +153,12 @@ def view_command(
     """
     import_module("zstate.view")  # reports a missing viser before anything starts
 
+    from zstate.model.load import is_path
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
 
-    models = named_models(robots)
+    models = parse_models(robots)
     files = [Path(one) for one in models if Path(one).suffix in _RECORDINGS or Path(one).is_dir()]
     if files and len(models) > 1:
         raise click.UsageError(f"a recording must be the only argument; got {', '.join(models)}")
@@ -225,6 +214,7 @@ class NamedRobot(NamedTuple):
 
 
 def _load_named(argument: str, xacro_args: Mapping[str, str] | None = None) -> tuple[NamedRobot, RobotModel]:
+    from zstate.model.catalog import find_entry
     from zstate.model.load import is_path
 
     model, robot = load_robot(argument, None, xacro_args)
@@ -239,6 +229,7 @@ def _open_sliders(
 
     A name is that of an announced robot; if no such robot is announced, that of a catalog model.
     """
+    from zstate.net.presence import discover
     from zstate.view.sliders import SliderPublisher
 
     within_s = _DISCOVERY_S if named else _ANNOUNCED_WITHIN_S
@@ -281,6 +272,7 @@ def _running(view: View) -> Generator[BackgroundCall[None]]:
 
 
 def _print_address(page: ViewServer) -> None:
+    from zstate.view.access import is_loopback
 
     print_result(f"the view is at {page.url}")
     if not is_loopback(page.host):
@@ -300,6 +292,7 @@ def _write_snapshot(
     fixed_frame: str,
 ) -> None:
     """Write a picture once ``robots`` have arrived, and print which robots and meshes are not in it."""
+    from zstate.view.screenshot import save_screenshot
 
     def has_models() -> bool:
         models = source.models
@@ -350,6 +343,7 @@ def _first_few(lines: Sequence[str]) -> str:
 
 def _wait_for(source: ViewSource, condition: Callable[[], bool], timeout_s: float) -> bool:
     """Wait until ``condition()``, on the contents of ``source``, is true; False after ``timeout_s``."""
+    from zstate.cli.waiting import ConditionWaiter
 
     waiter = ConditionWaiter()
     if source.listener is not None:

@@ -91,7 +91,7 @@ def _wait_for_pose(network: SessionOptions, names: tuple[str, ...], wire: str, t
         RobotDirectory(session, "*", wire) as directory,
         TransformListener(session, wire=wire, follow=default_stream(wire)) as listener,
     ):
-        PoseWaiter(listener, directory, target, source).answer(
+        PoseWaiter(listener, directory, target, source).wait(
             timeout_s=max(round(deadline - time.monotonic(), 1), 0.1)
         )
     return f"ready: the pose of {source!r} in {target!r} is known"
@@ -101,7 +101,7 @@ def _wait_for_router(network: SessionOptions, names: tuple[str, ...], wire: str,
     from zstate.cli.processes import BackgroundCall
     from zstate.net.config import ROUTER_ENDPOINT
 
-    endpoints = names or network.connect or (() if network.is_given else (ROUTER_ENDPOINT,))
+    endpoints = names or network.connect or (() if network.is_explicit else (ROUTER_ENDPOINT,))
     client = replace(network, mode="client", connect=endpoints)
     where = " or ".join(map(repr, endpoints)) or "the configured endpoints"
 

@@ -1,1 +1,1 @@
-"""The chain from a robot to whoever wants its poses, looked at link by link."""
+"""Checks of the chain from a robot to the readers of its poses, link by link."""

@@ -1,4 +1,4 @@
-"""Check: what was found of one link of the chain."""
+"""Result of one check of `zstate doctor`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ State = Literal["ok", "warning", "broken", "skipped"]
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One link: its ``name``, how it is and what that was seen by; ``next`` is the command to go on with.
+    """One link of the chain: its ``name``, its state, and the evidence in ``text``.
 
-    ``robot`` is whose link it is; None for those that all robots share. A link is skipped when those
-    before it leave nothing to look at.
+    ``next`` is the command to continue with. ``robot`` is None for links that all robots share. A link is
+    skipped if the links before it leave nothing to check.
     """
 
     name: str
@@ -23,31 +23,31 @@ class Check:
     next: str = ""
     robot: str | None = None
 
-    def of(self, robot: str) -> Check:
-        """The same, of ``robot``."""
+    def for_robot(self, robot: str) -> Check:
+        """The same check as a link of ``robot``."""
         return replace(self, robot=robot)
 
 
 def ok(name: str, text: str) -> Check:
-    """A link that holds."""
+    """A link that works."""
     return Check(name, "ok", text)
 
 
 def warning(name: str, text: str, then: str = "") -> Check:
-    """A link that holds, and might not for long, or not for everybody."""
+    """A link that works, but may fail later or for other readers."""
     return Check(name, "warning", text, then)
 
 
 def broken(name: str, text: str, then: str) -> Check:
-    """A link that does not hold."""
+    """A link that does not work."""
     return Check(name, "broken", text, then)
 
 
 def skipped(name: str, text: str) -> Check:
-    """A link that cannot be looked at."""
+    """A link that cannot be checked."""
     return Check(name, "skipped", text)
 
 
 def first_broken(checks: Sequence[Check]) -> Check | None:
-    """The link to mend first: all behind it may hang on it."""
+    """The link to repair first: failures of later links may follow from it."""
     return next((check for check in checks if check.state == "broken"), None)

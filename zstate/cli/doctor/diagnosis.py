@@ -1,4 +1,4 @@
-"""Diagnosis: the checks of `zstate doctor` in order, each reported as soon as it is done, and their text."""
+"""The checks of `zstate doctor` in order, each reported as soon as it is done, and their text and JSON."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import click
 from zstate.cli.doctor.check import Check, broken, first_broken, ok, warning
 from zstate.cli.doctor.network_checks import (
     access_check,
+    connect_options,
     find_elsewhere,
     installation_check,
     network_check,
@@ -37,13 +38,12 @@ if TYPE_CHECKING:
     from zstate.net.presence import RobotInfo
     from zstate.net.session import Session
 
-_AT_ONCE = 50
-"""So many robots are listened to at once: each takes eight threads."""
+_GROUP = 50
+"""The number of robots probed at the same time: each takes eight threads."""
 
-_TIMEOUTS = 5
-"""After so many timeouts no more robots are examined: of a large fleet, those that are silent take one for
-each group of them."""
-
+_MAX_TIMEOUTS = 5
+"""The number of timeouts after which no more robots are examined. In a large fleet, silent robots take one
+timeout for each group of them."""
 
 _COLORS = {"ok": "green", "warning": "yellow", "broken": "red", "skipped": None}
 _STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
@@ -52,7 +52,7 @@ _STATE, _NAME, _MIN_TEXT = 7, 12, 20  # widths
 def diagnosis(network: SessionOptions, robot: str, wire: str, timeout_s: float) -> Iterator[Check]:
     """The links to ``robot``, or to every robot for "*".
 
-    What is behind a broken link of all robots is not looked at.
+    Ends at the first broken link that all robots share.
     """
     yield installation_check()
     with ExitStack() as opened:
@@ -71,7 +71,9 @@ def diagnosis(network: SessionOptions, robot: str, wire: str, timeout_s: float) 
 
 def effective_network(network: SessionOptions, wire: str) -> SessionOptions:
     """The options that ``open_session`` uses, with its default on a ROS wire."""
-    return SessionOptions("client", (ROUTER_ENDPOINT,)) if is_ros(wire) and not network.is_given else network
+    if is_ros(wire) and not network.is_explicit:
+        return SessionOptions("client", (ROUTER_ENDPOINT,))
+    return network
 
 
 def _after_connecting(
@@ -80,72 +82,73 @@ def _after_connecting(
     from zstate.net.presence import discover
 
     robots = discover(session, wire=wire)
-    check = network_check(session, effective_network(network, wire))  # later than the others, whom it counts
+    # After discovery: this check counts the links that discovery had time to establish.
+    check = network_check(session, effective_network(network, wire))
     yield check
     if check.state == "broken":
         return
     access = None if robot == ANY else access_check(session, network, robot)
     if access is not None:
         yield access
-    wanted = [info for info in robots if robot in (ANY, info.name)]
+    selected = [info for info in robots if robot in (ANY, info.name)]
     if is_ros(wire) and messages_for(wire).robot:
-        wanted = list(robots)  # there is one at most, and ROS has no name for it
-    if not wanted:
-        yield _absent_check(session, network, robot, robots, wire)
+        selected = list(robots)  # at most one, which has no name in ROS
+    if not selected:
+        yield _missing_robot_check(session, network, robot, robots, wire)
         return
     names = ", ".join(repr(info.name) for info in robots)
     yield ok("robots", messages_for(wire).announced(robots) if is_ros(wire) else f"{names} announced")
-    for found in _of_robots(session, wanted, robots, wire, timeout_s, called=robot):
+    for found in _robots_checks(session, selected, robots, wire, timeout_s, model_name=robot):
         yield replace(found, next=with_same_options(found.next, network, wire)) if found.next else found
 
 
-def _of_robots(
+def _robots_checks(
     session: Session,
-    wanted: Sequence[RobotInfo],
+    selected: Sequence[RobotInfo],
     robots: Sequence[RobotInfo],
     wire: str,
     timeout_s: float,
     *,
-    called: str,
+    model_name: str,
 ) -> Iterator[Check]:
     from zstate.cli.doctor.clock_checks import domains_check
-    from zstate.cli.doctor.ear import Ear, listen
     from zstate.cli.doctor.robot_checks import robot_checks, shared_roots_checks, static_roots
+    from zstate.cli.doctor.robot_probe import RobotProbe, wait_for_probes
     from zstate.cli.doctor.ros_checks import ros_checks
     from zstate.net.clock_offset import measure_offsets
 
-    words = messages_for(wire)
+    messages = messages_for(wire)
     offsets = measure_offsets(session, ANY) if wire == "native" else ()
     tops: list[FrameInfo] = []
     clocks: dict[str, str] = {}
-    deadline = time.monotonic() + _TIMEOUTS * timeout_s
-    for first in range(0, len(wanted), _AT_ONCE):
+    deadline = time.monotonic() + _MAX_TIMEOUTS * timeout_s
+    for first in range(0, len(selected), _GROUP):
         if time.monotonic() > deadline:
             text = (
-                f"{len(wanted) - first} of {len(wanted)} robots were not examined within "
-                f"{_TIMEOUTS * timeout_s:g} s; name one, or give more --timeout"
+                f"{len(selected) - first} of {len(selected)} robots were not examined within "
+                f"{_MAX_TIMEOUTS * timeout_s:g} s; name one robot, or raise --timeout"
             )
-            yield warning("robots", text, f"zstate doctor {wanted[first].name}")
+            yield warning("robots", text, f"zstate doctor {selected[first].name}")
             break
-        with ExitStack() as listening:
-            some = wanted[first : first + _AT_ONCE]
-            waiter = ConditionWaiter()
-            ears = [listening.enter_context(Ear(session, info, wire, robots, waiter.notify)) for info in some]
+        with ExitStack() as opened:
+            waiter, probes = ConditionWaiter(), list[RobotProbe]()
+            for info in selected[first : first + _GROUP]:
+                probes.append(opened.enter_context(RobotProbe(session, info, wire, robots, waiter.notify)))
             if wire == "native":
-                for ear in ears:
-                    ear.offsets = tuple(one for one in offsets if one.robot == ear.info.name)
-                    ear.ask()
-            listen(ears, waiter, timeout_s)
-            for ear in ears:
-                if ear.description is not None:
-                    clocks[ear.info.name] = ear.description.clock
-                if isinstance(words, RosMessages):
-                    checks = ros_checks(ear, session, words, called)
+                for probe in probes:
+                    probe.offsets = tuple(one for one in offsets if one.robot == probe.info.name)
+                    probe.find_unresponsive()
+            wait_for_probes(probes, waiter, timeout_s)
+            for probe in probes:
+                if probe.description is not None:
+                    clocks[probe.info.name] = probe.description.clock
+                if isinstance(messages, RosMessages):
+                    checks = ros_checks(probe, session, messages, model_name)
                 else:
-                    checks = robot_checks(ear, session)
+                    checks = robot_checks(probe, session)
                 for check in checks:
-                    yield check.of(ear.info.name)
-                tops += static_roots(ear)
+                    yield check.for_robot(probe.info.name)
+                tops += static_roots(probe)
     if wire == "native":
         yield from shared_roots_checks(tops)
     different = domains_check(clocks)
@@ -153,51 +156,38 @@ def _of_robots(
         yield different
 
 
-def _absent_check(
+def _missing_robot_check(
     session: Session, network: SessionOptions, robot: str, robots: tuple[RobotInfo, ...], wire: str
 ) -> Check:
-    names = [info.name for info in robots]
-    near = get_close_matches(robot, names, n=1)
-    what = "no robot is announced" if robot == ANY else f"nobody announces the robot {robot!r}"
-    if is_ros(wire) and not names:
-        text = messages_for(wire).announced(robots).partition(";")[0]
-        then = f"zstate ls --wire {wire}{_connecting(network)}  # are the domain and the router right?"
-        return broken("robots", text, then)
-    if names:
-        text = f"{what}; announced: {', '.join(map(repr, names))}"
-        then = f"zstate doctor {(near or names)[0]}"
-        return broken("robots", text, with_same_options(then, network, wire))
-    for options, others in find_elsewhere(network) if wire == "native" else ():
-        found = next((name for name in others if name == robot), others[0])
-        text = f"{what} here; {with_options(options)}: {', '.join(map(repr, others))}"
-        return broken("robots", text, f"zstate doctor {found}{options}")
-    if wire == "native" and session.zenoh.info.routers_zid() and _has_ros(session):
-        text = f"{what} on the native wire; ROS 2 nodes are behind this router, too"
-        return broken("robots", text, f"zstate doctor --wire ros2{_connecting(network)}")
-    if session.probe is not None:
-        what += f", or the router shows none to {session.probe.identity}"
-    text = f"{what}: its publisher is not running" if robot != ANY else what
-    return broken("robots", text, f"{_start(robot)}{_connecting(network)}")
-
-
-def _has_ros(session: Session) -> bool:
     from zstate.net.presence import discover
 
-    return bool(discover(session, 0.3, wire="ros2"))
-
-
-def _start(robot: str) -> str:
-    """What would put ``robot`` there."""
+    names, options = [info.name for info in robots], connect_options(network)
+    what = "no robot is announced" if robot == ANY else f"robot {robot!r} is not announced"
+    if is_ros(wire) and not names:
+        text = messages_for(wire).announced(robots).partition(";")[0]
+        return broken(
+            "robots", text, f"zstate ls --wire {wire}{options}  # are the domain and the router right?"
+        )
+    if names:
+        near = get_close_matches(robot, names, n=1)
+        then = with_same_options(f"zstate doctor {(near or names)[0]}", network, wire)
+        return broken("robots", f"{what}; announced: {', '.join(map(repr, names))}", then)
+    for other_options, others in find_elsewhere(network) if wire == "native" else ():
+        found = next((name for name in others if name == robot), others[0])
+        text = f"{what} here; {with_options(other_options)}: {', '.join(map(repr, others))}"
+        return broken("robots", text, f"zstate doctor {found}{other_options}")
+    if wire == "native" and session.zenoh.info.routers_zid() and discover(session, 0.3, wire="ros2"):
+        text = f"{what} on the native wire; this router also has ROS 2 nodes"
+        return broken("robots", text, f"zstate doctor --wire ros2{options}")
+    if session.probe is not None:
+        what += f", or the router shows none to {session.probe.identity}"
     if robot == ANY:
         from zstate.model.catalog import example_name
 
-        return f"zstate publish {example_name()} --source sine"
+        return broken("robots", what, f"zstate publish {example_name()} --source sine{options}")
     command = publish_command_for("publish", robot)
-    return command if "FILE" in command else f"{command} --source sine"
-
-
-def _connecting(network: SessionOptions) -> str:
-    return "".join(f" --connect {endpoint}" for endpoint in network.connect)
+    source = "" if "FILE" in command else " --source sine"
+    return broken("robots", f"{what}: its publisher is not running", f"{command}{source}{options}")
 
 
 def with_same_options(command: str, network: SessionOptions, wire: str) -> str:

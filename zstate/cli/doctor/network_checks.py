@@ -1,4 +1,4 @@
-"""The links that all robots share: this installation, and the way to the others."""
+"""Checks of the links that all robots share: this installation, and the connection to other processes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import platform
 from collections.abc import Iterator
 from contextlib import ExitStack
 from importlib import metadata
+from pathlib import Path
 
 from zstate import __version__
 from zstate.cli.doctor.check import Check, broken, ok, warning
@@ -26,84 +27,85 @@ from zstate.net.security.connection_check import (
 )
 from zstate.net.session import Session, connect
 
-_MET_WITHIN_S = 1.0
+_RENDEZVOUS_WITHIN_S = 1.0
 
-_DIFFERENTLY = {
-    "TLS demanded": "--certs DIR --identity NAME",
-    "certificate demanded": "--certs DIR --identity NAME",
-    "wrong CA": "--certs DIR --identity NAME",
+_CERTIFICATE = "--certs DIR --identity NAME"
+_MISSING_OPTIONS = {
+    "TLS demanded": _CERTIFICATE,
+    "certificate demanded": _CERTIFICATE,
+    "wrong CA": _CERTIFICATE,
     "user demanded": "--user NAME",
 }
 
 
 def installation_check() -> Check:
-    """What runs here."""
+    """The versions in use."""
     zenoh = metadata.version("eclipse-zenoh")
     text = f"zstate {__version__}, kernel {kernel}, Zenoh {zenoh}, Python {platform.python_version()}"
     if kernel == "c" or kernel.reason.startswith(VARIABLE):
         return ok("zstate", text)
     return warning(
         "zstate",
-        f"{text}: {kernel.reason}; lookups give the same answers and take longer",
+        f"{text}: {kernel.reason}; lookups return the same results and take longer",
         "pip install --force-reinstall --no-deps zstate",
     )
 
 
 def refused_check(error: ZStateError, network: SessionOptions) -> Check:
-    """There is no session, and ``error`` says why."""
+    """The check of a network that no session could join, because of ``error``."""
+    config = f"zstate config{connect_options(network)}"
     if isinstance(error, Unreachable) and error.endpoints:
         text, then = check_all_tcp(error.endpoints)
         for options, robots in find_elsewhere(network):
             text += f"; {with_options(options)}: {', '.join(map(repr, robots))}"
-        return broken("network", text, then or f"zstate config{_options(network)}")
+        return broken("network", text, then or config)
     if isinstance(error, AccessDenied):
-        endpoint = error.endpoint
+        endpoint, missing = error.endpoint, _MISSING_OPTIONS.get(error.reason)
         if error.reason in ("TLS demanded", "no TLS there"):
             protocol = "tls/" if error.reason == "TLS demanded" else "tcp/"
             endpoint = protocol + endpoint.partition("/")[2]
-        options = " ".join(filter(None, (f"--connect {endpoint}", _DIFFERENTLY.get(error.reason))))
-        known = error.reason in _DIFFERENTLY or endpoint != error.endpoint
-        return broken("network", str(error), f"zstate doctor {options}" if known else "zstate config")
-    return broken("network", str(error), f"zstate config{_options(network)}")
+        options = " ".join(filter(None, (f"--connect {endpoint}", missing)))
+        is_solvable = missing is not None or endpoint != error.endpoint
+        return broken("network", str(error), f"zstate doctor {options}" if is_solvable else "zstate config")
+    return broken("network", str(error), config)
 
 
 def network_check(session: Session, network: SessionOptions) -> Check:
-    """Whom the session has links to."""
-    if not network.is_given:
-        return _host_check(session)
-    met = connections(session)
-    parts = [count_text(number, kind) for kind, number in met.sessions.items() if number]
+    """The processes that the session has links to."""
+    if not network.is_explicit:
+        return _rendezvous_check(session)
+    counts = connections(session).sessions
+    parts = [count_text(number, kind) for kind, number in counts.items() if number]
     links = ", ".join(sorted({str(link.dst) for link in session.zenoh.info.links()}))
-    text = f"{network.joins_as}, linked to {' and '.join(parts) or 'nobody'}{f' ({links})' if links else ''}"
+    joined = f"{' and '.join(parts) or 'no session'}{f' ({links})' if links else ''}"
     for endpoint in network.connect if network.joins_as != "client" else ():
-        why = check_tcp(endpoint)
-        if why is not None:
-            text = f"nothing answers at {endpoint!r} ({why.text}); a peer goes on trying"
-            return broken("network", text, why.next)
-        answers = check_endpoints([endpoint], network.credentials)
-        if answers.are_refusals and not parts:
-            return broken("network", str(answers.error), f"zstate config{_options(network)}")
-    return ok("network", text)
+        reason = check_tcp(endpoint)
+        if reason is not None:
+            text = f"nothing answers at {endpoint!r} ({reason.text}); a peer keeps trying"
+            return broken("network", text, reason.next)
+        replies = check_endpoints([endpoint], network.credentials)
+        if replies.are_refusals and not parts:
+            return broken("network", str(replies.error), f"zstate config{connect_options(network)}")
+    return ok("network", f"{network.joins_as}, linked to {joined}")
 
 
-def _host_check(session: Session) -> Check:
+def _rendezvous_check(session: Session) -> Check:
     addresses = [f"{host}:{port}" for host, port in rendezvous_addresses()]
-    met = _met_at(session, len(addresses))
-    if met == 0:
+    number = _rendezvous_number(session, len(addresses))
+    if number == 0:
         count = connections(session).sessions["peer"] - 1
         return ok("network", f"programs of this host, which meet at {addresses[0]}: {count} besides this one")
     silent = check_rendezvous(silent_addresses())
     if silent is None:
-        return broken(
-            "network", f"programs of this host meet at {addresses[0]}, and none of them is found", ""
-        )
-    if met is None:
+        text = f"programs of this host meet at {addresses[0]}, and none of them is found"
+        return broken("network", text, "")
+    if number is None:
         return broken("network", silent.text, silent.next)
-    return warning("network", f"{silent.text}; the others meet at {addresses[met]} meanwhile", silent.next)
+    return warning("network", f"{silent.text}; the others meet at {addresses[number]}", silent.next)
 
 
-def _met_at(session: Session, count: int) -> int | None:
-    """Number of the first rendezvous address with a lobby; None if none is seen within 1 s."""
+def _rendezvous_number(session: Session, count: int) -> int | None:
+    """The number of the first of ``count`` rendezvous addresses with a peer; None if none is found in 1 s."""
     waiter = ConditionWaiter()
     with ExitStack() as opened:
         publishers = [session.zenoh.declare_publisher(rendezvous_key(number)) for number in range(count)]
@@ -111,22 +113,24 @@ def _met_at(session: Session, count: int) -> int | None:
             opened.callback(session.release, publisher)
             opened.callback(session.release, publisher.declare_matching_listener(waiter.notify))
 
-        def met() -> list[int]:
-            # The stub of zenoh says bool; it is an object that is always true.
+        def found() -> list[int]:
+            # Zenoh's stub declares a bool; it is an object that is always true.
             return [number for number, one in enumerate(publishers) if one.matching_status.matching]  # pyright: ignore
 
-        waiter.wait_for(met, _MET_WITHIN_S)
-        return next(iter(met()), None)
+        waiter.wait_for(found, _RENDEZVOUS_WITHIN_S)
+        return next(iter(found()), None)
 
 
 def access_check(session: Session, network: SessionOptions, robot: str) -> Check | None:
-    """Whether whoever is called like ``robot`` may write as it; None for others, and where nobody asks."""
+    """Whether an identity named ``robot`` may write as that robot; None for other identities."""
     from zstate.net.security.write_permission import check_may_write
 
     credentials = network.credentials
-    if session.probe is None or credentials is None or robot not in _names(network):
+    if session.probe is None or credentials is None:
         return None
-    # Among the keys of its writers, and none that a reader could take for a writer's.
+    if robot not in (credentials.user, Path(credentials.certificate or "").stem):
+        return None
+    # A key below those of its writers that no reader takes for a writer.
     token = f"zstate/{robot}/@writer/doctor/{session.zid}"
     with announce(session, token):
         try:
@@ -136,20 +140,10 @@ def access_check(session: Session, network: SessionOptions, robot: str) -> Check
     return ok("access", f"the router lets {credentials.identity} write as {robot!r}")
 
 
-def _names(network: SessionOptions) -> set[str]:
-    from pathlib import Path
-
-    credentials = network.credentials
-    if credentials is None:
-        return set()
-    certificate = Path(credentials.certificate).stem if credentials.certificate else ""
-    return {credentials.user or "", certificate} - {""}
-
-
 def find_elsewhere(network: SessionOptions) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Options with which other robots than now would be seen, and which."""
+    """Other options with which robots are announced, and their names."""
     router = SessionOptions("client", (ROUTER_ENDPOINT,))
-    others = [("", SessionOptions())] if network.is_given else []
+    others = [("", SessionOptions())] if network.is_explicit else []
     if ROUTER_ENDPOINT not in network.connect and accepts_tcp(ROUTER_ENDPOINT):
         others.append((f" --connect {ROUTER_ENDPOINT}", router))
     for options, other in others:
@@ -166,9 +160,10 @@ def find_elsewhere(network: SessionOptions) -> Iterator[tuple[str, tuple[str, ..
 
 
 def with_options(options: str) -> str:
-    """Where robots are seen with ``options`` as ``elsewhere`` gives them."""
+    """Description of ``options`` as ``find_elsewhere`` returns them."""
     return f"with{options}" if options else "without --connect, among the programs of this host"
 
 
-def _options(network: SessionOptions) -> str:
+def connect_options(network: SessionOptions) -> str:
+    """The endpoints as options of a command."""
     return "".join(f" --connect {endpoint}" for endpoint in network.connect)

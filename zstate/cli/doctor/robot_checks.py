@@ -1,14 +1,13 @@
-"""The links of one robot: its writers, its model, its samples, its fixed edges, and the poses at the end."""
+"""Checks of one robot: writers, model, samples, joint limits, static edges and poses."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 
 from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.check import Check, broken, ok, skipped, warning
 from zstate.cli.doctor.clock_checks import clocks_check, stamps_check
-from zstate.cli.doctor.ear import Ear
-from zstate.cli.doctor.samples import Ranges
+from zstate.cli.doctor.robot_probe import PositionRanges, RobotProbe
 from zstate.cli.frame_checks import similar_frames, without_program_advice
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import publish_command_for
@@ -16,118 +15,102 @@ from zstate.errors import LookupFailed, ModelError, format_duration
 from zstate.model.joint_limits import JointLimits
 from zstate.model.robot import RobotModel, representative_links
 from zstate.model.urdf import parse_urdf
-from zstate.net.presence import RobotInfo
 from zstate.net.session import Session
 from zstate.nodes.publisher_status import ARE_OUTSIDE
 from zstate.wire.keys import MODEL_WRITER, foreign_edge_problem
 from zstate.wire.messages import Status
 
-_FEWER = 0.8
-"""Of what is sent, at least so much is to arrive."""
+_MIN_RECEIVED = 0.8
+"""The least ratio of received to sent samples."""
 
-_KEPT = 0.95
-"""Of the rate it is to keep, so much is good enough."""
+_MIN_RATE = 0.95
+"""The least ratio of the achieved to the commanded rate."""
 
-_OF_VERSIONS = ("newer version", "foreign")
-_OF_THE_MODEL = ("robot description", "no description")
-_OF_STATICS = "static edge of"
-"""So begin the texts of refused ones."""
+# Reasons of refused messages.
+_VERSION_REASONS = ("newer version", "foreign")
+_MODEL_REASONS = ("robot description", "no description")
+_STATIC_PREFIX = "static edge of"
+"""The texts of refused static edges start with this."""
 
 
-def robot_checks(ear: Ear, session: Session) -> Iterator[Check]:
-    """Every link of the robot that ``ear`` has heard for a while."""
-    yield _writers_check(ear)
-    if ear.is_mute and ear.info.writers:
-        yield _mute_check(ear, session)
+def robot_checks(probe: RobotProbe, session: Session) -> Iterator[Check]:
+    """The checks of the robot of ``probe``, which has collected data for a while."""
+    yield _writers_check(probe)
+    if probe.is_silent and probe.info.writers:
+        yield _silent_check(probe, session)
         return
-    versions = _version_check(ear)
-    if versions is not None:
-        yield versions
-    model, check = model_check(ear)
+    for reason in _VERSION_REASONS:
+        if text := probe.listener.refusals.get(reason):
+            is_newer = reason == "newer version"
+            advice = f"zstate ls  # shows the writers of {probe.info.name}"
+            yield broken("version", text, "pip install -U zstate" if is_newer else advice)
+            break
+    model, check = model_check(probe)
     yield check
-    yield _samples_check(ear)
-    yield clocks_check(ear)
-    yield stamps_check(ear, session)
+    yield _samples_check(probe)
+    yield clocks_check(probe)
+    yield stamps_check(probe, session)
     if model is not None:
-        ranges = [writer.ranges for writer in ear.samples.writers.values()]
-        yield from limits_check(ear, model, ranges, f"zstate echo {ear.info.name}")
-    yield statics_check(ear)
-    yield poses_check(ear, model)
+        ranges = [writer.ranges for writer in probe.samples.writers.values()]
+        yield from limits_check(probe, model, ranges, f"zstate echo {probe.info.name}")
+    yield statics_check(probe)
+    yield poses_check(probe, model)
 
 
-def _writers_check(ear: Ear) -> Check:
-    for event in ear.events:
+def _writers_check(probe: RobotProbe) -> Check:
+    robot = probe.info.name
+    for event in probe.events:
         if event.kind == "conflict" and event.stream == "tf_static":
-            if _refused_static(ear) is None:  # which says more
-                return warning(
-                    "writers",
-                    without_program_advice(event.text),
-                    f"zstate tree {ear.info.name}  # shows the edge that counts",
-                )
+            if _refused_static(probe) is None:  # statics_check reports that in more detail
+                then = f"zstate tree {robot}  # shows the edge in use"
+                return warning("writers", without_program_advice(event.text), then)
         elif event.kind == "conflict":
-            then = (
-                f"zstate ls  # shows both; end one of them, or give it --name, another than {ear.info.name}"
-            )
+            then = f"zstate ls  # shows both; stop one of them, or start it with a --name other than {robot}"
             return warning("writers", event.text, then)
-    for status in ear.statuses.values():
-        if status.level == "error" or (status.level == "warn" and not _is_elsewhere(status)):
-            text = f"{status.program}@{status.host} pid {status.pid} says: {status.text}"
-            return warning("writers", text, f"zstate monitor --robots --robot {ear.info.name}")
-    streams: dict[str, list[str]] = {}
-    for stream, writer in ear.info.writers:
-        streams.setdefault(str(writer), []).append(stream)
-    said = [f"{writer} ({', '.join(streams)})" for writer, streams in streams.items()]
-    return ok("writers", "; ".join(said))
+    for status in probe.statuses.values():
+        if status.level == "error" or (status.level == "warn" and not _has_own_check(status)):
+            text = f"{status.program}@{status.host} pid {status.pid} reports: {status.text}"
+            return warning("writers", text, f"zstate monitor --robots --robot {robot}")
+    return ok("writers", probe.writers_text())
 
 
-def _is_elsewhere(status: Status) -> bool:
-    """Whether another check has what the status says, or it only was late now and then."""
+def _has_own_check(status: Status) -> bool:
+    """Whether another check covers a warning, or the writer was only late now and then."""
     if ARE_OUTSIDE in status.text:
         return True
     commanded = status.values.get("commanded", "").partition(" ")[0]
-    return bool(commanded) and status.rate_hz >= _KEPT * float(commanded)
+    return bool(commanded) and status.rate_hz >= _MIN_RATE * float(commanded)
 
 
-def _mute_check(ear: Ear, session: Session) -> Check:
-    """Writers are announced, and nothing that they say arrives."""
-    robot, writer = ear.info.name, ear.info.writers[0][1]
-    if writer in ear.stuck:
-        text = f"{writer} is announced and answers nothing: it is stopped, frozen, or behind a dead link"
+def _silent_check(probe: RobotProbe, session: Session) -> Check:
+    """Writers are announced, and none of their data arrives."""
+    robot, writer = probe.info.name, probe.info.writers[0][1]
+    if writer in probe.unresponsive:
+        text = f"{writer} is announced but does not respond: it is stopped, frozen, or behind a dead link"
         return broken("writers", text, f"ps -o stat= -p {writer.pid}  # on {writer.host}; T: it is stopped")
     if session.zenoh.info.routers_zid():
-        who = "to this identity" if session.probe is None else f"to {session.probe.identity}"
+        identity = "this identity" if session.probe is None else session.probe.identity
         text = (
-            f"{robot!r} is alive, and nothing it says arrives: the router denies zstate/{robot}/** {who}; "
-            "its access control lets those read whom it names as viewers"
+            f"{robot!r} is announced, but none of its data arrives: the router denies zstate/{robot}/** to "
+            f"{identity}; its access control lists the viewers that may read"
         )
-        return broken("access", text, "zstate acl --viewer NAME  # for the router; then it is started anew")
-    text = f"{writer} is announced, and nothing it says arrives"
+        return broken(
+            "access", text, "zstate acl --viewer NAME  # for the router, which then needs a restart"
+        )
+    text = f"{writer} is announced, but none of its data arrives"
     return broken("writers", text, f"zstate echo {robot}")
 
 
-def _version_check(ear: Ear) -> Check | None:
-    for reason in _OF_VERSIONS:
-        text = ear.listener.refusals.get(reason)
-        if text:
-            then = (
-                "pip install -U zstate"
-                if reason == "newer version"
-                else f"zstate ls  # who is {ear.info.name}?"
-            )
-            return broken("version", text, then)
-    return None
-
-
-def model_check(ear: Ear) -> tuple[RobotModel | None, Check]:
-    """What the robot says it is, where that can be used, and whether it can."""
-    robot = ear.info.name
-    if ear.description is None:
-        return None, _no_model_check(ear)
+def model_check(probe: RobotProbe) -> tuple[RobotModel | None, Check]:
+    """The model of the robot if it can be used, and the check."""
+    robot = probe.info.name
+    if probe.description is None:
+        return None, _no_model_check(probe)
     try:
-        model = parse_urdf(ear.description.urdf, f"the URDF of {robot!r}")
+        model = parse_urdf(probe.description.urdf, f"the URDF of {robot!r}")
     except ModelError as error:
-        return None, broken("model", str(error), "zstate check FILE  # the file that its publisher was given")
-    refused = ear.listener.refusals.get("robot description")
+        return None, broken("model", str(error), "zstate check FILE  # the file that its publisher loads")
+    refused = probe.listener.refusals.get("robot description")
     if refused:
         return None, broken("model", refused, f"zstate tree {robot}")
     size = f"{count_text(len(model.links), 'link')}, {count_text(len(model.joint_names), 'joint')}"
@@ -139,186 +122,171 @@ def model_check(ear: Ear) -> tuple[RobotModel | None, Check]:
     return model, ok("model", text)
 
 
-def _no_model_check(ear: Ear) -> Check:
-    robot = ear.info.name
-    writers = ear.writers("robot_description")
+def _no_model_check(probe: RobotProbe) -> Check:
+    robot, writers = probe.info.name, probe.writers("robot_description")
     if writers:
         text = f"{writers[-1]} announces the model, which has not arrived"
         return broken("model", text, f"zstate doctor {robot} --timeout 10")
-    if ear.followed == "tf":
-        return ok("model", "nobody publishes one, and none is needed: poses come ready made on tf")
-    return broken("model", f"nobody publishes the model of {robot!r}", publish_command_for("publish", robot))
+    if probe.followed == "tf":
+        return ok("model", "not published, and not needed: the poses are published on tf")
+    text = f"the model of {robot!r} has no publisher"
+    return broken("model", text, publish_command_for("publish", robot))
 
 
-def _samples_check(ear: Ear) -> Check:
-    stream, robot, statistics = ear.followed, ear.info.name, ear.samples.statistics
-    writers = ear.writers(stream)
-    if not statistics.count and (not writers or "joint_states" not in ear.streams):
-        return _nobody_check(ear)
-    who = str(writers[-1]) if writers else "somebody unannounced"
-    if not statistics.count:
-        return broken(
-            stream, f"{who} is there, but no sample comes: {_idle_text(ear)}", f"zstate echo {robot}"
-        )
-    refused = refused_check(ear)
+def _samples_check(probe: RobotProbe) -> Check:
+    stream, robot, statistics = probe.followed, probe.info.name, probe.samples.statistics
+    writers, window = probe.writers(stream), statistics.window()
+    if window is None and (not writers or "joint_states" not in probe.streams):
+        return _no_writer_check(probe)
+    writer = str(writers[-1]) if writers else "an unannounced writer"
+    if window is None:
+        status = probe.statuses.get(writers[-1].session)
+        if status is not None:
+            cause = f"it runs, but {status.text or 'publishes nothing'}"
+        else:
+            is_stuck = writers[-1] in probe.unresponsive
+            cause = "it does not respond either: stopped, or frozen" if is_stuck else "it is slow"
+        text = f"{writer} is announced, but no sample arrives: {cause}"
+        return broken(stream, text, f"zstate echo {robot}")
+    refused = refused_check(probe)
     if refused is not None:
         return refused
-    window = statistics.window()
-    rate_hz = None if window is None else window.rate_hz
-    if rate_hz is None:
-        return warning(stream, f"one sample came from {who}; too few to tell a rate", f"zstate hz {robot}")
+    if window.rate_hz is None:
+        return warning(stream, f"one sample from {writer}; too few for a rate", f"zstate hz {robot}")
+    return _rate_check(probe, writer, window.rate_hz)
+
+
+def _rate_check(probe: RobotProbe, writer: str, rate_hz: float) -> Check:
+    stream, robot, statistics = probe.followed, probe.info.name, probe.samples.statistics
+    silence, hz = format_duration(round(statistics.silent_s() * 1e9)), f"zstate hz {robot} --stream {stream}"
     if statistics.is_stale():
-        text = f"samples of {who} came, and none for {_silence_text(ear)}"
-        return broken(stream, text, f"zstate hz {robot} --stream {stream}")
-    return _rate_check(ear, rate_hz, who)
+        return broken(stream, f"the samples of {writer} stopped {silence} ago", hz)
+    text, stats = f"{rate_hz:.1f} Hz from {writer}", probe.listener.stats
+    status = probe.statuses.get(statistics.session)
+    if status is not None and rate_hz < _MIN_RECEIVED * status.rate_hz:
+        sent = f"which sends {status.rate_hz:.1f} Hz"
+        return warning(stream, f"{text}, {sent}: the rest is lost or downsampled on the way", hz)
+    if stats.missed + stats.dropped > _MIN_RECEIVED * statistics.count:
+        text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
+        return warning(stream, text, f"zstate monitor --robots --robot {robot}")
+    return ok(stream, f"{text}, newest {silence} ago")
 
 
-def _silence_text(ear: Ear) -> str:
-    return format_duration(round(ear.samples.statistics.silent_s() * 1e9))
+def _no_writer_check(probe: RobotProbe) -> Check:
+    robot, waiting = probe.info.name, probe.writers("tf")
+    then = f"{publish_command_for('joints', robot)}  # moves it, until the driver runs"
+    if "robot_description" not in probe.streams and not waiting:
+        return warning(
+            "joint_states", f"{robot!r} has no writer of joint_states or tf: it does not move", then
+        )
+    waits = f", which {waiting[-1]} waits for" if waiting else ""
+    text = f"{robot!r} has no writer of joint_states{waits}: its driver is not running"
+    for info in probe.neighbours:
+        if {stream for stream, _ in info.writers} == {"joint_states"}:
+            text += f", or it uses the name {info.name!r}, which has joint_states but no model"
+            return broken("joint_states", text, publish_command_for("publish", info.name))
+    return broken("joint_states", text, then)
 
 
-def _nobody_check(ear: Ear) -> Check:
-    robot, waiting = ear.info.name, ear.writers("tf")
-    if "robot_description" not in ear.streams and not waiting:
-        text = f"nobody writes joint_states of {robot!r}, nor tf: it stands still"
-        return warning("joint_states", text, f"{publish_command_for('joints', robot)}  # moves it, for a try")
-    waits = f", for which {waiting[-1]} waits" if waiting else ""
-    text = f"nobody writes joint_states of {robot!r}{waits}: its driver is not running (any more)"
-    others = [info.name for info in ear.neighbours if _streams(info) == {"joint_states"}]
-    if others:
-        text += f", or calls the robot {others[0]!r}, of which there are joint_states and no model"
-        return broken("joint_states", text, publish_command_for("publish", others[0]))
-    return broken(
-        "joint_states", text, f"{publish_command_for('joints', robot)}  # moves it, until the driver runs"
-    )
-
-
-def _streams(info: RobotInfo) -> set[str]:
-    return {stream for stream, _ in info.writers}
-
-
-def _idle_text(ear: Ear) -> str:
-    writer = ear.writers(ear.followed)[-1]
-    status = ear.statuses.get(writer.session)
-    if status is None:
-        return "it says nothing else either: stopped, or frozen" if writer in ear.stuck else "it is slow"
-    return f"it runs, but {status.text or 'publishes nothing'}"
-
-
-def refused_check(ear: Ear) -> Check | None:
-    """Why samples that came cannot be used; None where all can."""
-    refused, texts = ear.listener.stats.refused, ear.listener.refusals
+def refused_check(probe: RobotProbe) -> Check | None:
+    """Why samples that arrived cannot be used; None if all can."""
+    refused, texts = probe.listener.stats.refused, probe.listener.refusals
     reasons = [
         reason
         for reason, text in texts.items()
-        if reason not in (*_OF_THE_MODEL, *_OF_VERSIONS) and not text.startswith(_OF_STATICS)
+        if reason not in (*_MODEL_REASONS, *_VERSION_REASONS) and not text.startswith(_STATIC_PREFIX)
     ]
     if not reasons:
         return None
     reason = max(reasons, key=lambda one: refused[one])
     text = f"{count_text(refused[reason], 'message')} cannot be used ({reason}): {texts[reason]}"
-    if ear.listener.stats.received:
-        return warning(ear.followed, text, f"zstate monitor --robots --robot {ear.info.name}")
-    return broken(ear.followed, text, f"zstate echo {ear.info.name} --once")
+    if probe.listener.stats.received:
+        return warning(probe.followed, text, f"zstate monitor --robots --robot {probe.info.name}")
+    return broken(probe.followed, text, f"zstate echo {probe.info.name} --once")
 
 
-def _rate_check(ear: Ear, rate_hz: float, who: str) -> Check:
-    stream, robot, stats = ear.followed, ear.info.name, ear.listener.stats
-    text = f"{rate_hz:.1f} Hz from {who}"
-    status = ear.statuses.get(ear.samples.statistics.session)
-    if status is not None and rate_hz < _FEWER * status.rate_hz:
-        text += f", which sends {status.rate_hz:.1f} Hz: the rest is lost, or thinned by a router, on the way"
-        return warning(stream, text, f"zstate hz {robot} --stream {stream}")
-    if stats.missed + stats.dropped > _FEWER * ear.samples.statistics.count:
-        text += f"; {stats.missed} were lost on the way and {stats.dropped} here"
-        return warning(stream, text, f"zstate monitor --robots --robot {robot}")
-    return ok(stream, f"{text}, newest {_silence_text(ear)} ago")
-
-
-def limits_check(ear: Ear, model: RobotModel, ranges: Iterable[Ranges], echo: str) -> Iterator[Check]:
-    """Warnings where joint positions of ``model`` are outside its limits; ``echo`` prints them."""
+def limits_check(
+    probe: RobotProbe, model: RobotModel, ranges: Iterable[PositionRanges], echo: str
+) -> Iterator[Check]:
+    """Warnings if joint positions of ``model`` are outside its limits; the command ``echo`` prints them."""
     limits = JointLimits(model)
-    found = [limits.explanation(of_writer.positions(model)) for of_writer in ranges]
-    said = [status.text for status in ear.statuses.values() if ARE_OUTSIDE in status.text]
-    for text in list(filter(None, found)) or said[:1]:
+    found = [text for writer in ranges if (text := limits.explanation(writer.positions(model)))]
+    reported = [status.text for status in probe.statuses.values() if ARE_OUTSIDE in status.text]
+    for text in found or reported[:1]:
         yield warning("limits", text, f"{echo} --once  # `zstate check FILE --joints` shows the limits")
 
 
-def statics_check(ear: Ear) -> Check:
-    """Whether all who announce fixed edges place some."""
-    frames = ear.listener.buffer.frames()
-    owned = [frame for frame in frames if frame.kind == "static"]
-    heard = {frame.writer for frame in owned}
-    others = {name: writer for name, writer in ear.info.static_names if name != MODEL_WRITER}
-    silent = [name for name in others if name not in heard]
-    refused = _refused_static(ear) or _foreign_static(ear, owned)
+def statics_check(probe: RobotProbe) -> Check:
+    """Whether all static edges are used, and every announced writer of static edges has one."""
+    robot = probe.info.name
+    static = [frame for frame in probe.listener.buffer.frames() if frame.kind == "static"]
+    refused = _refused_static(probe)
+    if refused is None and not probe.nodes:  # ROS nodes share all frames
+        robots = {info.name for info in probe.neighbours}
+        for frame in static:
+            # Listeners of all robots refuse the edge, although this listener of one robot does not.
+            problem = foreign_edge_problem(robot, (frame.parent or "", frame.name), robots)
+            if problem and refused is None:
+                refused = f"{_STATIC_PREFIX} {frame.writer!r}: {problem}"
     if refused is not None:
-        then = f"zstate tree {ear.info.name}  # the frames without that edge; end its writer, or correct it"
+        then = f"zstate tree {robot}  # the frames without that edge; stop its writer, or correct it"
         return warning("tf_static", without_program_advice(refused), then)
-    if silent:
-        text = f"{others[silent[0]]} announces static edges as {silent[0]!r}, and places no frame"
-        return warning("tf_static", text, f"zstate tree {ear.info.name}")
-    return ok("tf_static", f"{count_text(len(owned), 'fixed edge')}")
+    writers = {frame.writer for frame in static}
+    for name, writer in dict(probe.info.static_names).items():
+        if name != MODEL_WRITER and name not in writers:
+            text = f"{writer} announces static edges as {name!r}, but places no frame"
+            return warning("tf_static", text, f"zstate tree {robot}")
+    return ok("tf_static", f"{count_text(len(static), 'fixed edge')}")
 
 
-def _refused_static(ear: Ear) -> str | None:
-    """Why a static edge is not used, and whose it is."""
-    found = (text for text in ear.listener.refusals.values() if text.startswith(_OF_STATICS))
-    refused = next(found, None)
-    for name, writer in ear.info.static_names:
-        if refused is not None and refused.startswith(f"{_OF_STATICS} {name!r}:"):
+def _refused_static(probe: RobotProbe) -> str | None:
+    """Why a static edge is not used, with its writer."""
+    texts = probe.listener.refusals.values()
+    refused = next((text for text in texts if text.startswith(_STATIC_PREFIX)), None)
+    for name, writer in probe.info.static_names:
+        if refused is not None and refused.startswith(f"{_STATIC_PREFIX} {name!r}:"):
             return refused.replace(f"{name!r}:", f"{name!r} ({writer}):", 1)
     return refused
 
 
-def _foreign_static(ear: Ear, owned: Iterable[FrameInfo]) -> str | None:
-    """Which static edge of this robot is refused by readers of all robots."""
-    robots = {info.name for info in ear.neighbours}
-    for frame in owned:
-        text = foreign_edge_problem(ear.info.name, (frame.parent or "", frame.name), robots)
-        if text and not ear.nodes:  # in ROS all writers share all frames
-            return f"{_OF_STATICS} {frame.writer!r}: {text}"
-    return None
-
-
-def poses_check(ear: Ear, model: RobotModel | None) -> Check:
-    """Whether the frames hang together, and a pose of the outermost is known."""
-    frames, robot = ear.listener.buffer.frames(), ear.info.name
+def poses_check(probe: RobotProbe, model: RobotModel | None) -> Check:
+    """Whether all frames are in one tree, and the pose of an outermost frame is known."""
+    frames, robot = probe.listener.buffer.frames(), probe.info.name
     roots = sorted(frame.name for frame in frames if frame.parent is None)
     if len(roots) > 1:
-        return _trees_check(ear, frames, roots)
-    is_driven = "joint_states" in ear.streams and model is not None
-    if not (ear.samples.statistics.count or is_driven or (model is not None and not model.joint_names)):
+        return _trees_check(probe, {frame.name for frame in frames}, roots)
+    has_samples = bool(probe.samples.statistics.count)
+    is_driven = "joint_states" in probe.streams and model is not None
+    if not (has_samples or is_driven or (model is not None and not model.joint_names)):
         return skipped("poses", "no joint positions")
     if not frames:
         return skipped("poses", "no frame is known")
     ends = representative_links(model, 1) if model is not None else ()
     target, source = roots[0], f"{robot}/{ends[0]}" if ends else frames[-1].name
     try:
-        ear.listener.buffer.lookup(target, source)
+        probe.listener.buffer.lookup(target, source)
     except LookupFailed as error:
-        if not ear.samples.statistics.count:
+        if not has_samples:
             return skipped("poses", f"no joint positions: {error}")
         return broken("poses", str(error), f"zstate tf {target} {source}")
     return ok("poses", f"{count_text(len(frames), 'frame')} in one tree; {source} in {target} is known")
 
 
-def _trees_check(ear: Ear, frames: Sequence[FrameInfo], roots: Sequence[str]) -> Check:
-    """Frames that are not joined: by a name that is nearly right, or by an edge that is missing."""
+def _trees_check(probe: RobotProbe, frames: Set[str], roots: Sequence[str]) -> Check:
     text = f"{count_text(len(frames), 'frame')} in {len(roots)} trees, with the roots {', '.join(roots)}"
-    for frame in static_roots(ear):
+    for frame in static_roots(probe):
         root = frame.parent or ""
-        near = similar_frames(root, {frame.name for frame in frames} - {root})
+        near = similar_frames(root, frames - {root})
         if near:
             robot, _, bare = root.partition("/")
-            text = f"{text}: {bare!r} is near {near[0]!r}, and {frame.name!r} is on it"
+            text = f"{text}: {bare!r}, the parent of {frame.name!r}, is similar to {near[0]!r}"
             then = f"zstate tree {robot}  # if {near[0]!r} is meant, start {frame.writer} with that name"
             return warning("poses", text, then)
     return warning("poses", text, f"zstate static {roots[0]} {roots[1]} --xyz 0 0 0  # joins two of them")
 
 
 def shared_roots_checks(tops: Iterable[FrameInfo]) -> Iterator[Check]:
-    """Warnings where several robots each have a frame of the same name on top, such as a/map and b/map.
+    """Warnings if several robots each have a root of the same name, such as a/map and b/map.
 
     ``tops`` are the ``static_roots`` of all robots.
     """
@@ -333,12 +301,12 @@ def shared_roots_checks(tops: Iterable[FrameInfo]) -> Iterator[Check]:
             yield warning("frames", text, then)
 
 
-def static_roots(ear: Ear) -> Iterator[FrameInfo]:
-    """For each root of its own that no model places anything on: one of the frames there."""
-    frames = ear.listener.buffer.frames()
-    writers = {name for name, _ in ear.info.static_names if name != MODEL_WRITER}
+def static_roots(probe: RobotProbe) -> Iterator[FrameInfo]:
+    """One child of each root of the robot whose children are all placed by static writers, not by a model."""
+    frames = probe.listener.buffer.frames()
+    writers = {name for name, _ in probe.info.static_names if name != MODEL_WRITER}
     for root in frames:
-        on_it = [frame for frame in frames if frame.parent == root.name]
-        is_own = root.parent is None and root.name.startswith(f"{ear.info.name}/")
-        if is_own and on_it and all(frame.writer in writers for frame in on_it):
-            yield on_it[0]
+        children = [frame for frame in frames if frame.parent == root.name]
+        is_local = root.parent is None and root.name.startswith(f"{probe.info.name}/")
+        if is_local and children and all(frame.writer in writers for frame in children):
+            yield children[0]

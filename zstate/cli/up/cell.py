@@ -18,7 +18,7 @@ from zstate.cli.up.schema import (
     RouterSection,
     StaticSection,
 )
-from zstate.cli.up.template import Located, expand, known_keys
+from zstate.cli.up.template import Located, expand, valid_keys
 
 _Section = TypeVar("_Section", RobotSection, StaticSection, ProgramSection, RouterSection, NetworkSection)
 
@@ -64,7 +64,7 @@ def _checked(kind: str, table: Located[dict[str, Any]], section: type[_Section])
         unknown = re.search(r"unknown field `(.*)`", text)
         if unknown is None:
             raise table.file.error(f"{table.place}{place.strip('`')}", text) from None
-        known = known_keys(kind, section.__struct_fields__)
-        hint = did_you_mean(unknown[1], known) or f"; there are {', '.join(known)}"
+        valid = valid_keys(kind, section.__struct_fields__)
+        hint = did_you_mean(unknown[1], valid) or f"; there are {', '.join(valid)}"
         raise table.error(f"there is no such key{hint}", unknown[1]) from None
     return Located(values, table.file, table.place, table.iteration)

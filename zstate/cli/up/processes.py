@@ -12,7 +12,7 @@ from typing import Any
 
 from zstate._util.endpoint import format_host
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.options import load_robot, parsed_xacro_args
+from zstate.cli.options import load_robot, parse_xacro_args
 from zstate.cli.up.cell import Cell
 from zstate.cli.up.schema import (
     NetworkSection,
@@ -112,7 +112,7 @@ def _robot_spec(table: Located[RobotSection], cell: Cell, first: tuple[str, ...]
         metrics = ("--metrics", f"{format_host(host)}:{port}")
     _check_identity(table, cell)
     arguments = (
-        *("publish", model, *_xacro_words(robot), "--name", name, "--source", source),
+        *("publish", model, *_xacro_texts(robot), "--name", name, "--source", source),
         *(() if robot.rate is None else ("--rate", repr(robot.rate))),
         *_repeated("--wire", robot.wires),
         *(() if robot.clock == "system" else ("--clock", robot.clock)),
@@ -129,18 +129,18 @@ def _model_and_name(table: Located[RobotSection]) -> tuple[str, str]:
     if is_path(model) or Path(path).is_file():
         model = path
     try:
-        default = _default_name(model, table.section.name, _xacro_words(table.section))
+        default = _default_name(model, table.section.name, _xacro_texts(table.section))
         return model, check_robot(table.section.name or default)
     except (ModelError, InvalidInput) as error:
         raise table.error(str(error)) from None
 
 
 @lru_cache(maxsize=256)
-def _default_name(model: str, name: str | None, xacro_words: tuple[str, ...]) -> str:
-    return load_robot(model, name, parsed_xacro_args(xacro_words))[1]
+def _default_name(model: str, name: str | None, xacro_texts: tuple[str, ...]) -> str:
+    return load_robot(model, name, parse_xacro_args(xacro_texts))[1]
 
 
-def _xacro_words(robot: RobotSection) -> tuple[str, ...]:
+def _xacro_texts(robot: RobotSection) -> tuple[str, ...]:
     """Xacro arguments as on a command line; truth values of xacro are those of Python in lower case."""
     return tuple(
         f"{name}:={str(value).lower() if isinstance(value, bool) else value}"
@@ -180,9 +180,9 @@ def _check_identity(table: Located[RobotSection] | Located[ProgramSection], cell
     network = NetworkSection() if cell.network is None else cell.network.section
     identity = table.section.identity
     if network.certs is not None and not (identity or network.identity):
-        raise table.error("the certs of [network] are of no use without identity, here or there")
+        raise table.error("the certs of [network] need an identity, here or there")
     if identity and network.certs is None:
-        raise table.error("is of no use without certs = in [network]", "identity")
+        raise table.error("needs certs = in [network]", "identity")
 
 
 def _check_order(name: str, specs: Mapping[str, ProcessSpec], table: Located[Any]) -> None:
@@ -192,16 +192,16 @@ def _check_order(name: str, specs: Mapping[str, ProcessSpec], table: Located[Any
         for other in specs[new.pop()].after:
             if other not in specs:
                 known = did_you_mean(other, specs) or f"; there are {', '.join(specs)}"
-                raise table.error(f"nothing here is called {other!r}{known}", "after")
+                raise table.error(f"no process is called {other!r}{known}", "after")
             if other == name:
-                raise table.error(f"{other!r} would wait for itself", "after")
+                raise table.error(f"{other!r} waits for itself", "after")
             if other not in seen:
                 seen.add(other)
                 new.append(other)
 
 
 def _session_values(cell: Cell, identity: str | None) -> dict[str, tuple[str, ...]]:
-    """The values of [network] by key, with ``identity`` if that is given.
+    """The values of [network] by key, with ``identity`` if it is set.
 
     Without an endpoint or a mode, the processes connect to the router of the file.
     """

@@ -141,8 +141,8 @@ class StaticSection(_Section, frozen=True):
         try:
             return Transform.from_rpy(self.target, self.source, xyz, self._angles())
         except InvalidInput as error:
-            given = " ".join(f"{angle:g}" for angle in self.rpy or ())
-            degrees = f"; to give degrees use --rpy-deg {given} (in a file: rpy_deg)" if given else ""
+            angles = " ".join(f"{angle:g}" for angle in self.rpy or ())
+            degrees = f"; to give degrees use --rpy-deg {angles} (in a file: rpy_deg)" if angles else ""
             raise InvalidInput(f"{error}{degrees}") from None
 
     @property

@@ -26,7 +26,7 @@ _SECTION_KEYS = frozenset({"target", "source", "xyz", "rpy_deg", "rpy", "quat_xy
 
 @dataclass(frozen=True, slots=True)
 class OwnedEdge:
-    """An edge, its robot (None: not given), and the wires to publish it on (None: those of the command)."""
+    """An edge, its robot (None: unknown), and the wires to publish it on (None: those of the command)."""
 
     edge: Transform
     robot: str | None = None
@@ -38,8 +38,8 @@ def owned_edges(cell: Cell, robots: Sequence[str]) -> list[OwnedEdge]:
     return [
         OwnedEdge(edge, robot, table.section.wires)
         for table in cell.static
-        for edge in _edges_of(table)
-        for robot in _robots_of(table, robots, edge) or (None,)
+        for edge in _table_edges(table)
+        for robot in _table_robots(table, robots, edge) or (None,)
     ]
 
 
@@ -47,10 +47,12 @@ def check_edges(cell: Cell, robots: Sequence[str]) -> None:
     """Raise ConfigError if an edge has no robot, or if the edges of a robot contradict each other."""
     buffer = TransformBuffer()
     for table in cell.static:
-        for edge in _edges_of(table):
-            owners = _robots_of(table, robots, edge)
+        for edge in _table_edges(table):
+            owners = _table_robots(table, robots, edge)
             if not owners:
-                raise table.error(f"whose edge is this? Add robot = (in this file: {_listed(robots)})")
+                raise table.error(
+                    f"the robot of this edge is unknown; add robot = (in this file: {_listed(robots)})"
+                )
             try:
                 for robot in map(check_robot, owners):
                     target, source = full_name(robot, edge.target), full_name(robot, edge.source)
@@ -64,7 +66,7 @@ def with_frames(edge: Transform, target: str | None, source: str | None) -> Tran
     return Transform(target or edge.target, source or edge.source, edge.translation, edge.rotation)
 
 
-def _edges_of(table: Located[StaticSection]) -> tuple[Transform, ...]:
+def _table_edges(table: Located[StaticSection]) -> tuple[Transform, ...]:
     section = table.section
     if section.file is None:
         return (section.transform(),)
@@ -77,7 +79,7 @@ def _edges_of(table: Located[StaticSection]) -> tuple[Transform, ...]:
     return tuple(with_frames(edge, section.target, section.source) for edge in found)
 
 
-def _robots_of(table: Located[StaticSection], robots: Sequence[str], edge: Transform) -> tuple[str, ...]:
+def _table_robots(table: Located[StaticSection], robots: Sequence[str], edge: Transform) -> tuple[str, ...]:
     patterns = as_tuple(table.section.robot)
     if not patterns:
         named = [frame.partition("/")[0] for frame in (edge.source, edge.target) if "/" in frame]
@@ -87,7 +89,7 @@ def _robots_of(table: Located[StaticSection], robots: Sequence[str], edge: Trans
         matching = [robot for robot in robots if fnmatchcase(robot, pattern)] if "*" in pattern else [pattern]
         if not matching:
             known = _listed(robots)
-            raise table.error(f"no robot is called like {pattern!r}; in this file: {known}", "robot")
+            raise table.error(f"no robot matches {pattern!r}; in this file: {known}", "robot")
         names |= dict.fromkeys(matching)
     return tuple(names)
 

@@ -14,10 +14,10 @@ from zstate.clock import LONGEST_WAIT_S
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
-_NOTE_AFTER_S = 5.0
+_REPORT_AFTER_S = 5.0
 
 # Exit codes of a program that was asked to end: one of the user's need not catch Ctrl-C.
-_ENDED_AS_ASKED = (0, 130, 143, -2, -15)
+_REQUESTED_EXIT_CODES = (0, 130, 143, -2, -15)
 
 
 class ManagedProcess:
@@ -61,13 +61,13 @@ class Supervisor:
     def run(self) -> str:
         """Run to the end and return the failure of a process, or "" if all have succeeded."""
         failure = ""
-        note_at = time.monotonic() + _NOTE_AFTER_S
+        report_at = time.monotonic() + _REPORT_AFTER_S
         try:
             while not failure and not all(process.is_over for process in self._processes.values()):
                 self._start_due()
                 failure = self._next_event()
-                if time.monotonic() > note_at:
-                    note_at = float("inf")
+                if time.monotonic() > report_at:
+                    report_at = float("inf")
                     for process in self._processes.values():
                         awaited = ", ".join(map(repr, self._not_ready(process)))
                         if process.child is None and awaited:
@@ -142,14 +142,16 @@ class Supervisor:
             needed = {name for spec, _ in running.values() for name in spec.after}
             ending = [running[name] for name in running if name not in needed]
             for _, child in ending:
-                child.ask_to_end()
+                child.request_exit()
             deadline = time.monotonic() + END_WITHIN_S
             for spec, child in ending:
                 child.wait(deadline)
-                if spec.is_program and child.exit_code not in _ENDED_AS_ASKED:
+                if spec.is_program and child.exit_code not in _REQUESTED_EXIT_CODES:
                     print_status(_end_text(child))
                 del running[spec.name]
 
 
 def _end_text(child: ChildProcess) -> str:
-    return f"{child.name!r} ended with exit code {child.exit_code}: {child.last_error or 'it said nothing'}"
+    return (
+        f"{child.name!r} ended with exit code {child.exit_code}: {child.last_error or 'it printed no error'}"
+    )

@@ -121,7 +121,7 @@ def expand(path: Path, settings: Mapping[str, str]) -> Iterator[tuple[str, Locat
 
 
 def parse_settings(texts: Sequence[str]) -> dict[str, str]:
-    """Parameters given as ``KEY=VALUE`` on a command line. Raises InvalidInput."""
+    """Parameters as ``KEY=VALUE`` on a command line. Raises InvalidInput."""
     settings: dict[str, str] = {}
     for text in texts:
         key, sign, value = text.partition("=")
@@ -133,7 +133,7 @@ def parse_settings(texts: Sequence[str]) -> dict[str, str]:
     return settings
 
 
-def known_keys(kind: str, section: Sequence[str]) -> tuple[str, ...]:
+def valid_keys(kind: str, section: Sequence[str]) -> tuple[str, ...]:
     """The keys of a table: those of its ``section``, and those of its loop and condition."""
     return (*section, *(_LOOP_KEYS if kind in _LOOPS else ("when",)))
 
@@ -194,8 +194,8 @@ def _parameters(files: Sequence[TomlFile], settings: Mapping[str, str]) -> Varia
     for name, (file, value) in declared.items():
         with _error_at(file, f"parameters.{name}"):
             is_set = name in settings
-            meant = _parsed_like(value, settings[name]) if is_set else variables.substitute(value)
-        variables = variables.extended({name: meant})
+            parsed = _parsed_like(value, settings[name]) if is_set else variables.substitute(value)
+        variables = variables.extended({name: parsed})
     return variables
 
 
@@ -209,7 +209,7 @@ def _parsed_like(value: object, text: str) -> Any:
         parsed = None
     types = (int, float) if type(value) in (int, float) else (type(value),)
     if type(parsed) not in types:
-        raise InvalidInput(f"it is {value!r} in the file, and {text!r} is nothing of that kind")
+        raise InvalidInput(f"it is {value!r} in the file, and {text!r} is not of that type")
     return parsed
 
 
@@ -224,8 +224,8 @@ def _iterations(
             with _error_at(file, f"{place}.name"):
                 inner = inner.extended({"name": inner.substitute(keys["name"])})
         with _error_at(file, f"{place}.when"):
-            is_wanted = evaluate_condition(inner.substitute(keys.get("when", True)))
-        if is_wanted:
+            is_enabled = evaluate_condition(inner.substitute(keys.get("when", True)))
+        if is_enabled:
             rest = {key: value for key, value in keys.items() if key not in (*_LOOP_KEYS, "name")}
             values = _substituted(table, rest, inner)
             if "name" in keys or "names" in keys:
@@ -249,7 +249,7 @@ def _loop_variables(kind: str, table: Located[dict[str, Any]], variables: Variab
             {"name": name} for name in (re.findall(r"[^\s,]+", names) if isinstance(names, str) else names)
         ]
     if not str(loop["count"]).isdecimal():
-        raise table.error(f"{loop['count']!r} is not how often", "count")
+        raise table.error(f"{loop['count']!r} is not a count", "count")
     return [{"number": number} for number in range(1, int(loop["count"]) + 1)]
 
 

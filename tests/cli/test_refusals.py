@@ -1,4 +1,4 @@
-"""Commands that go on trying where they are refused say why, on one line."""
+"""Commands that keep trying after a refusal print the reason on one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.processes
 
 
 @pytest.mark.parametrize("command", [("router",), ("publish", RRBOT, "--source", "sine")])
-def test_a_wrong_user_is_told_what_to_check(
+def test_wrong_user_gets_the_settings_to_check(
     spawn: Spawn, free_port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
 ):
     users = tmp_path / "users.txt"
@@ -26,7 +26,7 @@ def test_a_wrong_user_is_told_what_to_check(
     child = started(spawn, *command, "--connect", fleet, "--listen", here, *who)
     child.line()
     until(lambda: "does not let this session in" in child.stderr)
-    (told,) = [line for line in child.stderr.splitlines() if "does not let this session in" in line]
-    assert told.startswith(f"zstate: '{fleet}' answers and ")
-    assert "the user 'alice' or the password" in told
-    assert "--users file" in told
+    (line,) = [line for line in child.stderr.splitlines() if "does not let this session in" in line]
+    assert line.startswith(f"zstate: '{fleet}' answers and ")
+    assert "the user 'alice' or the password" in line
+    assert "--users file" in line

@@ -1,0 +1,244 @@
+"""Collects everything one robot publishes during a short window."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zstate._util.closeable import Closeable
+from zstate.cli.waiting import ConditionWaiter
+from zstate.errors import MessageError
+from zstate.ingest.events import WriterEvent
+from zstate.model.robot import RobotModel, coordinate_names
+from zstate.net.clock_offset import MeasuredOffset
+from zstate.net.latched import LatchedSubscriber
+from zstate.net.presence import RobotInfo
+from zstate.net.queryable import query
+from zstate.net.session import Session
+from zstate.net.status import watch_status
+from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
+from zstate.nodes.listener import Follow, TransformListener
+from zstate.wire.identity import WriterId
+from zstate.wire.keys import Stream, clock_key
+from zstate.wire.messages import (
+    JointState,
+    RobotDescription,
+    Sample,
+    Status,
+    TransformSample,
+    from_block,
+    order_digest,
+)
+from zstate.wire.protocol import SerializedSample, Wire
+from zstate.wire.registry import get_wire
+
+_MIN_WINDOW_S = 1.2  # writers publish their status once a second
+_REPLY_WITHIN_S = 0.4
+_ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf")
+_ALL = ""
+
+
+class PositionRanges:
+    """The least and greatest positions of the samples of one writer."""
+
+    def __init__(self) -> None:
+        self._kind: object = None
+        self._names: tuple[str, ...] | None = None
+        self._order = b""
+        self._extremes = np.empty((2, 0))
+
+    def add(self, state: JointState) -> None:
+        """Include the positions of ``state``; those of another writer or joint order replace all before."""
+        positions = from_block(state.positions)
+        kind = (state.session, state.order, positions.size)
+        if kind != self._kind:
+            self._kind, self._names, self._order = kind, state.names, state.order
+            self._extremes = np.stack((positions, positions))
+        np.fmin(self._extremes[0], positions, out=self._extremes[0])
+        np.fmax(self._extremes[1], positions, out=self._extremes[1])
+
+    def positions(self, model: RobotModel) -> NDArray[np.float64]:
+        """Two position vectors of ``model``, the least and the greatest; NaN for what the samples lack."""
+        coordinates, names = coordinate_names(model), self._names
+        if names is None:
+            names = coordinates if self._order == order_digest(model.joint_names) else ()
+        columns = {name: column for column, name in enumerate(names)}
+        found = np.full((2, len(coordinates)), np.nan)
+        for column, name in enumerate(coordinates):
+            if name in columns:
+                found[:, column] = self._extremes[:, columns[name]]
+        return found
+
+
+@dataclass
+class WriterSamples:
+    """Statistics of one writer, its joints or child frames, and the ranges of its joint positions."""
+
+    statistics: IntervalStatistics
+    names: dict[str, None] = field(default_factory=dict[str, None])
+    ranges: PositionRanges = field(default_factory=PositionRanges)
+
+
+class StreamSamples(Closeable):
+    """Subscribes to ``stream`` of ``robot``; counts its samples together and by writer."""
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        stream: Stream,
+        wire: Wire,
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._writers: dict[int, WriterSamples] = {}
+        self._on_change = on_change
+        self.topic = TopicStatistics(
+            session,
+            wire,
+            sources=lambda _, __, sample: iter((_ALL, sample.session)),
+            on_sample=self._on_sample,
+        )
+        self.topic.subscribe(stream, robot)
+
+    def close(self) -> None:
+        self.topic.close()
+
+    def _on_sample(self, stream: Stream, sample: Sample) -> None:
+        writer = self._writers.get(sample.session)
+        if writer is None:
+            statistics = self.topic.get(sample.session)
+            assert statistics is not None
+            writer = self._writers[sample.session] = WriterSamples(statistics)
+        if isinstance(sample, JointState):
+            writer.names.update(dict.fromkeys(sample.names or ()))
+            writer.ranges.add(sample)
+        elif isinstance(sample, TransformSample):
+            writer.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
+        self._on_change()
+
+    @property
+    def statistics(self) -> IntervalStatistics:
+        """Of all writers together."""
+        return self.topic.get(_ALL) or IntervalStatistics()
+
+    @property
+    def writers(self) -> dict[int, WriterSamples]:
+        """By session, each writer whose samples have arrived."""
+        return self._writers.copy()
+
+
+class RobotProbe(Closeable):
+    """Subscribes to the streams of ``info`` and to the status of its writers.
+
+    ``neighbours`` are all announced robots. ``on_change()`` is called after each description and sample.
+    ``nodes`` are the samples of each stream by ROS node, on a ROS wire.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        info: RobotInfo,
+        wire: str,
+        neighbours: Iterable[RobotInfo] = (),
+        on_change: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.info, self.neighbours = info, tuple(neighbours)
+        self.streams = frozenset(stream for stream, _ in info.writers)
+        is_native = wire == "native"
+        moves_by_joints = "joint_states" in self.streams or "tf" not in self.streams
+        self.followed: Follow = "joint_states" if is_native and moves_by_joints else "tf"
+        self.description: RobotDescription | None = None
+        self.statuses: dict[int, Status] = {}
+        self.events: list[WriterEvent] = []
+        self.offsets: tuple[MeasuredOffset, ...] = ()
+        self.unresponsive: set[WriterId] = set()
+        self.nodes: dict[Stream, StreamSamples] = {}
+        self._session, self._wire, self._on_change = session, get_wire(wire), on_change
+        with ExitStack() as opening:
+            key = self._wire.expression(info.name, "robot_description")
+            opening.enter_context(LatchedSubscriber(session, key, self._on_description))
+            samples = StreamSamples(session, info.name, self.followed, self._wire, on_change)
+            self.samples = opening.enter_context(samples)
+            if is_native:
+                opening.enter_context(watch_status(session, info.name, self._on_status))
+            else:
+                for stream in _ROS_STREAMS:
+                    nodes = StreamSamples(session, info.name, stream, self._wire)
+                    self.nodes[stream] = opening.enter_context(nodes)
+            listener = TransformListener(
+                session, info.name, wire=wire, follow=self.followed, on_event=self.events.append
+            )
+            self.listener = opening.enter_context(listener)
+            self._opened = opening.pop_all()
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def _on_description(self, arrival: SerializedSample) -> None:
+        with suppress(MessageError):  # withdrawn; or invalid, which the listener counts and reports
+            for message in self._wire.decode("robot_description", arrival, self.info.name):
+                if isinstance(message, RobotDescription):
+                    self.description = message
+                    self._on_change()
+
+    def _on_status(self, _: str, status: Status) -> None:
+        self.statuses[status.session] = status
+
+    def writers(self, stream: Stream) -> list[WriterId]:
+        """The announced writers of ``stream``, the newest last."""
+        found = [writer for written, writer in self.info.writers if written == stream]
+        return sorted(found, key=lambda writer: writer.since)
+
+    def writers_text(self) -> str:
+        """Every announced writer with its streams."""
+        streams: dict[str, dict[str, None]] = {}
+        for stream, writer in self.info.writers:
+            streams.setdefault(str(writer), {})[stream] = None
+        return "; ".join(f"{writer} ({', '.join(written)})" for writer, written in streams.items())
+
+    def writer_name(self, session: int) -> str:
+        """The writer with this session number."""
+        names = {writer.session: str(writer) for _, writer in self.info.writers}
+        return names.get(session, "an unannounced writer")
+
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether announced data has not arrived yet."""
+        lacks_model = "robot_description" in self.streams and self.description is None
+        return lacks_model or (self.followed in self.streams and self.samples.statistics.count < 2)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing has arrived except announcements."""
+        frames = any(frame.kind == "static" for frame in self.listener.buffer.frames())
+        return not (
+            self.description or self.samples.statistics.count or self.statuses or self.offsets or frames
+        )
+
+    def find_unresponsive(self) -> None:
+        """Query the writers that have not reported their clocks, and collect those that do not reply.
+
+        A stopped process receives the query and lets it time out. Where a router denies the query, it ends
+        at once without a reply, which is not counted.
+        """
+        known = {offset.writer.session for offset in self.offsets}
+        for writer in {writer for _, writer in self.info.writers if writer.session not in known}:
+            began, key = time.monotonic(), clock_key(self.info.name, writer.identity)
+            replies = list(query(self._session.zenoh, key, _REPLY_WITHIN_S))
+            has_timed_out = time.monotonic() - began > 0.9 * _REPLY_WITHIN_S
+            if has_timed_out and all(reply.ok is None for reply in replies):
+                self.unresponsive.add(writer)
+
+
+def wait_for_probes(probes: Sequence[RobotProbe], waiter: ConditionWaiter, timeout_s: float) -> None:
+    """Wait until all announced data has arrived, at least 1.2 s, at most ``timeout_s``.
+
+    ``waiter`` is notified by the probes.
+    """
+    time.sleep(min(_MIN_WINDOW_S, timeout_s))
+    waiter.wait_for(lambda: not any(probe.is_incomplete for probe in probes), timeout_s - _MIN_WINDOW_S)
