@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from helpers.deployment import DEPLOY
-from helpers.processes import a_free_port
+from helpers.processes import find_free_port
 
 UNITS = sorted(path.name for path in DEPLOY.glob("*.service"))
 
@@ -47,7 +47,7 @@ def test_it_is_started_again_and_may_do_little(name: str):
 
 @pytest.mark.processes
 def test_the_units_programs_meet_and_end_as_the_units_expect(spawn: Any, tmp_path):
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     config = tmp_path / "router.json5"
     config.write_text(f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }} }}')
     values = {"${ROBOT_MODEL}": "rrbot", "%i": "r1", "/etc/zstate/router.json5": str(config)}

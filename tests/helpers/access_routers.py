@@ -7,7 +7,7 @@ from pathlib import Path
 
 from zstate.net.security.credentials import Credentials
 
-ROUTERS = """
+ROUTERS_PROGRAM = """
     import sys
     from pathlib import Path
     from zstate.net.security.credentials import Credentials
@@ -29,7 +29,7 @@ ROUTERS = """
 
 
 @dataclass(frozen=True)
-class Fleet:
+class AccessRouters:
     """Routers, by what they are, and the folders of two authorities."""
 
     folder: Path

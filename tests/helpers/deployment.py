@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from helpers.processes import DEADLINE_S, Child, a_free_port
+from helpers.processes import DEADLINE_S, Child, find_free_port
 from ruamel.yaml import YAML
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
@@ -19,12 +19,12 @@ class Deployment:
 
     def __init__(self, folder: Path) -> None:
         self.certs = folder / "certs"
-        self.port = a_free_port()
+        self.port = find_free_port()
         self.services: dict[str, Any] = YAML(typ="safe").load(DEPLOY / "compose.yaml")["services"]
         self.router_file = folder / "router.json5"
-        self.router_file.write_text(self.here((DEPLOY / "router.json5").read_text()))
+        self.router_file.write_text(self.localized((DEPLOY / "router.json5").read_text()))
 
-    def here(self, text: str) -> str:
+    def localized(self, text: str) -> str:
         """``text`` as it reads on this host."""
         for there, this in {
             "tls/router:7447": f"tls/localhost:{self.port}",
@@ -36,7 +36,7 @@ class Deployment:
 
     def environment(self, service: str) -> dict[str, str]:
         given = self.services[service].get("environment", {})
-        return {**os.environ, **{name: self.here(value) for name, value in given.items()}}
+        return {**os.environ, **{name: self.localized(value) for name, value in given.items()}}
 
     def start(self, spawn: Any, service: str) -> Child:
         """What the container of ``service`` would run."""

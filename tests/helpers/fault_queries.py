@@ -18,7 +18,7 @@ MAX_AGE_S = 0.5
 """What is called fresh."""
 
 
-def comes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
+def becomes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
     """Whether ``condition()`` becomes true in time. It is looked at each millisecond."""
     deadline = time.monotonic() + timeout_s
     while not (is_true := condition()) and time.monotonic() < deadline:
@@ -26,7 +26,7 @@ def comes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
     return is_true
 
 
-class Answers:
+class ReaderQueries:
     """What a reader can say of the robots it follows. An answer that is not the sine's is an error."""
 
     def __init__(self, listener: TransformListener) -> None:
@@ -35,11 +35,11 @@ class Answers:
         self._model = load_model("rrbot")
         self._kinematics = Kinematics(self._model)
         self._source = SineSource(self._model)
-        self._watching: dict[str, Watching] = {}
+        self._watching: dict[str, FreshnessMonitor] = {}
 
     def near(self, robot: str, stamp: int, timeout_s: float = 10.0) -> bool:
         """Whether the newest sample comes to be within half a minute of a stamp."""
-        is_near = comes_true(lambda: abs(self.newest(robot) - stamp) <= 30_000_000_000, timeout_s)
+        is_near = becomes_true(lambda: abs(self.newest(robot) - stamp) <= 30_000_000_000, timeout_s)
         if is_near:
             self._check(robot)
         return is_near
@@ -53,7 +53,7 @@ class Answers:
 
     def after(self, robot: str, stamp: int, timeout_s: float = 15.0) -> int | None:
         """When [ns] there was an answer with a later stamp; it is checked."""
-        if not comes_true(lambda: self.newest(robot) > stamp, timeout_s):
+        if not becomes_true(lambda: self.newest(robot) > stamp, timeout_s):
             return None
         heard_at = time.time_ns()
         self._check(robot)
@@ -69,7 +69,7 @@ class Answers:
 
     def mark(self, robot: str, value: float, timeout_s: float = 10.0) -> int | None:
         """When [ns] the robot's static edge had this length."""
-        return time.time_ns() if comes_true(lambda: self._mark(robot) == value, timeout_s) else None
+        return time.time_ns() if becomes_true(lambda: self._mark(robot) == value, timeout_s) else None
 
     def _mark(self, robot: str) -> float | None:
         try:
@@ -87,7 +87,7 @@ class Answers:
         return {name: getattr(stats, name) for name in names}
 
     def watch(self, robot: str) -> None:
-        self._watching[robot] = Watching(self, robot)
+        self._watching[robot] = FreshnessMonitor(self, robot)
 
     def watched(self, robot: str) -> dict[str, Any]:
         return self._watching.pop(robot).report()
@@ -104,10 +104,10 @@ class Answers:
         return ages
 
 
-class Watching:
+class FreshnessMonitor:
     """Looks at one robot every few milliseconds: newest must never go back, nor old be called fresh."""
 
-    def __init__(self, answers: Answers, robot: str) -> None:
+    def __init__(self, answers: ReaderQueries, robot: str) -> None:
         self._answers = answers
         self._robot = robot
         self._stop = threading.Event()

@@ -42,7 +42,7 @@ def every_joint() -> Kinematics:
     return Kinematics(parse_urdf(EVERY_JOINT, "every_joint.urdf"))
 
 
-def own(name: str) -> Kinematics:
+def local_model(name: str) -> Kinematics:
     path = Path(__file__).parents[2] / "models" / f"{name}.urdf"
     return Kinematics(parse_urdf(path.read_text(), path.name))
 

@@ -24,7 +24,7 @@ SOON_S = 3.0
 _TURNS = Path(tempfile.gettempdir(), f"zstate-test-ports-{os.getuid()}")
 
 
-def a_free_port() -> int:
+def find_free_port() -> int:
     """One that nobody else gets: the system hands out higher ones, and tests that run beside take turns."""
     with _TURNS.open("a+") as turns:
         fcntl.flock(turns, fcntl.LOCK_EX)
@@ -53,7 +53,7 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
 
 
 @contextmanager
-def again_and_again(action: Callable[[], object], every_s: float = 0.01) -> Iterator[None]:
+def repeated(action: Callable[[], object], every_s: float = 0.01) -> Iterator[None]:
     """Meanwhile ``action`` is done, a hundred times a second unless said otherwise."""
     stop = threading.Event()
 
@@ -70,7 +70,7 @@ def again_and_again(action: Callable[[], object], every_s: float = 0.01) -> Iter
         thread.join()
 
 
-class Stepping:
+class SteppingClock:
     """A clock that goes at once to where it is waited for, plus the lateness of that wait."""
 
     domain = "system"
@@ -123,7 +123,7 @@ class Child:
         except queue.Empty:
             raise AssertionError(f"silent for {timeout_s} s; stderr: {self.stderr!r}") from None
 
-    def tell(self, line: str = "") -> None:
+    def send_line(self, line: str = "") -> None:
         assert self.process.stdin
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()

@@ -69,7 +69,7 @@ def _transient_local() -> dict[str, Any]:
 
 
 # A publisher that nobody holds any more would take its latched value with it.
-_ALIVE: list[RosPublisher] = []
+_OPEN_PUBLISHERS: list[RosPublisher] = []
 
 
 class RosPublisher:
@@ -82,13 +82,13 @@ class RosPublisher:
         self.publisher = zenoh.ext.declare_advanced_publisher(
             session.zenoh, key, **(_transient_local() if latched else {})
         )
-        _ALIVE.append(self)
+        _OPEN_PUBLISHERS.append(self)
 
     def announce(self) -> RosPublisher:
         self._alive = self._session.zenoh.liveliness().declare_token(self.token)
         return self
 
-    def await_reader(self) -> RosPublisher:
+    def wait_for_reader(self) -> RosPublisher:
         with StreamPublisher(self._session, self.key, "") as probe:
             until(lambda: probe.has_readers)
         return self
@@ -112,12 +112,12 @@ class RosPublisher:
     def text(self, text: str) -> None:
         self.put(rosbags_cdr("std_msgs/msg/String", text))
 
-    def leave(self) -> None:
+    def close(self) -> None:
         """As a node does that ends."""
         if self._alive is not None:
             self._alive.undeclare()
         self.publisher.undeclare()
-        _ALIVE.remove(self)
+        _OPEN_PUBLISHERS.remove(self)
 
 
 class RosNode:
@@ -140,7 +140,7 @@ class RosNode:
         return RosPublisher(self._session, topic, key, token, latched=topic in (TF_STATIC, DESCRIPTION))
 
 
-class Ear:
+class KeySubscriber:
     """What a ROS node's subscription hears on one key, as Zenoh delivers it."""
 
     def __init__(self, session: Session, key: str, *, latched: bool = False) -> None:
@@ -157,16 +157,16 @@ class Ear:
         else:
             self._subscriber = session.zenoh.declare_subscriber(key, self.samples.append)
 
-    def heard(self, number: int) -> list[zenoh.Sample]:
+    def wait_for(self, number: int) -> list[zenoh.Sample]:
         until(lambda: len(self.samples) >= number)
         return list(self.samples)
 
     def messages(self, number: int, name: str) -> list:
-        return [STORE.deserialize_cdr(sample.payload.to_bytes(), name) for sample in self.heard(number)]
+        return [STORE.deserialize_cdr(sample.payload.to_bytes(), name) for sample in self.wait_for(number)]
 
     def attachments(self, number: int) -> list[tuple[int, int, bytes]]:
         """Sequence number, source time and gid of each."""
-        return [read_attachment(sample) for sample in self.heard(number)]
+        return [read_attachment(sample) for sample in self.wait_for(number)]
 
 
 def read_attachment(sample: zenoh.Sample) -> tuple[int, int, bytes]:

@@ -25,19 +25,19 @@ STAMP = 1_789_012_345_678_901_234
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-def await_reader(session: Session, key: str) -> None:
+def wait_for_reader(session: Session, key: str) -> None:
     """Return when ``session`` knows that somebody reads ``key``: what it puts from now on arrives."""
     with StreamPublisher(session, key, "") as probe:
         until(lambda: probe.has_readers)
 
 
-def settle(session: Session, robot: str, *streams: str) -> None:
+def wait_for_stream_readers(session: Session, robot: str, *streams: str) -> None:
     """Return when somebody hears ``streams`` of ``robot``, by default its joint states."""
     for stream in streams or ("joint_states",):
-        await_reader(session, f"zstate/{robot}/{stream}")
+        wait_for_reader(session, f"zstate/{robot}/{stream}")
 
 
-class Tap:
+class SampleCollector:
     """Everything that was heard on one key, as it came."""
 
     def __init__(self, session: Session, key: str) -> None:

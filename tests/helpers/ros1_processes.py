@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.processes import Child, a_free_port, until
+from helpers.processes import Child, find_free_port, until
 
 from zstate.bridges.ros1.node import Master
 from zstate.errors import Unreachable
@@ -119,7 +119,7 @@ ROS_PEER = """
 """
 
 
-class Peer:
+class RosPeer:
     """A node of ROS that talks and listens (``ROS_PEER``)."""
 
     def __init__(self, child: Child) -> None:
@@ -127,25 +127,25 @@ class Peer:
         self.joints: list[tuple[int, list[str], list[list[float]]]] = []
         self.edges: dict[tuple[str, str, int], tuple[str, list[float]]] = {}
 
-    def ask(self, *question: Any) -> Any:
-        self._child.tell(json.dumps(question))
+    def query(self, *question: Any) -> Any:
+        self._child.send_line(json.dumps(question))
         return json.loads(self._child.line())
 
-    def listen(self) -> None:
+    def collect(self) -> None:
         """Add what was heard since to ``joints`` and to ``edges``: writer and pose, by edge and stamp."""
-        joints, edges = self.ask("heard")
+        joints, edges = self.query("heard")
         self.joints += map(tuple, joints)
         for writer, parent, child, stamp, pose in edges:
             self.edges[parent, child, stamp] = (writer, pose)
 
     def counts(self) -> Counter[int]:
         """How often each stamp was heard on ``joint_states``."""
-        self.listen()
+        self.collect()
         return Counter(stamp for stamp, *_ in self.joints)
 
 
 @functools.cache
-def why_no_ros() -> str:
+def missing_ros_reason() -> str:
     """Why there is no ROS 1 to test against; empty when there is one."""
     for program in (ROSCORE, STATE_PUBLISHER):
         if not program.exists():
@@ -192,7 +192,7 @@ def ros_environment(home: Path) -> dict[str, str]:
         "ROS_HOME": str(home / "ros"),
         "ROS_LOG_DIR": str(home / "log"),
         "ROS_IP": "127.0.0.1",
-        "ROS_MASTER_URI": f"http://127.0.0.1:{a_free_port()}",
+        "ROS_MASTER_URI": f"http://127.0.0.1:{find_free_port()}",
     }
 
 

@@ -76,7 +76,7 @@ def is_seen(server: viser.ViserServer, path: str) -> bool:
 
 
 @contextmanager
-def told(server: viser.ViserServer) -> Iterator[list[Any]]:
+def sent_messages(server: viser.ViserServer) -> Iterator[list[Any]]:
     """What viser is told meanwhile, message by message."""
     messages: list[Any] = []
     scene = server.scene

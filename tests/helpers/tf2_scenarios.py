@@ -39,7 +39,7 @@ THEIR_KINDS = {
 
 
 @cache
-def why_no_tf2() -> str:
+def missing_tf2_reason() -> str:
     """Why tf2 cannot be asked here; empty when it can."""
     try:
         probe = subprocess.run(
@@ -50,7 +50,7 @@ def why_no_tf2() -> str:
     return "" if probe.returncode == 0 else "tf2 is not installed (apt-get install python3-tf2)"
 
 
-def ask_tf2(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+def tf2_answers(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     """tf2's answers to every question of every scenario."""
     lines = "".join(json.dumps(scenario) + "\n" for scenario in scenarios)
     command = [SYSTEM_PYTHON, str(Path(__file__).with_name("tf2_process.py"))]
@@ -59,7 +59,7 @@ def ask_tf2(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def kind_of_theirs(answer: dict[str, Any]) -> str:
+def tf2_error_kind(answer: dict[str, Any]) -> str:
     return THEIR_KINDS[answer["error"]] if "error" in answer else "answer"
 
 
@@ -77,11 +77,11 @@ _KINDS = {
 }
 
 
-def kind_of_ours(answer: Answer) -> str:
+def zstate_error_kind(answer: Answer) -> str:
     return _KINDS[type(answer)]
 
 
-def ask_us(scenario: dict[str, Any]) -> list[Answer]:
+def zstate_answers(scenario: dict[str, Any]) -> list[Answer]:
     """Our answers to every question of one scenario; what is refused at insert is left out."""
     buffer = TransformBuffer(scenario["history"] / S)
     answers: list[Answer] = []

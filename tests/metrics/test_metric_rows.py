@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from helpers.processes import until
 from helpers.prometheus_text import collected, row
-from helpers.robots import RRBOT, settle
+from helpers.robots import RRBOT, wait_for_stream_readers
 from prometheus_client.core import CounterMetricFamily
 
 from zstate.errors import InFuture, InvalidInput
@@ -88,7 +88,7 @@ def test_a_listener_tells_its_stats_ages_latency_and_lookups(sessions):
         TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener,
         StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as noise,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         noise.put(b"noise")
         for _ in range(4):
             publisher.publish([0.0, 0.0])
@@ -114,7 +114,7 @@ def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
         StatePublisher(writer, RRBOT, "r1") as one,
         StatePublisher(writer, RRBOT, "r2") as two,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
 
         def all_heard() -> bool:
             for publisher in (one, two):
@@ -135,7 +135,7 @@ def test_a_listener_that_follows_all_tells_the_age_of_each(sessions):
 def test_a_writer_that_starts_again_and_again_adds_no_row(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         metrics = ListenerMetrics(lambda: [listener])
         writers = WriterMetrics(lambda: discover(reader))
         seen: list[set[object]] = []

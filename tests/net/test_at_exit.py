@@ -228,7 +228,7 @@ def test_a_frozen_reader_holds_the_end_of_a_program_up_for_two_seconds_at_most(s
     child: Child = spawn(BESIDE_A_FROZEN_READER)
     assert child.line() == "matched"
     os.kill(reader.process.pid, signal.SIGSTOP)
-    child.tell()
+    child.send_line()
     assert child.line() == "ending"
     began = time.monotonic()
     assert child.wait() == 3

@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.access_routers import Fleet
+from helpers.access_routers import AccessRouters
 from helpers.processes import Child, until
 
 from zstate.errors import ConfigError, PortBusy, Unreachable
@@ -101,7 +101,7 @@ def test_a_place_where_nobody_answers_or_somebody_listens_is_told_with_its_varia
 
 
 def test_who_a_program_is_comes_with_where_it_joins(
-    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: AccessRouters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("ZSTATE_CONNECT", fleet.tls("mtls and users"))
     monkeypatch.setenv("ZSTATE_CERTS", str(fleet.folder))

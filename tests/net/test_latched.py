@@ -112,7 +112,7 @@ def test_a_killed_writers_value_is_gone_for_later_joiners_and_stays_with_those_w
         until(lambda: late.values)
         assert late.values == {key("alive"): b"alive"}
         assert set(early.values) == {key("alive"), key("killed")}
-        alive.tell()
+        alive.send_line()
         assert alive.wait() == 0
         assert alive.stderr == ""
 

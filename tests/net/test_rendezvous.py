@@ -44,7 +44,7 @@ def test_two_processes_find_each_other_and_data_flows_both_ways(spawn):
     hears(first, "second")
     hears(second, "first")
     for child in (first, second):
-        child.tell()
+        child.send_line()
         assert child.wait() == 0
         assert child.stderr == ""
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, Child, until
-from helpers.robots import RRBOT, STAMP, Tap, kinematic_pose, settle
+from helpers.robots import RRBOT, STAMP, SampleCollector, kinematic_pose, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InPast, InvalidInput
@@ -71,7 +71,7 @@ def test_a_listener_that_opens_now_answers_for_the_last_two_seconds_bit_for_bit(
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1", follow=follow) as early,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         publish(publisher, 0, 400)
         until(knows(early, 399))
         with TransformListener(reader, "r1", follow=follow) as late:
@@ -103,7 +103,7 @@ def test_what_was_before_and_what_is_live_join_without_a_gap(sessions: tuple[Ses
         StatePublisher(writer, model, "r1") as publisher,
         TransformListener(reader, "r1", follow=follow, history_on_join=False) as early,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         thread = threading.Thread(target=write)
         thread.start()
         until(lambda: len(stamps) > 300)
@@ -200,7 +200,7 @@ def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
         StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher,
         TransformListener(reader, "r1", history_s=100.0) as listener,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publish(publisher, 0, 10)
         until(knows(listener, 0, 9))
         router.kill()
@@ -209,7 +209,7 @@ def test_what_was_said_while_the_router_was_away_is_learned_afterwards(
         publish(publisher, 10, 500)
         assert not knows(listener, 10)()
         spawn(ROUTER, endpoint).line()
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publish(publisher, 500, 501)
         until(knows(listener, 500))
         until(lambda: listener.stats.recalled >= 490)
@@ -240,7 +240,7 @@ def test_a_publisher_without_a_cache_and_a_listener_that_wants_none_have_no_past
     with StatePublisher(writer, RRBOT, "r2") as publisher:
         publish(publisher, 0, 10)
         with TransformListener(reader, "r2", history_on_join=False) as listener:
-            settle(writer, "r2")
+            wait_for_stream_readers(writer, "r2")
             publish(publisher, 10, 12)
             until(lambda: knows(listener, 10, 11)() and listener.stats.received == 2)
             assert listener.stats.recalled == 0
@@ -263,7 +263,7 @@ def test_a_gap_in_what_was_remembered_counts_as_no_loss(sessions: tuple[Session,
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         publish(publisher, 0, 10)
         with TransformListener(reader, "r1") as listener:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             publish(publisher, 10, 20)
             until(lambda: knows(listener, 0, 19)() and listener.stats.received == 10)
             assert listener.stats.missed == listener.stats.dropped == 0
@@ -287,7 +287,7 @@ def test_a_writer_that_starts_while_we_listen_begins_a_history_of_its_own(
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         with StatePublisher(writer, RRBOT, "r1") as first:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             publish(first, 0, 10)
             until(knows(listener, 0, 9))
         with StatePublisher(writer, RRBOT, "r1") as second:
@@ -331,9 +331,9 @@ def test_a_publisher_that_only_derives_transforms_tells_their_past(sessions: tup
 
 def test_what_is_remembered_is_what_was_sent_byte_for_byte(sessions: tuple[Session, Session]):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.5, 1.0], [0.1, 0.2], [3.0, 4.0], STAMP)
         publisher.publish([0.5, 1.0], stamp=STAMP + 1)
         assert publisher.cache is not None

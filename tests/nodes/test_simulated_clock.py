@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 from helpers.processes import until
-from helpers.robots import await_reader
+from helpers.robots import wait_for_reader
 
 from zstate.errors import Closed, NoClock
 from zstate.model.load import load_model
@@ -64,7 +64,7 @@ def telling(publisher: ClockPublisher, clock: SimulatedClock) -> Callable[[int],
 def test_now_is_the_newest_time_that_was_told(sessions, wire, key):
     writer, reader = sessions
     with ClockPublisher(writer, (wire,)) as publisher, SimulatedClock(reader, wire) as clock:
-        await_reader(writer, key)
+        wait_for_reader(writer, key)
         tell = telling(publisher, clock)
         for stamp in (5 * SECOND, 5 * SECOND + 1, 3600 * SECOND):
             tell(stamp)
@@ -85,7 +85,7 @@ def test_who_tells_no_time_is_waited_for_as_long_as_was_said(sessions):
 def test_the_first_time_ends_the_wait_for_it(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         threading.Timer(0.02, publisher.publish, (7,)).start()
         assert clock.now() == 7
 
@@ -93,7 +93,7 @@ def test_the_first_time_ends_the_wait_for_it(sessions):
 def test_a_wait_ends_when_its_instant_comes_and_not_while_time_stands_still(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         tell = telling(publisher, clock)
         tell(SECOND)
         early, late = Waiting(clock, 2 * SECOND), Waiting(clock, 3 * SECOND)
@@ -126,7 +126,7 @@ def test_a_wait_ends_at_once_when_it_is_stopped_or_the_clock_closed(sessions):
 def test_a_jump_back_ends_waits_and_is_told_once(sessions, caplog):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         tell = telling(publisher, clock)
         with caplog.at_level(logging.WARNING, "zstate"):
             tell(100 * SECOND)
@@ -150,7 +150,7 @@ def test_of_two_who_tell_the_time_the_newer_is_followed(sessions):
         ClockPublisher(writer) as second,
         SimulatedClock(reader) as clock,
     ):
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         telling(first, clock)(SECOND)
         telling(second, clock)(50 * SECOND)
         first.publish(2 * SECOND)
@@ -166,7 +166,7 @@ def test_what_is_no_time_is_counted_and_changes_nothing(sessions):
         StreamPublisher(writer, "zstate/clock", "text/plain") as stranger,
         SimulatedClock(reader) as clock,
     ):
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         telling(publisher, clock)(SECOND)
         stranger.put(b"noon")
         until(lambda: clock.refused == {"foreign": 1})
@@ -179,7 +179,7 @@ def test_a_rate_has_its_number_of_ticks_in_a_simulated_second_at_any_speed(sessi
     writer, reader = sessions
     step, start, seconds, rate_hz = round(speed * 10 * MS), 5 * SECOND, 2, 250.0
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         tell = telling(publisher, clock)
         tell(start)
         ticks: list[int] = []
@@ -199,7 +199,7 @@ def test_a_rate_has_its_number_of_ticks_in_a_simulated_second_at_any_speed(sessi
 def test_a_rate_follows_a_time_that_goes_back_while_it_waits(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         tell = telling(publisher, clock)
         tell(100 * SECOND)
         ticks: list[int] = []
@@ -218,7 +218,7 @@ def test_a_rate_follows_a_time_that_goes_back_while_it_waits(sessions):
 def test_a_jump_ahead_does_not_become_a_burst(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         tell = telling(publisher, clock)
         tell(0)
         ticks: list[int] = []
@@ -242,8 +242,8 @@ def test_a_publisher_and_a_listener_on_simulated_time_agree(sessions):
         TransformListener(reader, "r1", clock=heard) as listener,
     ):
         assert robot.description().clock == "sim"
-        await_reader(writer, "zstate/clock")
-        await_reader(writer, "zstate/r1/joint_states")
+        wait_for_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/r1/joint_states")
         tell = telling(publisher, told)
         tell(SECOND)
         running = threading.Thread(

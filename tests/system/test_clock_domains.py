@@ -9,8 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 from helpers.processes import until
-from helpers.recording_builder import START, Tale
-from helpers.robots import RRBOT, await_reader, settle
+from helpers.recording_builder import START, RecordingBuilder
+from helpers.robots import RRBOT, wait_for_reader, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock, SystemClock
@@ -64,7 +64,7 @@ def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_both_is_refused(s
         buffer = listener.buffer
         for robot in ("r1", "r2"):
             cell.set(Transform("cell/map", f"{robot}/world", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
-            settle(writer, robot, follow)
+            wait_for_stream_readers(writer, robot, follow)
         until(lambda: (buffer.domain.domain_of("r1"), buffer.domain.domain_of("r2")) == ("system", "sim"))
         for robot in (virtual, real):
             robot.publish([0.5, 0.5])
@@ -171,7 +171,7 @@ def test_one_domain_where_one_is_needed_is_that_of_most_robots_with_samples(sess
         listener = opened.enter_context(TransformListener(reader))
         domain = listener.buffer.domain
         for name in names:
-            settle(writer, name)
+            wait_for_stream_readers(writer, name)
             until(lambda name=name: domain.domain_of(name) is not None)
         assert domain.name is None
         for name, expected in (("v1", "sim"), ("r1", "sim"), ("r2", "system"), ("v2", "system")):
@@ -190,11 +190,11 @@ def test_a_robot_may_change_its_clock(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener:
         with StatePublisher(writer, RRBOT, "r1") as real:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             real.publish([0.5, 0.5])
             listener.buffer.wait("world", "tool", timeout_s=5.0)
         with StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             virtual.publish([0.5, 0.5])
             until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
             until(lambda: listener.buffer.latest("world", "tool") == 5 * SECOND)
@@ -207,7 +207,7 @@ def test_an_age_by_another_time_is_an_error_with_both_names(sessions):
         StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual,
         TransformListener(reader, "r1") as listener,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         virtual.publish([0.5, 0.5])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
@@ -235,7 +235,7 @@ def test_85_us_back_are_a_sorted_sample_and_nothing_else(sessions, caplog, follo
         StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
         TransformListener(reader, "r1", follow=follow, clock=ManualClock(NOW)) as listener,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         stamps = [NOW, NOW + MS, NOW + MS - 85_000, NOW + MS - 85_000 + MS]
         for number, stamp in enumerate(stamps):
             clock.set(stamp)
@@ -259,8 +259,8 @@ def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot
         StatePublisher(writer, RRBOT, "r2", clock=ManualClock(NOW)) as steady,
         TransformListener(reader, follow=follow, clock=ManualClock(NOW)) as listener,
     ):
-        settle(writer, "r1", follow)
-        settle(writer, "r2", follow)
+        wait_for_stream_readers(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r2", follow)
         buffer = listener.buffer
 
         def publish(stamp: int) -> None:
@@ -305,8 +305,8 @@ def test_a_clock_set_back_by_less_than_the_history_begins_a_new_history_of_that_
         TransformListener(reader, follow=follow, clock=ManualClock(NOW), history_s=10.0) as listener,
     ):
         buffer = listener.buffer
-        settle(writer, "r1", follow)
-        settle(writer, "r2", follow)
+        wait_for_stream_readers(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r2", follow)
         steady.publish([0.5, 0.5])
         for number, stamp in enumerate((0, 10, 20, 30, -5_000, -4_990, -4_980)):
             clock.set(NOW + stamp * MS)
@@ -366,7 +366,7 @@ def test_a_simulation_that_begins_again_soon_is_a_new_epoch_at_its_second_sample
         StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
         TransformListener(reader, "r1", follow=follow, history_s=10.0) as listener,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         # Eight seconds, well inside of the history, then the start again.
         for stamp in (0, 4 * SECOND, 8 * SECOND, 0, 10 * MS):
             clock.set(stamp)
@@ -387,7 +387,7 @@ def test_stamps_far_off_are_used_counted_and_named_once_for_each_program(session
             with StatePublisher(writer, RRBOT, "r1", program="driver") as publisher:
                 # Its model, and so whose time it keeps, and its name.
                 until(lambda: any("driver@" in (one.writer or "") for one in listener.buffer.frames()))
-                settle(writer, "r1")
+                wait_for_stream_readers(writer, "r1")
                 for number in range(5):
                     publisher.publish([0.5, 0.5], stamp=(time.time_ns() + number) // SECOND)
                 until(lambda start=start: listener.stats.off_clock == 5 * start)
@@ -415,7 +415,7 @@ def test_a_minute_off_is_not_far_and_a_little_more_is(sessions):
         TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener,
     ):
         until(lambda: listener.buffer.domain.domain_of("r1") == "system")
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         for stamp in (NOW - 60 * SECOND, NOW + 60 * SECOND):
             publisher.publish([0.5, 0.5], stamp=stamp)
         until(lambda: listener.stats.received + listener.stats.late == 2)
@@ -447,8 +447,8 @@ def test_simulated_time_is_never_far_off(sessions):
         StatePublisher(writer, RRBOT, "r1", clock=simulated()) as publisher,
         TransformListener(reader, "r1", clock=clock) as listener,
     ):
-        await_reader(writer, "zstate/clock")
-        settle(writer, "r1")
+        wait_for_reader(writer, "zstate/clock")
+        wait_for_stream_readers(writer, "r1")
         told.publish(HOUR)
         publisher.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 1)
@@ -457,7 +457,7 @@ def test_simulated_time_is_never_far_off(sessions):
 
 def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
     writer, reader = sessions
-    with Tale(tmp_path / "run.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
         tale.describe("arm")
         for number in range(10):
             tale.joints("arm", START + number * 10 * MS, [0.1 * number, 0.0])

@@ -89,7 +89,7 @@ def started(child: Child) -> Child:
 
 def ask(listener: Child, robot: str = "r1", after: str = "now") -> int:
     """The stamp of the answer, which is checked against the sine that everybody can compute."""
-    listener.tell(f"{robot} {after}")
+    listener.send_line(f"{robot} {after}")
     stamp, kind, pose7 = json.loads(listener.line())
     assert kind == "exact"
     expected = KINEMATICS.link_poses(SineSource(RRBOT).read(stamp).positions)[TOOL]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.processes import until
 from helpers.raw_ros_nodes import JOINT_STATES, key_of
-from helpers.robots import await_reader, settle
+from helpers.robots import wait_for_reader, wait_for_stream_readers
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
 from zstate.recording.recorder import Recorder
@@ -143,7 +143,7 @@ def test_a_recording_is_a_world_without_a_network(sessions, tmp_path: Path):
     writing, reading = sessions
     file = tmp_path / "one.mcap"
     with Recorder(reading, file) as recorder, StatePublisher(writing, MODEL, "r1") as publisher:
-        settle(writing, "r1")
+        wait_for_stream_readers(writing, "r1")
         source = SineSource(MODEL)
         stamps = [publisher.publish(source.read(n * SECOND).positions) for n in range(3)]
         assert stamps
@@ -160,7 +160,7 @@ def test_robots_that_speak_ros_are_seen_like_others(sessions, monkeypatch: pytes
         StatePublisher(sessions[0], MODEL, wires="ros2") as publisher,
         ViewSource(sessions[1], wire="ros2") as world,
     ):
-        await_reader(sessions[0], key_of(JOINT_STATES))
+        wait_for_reader(sessions[0], key_of(JOINT_STATES))
         publisher.publish([0.5, -0.5])
         until(lambda: world.moment().stamp is not None)
         assert [model.digest for model in world.models.values()] == [MODEL.digest]

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("viser")
 
 import viser
-from helpers.processes import SOON_S, a_free_port, until
+from helpers.processes import SOON_S, find_free_port, until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -125,7 +125,7 @@ def test_it_closes_soon_beside_a_browser_that_does_not_answer_any_more():
 
 
 def test_a_port_that_is_taken_is_told_and_without_one_the_next_is_had():
-    with ViewServer(port=a_free_port()) as first:
+    with ViewServer(port=find_free_port()) as first:
         with pytest.raises(InvalidInput, match=f"port {first.port} is taken"):
             ViewServer(port=first.port)
         with ViewServer() as second, ViewServer() as third:

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.robots import RRBOT, Tap
+from helpers.robots import RRBOT, SampleCollector
 
 from zstate.errors import InvalidInput
 from zstate.model.urdf import parse_urdf
@@ -42,7 +42,7 @@ def test_they_begin_at_zero_or_where_zero_is_out_of_reach_in_the_middle(arm):
 
 
 def test_a_dial_that_is_turned_is_what_is_published(arm, sessions):
-    tap = Tap(sessions[1], "zstate/arm1/joint_states")
+    tap = SampleCollector(sessions[1], "zstate/arm1/joint_states")
     arm.set("bent", 1.25)
     until(lambda: any(from_block(state.positions)[0] == 1.25 for state in tap.joint_states(1)))
     tap.close()

@@ -21,18 +21,18 @@ from helpers.ros1_processes import (
     JOINTS,
     RRBOT,
     STATE_PUBLISHER,
-    Peer,
     Roscore,
+    RosPeer,
     Spawn,
+    missing_ros_reason,
     ros_environment,
-    why_no_ros,
 )
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
 from zstate.bridges.ros1.node import Master
 from zstate.sources import SubscribedSource
 
-pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(why_no_ros()), reason=why_no_ros())]
+pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(missing_ros_reason()), reason=missing_ros_reason())]
 
 Bridge = Callable[..., Child]
 MODEL = load_model(RRBOT)
@@ -47,8 +47,8 @@ def swing(stamp: int) -> list[float]:
     return [0.5 * math.sin(1.5 * t), -0.3 + 0.4 * math.cos(t)]
 
 
-def say_joints(speaking: Peer, stamp: int) -> None:
-    speaking.ask("joints", stamp, JOINTS, swing(stamp))
+def say_joints(speaking: RosPeer, stamp: int) -> None:
+    speaking.query("joints", stamp, JOINTS, swing(stamp))
 
 
 def answer(listener: TransformListener, target: str, source: str) -> Transform | None:
@@ -69,7 +69,7 @@ def interrupted(child: Child) -> None:
     assert "Traceback" not in child.stderr
 
 
-def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_listener: Callable[[], Peer]):
+def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_listener: Callable[[], RosPeer]):
     listening = tf2_listener()
     with (
         connect() as session,
@@ -88,24 +88,24 @@ def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_liste
             return stamp
 
         # Until a sample has come through, nobody is sure to hear the next ones.
-        until(lambda: isinstance(listening.ask("base", "probe", goes_on(), 0.02), list))
+        until(lambda: isinstance(listening.query("base", "probe", goes_on(), 0.02), list))
         begin = stamp
         end = [goes_on() for _ in range(50)][-1]
         for at in range(begin, end, 17_000_003):
-            theirs, at_theirs = listening.ask("world", "probe", at, 5.0)
+            theirs, at_theirs = listening.query("world", "probe", at, 5.0)
             ours = listener.buffer.lookup("world", "probe", at, timeout_s=5.0)
             assert_same_pose(theirs, ours.pose7.tolist(), NOETIC)
             # Noetic's Python asks at float seconds.
             assert abs(at_theirs - at) < 1_000
         # Whoever comes late has the edges that never move, of the model and of others.
-        theirs, _ = tf2_listener().ask("lower", "probe", 0, 5.0)
+        theirs, _ = tf2_listener().query("lower", "probe", 0, 5.0)
         assert_same_pose(theirs, listener.buffer.lookup("lower", "probe").pose7.tolist(), 1e-12)
         interrupted(carrying)
         assert carrying.line().endswith(" samples to ROS, 0 from there")
 
 
 def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
-    bridge: Bridge, peer: Callable[..., Peer], program: Bridge, namespace: str
+    bridge: Bridge, peer: Callable[..., RosPeer], program: Bridge, namespace: str
 ):
     Master().set_parameter(f"{namespace}/robot_description", RRBOT.read_text())
     program(str(STATE_PUBLISHER), "_publish_frequency:=1000", "_ignore_timestamp:=true")
@@ -117,11 +117,11 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
         lookup = listener.buffer.lookup
         # In ROS the newest parent of a child counts, and its newest pose.
         for parent, pose in (("lower", identity), ("tool", identity), ("tool", probe.pose7.tolist())):
-            speaking.ask("edge", "/tf_static", parent, "probe", pose)
+            speaking.query("edge", "/tf_static", parent, "probe", pose)
             placed = Transform.from_pose7(parent, "probe", pose)
             until(lambda placed=placed: answer(listener, placed.target, "probe") == placed)
-        speaking.ask("edge", "/tf", "odom", "world", identity)
-        until(lambda: speaking.ask("readers") == 3)  # the state publisher, the other node, and the bridge
+        speaking.query("edge", "/tf", "odom", "world", identity)
+        until(lambda: speaking.query("readers") == 3)  # the state publisher, the other node, and the bridge
         stamps: list[int] = []
 
         def have_met() -> bool:
@@ -130,7 +130,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
             return listener.buffer.can_lookup("world", "probe") and len(stamps) > 50
 
         until(have_met)
-        until(lambda: hearing.listen() or ("upper", "lower", stamps[-1]) in hearing.edges)
+        until(lambda: hearing.collect() or ("upper", "lower", stamps[-1]) in hearing.edges)
         listener.buffer.wait("world", "tool", stamps[-1], 5.0)
         compared = [key for key in hearing.edges if listener.buffer.can_lookup(*key)]
         assert len(compared) >= 20
@@ -150,7 +150,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
     assert carrying.stderr.count("odom") == 1
 
 
-def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[..., Peer]):
+def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[..., RosPeer]):
     hearing, speaking = peer("hear"), peer()
     carrying = bridge("--to-ros", "--from-ros")
     in_zstate: Counter[int] = Counter()
@@ -197,7 +197,7 @@ def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[...,
     assert "refused" not in carrying.stderr
 
 
-def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callable[..., Peer]):
+def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callable[..., RosPeer]):
     hearing = peer("hear")
     bridge("--to-ros")
     back = bridge("--from-ros", "--model", str(RRBOT))
@@ -213,7 +213,7 @@ def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callabl
 
 
 def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
-    bridge: Bridge, peer: Callable[..., Peer], namespace: str
+    bridge: Bridge, peer: Callable[..., RosPeer], namespace: str
 ):
     hearing = peer("hear")
     bridge("--to-ros", "--frame-prefix", "left_")
@@ -224,7 +224,7 @@ def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
         def heard() -> bool:
             sent.add(stamp := next(stamps))
             publisher.publish([0.25, -1.5], [0.5, 1.0], [7.0, -8.0], stamp)
-            hearing.listen()
+            hearing.collect()
             return bool(hearing.joints and hearing.edges)
 
         until(heard)
@@ -234,24 +234,24 @@ def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
     edges = {(parent, child) for parent, child, _ in hearing.edges}
     assert edges == {("left_base", "left_upper"), ("left_upper", "left_lower")}
     # It is set by the thread that hears of the model, not by the one that carries samples.
-    until(lambda: hearing.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
+    until(lambda: hearing.query("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
 
 
-def test_what_cannot_be_used_is_counted_and_said_once(bridge: Bridge, peer: Callable[..., Peer]):
+def test_what_cannot_be_used_is_counted_and_said_once(bridge: Bridge, peer: Callable[..., RosPeer]):
     speaking = peer()
     carrying = bridge("--from-ros", "--model", str(RRBOT))
-    until(lambda: speaking.ask("readers") == 1)
+    until(lambda: speaking.query("readers") == 1)
     with connect() as session, TransformListener(session, "rrbot") as listener:
         for _ in range(2):
-            speaking.ask("joints", 0, JOINTS, [0.0, 0.0])
-            speaking.ask("joints", S, JOINTS, [0.0, math.nan])
-            speaking.ask("joints", S, ["shoulder"], [0.0])
-            speaking.ask("joints", S, JOINTS, [0.0])
+            speaking.query("joints", 0, JOINTS, [0.0, 0.0])
+            speaking.query("joints", S, JOINTS, [0.0, math.nan])
+            speaking.query("joints", S, ["shoulder"], [0.0])
+            speaking.query("joints", S, JOINTS, [0.0])
         # It goes on; joints beside those of the model are left out.
         stamps = iter(range(2 * S, 3 * S))
 
         def is_carried() -> bool:
-            speaking.ask("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
+            speaking.query("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
             return listener.buffer.can_lookup("world", "tool")
 
         until(is_carried)

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started
 
 from zstate import TransformListener, connect, load_model
 from zstate.model.kinematics import Kinematics
@@ -27,7 +27,7 @@ def test_a_native_robot_is_heard_on_ros_and_both_its_coming_and_its_going_are_sa
         connect(mode="client", endpoints=ros) as session,
         TransformListener(session, "rrbot", wire=wire) as listener,
     ):
-        with standing():
+        with published_robot():
             command = started(spawn, "bridge", *given, "--ros", ros)
             assert command.line().startswith(f"bridging {'every robot' if wire == EACH else repr('rrbot')} ")
             assert command.line() == "carrying 'rrbot': native to ROS"
@@ -51,7 +51,7 @@ def test_a_robot_on_ros_is_heard_natively(spawn: Spawn, ros: str):
 
 
 def test_several_robots_do_not_share_the_root_namespace(ros: str):
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         said = failure("bridge", "--ros", ros)
     assert "room for one robot, not for 'left' and 'right'" in said
     assert "zstate bridge panda" in said

@@ -6,7 +6,7 @@ import socket
 from xml.etree import ElementTree
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, standing, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import StaticPublisher, TransformListener, connect, discover
@@ -54,7 +54,7 @@ def test_pictures_have_a_node_for_each_program_and_bundle_and_an_edge_for_each_u
 @pytest.mark.processes
 def test_writers_and_readers_of_a_robot_are_seen_with_rates():
     here = f"@{socket.gethostname()} pid {os.getpid()}"
-    with standing(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
+    with published_robot(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
         until(lambda: discover(session))
         facts = json.loads(zstate("graph", "--json").stdout)
     streams = {one["stream"]: one for one in facts["streams"]}
@@ -80,7 +80,7 @@ def test_whoever_reads_all_robots_reads_each_of_them_and_static_writers_have_nam
     with (
         connect() as session,
         StaticPublisher(session, "left", "mount"),
-        standing("right"),
+        published_robot("right"),
         TransformListener(session),
     ):
         text = zstate("graph").stdout.decode()
@@ -90,7 +90,7 @@ def test_whoever_reads_all_robots_reads_each_of_them_and_static_writers_have_nam
 
 @pytest.mark.processes
 def test_a_robot_that_nobody_speaks_of_is_an_error_and_no_robot_at_all_is_none():
-    with standing():
+    with published_robot():
         assert "did you mean 'rrbot'?" in failure("graph", "rbot")
     ended = zstate("graph")
     assert (ended.returncode, ended.stdout) == (0, b"")
@@ -99,7 +99,7 @@ def test_a_robot_that_nobody_speaks_of_is_an_error_and_no_robot_at_all_is_none()
 
 @pytest.mark.processes
 def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         text = zstate("graph").stdout.decode()
     assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
     assert text.count("written by  /") == 1

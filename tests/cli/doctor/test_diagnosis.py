@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import EVERYTHING, RRBOT, Spawn, failure, standing, started, zstate
-from helpers.processes import a_free_port, again_and_again
+from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, started, zstate
+from helpers.processes import find_free_port, repeated
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
@@ -47,19 +47,19 @@ def warnings(*arguments: str) -> dict[str, str]:
 
 
 @contextmanager
-def stamping(stamp: Callable[[], int], streams: tuple[Stream, ...] = EVERYTHING) -> Iterator[None]:
+def stamping(stamp: Callable[[], int], streams: tuple[Stream, ...] = ALL_STREAMS) -> Iterator[None]:
     """rrbot, a hundred times a second, with stamps as ``stamp`` says."""
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), streams=streams) as publisher,
-        again_and_again(lambda: publisher.publish([0.0, 0.0], stamp=stamp())),
+        repeated(lambda: publisher.publish([0.0, 0.0], stamp=stamp())),
     ):
         yield
 
 
 def test_of_a_robot_that_is_well_every_link_is_ok(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_KERNEL", "reference")  # wanted, it is no worry
-    with standing():
+    with published_robot():
         said = diagnosed("rrbot", code=0)
         text = zstate("doctor", "rrbot").stdout.decode()
     assert said["sound"]
@@ -71,7 +71,7 @@ def test_of_a_robot_that_is_well_every_link_is_ok(monkeypatch: pytest.MonkeyPatc
 
 
 def test_of_several_robots_one_line_is_enough_for_those_that_are_well():
-    with standing("left"), standing("right", streams=("tf_static", "robot_description")):
+    with published_robot("left"), published_robot("right", streams=("tf_static", "robot_description")):
         lines = zstate("doctor").stdout.decode().splitlines()
     (left,) = [line for line in lines if "left" in line and "announced" not in line]
     assert left.split()[:2] == ["ok", "left"]
@@ -86,7 +86,7 @@ def test_where_nobody_is_it_says_how_to_begin():
 
 
 def test_a_robot_that_is_not_there_is_told_from_those_that_are():
-    with standing():
+    with published_robot():
         found = broken_link("rbot")
     assert found["text"] == "nobody announces the robot 'rbot'; announced: 'rrbot'"
     assert found["next"] == "zstate doctor rrbot"
@@ -95,21 +95,21 @@ def test_a_robot_that_is_not_there_is_told_from_those_that_are():
 def test_robots_on_the_other_side_of_an_option_are_found(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
-    with standing():
+    with published_robot():
         found = broken_link("--connect", endpoint)
     assert "'rrbot'" in found["text"]
     assert found["next"] == "zstate doctor rrbot"
 
 
 def test_where_the_router_is_missing_robots_of_this_host_are_found(free_port: int):
-    with standing():
+    with published_robot():
         found = broken_link("--connect", f"tcp/127.0.0.1:{free_port}")
     assert found["name"] == "network"
     assert "without --connect, among the programs of this host: 'rrbot'" in found["text"]
 
 
 def test_a_robot_without_its_driver_lacks_joint_states():
-    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
+    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]):
         found = broken_link("rrbot")
     assert (found["name"], found["robot"]) == ("joint_states", "rrbot")
     assert "nobody writes joint_states of 'rrbot'" in found["text"]
@@ -117,9 +117,9 @@ def test_a_robot_without_its_driver_lacks_joint_states():
 
 def test_a_driver_that_calls_the_robot_otherwise_is_found():
     with (
-        standing("rrbot1", streams=("joint_states",)),
+        published_robot("rrbot1", streams=("joint_states",)),
         connect() as session,
-        StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]),
+        StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]),
     ):
         found = broken_link("rrbot")
     assert "'rrbot1', of which there are joint_states and no model" in found["text"]
@@ -127,7 +127,7 @@ def test_a_driver_that_calls_the_robot_otherwise_is_found():
 
 
 def test_joint_states_without_a_model_lack_the_model():
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         found = broken_link("rrbot")
     assert (found["name"], found["next"]) == ("model", "zstate publish rrbot")
 
@@ -136,9 +136,9 @@ def test_joints_of_another_model_are_refused_with_the_reason(tmp_path: Path):
     other = tmp_path / "other.urdf"
     other.write_text(Path(RRBOT).read_text().replace('"elbow"', '"knee"'))
     with (
-        standing(streams=("joint_states",), model=str(other)),
+        published_robot(streams=("joint_states",), model=str(other)),
         connect() as session,
-        StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]),
+        StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]),
     ):
         found = broken_link("rrbot")
     assert found["name"] == "joint_states"
@@ -199,7 +199,7 @@ def test_a_clock_that_is_ahead_is_broken_before_the_stamps_it_makes():
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), clock=Ahead()) as publisher,
-        again_and_again(lambda: publisher.publish([0.0, 0.0])),
+        repeated(lambda: publisher.publish([0.0, 0.0])),
     ):
         found = broken_link("rrbot")
     assert found["name"] == "clocks"
@@ -212,7 +212,7 @@ def simulated_time() -> Iterator[None]:
     with (
         connect() as session,
         ClockPublisher(session) as publisher,
-        again_and_again(lambda: publisher.publish(5 * SECOND)),
+        repeated(lambda: publisher.publish(5 * SECOND)),
     ):
         yield
 
@@ -222,7 +222,7 @@ def test_simulated_time_that_nobody_tells_is_missed():
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), clock=clock) as publisher,
-        again_and_again(lambda: publisher.publish([0.0, 0.0])),
+        repeated(lambda: publisher.publish([0.0, 0.0])),
     ):
         found = broken_link("rrbot")
     assert found["name"] == "stamps"
@@ -230,7 +230,11 @@ def test_simulated_time_that_nobody_tells_is_missed():
 
 
 def test_robots_with_different_clocks_are_a_warning_that_names_them():
-    with simulated_time(), standing("left"), standing("right", clock=ManualClock(5 * SECOND, "sim")):
+    with (
+        simulated_time(),
+        published_robot("left"),
+        published_robot("right", clock=ManualClock(5 * SECOND, "sim")),
+    ):
         done = zstate("doctor")
     lines = done.stdout.decode().splitlines()
     (told,) = [line for line in lines if "different clocks" in line]
@@ -240,9 +244,9 @@ def test_robots_with_different_clocks_are_a_warning_that_names_them():
 
 
 def test_a_writer_of_a_newer_version_is_named_as_such():
-    with standing(), connect() as session:
+    with published_robot(), connect() as session:
         newer = session.zenoh.declare_publisher("zstate/rrbot/joint_states", encoding="zstate/JointState;v=2")
-        with again_and_again(lambda: newer.put(b"\x90")):
+        with repeated(lambda: newer.put(b"\x90")):
             found = broken_link("rrbot")
     assert (found["name"], found["next"]) == ("version", "pip install -U zstate")
     assert "version 2" in found["text"]
@@ -250,7 +254,7 @@ def test_a_writer_of_a_newer_version_is_named_as_such():
 
 def test_two_who_write_the_same_are_a_warning():
     with (
-        standing(),
+        published_robot(),
         connect() as session,
         StatePublisher(session, load_model(RRBOT), streams=("joint_states",), takeover=True),
     ):
@@ -263,7 +267,7 @@ def test_two_who_write_the_same_are_a_warning():
 def test_frames_that_hang_together_with_nothing_are_a_warning(spawn: Spawn):
     child = started(spawn, "static", "rrbot/map", "rrbot/odom", "--xyz", "0", "0", "1")
     child.line()
-    with standing():
+    with published_robot():
         assert "in 2 trees" in warnings("rrbot")["poses"]
 
 
@@ -273,7 +277,7 @@ def test_a_static_edge_that_would_hide_the_robot_is_a_warning_with_its_writer(mo
         session = opened.enter_context(connect())
         wrong = StaticPublisher(session, "rrbot", "mix-up", program="rigger", takeover=True)
         steps = [
-            lambda: opened.enter_context(standing()),
+            lambda: opened.enter_context(published_robot()),
             lambda: wrong.set(Transform("lower", "world", (1, 0, 0), (0, 0, 0, 1))),
         ]
         opened.enter_context(wrong)
@@ -289,8 +293,8 @@ def test_a_static_edge_that_would_hide_the_robot_is_a_warning_with_its_writer(mo
 
 def test_a_static_edge_that_places_another_robots_frames_is_a_warning():
     with (
-        standing("r1"),
-        standing("r2"),
+        published_robot("r1"),
+        published_robot("r2"),
         connect() as session,
         StaticPublisher(session, "r2", "thief", takeover=True) as thief,
     ):
@@ -314,7 +318,7 @@ def test_a_name_that_is_no_host_is_told_from_a_host_that_refuses():
 
 
 def test_a_stranger_at_the_rendezvous_is_seen(monkeypatch: pytest.MonkeyPatch):
-    with socket.create_server(("127.0.0.1", a_free_port())) as stranger:
+    with socket.create_server(("127.0.0.1", find_free_port())) as stranger:
         monkeypatch.setenv("ZSTATE_RENDEZVOUS", "{}:{}".format(*stranger.getsockname()))
         found = broken_link()
     assert (found["name"], "does not answer: it is another program" in found["text"]) == ("network", True)
@@ -334,7 +338,7 @@ def test_a_stopped_program_that_keeps_the_others_from_meeting_is_named_by_whoeve
     assert why in zstate("ls").stderr.decode()
     # The same with a second address: there the others meet, and are found.
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
-    with standing("r1"):
+    with published_robot("r1"):
         assert b"r1" in zstate("ls", "--json").stdout
         said = warnings()["network"]
     assert why in said
@@ -416,7 +420,7 @@ ARM = """<robot name="arm"><link name="base"/><link name="upper"/><link name="ti
 def test_positions_outside_joint_limits_are_a_warning_that_names_degrees(
     positions: tuple[float, ...], text: str
 ):
-    with standing("arm", positions, model=ARM):
+    with published_robot("arm", positions, model=ARM):
         said = diagnosed("arm", code=0)
     (found,) = [check for check in said["checks"] if check["state"] == "warning"]
     assert (found["name"], found["text"]) == ("limits", text)
@@ -424,7 +428,7 @@ def test_positions_outside_joint_limits_are_a_warning_that_names_degrees(
 
 
 def test_a_wheel_that_has_turned_often_is_sound():
-    with standing("arm", (2.0005, 900.0), model=ARM):
+    with published_robot("arm", (2.0005, 900.0), model=ARM):
         assert warnings("arm") == {}
 
 
@@ -442,7 +446,7 @@ def static_edges(*edges: tuple[str, str, str]) -> Iterator[None]:
 
 
 def test_a_static_target_that_is_nearly_a_frame_is_named_and_not_joined():
-    with standing(), static_edges(("rrbot", "lowr", "camera")):
+    with published_robot(), static_edges(("rrbot", "lowr", "camera")):
         said = diagnosed("rrbot", code=0)
     (found,) = [check for check in said["checks"] if check["name"] == "poses"]
     assert "'lowr' is near 'lower', and 'rrbot/camera' is on it" in found["text"]
@@ -450,14 +454,18 @@ def test_a_static_target_that_is_nearly_a_frame_is_named_and_not_joined():
 
 
 def test_a_static_frame_like_no_other_may_be_joined():
-    with standing(), static_edges(("rrbot", "island", "palm")):
+    with published_robot(), static_edges(("rrbot", "island", "palm")):
         said = diagnosed("rrbot", code=0)
     (found,) = [check for check in said["checks"] if check["name"] == "poses"]
     assert found["next"].startswith("zstate static rrbot/island rrbot/world")
 
 
 def test_robots_with_a_map_each_are_led_to_one_that_they_share():
-    with standing("a"), standing("b"), static_edges(("a", "map", "world"), ("b", "map", "world")):
+    with (
+        published_robot("a"),
+        published_robot("b"),
+        static_edges(("a", "map", "world"), ("b", "map", "world")),
+    ):
         said = diagnosed(code=0)
     (found,) = [check for check in said["checks"] if check["state"] == "warning"]
     assert (found["name"], found["robot"]) == ("frames", None)
@@ -469,15 +477,15 @@ def test_robots_with_a_map_each_are_led_to_one_that_they_share():
 
 def test_robots_in_one_shared_map_and_of_one_model_are_sound():
     with (
-        standing("a"),
-        standing("b"),
+        published_robot("a"),
+        published_robot("b"),
         static_edges(("a", "fleet/map", "a/world"), ("b", "fleet/map", "b/world")),
     ):
         assert warnings() == {}
 
 
 def test_a_second_parent_leads_to_commands_that_exist():
-    with standing(), static_edges(("rrbot", "world", "lower")):
+    with published_robot(), static_edges(("rrbot", "world", "lower")):
         said = diagnosed("rrbot", code=0)
     worrying = [check for check in said["checks"] if check["name"] == "tf_static"]
     assert {check["state"] for check in worrying} == {"warning"}

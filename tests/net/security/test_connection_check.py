@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 
 import pytest
-from helpers.access_routers import ROUTERS, Fleet
+from helpers.access_routers import ROUTERS_PROGRAM, AccessRouters
 
 from zstate.errors import AccessDenied, Unreachable
 from zstate.net.security.credentials import Credentials
@@ -26,7 +26,7 @@ def lets_in(endpoint: str, credentials: Credentials | None) -> bool:
         return bool(list(session.zenoh.info.routers_zid()))
 
 
-def test_the_right_ones_are_let_in(fleet: Fleet):
+def test_the_right_ones_are_let_in(fleet: AccessRouters):
     assert lets_in(fleet.tls("mtls"), fleet.identity("r1"))
     assert lets_in(fleet.tls("mtls", "localhost"), fleet.identity("r1"))
     assert lets_in(fleet.tcp("users"), Credentials(user="alice", password="wonder"))
@@ -34,32 +34,32 @@ def test_the_right_ones_are_let_in(fleet: Fleet):
     assert lets_in(fleet.tls("mtls and users"), fleet.identity("r1", "alice", "wonder"))
 
 
-def test_plain_tcp_towards_tls(fleet: Fleet):
+def test_plain_tcp_towards_tls(fleet: AccessRouters):
     reason, text = denied(fleet.tcp("mtls"), None)
     assert reason == "TLS demanded"
     assert "write 'tls/'" in text
     assert "--certs" in text
 
 
-def test_tls_towards_plain_tcp(fleet: Fleet):
+def test_tls_towards_plain_tcp(fleet: AccessRouters):
     reason, text = denied(fleet.tls("open"), fleet.identity("r1"))
     assert reason == "no TLS there"
     assert "zstate router --certs" in text
 
 
-def test_a_router_of_another_authority(fleet: Fleet):
+def test_a_router_of_another_authority(fleet: AccessRouters):
     reason, text = denied(fleet.tls("mtls"), Credentials.from_folder(fleet.strangers, "r1"))
     assert reason == "wrong CA"
     assert f"not signed by '{fleet.strangers / 'ca.pem'}'" in text
 
 
-def test_tls_without_an_authority_of_ones_own(fleet: Fleet):
+def test_tls_without_an_authority_of_ones_own(fleet: AccessRouters):
     reason, text = denied(fleet.tls("mtls"), None)
     assert reason == "wrong CA"
     assert "--certs DIR" in text
 
 
-def test_a_certificate_of_another_authority(fleet: Fleet):
+def test_a_certificate_of_another_authority(fleet: AccessRouters):
     stranger = Credentials(
         ca=fleet.folder / "ca.pem", certificate=fleet.strangers / "r1.pem", key=fleet.strangers / "r1.key"
     )
@@ -68,14 +68,14 @@ def test_a_certificate_of_another_authority(fleet: Fleet):
     assert f"refuses '{fleet.strangers / 'r1.pem'}'" in text
 
 
-def test_no_certificate(fleet: Fleet):
+def test_no_certificate(fleet: AccessRouters):
     reason, text = denied(fleet.tls("mtls"), Credentials(ca=fleet.folder / "ca.pem"))
     assert reason == "certificate demanded"
     assert "--identity NAME" in text
 
 
 @pytest.mark.parametrize("name", ["expired", "early"])
-def test_a_certificate_out_of_its_time(fleet: Fleet, name: str):
+def test_a_certificate_out_of_its_time(fleet: AccessRouters, name: str):
     reason, text = denied(fleet.tls("mtls"), fleet.identity(name))
     assert reason == "our certificate expired"
     assert f"'{fleet.folder / name}.pem' has expired, or is not valid yet" in text
@@ -89,7 +89,9 @@ def test_a_certificate_out_of_its_time(fleet: Fleet, name: str):
         ("early", "their certificate not yet valid", "clock behind"),
     ],
 )
-def test_a_router_whose_certificate_is_out_of_its_time(fleet: Fleet, kind: str, expected: str, hint: str):
+def test_a_router_whose_certificate_is_out_of_its_time(
+    fleet: AccessRouters, kind: str, expected: str, hint: str
+):
     reason, text = denied(fleet.tls(kind), fleet.identity("r1"))
     assert reason == expected
     assert hint in text
@@ -97,7 +99,7 @@ def test_a_router_whose_certificate_is_out_of_its_time(fleet: Fleet, kind: str, 
 
 @pytest.mark.parametrize(("user", "password"), [("eve", "wonder"), ("alice", "wander")])
 @pytest.mark.parametrize("kind", ["users", "mtls and users"])
-def test_a_wrong_user_or_password(fleet: Fleet, kind: str, user: str, password: str):
+def test_a_wrong_user_or_password(fleet: AccessRouters, kind: str, user: str, password: str):
     plain = kind == "users"
     given = Credentials(user=user, password=password) if plain else fleet.identity("r1", user, password)
     reason, text = denied(fleet.tcp(kind) if plain else fleet.tls(kind), given)
@@ -106,27 +108,27 @@ def test_a_wrong_user_or_password(fleet: Fleet, kind: str, user: str, password: 
     assert password not in text
 
 
-def test_no_user_where_one_is_asked_for(fleet: Fleet):
+def test_no_user_where_one_is_asked_for(fleet: AccessRouters):
     reason, text = denied(fleet.tcp("users"), None)
     assert reason == "user demanded"
     assert "ZSTATE_PASSWORD" in text
 
 
-def test_a_user_where_nobody_knows_any(fleet: Fleet):
+def test_a_user_where_nobody_knows_any(fleet: AccessRouters):
     reason, text = denied(fleet.tcp("open"), Credentials(user="alice", password="wonder"))
     assert reason == "user or password"
     assert "a router that has none refuses whoever names a user" in text
 
 
-def test_a_router_at_a_host_that_is_not_in_its_certificate(fleet: Fleet, spawn, free_port: int):
+def test_a_router_at_a_host_that_is_not_in_its_certificate(fleet: AccessRouters, spawn, free_port: int):
     endpoint = f"tls/127.0.0.2:{free_port}"
-    spawn(ROUTERS, str(fleet.folder), endpoint).line()
+    spawn(ROUTERS_PROGRAM, str(fleet.folder), endpoint).line()
     reason, text = denied(endpoint, fleet.identity("r1"))
     assert reason == "name mismatch"
     assert "--host 127.0.0.2" in text
 
 
-def test_a_configuration_of_zenoh_that_shows_the_wrong_certificate_is_told_the_same(fleet: Fleet):
+def test_a_configuration_of_zenoh_that_shows_the_wrong_certificate_is_told_the_same(fleet: AccessRouters):
     config = {
         "mode": "client",
         "connect": {"endpoints": [fleet.tls("mtls")], "timeout_ms": 200, "exit_on_failure": True},
@@ -139,7 +141,7 @@ def test_a_configuration_of_zenoh_that_shows_the_wrong_certificate_is_told_the_s
 
 
 def test_where_nobody_listens_there_is_no_refusal_and_of_two_the_one_that_refuses_is_told(
-    fleet: Fleet, free_port: int
+    fleet: AccessRouters, free_port: int
 ):
     nobody = f"tls/127.0.0.1:{free_port}"
     with pytest.raises(Unreachable, match="nothing answers"):
@@ -151,7 +153,7 @@ def test_where_nobody_listens_there_is_no_refusal_and_of_two_the_one_that_refuse
     assert f"nothing answers at '{nobody}'" in str(caught.value)
 
 
-def test_a_listener_that_accepts_and_never_answers_is_not_taken_for_one_without_tls(fleet: Fleet):
+def test_a_listener_that_accepts_and_never_answers_is_not_taken_for_one_without_tls(fleet: AccessRouters):
     """As the kernel accepts for a router process that is stopped."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
@@ -165,11 +167,11 @@ def test_a_listener_that_accepts_and_never_answers_is_not_taken_for_one_without_
 
 
 def test_a_router_that_is_busy_with_failed_handshakes_is_told_from_one_that_refuses(
-    fleet: Fleet, spawn, free_port: int
+    fleet: AccessRouters, spawn, free_port: int
 ):
     """Zenoh pauses its accepting for 0.1 s after each handshake that failed."""
     endpoint = f"tls/127.0.0.1:{free_port}"
-    assert spawn(ROUTERS, str(fleet.folder), endpoint).line() == "ready"
+    assert spawn(ROUTERS_PROGRAM, str(fleet.folder), endpoint).line() == "ready"
     with connect(mode="client", endpoints=endpoint, credentials=fleet.identity("r1")) as session:
         for idle in [socket.create_connection(("127.0.0.1", free_port)) for _ in range(80)]:
             idle.close()
@@ -179,7 +181,7 @@ def test_a_router_that_is_busy_with_failed_handshakes_is_told_from_one_that_refu
 
 
 def test_idle_connections_do_not_keep_a_client_out_of_a_router_that_asks_for_users(
-    fleet: Fleet, spawn, free_port: int
+    fleet: AccessRouters, spawn, free_port: int
 ):
     """By Zenoh's own settings the first hundred do, for ten seconds."""
     endpoint = f"tcp/127.0.0.1:{free_port}"

@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers.access_routers import Fleet
-from helpers.processes import Child, a_free_port, until
+from helpers.access_routers import AccessRouters
+from helpers.processes import Child, find_free_port, until
 
 from zstate.net.security import connection_monitor
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
-CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | None]]] = {
+CASES: dict[str, tuple[Callable[[AccessRouters], str], Callable[[AccessRouters], Credentials | None]]] = {
     "no TLS there": (lambda fleet: fleet.tls("open"), lambda fleet: fleet.identity("r1")),
     "TLS demanded": (lambda fleet: fleet.tcp("mtls"), lambda _: None),
     "wrong CA": (
@@ -50,13 +50,13 @@ def refusals(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
 
 def own_listener(credentials: Credentials | None) -> str:
     is_encrypted = credentials is not None and credentials.ca is not None
-    return f"{'tls' if is_encrypted else 'tcp'}/127.0.0.1:{a_free_port()}"
+    return f"{'tls' if is_encrypted else 'tcp'}/127.0.0.1:{find_free_port()}"
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
 @pytest.mark.parametrize("reason", CASES)
 def test_whoever_is_refused_and_goes_on_is_told_what_to_check(
-    fleet: Fleet, caplog: pytest.LogCaptureFixture, mode: str, reason: str
+    fleet: AccessRouters, caplog: pytest.LogCaptureFixture, mode: str, reason: str
 ):
     endpoint, credentials = (of(fleet) for of in CASES[reason])
     where = own_listener(credentials)
@@ -68,7 +68,7 @@ def test_whoever_is_refused_and_goes_on_is_told_what_to_check(
     assert text.endswith("; still trying")
 
 
-def test_a_configuration_of_zenoh_is_told_the_same(fleet: Fleet, caplog: pytest.LogCaptureFixture):
+def test_a_configuration_of_zenoh_is_told_the_same(fleet: AccessRouters, caplog: pytest.LogCaptureFixture):
     config = {
         "mode": "router",
         "connect": {"endpoints": [fleet.tcp("users")]},
@@ -79,9 +79,11 @@ def test_a_configuration_of_zenoh_is_told_the_same(fleet: Fleet, caplog: pytest.
     assert refusals(caplog)[0][0] == "user demanded"
 
 
-def test_only_of_those_who_refuse_something_is_said_and_once(fleet: Fleet, caplog: pytest.LogCaptureFixture):
-    first, second = (f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2))
-    nobody, refusing = f"tcp/127.0.0.1:{a_free_port()}", fleet.tcp("users")
+def test_only_of_those_who_refuse_something_is_said_and_once(
+    fleet: AccessRouters, caplog: pytest.LogCaptureFixture
+):
+    first, second = (f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2))
+    nobody, refusing = f"tcp/127.0.0.1:{find_free_port()}", fleet.tcp("users")
     # Each calls the other, of which one link remains.
     ours = {"endpoints": [nobody, second, fleet.tcp("open"), refusing], "listen": first}
     with connect(endpoints=first, listen=second), connect(**ours) as session:
@@ -135,7 +137,7 @@ def test_a_client_that_finds_another_router_in_the_place_of_its_own_is_told(
 def test_after_there_was_a_link_it_is_told_again(
     routers: Callable[[str, str], Child], caplog: pytest.LogCaptureFixture, free_port: int
 ):
-    endpoint, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{find_free_port()}"
     stranger = routers(endpoint, "eve")
     with connect(endpoints=[endpoint, other], listen=own_listener(None), credentials=ALICE) as session:
         until(lambda: len(refusals(caplog)) == 1)
@@ -153,7 +155,7 @@ def test_after_there_was_a_link_it_is_told_again(
 
 
 def test_a_peer_with_credentials_is_warned_at_a_router_and_a_client_is_not(
-    fleet: Fleet, caplog: pytest.LogCaptureFixture
+    fleet: AccessRouters, caplog: pytest.LogCaptureFixture
 ):
     endpoint, identity = fleet.tls("mtls"), fleet.identity("r1")
     with (

@@ -4,7 +4,7 @@ import pickle
 from collections.abc import Iterator
 
 import pytest
-from helpers.processes import a_free_port
+from helpers.processes import find_free_port
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, StaticPublisher, connect, discover
@@ -19,7 +19,7 @@ USERS = ("r1", "r2", "desk", "stranger")
 @pytest.fixture
 def endpoint(tmp_path) -> Iterator[str]:
     """Where a router listens that knows the robots r1 and r2, and the viewer desk."""
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     users = tmp_path / "users.txt"
     users.write_text("".join(f"{name}:secret\n" for name in USERS))
     settings = {
@@ -64,7 +64,7 @@ def test_who_may_not_is_told_who_they_are_and_which_rule_is_missing(endpoint: st
 
 
 def test_who_shows_nothing_cannot_be_told_apart_and_is_not_asked():
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     with (
         connect(mode="router", listen=endpoint),
         connect(mode="client", endpoints=endpoint) as session,
@@ -74,7 +74,7 @@ def test_who_shows_nothing_cannot_be_told_apart_and_is_not_asked():
 
 
 def test_where_the_router_is_gone_nothing_is_held_against_the_writer(tmp_path):
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     users = tmp_path / "users.txt"
     users.write_text("r1:secret\n")
     settings = {

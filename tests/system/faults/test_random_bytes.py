@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import pytest
 import zenoh
 from helpers.processes import until
-from helpers.robots import RRBOT, await_reader
+from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
@@ -96,7 +96,7 @@ def test_random_bytes_on_every_key_are_counted_one_by_one_and_stop_nobody(monkey
             for follow in FOLLOWS
         ]
         for key in {key for target in targets for key in target.keys}:
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         for token in odd_tokens(dice):
             opened.enter_context(announce(writer, token))
         deadline = time.monotonic() + SECONDS
@@ -117,6 +117,6 @@ def test_random_bytes_on_every_key_are_counted_one_by_one_and_stop_nobody(monkey
         assert crashes == []
         # And a robot that makes sense is followed as before.
         with StatePublisher(writer, RRBOT, "fresh") as fresh:
-            await_reader(writer, "zstate/fresh/joint_states")
+            wait_for_reader(writer, "zstate/fresh/joint_states")
             fresh.publish([0.1, 0.2])
             targets[0].listener.buffer.wait("fresh/world", "fresh/tool", timeout_s=10.0)

@@ -9,7 +9,7 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
-from helpers.scene_drawing import at, in_fixed, is_seen, moment, told, tree  # noqa: E402
+from helpers.scene_drawing import at, in_fixed, is_seen, moment, sent_messages, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
 from zstate.view.scene.frame_nodes import FrameNodes  # noqa: E402
@@ -47,7 +47,7 @@ def test_every_frame_is_where_it_is_in_the_fixed_one(server, fixed):
 def test_what_stands_still_is_not_sent(server):
     nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         show(nodes, moment(ARM, POSES, stamp=1), "map", ALL)
     assert messages == []
 
@@ -56,7 +56,7 @@ def test_a_joint_that_turns_is_one_message_whatever_hangs_on_it(server):
     nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
     turned = moment(ARM, POSES | {"arm/upper": at(0, 0, 0.5, 0.8)})
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         show(nodes, turned, "map", ALL)
     assert [type(message).__name__ for message in messages] == ["SetOrientationMessage"]
     assert_placed(server, nodes, turned, "map")
@@ -66,7 +66,7 @@ def test_another_fixed_frame_moves_the_root_alone(server):
     nodes = FrameNodes(server.scene)
     shown = moment(ARM, POSES)
     show(nodes, shown, "map", ALL)
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         show(nodes, shown, "arm/tool", ALL)
     assert {message.name for message in messages} == {nodes.paths["map"]}
     assert_placed(server, nodes, shown, "arm/tool")
@@ -75,7 +75,7 @@ def test_another_fixed_frame_moves_the_root_alone(server):
 def test_noise_that_nobody_sees_is_not_sent_until_it_adds_up(server):
     nodes = FrameNodes(server.scene)
     show(nodes, moment(ARM, POSES), "map", ALL)
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         for k in range(1, 5):
             show(nodes, moment(ARM, POSES | {"arm/tool": at(0.4 + k * 2e-7)}), "map", ALL)
         assert messages == []
@@ -109,7 +109,7 @@ def test_a_frame_that_comes_leaves_the_others_as_they_are(server):
     more = tree(
         {"map": None, "arm/base": "map", "cup": "map", "arm/upper": "arm/base", "arm/tool": "arm/upper"}
     )
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         show(nodes, moment(more, POSES), "map", ALL)
     assert {name: nodes.paths[name] for name in before} == before
     assert not any("Remove" in type(message).__name__ for message in messages)

@@ -7,7 +7,7 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
-from helpers.scene_drawing import at, drawn, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
+from helpers.scene_drawing import at, drawn, handles, in_fixed, is_seen, moment, sent_messages, tree  # noqa: E402
 
 from zstate import se3  # noqa: E402
 from zstate.model.geometry import Box, MeshFile, Shape, Sphere  # noqa: E402
@@ -87,7 +87,7 @@ def test_one_message_moves_a_shape_of_all_robots(server):
     scene = fleet_of(server, NAMES)
     scene.axes = False
     scene.show(moment(TREE, POSES), "map")
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         scene.show(moment(TREE, POSES), "map")
         assert messages == []
         scene.show(moment(TREE, POSES | {f"{name}/base": at(5, 5, 5, 1) for name in NAMES}), "map")

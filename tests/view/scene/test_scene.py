@@ -7,7 +7,7 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
-from helpers.scene_drawing import at, drawn, handles, in_fixed, is_seen, moment, told, tree  # noqa: E402
+from helpers.scene_drawing import at, drawn, handles, in_fixed, is_seen, moment, sent_messages, tree  # noqa: E402
 
 from zstate.model.urdf import parse_urdf  # noqa: E402
 from zstate.view.scene.scene import Scene  # noqa: E402
@@ -61,7 +61,7 @@ def test_each_visual_is_drawn_where_its_link_is(scene, server):
 
 
 def test_a_shape_goes_with_its_link_without_being_sent_again(scene, server):
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         scene.axes = False
         scene.show(moment(TREE, POSES | {"cart/base": at(3, 0, 0)}), "map")
     assert [type(message).__name__ for message in messages if "Visibility" not in type(message).__name__] == [
@@ -205,7 +205,7 @@ def test_names_hang_on_their_frames(scene, server):
     scene.names = True
     scene.show(moment(TREE, POSES), "map")
     assert texts(server) == {"map", "base", "wheel"}
-    with told(server) as messages:
+    with sent_messages(server) as messages:
         scene.axes = False
         scene.show(moment(TREE, POSES | {"cart/base": at(3, 0, 0)}), "map")
     assert not any("Label" in type(message).__name__ for message in messages)
