@@ -1,4 +1,4 @@
-"""Routers that let some in and others not."""
+"""Routers with different access control."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROUTERS_PROGRAM = """
 
 @dataclass(frozen=True)
 class AccessRouters:
-    """Routers, by what they are, and the folders of two authorities."""
+    """Running routers by kind, and the folders of two certificate authorities."""
 
     folder: Path
     strangers: Path

@@ -1,11 +1,10 @@
-"""Hostile bytes for the decoders of ROS 2 messages.
+"""Fuzzer of the decoders of ROS 2 messages.
 
     python tests/helpers/cdr_fuzz.py [SECONDS]
 
-Messages that are whole, cut off, changed in a few bytes or counts, put together from two, or noise go
-to every decoder: once to a new one, which reads value by value, and once to one that has seen all that
-came before. Ends with an exception, and the bytes, at the first that raises anything but a MessageError
-or where the two do not agree.
+Complete, truncated, altered and spliced messages and noise go to every decoder: once to a new decoder, which
+reads value by value, and once to a decoder that has seen all earlier inputs. Stops with an exception and the
+bytes at the first input that raises another error than MessageError or on which the two disagree.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 
-from helpers import manual_cdr as by_hand
+from helpers import manual_cdr
 
 from zstate.errors import MessageError
 from zstate.wire.ros2.joint_state import JointStateDecoder
@@ -36,7 +35,7 @@ NEW: dict[str, Callable[[], Callable[[bytes], object]]] = {
 
 
 class Fuzz:
-    """One seed's worth of inputs, a few messages and what becomes of them."""
+    """The inputs of one seed, made from a few messages."""
 
     def __init__(self, seed: int, old: dict[str, Callable[[bytes], object]]) -> None:
         self.random = random.Random(seed)
@@ -47,11 +46,11 @@ class Fuzz:
         return self.random.choice(choices)()
 
     def message(self) -> bytes:
-        """A message as ROS 2 may send it; its gaps and its end hold anything."""
+        """A valid ROS 2 message with arbitrary padding and trailing bytes."""
         values = self.random.choice([self.joint_state, self.joint_state, self.tf_message, self.plain])()
-        fill = self.random.choice([self.random.randbytes, by_hand.zeros])
+        fill = self.random.choice([self.random.randbytes, manual_cdr.zeros])
         order = self.random.choice("<<<>")
-        return by_hand.cdr(values, order, fill) + self.random.choice([b"", b"", self.random.randbytes(5)])
+        return manual_cdr.cdr(values, order, fill) + self.random.choice([b"", b"", self.random.randbytes(5)])
 
     def names(self, count: int) -> list[str]:
         return [f"{'abcdefgh'[: self.random.randrange(1, 9)]}{number}" for number in range(count)]
@@ -66,18 +65,18 @@ class Fuzz:
             row if self.random.random() < chance else []
             for chance, row in zip((0.9, 0.5, 0.5), rows, strict=True)
         ]
-        return by_hand.joint_state(self.stamp(), "base"[: self.random.randrange(5)], names, *rows)
+        return manual_cdr.joint_state(self.stamp(), "base"[: self.random.randrange(5)], names, *rows)
 
     def tf_message(self):
         edges = list(pairwise(self.names(1 + self.random.randrange(4))))
         stamps = [self.stamp()] * len(edges)
         if edges and self.random.random() < 0.3:
             stamps[-1] = self.stamp()
-        return by_hand.tf_message(stamps, edges, [[self.random.random() for _ in range(7)] for _ in edges])
+        return manual_cdr.tf_message(stamps, edges, [[self.random.random() for _ in range(7)] for _ in edges])
 
     def plain(self):
         text = "".join(self.names(self.random.randrange(3)))
-        return self.random.choice([iter([("s", text)]), by_hand.time(self.stamp())])
+        return self.random.choice([iter([("s", text)]), manual_cdr.time(self.stamp())])
 
     def known(self) -> bytes:
         return self.random.choice(self.messages)
@@ -99,14 +98,14 @@ class Fuzz:
         return bytes(data)
 
     def counted(self) -> bytes:
-        """One of the words, perhaps a count or a length, holds another number."""
+        """Replaces one word, perhaps a count or a length, by another number."""
         data = bytearray(self.known())
         at = 4 * self.random.randrange(len(data) // 4)
         struct.pack_into(self.random.choice("<>") + "I", data, at, self.random.choice(COUNTS))
         return bytes(data)
 
     def renumbered(self) -> bytes:
-        """Another word of time or number: mostly a message that is whole, and known but for that."""
+        """Replaces one word by random bytes: mostly a valid message of a known layout."""
         data = bytearray(self.known())
         at = 4 * self.random.randrange(1, len(data) // 4)
         data[at : at + 4] = self.random.randbytes(4)
@@ -130,7 +129,7 @@ class Fuzz:
         return outcomes
 
     def outcome(self, kind: str, old: Callable[[bytes], object], data: bytes) -> str:
-        """What became of it: "read", or why it was not."""
+        """The outcome: "read", or the reason of the error."""
         try:
             new, known = decode_outcome(NEW[kind](), data), decode_outcome(old, data)
         except Exception as error:
@@ -148,12 +147,12 @@ def decode_outcome(decode: Callable[[bytes], object], data: bytes) -> tuple[str,
 
 
 def long_lived() -> dict[str, Callable[[bytes], object]]:
-    """Decoders for a whole run."""
+    """Decoders that live for a whole run."""
     return {kind: make() for kind, make in NEW.items()}
 
 
 def main() -> int:
-    """Fuzz for so many seconds."""
+    """Runs the fuzzer for the given seconds."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     outcomes: Counter[str] = Counter()
     old, start, inputs, seed = long_lived(), time.monotonic(), 0, 0

@@ -1,4 +1,4 @@
-"""What the tests of the looking commands share: commands as real processes, and a robot that stands still."""
+"""zstate commands as real processes, and a published robot."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Spawn = Callable[..., Child]
 
 
 def zstate(*arguments: str, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
-    """A command that ends by itself."""
+    """Runs a command that ends by itself."""
     command = [sys.executable, "-m", "zstate", *arguments]
     return subprocess.run(command, input=stdin, capture_output=True, timeout=DEADLINE_S, check=False)
 
 
 def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
-    """The message of a command that must fail, without a traceback."""
+    """The error message of a command that must fail without a traceback."""
     ended = zstate(*arguments, stdin=stdin)
     message = ended.stderr.decode()
     assert ended.returncode == code, (ended.returncode, ended.stdout, message)
@@ -40,12 +40,12 @@ def failure(*arguments: str, code: int = 1, stdin: bytes = b"") -> str:
 
 
 def started(spawn: Spawn, *arguments: str) -> Child:
-    """A command that goes on until it is told to end."""
+    """Starts a command that runs until it is stopped."""
     return spawn("from zstate.cli.main import main; main()", *arguments)
 
 
 def interrupted(child: Child) -> None:
-    """Ctrl-C: it must end within a second, with code 130 and no traceback."""
+    """Sends Ctrl-C; the command must end within a second with code 130 and without a traceback."""
     began = time.monotonic()
     child.process.send_signal(signal.SIGINT)
     assert child.wait() == 130
@@ -65,7 +65,7 @@ def published_robot(
     router: str = "",
     clock: Clock | None = None,
 ) -> Iterator[StatePublisher]:
-    """A robot that stands still and says so a hundred times a second, behind ``router`` if there is one."""
+    """Publishes constant positions of a robot at 100 Hz, through ``router`` if given."""
     stop = threading.Event()
 
     def publish() -> None:

@@ -1,6 +1,6 @@
-"""The processes that the fault suite breaks: each does its work, and answers questions on its standard input.
+"""The processes of the fault suite: each runs one role and replies to queries on its standard input.
 
-A question is a line of JSON, ``[name, *arguments]``; so is the answer.
+A query is a line of JSON, ``[name, *arguments]``; so is the reply.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _enter(namespace: str) -> None:
-    """Go there before any thread exists: a network namespace is a property of each thread."""
+    """Enters the namespace before any thread exists: a network namespace is a property of each thread."""
     libc = ctypes.CDLL(None, use_errno=True)
     with Path(f"/run/netns/{namespace}").open() as file:
         if libc.setns(file.fileno(), CLONE_NEWNET):
@@ -60,7 +60,7 @@ def _serve_queries(**answers: Answer) -> None:
 
 
 def resource_counts() -> dict[str, int]:
-    """What must not grow. Threads are those of the process, Zenoh's too."""
+    """Counts that must not grow. Threads include those of Zenoh."""
     status = Path("/proc/self/status").read_text()
     resident = next(line for line in status.splitlines() if line.startswith("VmRSS"))
     return {
@@ -71,7 +71,7 @@ def resource_counts() -> dict[str, int]:
 
 
 class ShiftedClock(SystemClock):
-    """The system's clock, set wrong by ``shift_ns``."""
+    """The system clock with an error of ``shift_ns``."""
 
     shift_ns = 0
 
@@ -83,7 +83,7 @@ class ShiftedClock(SystemClock):
 
 
 class PausableSource:
-    """A sine that remembers the last stamp it was asked for, until it is told to say nothing."""
+    """A sine source that keeps its last stamp, and returns no readings after ``pause``."""
 
     def __init__(self, source: SineSource) -> None:
         self._source = source
@@ -104,7 +104,7 @@ class PausableSource:
 def publisher(
     robot: str, session: Session, rate_hz: float = 100.0, mark: float = 0.0, takeover: bool = False
 ) -> None:
-    """A robot that moves, with one static edge besides its model, whose length is the mark."""
+    """Publishes a moving robot and one extra static edge, whose length is the mark."""
     model, clock = load_model("rrbot"), ShiftedClock()
     source = PausableSource(SineSource(model))
 
@@ -150,7 +150,7 @@ def router(listen: str, connect_to: list[str] | None = None) -> None:
 
 
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
-    """One that follows robots; with ``busy_ms`` each sample costs it so long, and nobody else runs."""
+    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long."""
     with connect(**session) as opened, TransformListener(opened, robot, follow=follow) as listener:
         answers = ReaderQueries(listener)
         if busy_ms:

@@ -1,4 +1,4 @@
-"""What a reader of the fault suite can say of the robots it follows."""
+"""Queries that a reader of the fault suite replies to."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from zstate.model.kinematics import Kinematics
 from zstate.transform import Transform
 
 MAX_AGE_S = 0.5
-"""What is called fresh."""
+"""The age limit of a fresh lookup [s]."""
 
 
 def becomes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Whether ``condition()`` becomes true in time. It is looked at each millisecond."""
+    """Whether ``condition()`` becomes true in time; checked every millisecond."""
     deadline = time.monotonic() + timeout_s
     while not (is_true := condition()) and time.monotonic() < deadline:
         time.sleep(0.001)
@@ -27,7 +27,7 @@ def becomes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
 
 
 class ReaderQueries:
-    """What a reader can say of the robots it follows. An answer that is not the sine's is an error."""
+    """Queries about the robots of a listener. A pose that is not on the sine is an error."""
 
     def __init__(self, listener: TransformListener) -> None:
         self._listener = listener
@@ -38,7 +38,7 @@ class ReaderQueries:
         self._watching: dict[str, FreshnessMonitor] = {}
 
     def near(self, robot: str, stamp: int, timeout_s: float = 10.0) -> bool:
-        """Whether the newest sample comes to be within half a minute of a stamp."""
+        """Whether the newest sample gets within half a minute of a stamp in time."""
         is_near = becomes_true(lambda: abs(self.newest(robot) - stamp) <= 30_000_000_000, timeout_s)
         if is_near:
             self._check(robot)
@@ -52,12 +52,12 @@ class ReaderQueries:
             return 0
 
     def after(self, robot: str, stamp: int, timeout_s: float = 15.0) -> int | None:
-        """When [ns] there was an answer with a later stamp; it is checked."""
+        """The time [ns] of the first lookup with a later stamp; its pose is checked."""
         if not becomes_true(lambda: self.newest(robot) > stamp, timeout_s):
             return None
-        heard_at = time.time_ns()
+        received_at = time.time_ns()
         self._check(robot)
-        return heard_at
+        return received_at
 
     def _check(self, robot: str) -> None:
         answer = self._buffer.lookup(f"{robot}/world", f"{robot}/tool")
@@ -68,7 +68,7 @@ class ReaderQueries:
         assert np.allclose(answer.matrix, expected.matrix, rtol=0.0, atol=1e-9), (answer, expected)
 
     def mark(self, robot: str, value: float, timeout_s: float = 10.0) -> int | None:
-        """When [ns] the robot's static edge had this length."""
+        """The time [ns] when the robot's static edge had this length."""
         return time.time_ns() if becomes_true(lambda: self._mark(robot) == value, timeout_s) else None
 
     def _mark(self, robot: str) -> float | None:
@@ -78,7 +78,7 @@ class ReaderQueries:
             return None
 
     def fresh(self, robot: str) -> Transform:
-        """The newest answer, if that is not too old."""
+        """The newest pose, if it is not older than ``MAX_AGE_S``."""
         return self._buffer.lookup(f"{robot}/world", f"{robot}/tool", max_age_s=MAX_AGE_S)
 
     def stats(self) -> dict[str, Any]:
@@ -93,7 +93,7 @@ class ReaderQueries:
         return self._watching.pop(robot).report()
 
     def latencies(self, robot: str, count: int) -> list[int]:
-        """How old [ns] each of the next samples is when it can be looked up."""
+        """Ages [ns] of the next samples at their first lookup."""
         ages: list[int] = []
         newest = self.newest(robot)
         while len(ages) < count:
@@ -105,7 +105,7 @@ class ReaderQueries:
 
 
 class FreshnessMonitor:
-    """Looks at one robot every few milliseconds: newest must never go back, nor old be called fresh."""
+    """Checks one robot every 3 ms: the newest stamp never goes back, no old pose passes as fresh."""
 
     def __init__(self, answers: ReaderQueries, robot: str) -> None:
         self._answers = answers

@@ -1,4 +1,4 @@
-"""Kinematics of a second make, for tests to compare with: numpy and the XML, nothing of zstate."""
+"""Independent kinematics for comparison: numpy and XML, without zstate."""
 
 from math import cos, sin
 from xml.etree import ElementTree
@@ -33,7 +33,7 @@ def translation_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 class MatrixKinematics:
-    """Poses of links: 4 x 4 matrices straight from the XML, a link at a time."""
+    """Poses of links: 4 x 4 matrices from the XML, one link at a time."""
 
     def __init__(self, urdf: str) -> None:
         self.joints = {

@@ -1,6 +1,6 @@
-"""Several hosts on one machine: network namespaces around a router that can be told to swallow all.
+"""Several hosts on one machine: network namespaces around a router that can drop packets.
 
-Each host has a cable of its own to the middle. Needs root and iproute2.
+Each host has its own cable to the router. Needs root and iproute2.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class NamespaceHosts:
 
     @property
     def _router(self) -> str:
-        return f"{self._mark}-middle"
+        return f"{self._mark}-router"
 
     def namespace(self, name: str) -> str:
         return f"{self._mark}-{name}"
@@ -60,7 +60,7 @@ class NamespaceHosts:
         return f"10.77.{self._numbers[name]}.2"
 
     def _port(self, name: str) -> str:
-        """The middle's end of a host's cable."""
+        """The router's end of a host's cable."""
         return f"port{self._numbers[name]}"
 
     def _add_host(self, name: str) -> None:
@@ -80,18 +80,18 @@ class NamespaceHosts:
         _ip("netns", "exec", self._router, "sh", "-c", command)
 
     def unplug(self, name: str) -> None:
-        """Both ends see that the cable is out."""
+        """Takes the link down; both ends notice it."""
         _ip("-n", self._router, "link", "set", self._port(name), "down")
 
     def plug(self, name: str) -> None:
         _ip("-n", self._router, "link", "set", self._port(name), "up")
 
     def drop_packets(self, name: str) -> None:
-        """From now on whatever is sent to this host or by it vanishes, and nobody is told."""
+        """Drops all packets to and from this host without any error."""
         self._run_in_router(f"echo 0 > /proc/sys/net/ipv4/conf/{self._port(name)}/forwarding")
         _ip("-n", self._router, "route", "add", "blackhole", f"{self.address(name)}/32")
 
     def pass_packets(self, name: str) -> None:
-        """The end of ``swallow``."""
+        """Ends ``drop_packets``."""
         self._run_in_router(f"echo 1 > /proc/sys/net/ipv4/conf/{self._port(name)}/forwarding")
         _ip("-n", self._router, "route", "del", "blackhole", f"{self.address(name)}/32")

@@ -1,6 +1,6 @@
-"""ROS 2 nodes by other hands: literal keys and tokens on a bare Zenoh session, bytes of rosbags.
+"""Independent ROS 2 nodes: literal keys and tokens on a plain Zenoh session, bytes of rosbags.
 
-Nothing here asks zstate how it is done, so that both can be wrong only apart.
+Nothing here uses zstate's implementation of the ROS wires.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ def _transient_local() -> dict[str, Any]:
     }
 
 
-# A publisher that nobody holds any more would take its latched value with it.
+# Keeps publishers alive: a collected publisher would withdraw its latched value.
 _OPEN_PUBLISHERS: list[RosPublisher] = []
 
 
 class RosPublisher:
-    """One topic of one node: announced on its own, which may be later than what it says."""
+    """One topic of one node; ``announce`` is separate and may follow the first messages."""
 
     def __init__(self, session: Session, topic: Topic, key: str, token: str, *, latched: bool) -> None:
         self.key, self.token, self.gid, self.seq = key, token, gid_of(token), 0
@@ -93,12 +93,12 @@ class RosPublisher:
             until(lambda: probe.has_readers)
         return self
 
-    def put(self, payload: bytes, beside: bytes | str | None = "next") -> None:
-        """Say ``payload`` with the next attachment, or with what is given ``beside`` it."""
-        if beside == "next":
+    def put(self, payload: bytes, extra: bytes | str | None = "next") -> None:
+        """Publishes ``payload`` with the next attachment, or with the attachment ``extra``."""
+        if extra == "next":
             self.seq += 1
-            beside = attachment(self.seq, self.gid)
-        self.publisher.put(payload, attachment=beside)
+            extra = attachment(self.seq, self.gid)
+        self.publisher.put(payload, attachment=extra)
 
     def joints(self, stamp: int, names: Sequence[str], *blocks: Sequence[float]) -> None:
         self.put(rosbags_joint_state(stamp, "", names, *blocks, *[()] * (3 - len(blocks))))
@@ -113,7 +113,7 @@ class RosPublisher:
         self.put(rosbags_cdr("std_msgs/msg/String", text))
 
     def close(self) -> None:
-        """As a node does that ends."""
+        """Undeclares token and publisher, as a node does at its end."""
         if self._alive is not None:
             self._alive.undeclare()
         self.publisher.undeclare()
@@ -121,7 +121,7 @@ class RosPublisher:
 
 
 class RosNode:
-    """A node that says what it is told to, on as many topics."""
+    """A node with publishers on any number of topics."""
 
     def __init__(self, session: Session, name: str, namespace: str = "/", domain: int = 0) -> None:
         self._session, self._domain = session, domain
@@ -141,7 +141,7 @@ class RosNode:
 
 
 class KeySubscriber:
-    """What a ROS node's subscription hears on one key, as Zenoh delivers it."""
+    """The samples of one key, subscribed as a ROS node does."""
 
     def __init__(self, session: Session, key: str, *, latched: bool = False) -> None:
         self.samples: list[zenoh.Sample] = []
@@ -179,13 +179,13 @@ def read_attachment(sample: zenoh.Sample) -> tuple[int, int, bytes]:
 
 
 def tokens(session: Session, domain: int = 0) -> list[str]:
-    """The keys of all tokens that are alive in a domain."""
+    """The keys of all live tokens of a domain."""
     replies = session.zenoh.liveliness().get(f"@ros2_lv/{domain}/**", timeout=5.0)
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
 def moved(x: float) -> tuple[float, ...]:
-    """A pose that is ``x`` along the parent's axis."""
+    """A pose at ``x`` along the parent's x axis."""
     return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Recordings built by hand: robot messages through a RecordingEncoder, and bags as ROS leaves them."""
+"""Builders of recordings: robot messages through a RecordingEncoder, and ROS 2 bags by rosbags."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MS = 1_000_000
 S = 1_000_000_000
 START = 1_700_000_000 * S
 LATENCY = 200_000
-"""From the stamp of a sample until it is recorded [ns]."""
+"""The delay from the stamp of a sample to its log time [ns]."""
 
 Edge = tuple[str, str]
 
@@ -42,7 +42,7 @@ def recorded_buffer(path: Path, robot: str | None = None) -> TransformBuffer:
 
 
 class RecordingBuilder:
-    """A recording in the making; everything is logged a little after its stamp."""
+    """Writes a recording; every message is logged ``LATENCY`` after its stamp by default."""
 
     def __init__(self, path: Path, alone: str | None = None, programs: dict[int, str] | None = None) -> None:
         self.writer = RecordingWriter(path)
@@ -65,8 +65,8 @@ class RecordingBuilder:
         return seq
 
     def describe(self, robot: str, model: RobotModel = RRBOT, session: int = 1, at: int = START) -> None:
-        said = RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
-        self.encoder.write_message(robot, said, at)
+        message = RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
+        self.encoder.write_message(robot, message, at)
 
     def joints(
         self,
@@ -114,8 +114,8 @@ class RecordingBuilder:
         session: int = 3,
         writer: str | None = "camera",
     ) -> None:
-        said = StaticTransforms(session, tuple(poses), to_block(list(poses.values())))
-        self.encoder.write_message(robot, said, at, writer)
+        message = StaticTransforms(session, tuple(poses), to_block(list(poses.values())))
+        self.encoder.write_message(robot, message, at, writer)
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> list[float]:
@@ -123,7 +123,7 @@ def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> li
 
 
 def swing_positions(seconds: float) -> list[float]:
-    """Where the joints of rrbot are, some time after the start."""
+    """The joint positions of rrbot at a time after the start."""
     return [math.sin(seconds), 0.5 * math.cos(2.0 * seconds)]
 
 
@@ -137,7 +137,7 @@ _DURABLE = {"/tf_static", "/robot_description"}
 
 
 class Bag:
-    """A bag of ROS 2, made by rosbags."""
+    """A ROS 2 bag, written by rosbags."""
 
     def __init__(self, path: Path, storage: StoragePlugin = StoragePlugin.SQLITE3) -> None:
         self._writer = Writer(path, version=9, storage_plugin=storage)

@@ -1,4 +1,4 @@
-"""Recordings to test with: one robot's description and joint states, written by a RecordingWriter."""
+"""Recordings of one robot's description and joint states, written by a RecordingWriter."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DESCRIPTION = string_bytes("<robot name='r'/>")
 
 
 def joint_states(count: int, every_ns: int = 10 * MS) -> list[tuple[int, bytes]]:
-    """Log times and payloads, which do not compress well."""
+    """Log times and incompressible payloads."""
     dice = random.Random(5)
     stamps = [START + number * every_ns for number in range(count)]
     return [(stamp, joint_bytes(stamp, [dice.random() for _ in range(7)])) for stamp in stamps]

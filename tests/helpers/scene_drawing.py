@@ -1,4 +1,4 @@
-"""What tests of the scene draw with: moments made by hand, and what viser was told of them."""
+"""Frame poses for tests of the scene, and the messages sent to viser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Pose
 
 
 def tree(parents: Mapping[str, str | None]) -> FrameTable:
-    """Frames by name with their parents, which stand before them."""
+    """Frames by name with their parents, parents first."""
     names = tuple(parents)
     rows = [-1 if parent is None else names.index(parent) for parent in parents.values()]
     kinds = tuple("root" if parent is None else "joint" for parent in parents.values())
@@ -33,14 +33,14 @@ def tree(parents: Mapping[str, str | None]) -> FrameTable:
 def moment(
     of: FrameTable, poses: Mapping[str, Pose], stamp: int = 0, unknown: Sequence[str] = ()
 ) -> FramePoses:
-    """Frames that are not named are where their parents are."""
+    """Poses of all frames; unnamed frames coincide with their parents."""
     rows = np.array([poses.get(name, HERE) for name in of.names])
     known = np.array([name not in unknown for name in of.names])
     return FramePoses(stamp, of, rows, known)
 
 
 def drawn(scene: Scene, shown) -> None:
-    """Show a moment until nothing is missing from the picture."""
+    """Shows poses until the picture is complete."""
 
     def complete() -> bool:
         scene.show(shown, "map")
@@ -51,13 +51,13 @@ def drawn(scene: Scene, shown) -> None:
 
 
 def handles(server: viser.ViserServer, kind: type[Any]) -> dict[str, Any]:
-    """Everything of a kind that is in the scene now, by its path."""
+    """All scene nodes of a kind, by path."""
     every = server.scene._handle_from_node_name
     return {path: handle for path, handle in every.items() if isinstance(handle, kind)}
 
 
 def in_fixed(server: viser.ViserServer, path: str) -> tuple[float, ...]:
-    """Where a node is that viser was told of: the pose of all nodes above it, one on the other."""
+    """The pose of a node in the fixed frame: the product of the poses of all nodes above it."""
     pose = se3.IDENTITY
     parts = path.split("/")
     for k in range(2, len(parts) + 1):
@@ -77,7 +77,7 @@ def is_seen(server: viser.ViserServer, path: str) -> bool:
 
 @contextmanager
 def sent_messages(server: viser.ViserServer) -> Iterator[list[Any]]:
-    """What viser is told meanwhile, message by message."""
+    """Collects the messages sent to viser inside the block."""
     messages: list[Any] = []
     scene = server.scene
     queue = scene._queue_scene_message

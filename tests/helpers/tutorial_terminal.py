@@ -1,4 +1,4 @@
-"""The tutorial's document: its files, and what its terminal is told and says."""
+"""The tutorial document: its files, its commands and their expected output."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FILES = {"xml": "arm.urdf", "python": "swing.py", "toml": "cell.toml"}
 
 _DONE = "exercise done: "
 
-# What differs from run to run, the first that fits.
+# Values that differ from run to run; the first match applies.
 _MASKS = {
     r"pid \d+": "pid N",
     r"@[\w.-]+ pid": "@HOST pid",
@@ -42,14 +42,14 @@ _MASKS = {
 
 
 class TerminalStep(NamedTuple):
-    """A command, and the lines that stand below it."""
+    """A command and its expected lines."""
 
     command: str
     lines: list[str]
 
     @property
     def is_background(self) -> bool:
-        """Whether it runs in the background; what it prints may come in another order."""
+        """Whether it runs in the background."""
         return self.command.endswith(" &")
 
 
@@ -58,7 +58,7 @@ def blocks(language: str) -> list[str]:
 
 
 def terminal_steps() -> Iterator[TerminalStep]:
-    """The terminal, from the first command to the last."""
+    """All commands of the document in order."""
     for block in blocks("console"):
         for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             command, *lines = part.splitlines()
@@ -66,13 +66,13 @@ def terminal_steps() -> Iterator[TerminalStep]:
 
 
 def masked(lines: list[str]) -> list[str]:
-    """The lines without what differs from run to run, and without those that tell of waiting."""
-    said: list[str] = []
+    """The lines with varying values masked, without lines about waiting."""
+    result: list[str] = []
     for line in lines:
         for pattern, name in _MASKS.items():
             line = re.sub(pattern, name, line)  # noqa: PLW2901  # one after the other
-        said.append(line.rstrip())
-    return [line for line in said if line and not line.startswith(("waiting: ", "heard "))]
+        result.append(line.rstrip())
+    return [line for line in result if line and not line.startswith(("waiting: ", "heard "))]
 
 
 class Terminal:
@@ -93,19 +93,19 @@ class Terminal:
             start_new_session=True,
         )
 
-    def run(self, one: TerminalStep) -> list[str]:
-        """What is printed; by a program in the background, once it has printed all that is expected."""
-        command = one.command.removesuffix(" &")
-        if not one.is_background:
-            return self._done(f"{{ {command}; }} </dev/null")
+    def run(self, step: TerminalStep) -> list[str]:
+        """Runs a command; returns its output, for a background program once it has the expected length."""
+        command = step.command.removesuffix(" &")
+        if not step.is_background:
+            return self._run(f"{{ {command}; }} </dev/null")
         self._background += 1
         log = self._folder / f".log{self._background}"
         log.touch()
-        self._done(f"{command} >{log} 2>&1 </dev/null &")
-        until(lambda: len(log.read_text().splitlines()) >= len(one.lines))
-        return log.read_text().splitlines()[: len(one.lines)]
+        self._run(f"{command} >{log} 2>&1 </dev/null &")
+        until(lambda: len(log.read_text().splitlines()) >= len(step.lines))
+        return log.read_text().splitlines()[: len(step.lines)]
 
-    def _done(self, command: str) -> list[str]:
+    def _run(self, command: str) -> list[str]:
         assert self._bash.stdin
         assert self._bash.stdout
         self._bash.stdin.write(f"{command}\necho '{_DONE}'\n")
@@ -113,7 +113,7 @@ class Terminal:
         return [line.rstrip("\n") for line in iter(self._bash.stdout.readline, f"{_DONE}\n")]
 
     def close(self) -> None:
-        """End bash and all that it has started."""
+        """Ends bash and all its children."""
         os.killpg(self._bash.pid, 9)
         self._bash.communicate()
 

@@ -50,7 +50,7 @@ def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
 
 @pytest.fixture
 def peer(namespace: str, spawn: Spawn) -> Callable[..., RosPeer]:
-    """``peer()`` is a node that talks, ``peer("hear")`` one that also listens."""
+    """``peer()`` is a publishing node, ``peer("subscribe")`` one that also subscribes."""
     return lambda *arguments: RosPeer(ready(spawn, ROS_PEER, *arguments))
 
 

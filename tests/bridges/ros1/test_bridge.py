@@ -109,7 +109,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
 ):
     Master().set_parameter(f"{namespace}/robot_description", RRBOT.read_text())
     program(str(STATE_PUBLISHER), "_publish_frequency:=1000", "_ignore_timestamp:=true")
-    speaking, hearing = peer(), peer("hear")
+    speaking, hearing = peer(), peer("subscribe")
     carrying = bridge("--from-ros")
     probe = Transform.from_rpy("tool", "probe", (0.1, 0.0, 0.05), (0.2, -0.3, 0.4))
     identity = [0.0] * 6 + [1.0]
@@ -151,7 +151,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_says(
 
 
 def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[..., RosPeer]):
-    hearing, speaking = peer("hear"), peer()
+    hearing, speaking = peer("subscribe"), peer()
     carrying = bridge("--to-ros", "--from-ros")
     in_zstate: Counter[int] = Counter()
 
@@ -198,7 +198,7 @@ def test_what_was_carried_does_not_come_back(bridge: Bridge, peer: Callable[...,
 
 
 def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callable[..., RosPeer]):
-    hearing = peer("hear")
+    hearing = peer("subscribe")
     bridge("--to-ros")
     back = bridge("--from-ros", "--model", str(RRBOT))
     with connect() as session, StatePublisher(session, MODEL, "rrbot", takeover=True) as publisher:
@@ -215,7 +215,7 @@ def test_two_bridges_of_one_robot_do_not_play_ball(bridge: Bridge, peer: Callabl
 def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
     bridge: Bridge, peer: Callable[..., RosPeer], namespace: str
 ):
-    hearing = peer("hear")
+    hearing = peer("subscribe")
     bridge("--to-ros", "--frame-prefix", "left_")
     stamps = iter(range(1_700_000_000_123_456_789, 2**62))
     sent: set[int] = set()
