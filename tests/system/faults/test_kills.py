@@ -16,7 +16,7 @@ BOUND_S = 1.0
 
 
 def since(party: FaultProcess, heard_at: int | None) -> float:
-    """Seconds from when a process was ready until the reader had its answer."""
+    """Seconds from the readiness of a process to the first lookup of the reader."""
     assert heard_at is not None
     return max(0.0, (heard_at - party.ready_at) * 1e-9)
 
@@ -27,7 +27,7 @@ def killed(party: FaultProcess) -> int:
     return time.time_ns()
 
 
-def test_a_publisher_killed_twenty_times_is_heard_again_within_a_second(start: Start, endpoint: str):
+def test_publisher_killed_twenty_times_is_received_again_within_a_second(start: Start, endpoint: str):
     def publisher(mark: float) -> FaultProcess:
         return start(
             "publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ, mark=mark, wait=False
@@ -57,7 +57,7 @@ def test_a_publisher_killed_twenty_times_is_heard_again_within_a_second(start: S
     assert reader.query("stats")["refused"] == {}
 
 
-def test_a_router_killed_twenty_times_loses_no_latched_value_though_it_changed_meanwhile(
+def test_router_killed_twenty_times_loses_no_latched_value_changed_during_the_outage(
     start: Start, endpoint: str
 ):
     router = start("router", listen=endpoint)
@@ -67,7 +67,7 @@ def test_a_router_killed_twenty_times_loses_no_latched_value_though_it_changed_m
     before, answered, latched, silent = [], [], [], []
     for mark in range(1, ROUNDS + 1):
         killed_at = killed(router)
-        publisher.query("mark", mark)  # nobody carries it now
+        publisher.query("mark", mark)  # no router forwards it now
         router = start("router", listen=endpoint)
         silent.append((reader.query("after", "r1", killed_at) - killed_at) * 1e-9)
         answered.append(since(router, reader.query("after", "r1", router.ready_at)))
@@ -85,7 +85,7 @@ def test_a_router_killed_twenty_times_loses_no_latched_value_though_it_changed_m
     assert max(latched) < BOUND_S * SLACK
 
 
-def test_a_listener_killed_twenty_times_has_everything_within_a_second(start: Start, endpoint: str):
+def test_listener_killed_twenty_times_has_all_data_within_a_second(start: Start, endpoint: str):
     router = start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ, mark=7.0)
     witness = start("reader", session=client(endpoint))
@@ -107,7 +107,7 @@ def test_a_listener_killed_twenty_times_has_everything_within_a_second(start: St
     assert max(latched) < BOUND_S * SLACK
 
 
-def test_when_a_router_dies_its_clients_go_on_with_the_next(start: Start):
+def test_clients_of_a_killed_router_continue_with_the_next(start: Start):
     first, second = (f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2))
     both = client(first, second)
     dying = start("router", listen=first)

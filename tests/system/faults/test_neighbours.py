@@ -1,4 +1,4 @@
-"""Who is slow, frozen or one of many, and what the others notice of it."""
+"""Slow, frozen and many processes, and their effect on others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def pass_time(seconds: float) -> None:
     until(lambda: time.monotonic() >= deadline, timeout_s=seconds + 5.0)
 
 
-def test_a_writer_frozen_for_3_s_is_stale_meanwhile_and_goes_on_afterwards(start: Start, endpoint: str):
+def test_writer_frozen_for_3_s_is_stale_and_recovers(start: Start, endpoint: str):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint))
     reader = start("reader", session=client(endpoint))
@@ -50,7 +50,7 @@ def test_a_writer_frozen_for_3_s_is_stale_meanwhile_and_goes_on_afterwards(start
 
 
 @pytest.mark.parametrize("way", ["through a router", "from peer to peer"])
-def test_a_frozen_reader_holds_neither_the_writer_nor_other_readers_up(start: Start, endpoint: str, way: str):
+def test_frozen_reader_blocks_neither_the_writer_nor_other_readers(start: Start, endpoint: str, way: str):
     session = client(endpoint) if way == "through a router" else {}
     if session:
         start("router", listen=endpoint)
@@ -71,7 +71,9 @@ def test_a_frozen_reader_holds_neither_the_writer_nor_other_readers_up(start: St
     assert frozen.query("census")
 
 
-def test_a_slow_reader_loses_samples_and_the_fast_one_beside_it_none_nor_time(start: Start, endpoint: str):
+def test_slow_reader_loses_samples_and_a_fast_reader_loses_neither_samples_nor_time(
+    start: Start, endpoint: str
+):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=500.0)
     fast = start("reader", session=client(endpoint))
@@ -88,7 +90,7 @@ def test_a_slow_reader_loses_samples_and_the_fast_one_beside_it_none_nor_time(st
     assert beside / alone < 4.5  # 1.5, and as much again for a busy machine
 
 
-def test_twenty_readers_of_one_robot_get_every_sample_and_every_latched_value(start: Start, endpoint: str):
+def test_twenty_readers_of_one_robot_receive_all_samples_and_latched_values(start: Start, endpoint: str):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), mark=20.0)
     readers = [start("reader", session=client(endpoint), wait=False) for _ in range(20)]
@@ -123,7 +125,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(place)], check=True)
 
 
-def test_a_recorder_whose_disk_is_full_says_so_and_nobody_else_notices(
+def test_recorder_with_a_full_disk_reports_it_and_others_are_unaffected(
     start: Start, endpoint: str, small_disk: Path
 ):
     start("router", listen=endpoint)

@@ -1,4 +1,4 @@
-"""Writers that fight for one robot, and writers whose clock steps."""
+"""Conflicting writers of one robot, and writers with clock steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.processes
 HOUR = 3600 * 1_000_000_000
 
 
-def test_a_second_writer_in_another_process_ends_and_names_the_first_who_goes_on(start: Start, endpoint: str):
+def test_second_writer_process_ends_naming_the_first_which_continues(start: Start, endpoint: str):
     start("router", listen=endpoint)
     first = start("publisher", robot="r1", session=client(endpoint))
     reader = start("reader", session=client(endpoint))
@@ -26,7 +26,7 @@ def test_a_second_writer_in_another_process_ends_and_names_the_first_who_goes_on
     assert (stats["missed"], stats["refused"]) == (0, {})
 
 
-def test_of_two_writers_that_fight_the_newer_is_followed_and_the_others_samples_are_counted(
+def test_newer_of_two_conflicting_writers_is_used_and_samples_of_the_other_are_counted(
     start: Start, endpoint: str
 ):
     start("router", listen=endpoint)
@@ -48,7 +48,7 @@ def test_of_two_writers_that_fight_the_newer_is_followed_and_the_others_samples_
 
 
 @pytest.mark.parametrize("step", [HOUR, -HOUR, 85_000, -85_000], ids=["+1h", "-1h", "+85us", "-85us"])
-def test_a_writer_whose_clock_steps_is_heard_again_within_a_second_as_is_when_it_steps_back(
+def test_writer_with_a_clock_step_is_received_again_within_a_second_also_after_the_step_back(
     start: Start, endpoint: str, step: int
 ):
     start("router", listen=endpoint)
