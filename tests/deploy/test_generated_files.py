@@ -1,4 +1,4 @@
-"""The files of deploy/ are what its README says makes them."""
+"""The files of deploy/ are the output of the commands in its README."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def router_command(contains: str, certs: Path) -> list[str]:
     return [str(certs) if word in ("certs", "/etc/zstate/certs") else word for word in options]
 
 
-def test_the_routers_configuration(certs: Path, tmp_path):
+def test_router_configuration_is_generated_by_the_readme_command(certs: Path, tmp_path):
     acl = tmp_path / "acl.json5"
     acl.write_text(said("acl", "--robot", "r1", "--viewer", "desk"))
     options = [str(acl) if word == "acl.json5" else word for word in router_command("--acl", certs)]
@@ -43,11 +43,11 @@ def test_the_routers_configuration(certs: Path, tmp_path):
     assert made == (DEPLOY / "router.json5").read_text()
 
 
-def test_the_configuration_of_a_sites_router(certs: Path):
+def test_site_router_configuration_is_generated_by_the_readme_command(certs: Path):
     made = said(*router_command("--wan", certs)).replace(str(certs), "/etc/zstate/certs")
     assert made == (DEPLOY / "site-router.json5").read_text()
 
 
-def test_the_other_commands_of_the_readme_are_commands():
+def test_other_commands_of_the_readme_exist():
     for words in commands_in_the_readme():
         said(words[1], "--help")
