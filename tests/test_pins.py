@@ -433,9 +433,7 @@ def test_names_of_metrics_and_their_labels(spawn: Any, tmp_path: Path, free_port
     commands = {
         "router": router,
         "publish": started(spawn, "publish", RRBOT, "--source", "sine", "--metrics", "0"),
-        "monitor": started(
-            spawn, "monitor", "--robots", "--robot", "rrbot", "--metrics", "0"
-        ),
+        "monitor": started(spawn, "monitor", "--robots", "--robot", "rrbot", "--metrics", "0"),
         "record": started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0"),
         "bridge": started(spawn, "bridge", "rrbot", "--ros", endpoint, "--metrics", "0"),
     }
