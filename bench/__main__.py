@@ -17,10 +17,10 @@ from rich.table import Table
 from bench import results
 from bench.plots import PlotsMissing, write_plots
 from bench.process import ROOT
-from bench.readme import renewed
+from bench.readme import with_current_tables
 from bench.report import write_report
-from bench.run import Turn, run, seconds, turns
-from bench.scenario import FULL, QUICK, named
+from bench.run import Turn, estimated_seconds, plan_turns, run
+from bench.scenario import FULL, QUICK, select_scenarios
 from bench.subjects import NAMES, subject_named
 from bench.subjects.subject import Subject
 from bench.trial import Facts
@@ -36,13 +36,13 @@ def main() -> None:
 @main.command()
 @click.argument("names", nargs=-1, metavar="[SUBJECT]...")
 def setup(names: tuple[str, ...]) -> None:
-    """Show what is installed; install each SUBJECT that is named, by the commands shown."""
+    """Show which subjects are installed; install each named SUBJECT with the commands shown."""
     for name in names:
         for command in _subject(name).install:
             CONSOLE.print(f"[bold]$ {command}[/]", highlight=False)
-            # What is shown is what is run; it is written in this repository.
+            # The command shown is the command run; it comes from this repository.
             if subprocess.run(command, shell=True, cwd=ROOT, check=False).returncode:
-                raise click.ClickException(f"{name}: this command failed; the others were not run")
+                raise click.ClickException(f"{name}: this command failed; the commands after it were not run")
     _show_installed([subject_named(name) for name in NAMES])
 
 
@@ -64,19 +64,25 @@ def _show_installed(subjects: Sequence[Subject]) -> None:
 @click.option(
     "--quick", is_flag=True, help="A few scenarios with short windows: minutes instead of most of an hour."
 )
-@click.option("--subject", "subjects", multiple=True, metavar="NAME", help="Only this one; may be repeated.")
+@click.option(
+    "--subject", "subjects", multiple=True, metavar="NAME", help="Run only this subject; may be repeated."
+)
 @click.option(
     "--scenario",
     "words",
     multiple=True,
     metavar="NAME",
-    help="Only this one, or this group; may be repeated.",
+    help="Run only this scenario or group; may be repeated.",
 )
 @click.option(
-    "--repeat", default=1, show_default=True, type=click.IntRange(min=1), help="So many times the rounds."
+    "--repeat",
+    default=1,
+    show_default=True,
+    type=click.IntRange(min=1),
+    help="Multiply the number of rounds.",
 )
-@click.option("--seed", type=int, help="Of the order of subjects; drawn unless given.")
-@click.option("--list", "only_list", is_flag=True, help="Say what would be run, and how long that takes.")
+@click.option("--seed", type=int, help="Seed of the order of subjects; random by default.")
+@click.option("--list", "only_list", is_flag=True, help="List the runs and their total duration, then exit.")
 def run_command(
     *,
     quick: bool,
@@ -88,14 +94,15 @@ def run_command(
 ) -> None:
     """Measure, and write the report."""
     try:
-        scenarios = named(QUICK if quick else FULL, words)
+        scenarios = select_scenarios(QUICK if quick else FULL, words)
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--scenario") from None
     chosen = [_subject(name) for name in subjects or NAMES]
     seed = secrets.randbits(32) if seed is None else seed
-    planned = turns([one for one in chosen if one.python() is not None], scenarios, repeat, seed)
+    planned = plan_turns([one for one in chosen if one.python() is not None], scenarios, repeat, seed)
     CONSOLE.print(
-        f"{len(planned)} runs, about {seconds(planned) / 60:.0f} minutes, seed {seed}", highlight=False
+        f"{len(planned)} runs, about {estimated_seconds(planned) / 60:.0f} minutes, seed {seed}",
+        highlight=False,
     )
     for one in chosen:
         if one.python() is None:
@@ -105,14 +112,14 @@ def run_command(
             CONSOLE.print(f"{turn.scenario.name}  {turn.subject.name}", highlight=False)
         return
     folder = results.new_folder()
-    results.begin(folder, shlex.join(["python", "-m", "bench", *sys.argv[1:]]), chosen, scenarios, seed)
+    results.write_about(folder, shlex.join(["python", "-m", "bench", *sys.argv[1:]]), chosen, scenarios, seed)
     _run(folder, planned)
     _report(folder)
 
 
 def _run(folder: Path, planned: list[Turn]) -> None:
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    # Drawn between the runs only: a bar that moves would be measured, too.
+    # Drawn only between runs: a moving bar would be measured too.
     with Progress(*columns, console=CONSOLE, auto_refresh=False) as progress:
         task = progress.add_task("", total=len(planned))
 
@@ -122,13 +129,13 @@ def _run(folder: Path, planned: list[Turn]) -> None:
                 progress.update(task, description=what, completed=number, refresh=True)
             else:
                 progress.update(task, completed=number + 1)
-                progress.print(f"{what}: {_outcome(facts)}", highlight=False, markup=False, soft_wrap=True)
+                progress.print(f"{what}: {_summary(facts)}", highlight=False, markup=False, soft_wrap=True)
 
         run(folder, planned, show)
         progress.update(task, description="done", refresh=True)
 
 
-def _outcome(facts: Facts) -> str:
+def _summary(facts: Facts) -> str:
     if "failed" in facts:
         return f"FAILED, {facts['failed']}"
     if "whole_ms" in facts:
@@ -142,13 +149,13 @@ def _outcome(facts: Facts) -> str:
 @main.command()
 @click.argument("folder", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option(
-    "--readme", is_flag=True, help="Write the tables of README.md anew, each from the folder it names."
+    "--readme", is_flag=True, help="Rewrite the tables of README.md, each from the folder it names."
 )
 def report(*, folder: Path | None, readme: bool) -> None:
-    """Write tables and plots of a run again: the last one, or that in FOLDER."""
+    """Rewrite the tables and plots of the last run, or of the run in FOLDER."""
     if readme:
         path = ROOT / "README.md"
-        path.write_text(renewed(path.read_text(encoding="utf-8")), encoding="utf-8")
+        path.write_text(with_current_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
     else:
         _report(folder or results.newest())
 

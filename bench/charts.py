@@ -1,4 +1,4 @@
-"""The charts: each answers one question of the issue at hand, in one figure."""
+"""Charts of a benchmark run, one question each."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.drawing import label_ends, note, pen, plain_ticks, styled
-from bench.outcome import Outcome, outcomes
+from bench.aggregate import Aggregate, aggregates
+from bench.chart_rows import cpu_bar, latency_row, name_rows, rate_bar, time_axis
+from bench.drawing import add_footnote, label_ends, line_style, plain_ticks, styled
 from bench.results import Results
-from bench.rows import cpu_bar, latency_row, name_rows, rate_bar, time_axis
 from bench.scenario import Scenario
 
-# A reader that is nearer to the commanded rate than this has kept up.
+# A reader keeps up if it reaches this fraction of the commanded rate.
 KEPT_UP = 0.995
 
 Lines = Mapping[str, Sequence[tuple[float, float]]]
@@ -21,8 +21,8 @@ Lines = Mapping[str, Sequence[tuple[float, float]]]
 
 @styled
 def overview(results: Results, scenario: Scenario) -> Figure:
-    """Rate, latency and CPU of everybody in one scenario: the one for a talk."""
-    found = outcomes(results, scenario)
+    """Rate, latency and CPU of every subject in one scenario; suits a talk."""
+    found = aggregates(results, scenario)
     figure = Figure(figsize=(13.0, 1.6 + 0.42 * len(found)))
     rate, latency, cpu = figure.subplots(1, 3, sharey=True, width_ratios=(1.0, 1.25, 1.25))
     name_rows(rate, results, found)
@@ -51,21 +51,21 @@ def overview(results: Results, scenario: Scenario) -> Figure:
         fontweight="bold",
     )
     figure.tight_layout(rect=(0, 0, 1, 0.99), w_pad=2.5)
-    _sign(figure, results, "Latency: bar from p1 to p99, dark from p25 to p75, dot p50, tick p99.9.")
+    _add_source(figure, results, "Latency: bar from p1 to p99, dark from p25 to p75, dot p50, tick p99.9.")
     return figure
 
 
 @styled
 def latencies(results: Results, scenarios: Sequence[Scenario]) -> Figure | None:
-    """The distribution of latencies, a panel for each rate."""
+    """Latency distributions, one panel per rate."""
     if not scenarios:
         return None
-    names = {name: one for scenario in scenarios for name, one in outcomes(results, scenario).items()}
+    names = {name: one for scenario in scenarios for name, one in aggregates(results, scenario).items()}
     figure = Figure(figsize=(2.4 + 4.6 * len(scenarios), 1.6 + 0.42 * len(names)))
     panels = figure.subplots(1, len(scenarios), sharey=True, sharex=True, squeeze=False)[0]
     name_rows(panels[0], results, names)
     for axes, scenario in zip(panels, scenarios, strict=True):
-        found = outcomes(results, scenario)
+        found = aggregates(results, scenario)
         for row, name in enumerate(names):
             if name in found:
                 latency_row(axes, row, name, found[name])
@@ -74,7 +74,7 @@ def latencies(results: Results, scenarios: Sequence[Scenario]) -> Figure | None:
         axes.tick_params(axis="y", length=0)
         axes.set_axisbelow(True)
     figure.tight_layout(w_pad=2.5)
-    _sign(
+    _add_source(
         figure,
         results,
         "From stamp to the answer of the reader's own buffer. "
@@ -102,8 +102,8 @@ def rates(results: Results, scenarios: Sequence[Scenario]) -> Figure:
     for name in kept:
         axes.plot(
             *zip(*lines[name], strict=True),
-            color=pen(name).color,
-            marker=pen(name).marker,
+            color=line_style(name).color,
+            marker=line_style(name).marker,
             ls="",
             ms=5,
             zorder=3,
@@ -114,7 +114,7 @@ def rates(results: Results, scenarios: Sequence[Scenario]) -> Figure:
     plain_ticks(axes, "y", commanded)
     axes.grid()
     label_ends(axes, ends)
-    _sign(figure, results, f"On the line: never below {100 * KEPT_UP:g} % of the commanded rate.")
+    _add_source(figure, results, f"On the line: never below {100 * KEPT_UP:g} % of the commanded rate.")
     return figure
 
 
@@ -125,20 +125,20 @@ def cpu_by_rate(results: Results, scenarios: Sequence[Scenario]) -> Figure:
     figure = _line_chart(
         results, lines, f"CPU of all processes, % of a core: {scenarios[0].robot}", "commanded, Hz"
     )
-    _sign(figure, results, "Writer, reader, and whatever else the system needs between them.")
+    _add_source(figure, results, "Writer, reader and every other process that the system needs.")
     return figure
 
 
 @styled
 def by_joints(results: Results, scenarios: Sequence[Scenario]) -> Figure:
-    """Bytes of a sample, and CPU, against the number of joints."""
+    """Bytes per sample and CPU against the number of joints."""
     figure = Figure(figsize=(13.0, 5.0))
     left, right = figure.subplots(1, 2)
 
     def joints(scenario: Scenario) -> float:
         return float(_joints(results, scenario))
 
-    figures: tuple[tuple[Axes, str, Callable[[Outcome], float]], ...] = (
+    figures: tuple[tuple[Axes, str, Callable[[Aggregate], float]], ...] = (
         (left, "Bytes on loopback for each sample", lambda one: one.bytes_per_sample),
         (right, "CPU of all processes, % of a core", lambda one: one.cpu_total),
     )
@@ -148,10 +148,10 @@ def by_joints(results: Results, scenarios: Sequence[Scenario]) -> Figure:
     for axes, _, figure_of in figures:
         label_ends(axes, _ends(results, _lines(results, scenarios, joints, figure_of)))
     robots = ", ".join(f"{one.robot} {_joints(results, one)}" for one in sorted(scenarios, key=joints))
-    _sign(
+    _add_source(
         figure,
         results,
-        f"At {scenarios[0].rate}, one reader. Joints: {robots}. Heads of IP and TCP included.",
+        f"At {scenarios[0].rate}, one reader. Joints: {robots}. IP and TCP headers included.",
     )
     return figure
 
@@ -166,14 +166,14 @@ def by_readers(results: Results, scenarios: Sequence[Scenario]) -> Figure:
         f"CPU of all processes, % of a core: {scenarios[0].robot} at {scenarios[0].rate}",
         "readers",
     )
-    _sign(figure, results, "Each reader is a process with a buffer of its own.")
+    _add_source(figure, results, "Each reader is a process with its own buffer.")
     return figure
 
 
 @styled
 def joins(results: Results, scenario: Scenario) -> Figure:
-    """How long late joiners took, each of them a dot."""
-    found = outcomes(results, scenario)
+    """Times of late joiners, one dot each."""
+    found = aggregates(results, scenario)
     figure = Figure(figsize=(8.2, 1.5 + 0.4 * len(found)))
     axes = figure.subplots()
     name_rows(axes, results, found)
@@ -184,7 +184,7 @@ def joins(results: Results, scenario: Scenario) -> Figure:
             ls="",
             marker="o",
             ms=6,
-            color=pen(name).color,
+            color=line_style(name).color,
             alpha=0.6,
             mew=0,
         )
@@ -208,7 +208,7 @@ def joins(results: Results, scenario: Scenario) -> Figure:
     axes.grid(axis="x")
     axes.tick_params(axis="y", length=0)
     figure.tight_layout()
-    _sign(
+    _add_source(
         figure,
         results,
         f"{scenario.robot} at {scenario.rate}; from the opening of the session. The figure is the median.",
@@ -238,24 +238,24 @@ def _lines(
     results: Results,
     scenarios: Sequence[Scenario],
     x: Callable[[Scenario], float],
-    y: Callable[[Outcome], float],
+    y: Callable[[Aggregate], float],
 ) -> Lines:
-    """The points of each subject, by ascending x; only those that were measured."""
+    """The measured points of each subject, by ascending x."""
     lines: dict[str, list[tuple[float, float]]] = {}
     for scenario in sorted(scenarios, key=x):
-        for name, one in outcomes(results, scenario).items():
+        for name, one in aggregates(results, scenario).items():
             lines.setdefault(name, []).append((x(scenario), y(one)))
     return {name: lines[name] for name in results.subjects if name in lines}
 
 
 def _draw(axes: Axes, results: Results, lines: Lines) -> list[tuple[float, float, str, str]]:
     for name, points in lines.items():
-        how = pen(name)
+        style = line_style(name)
         axes.plot(
             *zip(*points, strict=True),
-            color=how.color,
-            marker=how.marker,
-            ls=how.dashes,
+            color=style.color,
+            marker=style.marker,
+            ls=style.dashes,
             mec="white",
             mew=0.8,
         )
@@ -263,7 +263,7 @@ def _draw(axes: Axes, results: Results, lines: Lines) -> list[tuple[float, float
 
 
 def _ends(results: Results, lines: Lines) -> list[tuple[float, float, str, str]]:
-    return [(*points[-1], _title(results, name), pen(name).color) for name, points in lines.items()]
+    return [(*points[-1], _title(results, name), line_style(name).color) for name, points in lines.items()]
 
 
 def _joints(results: Results, scenario: Scenario) -> int:
@@ -274,6 +274,6 @@ def _title(results: Results, name: str) -> str:
     return str(results.subjects[name]["title"])
 
 
-def _sign(figure: Figure, results: Results, text: str) -> None:
+def _add_source(figure: Figure, results: Results, text: str) -> None:
     about = results.about
-    note(figure, f"{text}\n{about['machine']}; commit {about['commit']}, {about['began'][:10]}.")
+    add_footnote(figure, f"{text}\n{about['machine']}; commit {about['commit']}, {about['began'][:10]}.")

@@ -1,4 +1,4 @@
-"""Drawing: what all plots share, so that they look like parts of one report."""
+"""Style, labels and files shared by all plots of a report."""
 
 from __future__ import annotations
 
@@ -20,37 +20,38 @@ INK, FAINT, GRID = "#222222", "#767676", "#E4E4E4"
 
 
 @dataclass(frozen=True)
-class Pen:
-    """How one subject is drawn everywhere."""
+class LineStyle:
+    """Colour, marker and dashes of one subject in every plot."""
 
     color: str
     marker: str = "o"
     dashes: str = "-"
 
 
-# Okabe and Ito's colours, which colour-blind people can tell apart; a family differs by marker and dashes.
-PENS: Mapping[str, Pen] = {
-    "zstate_peer": Pen("#0072B2"),
-    "zstate_router": Pen("#0072B2", "s", "--"),
-    "zstate_ros2": Pen("#56B4E9", "D"),
-    "zstate_mtls": Pen("#56B4E9", "^", "--"),
-    "ros1": Pen("#D55E00"),
-    "ros1_cpp": Pen("#D55E00", "s", "--"),
-    "ros1_default": Pen("#E69F00", "v"),
-    "ros2": Pen("#CC79A7"),
-    "cyclone": Pen("#009E73"),
-    "raw_zenoh": Pen("#888888"),
-    "raw_zenoh_router": Pen("#888888", "s", "--"),
+# Okabe and Ito's colours, which are distinguishable with colour blindness; members of a family differ by
+# marker and dashes.
+LINE_STYLES: Mapping[str, LineStyle] = {
+    "zstate_peer": LineStyle("#0072B2"),
+    "zstate_router": LineStyle("#0072B2", "s", "--"),
+    "zstate_ros2": LineStyle("#56B4E9", "D"),
+    "zstate_mtls": LineStyle("#56B4E9", "^", "--"),
+    "ros1": LineStyle("#D55E00"),
+    "ros1_cpp": LineStyle("#D55E00", "s", "--"),
+    "ros1_default": LineStyle("#E69F00", "v"),
+    "ros2": LineStyle("#CC79A7"),
+    "cyclone": LineStyle("#009E73"),
+    "raw_zenoh": LineStyle("#888888"),
+    "raw_zenoh_router": LineStyle("#888888", "s", "--"),
 }
-OTHER = Pen("#000000", "x")
+UNKNOWN_STYLE = LineStyle("#000000", "x")
 NEAR = 1.2
 ROLE_SHADES = (1.0, 0.62, 0.34)
-"""How dark the CPU of writer, reader and others is drawn, in the subject's colour."""
+"""Opacity of the CPU bars of writer, reader and other processes, in the subject's colour."""
 
 
-def pen(subject: str) -> Pen:
-    """A subject's pen."""
-    return PENS.get(subject, OTHER)
+def line_style(subject: str) -> LineStyle:
+    """The line style of a subject."""
+    return LINE_STYLES.get(subject, UNKNOWN_STYLE)
 
 
 STYLE: Mapping[str, object] = {
@@ -78,7 +79,7 @@ STYLE: Mapping[str, object] = {
 
 
 def styled(draw: Callable[P, F]) -> Callable[P, F]:
-    """``draw`` in our style, whatever the user's is."""
+    """Runs ``draw`` with ``STYLE``, independent of the user's matplotlib style."""
 
     @wraps(draw)
     def drawn(*arguments: P.args, **options: P.kwargs) -> F:
@@ -89,7 +90,7 @@ def styled(draw: Callable[P, F]) -> Callable[P, F]:
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """As SVG and as PNG."""
+    """Writes the figure as SVG and PNG; returns both paths."""
     paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with mpl.rc_context(STYLE):
         figure.savefig(paths[0], bbox_inches="tight", metadata={"Date": None})
@@ -97,14 +98,14 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def note(figure: Figure, text: str) -> None:
-    """What must be known to read it, small, below."""
+def add_footnote(figure: Figure, text: str) -> None:
+    """Writes a small explanation below the figure."""
     figure.text(0.0, -0.02, text, fontsize=8.5, color=FAINT, va="top", ha="left")
 
 
 def label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]], gap: float = 0.052) -> None:
-    """Each line's name at its end, moved apart where they would touch: x, y, text and colour."""
-    axes.autoscale_view()  # else the places of points are not known yet
+    """Writes each line's name at its end without overlap; ``ends`` are x, y, text and colour."""
+    axes.autoscale_view()  # otherwise the positions of points are not known yet
     to_axes = axes.transAxes.inverted()
     placed = [
         (to_axes.transform(axes.transData.transform((x, y))), text, color) for x, y, text, color in ends
@@ -135,7 +136,7 @@ def label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]], gap: f
 
 
 def spread(heights: Sequence[float], gap: float) -> list[float]:
-    """Ascending heights moved as little as needed to be ``gap`` apart, each cluster about its own mean."""
+    """Moves ascending heights to be at least ``gap`` apart, each cluster about its mean."""
     clusters: list[list[float]] = []
     for height in heights:
         clusters.append([height])
@@ -154,7 +155,7 @@ def _top(cluster: Sequence[float], gap: float) -> float:
 
 
 def plain_ticks(axes: Axes, which: str, ticks: Sequence[float], text: str = "{:g}") -> None:
-    """These ticks and no others, written out unless the one before is too near (on a logarithmic axis)."""
+    """Sets exactly these ticks; a label is omitted if it is too close to the one before on a log axis."""
     labels: list[str] = []
     last = 0.0
     for tick in ticks:

@@ -1,4 +1,4 @@
-"""Job: everything the process of a writer or a reader must know, as JSON."""
+"""The job of a writer, reader or joiner process, as JSON."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Job:
-    """One run of one subject, as each of its processes is told.
+    """One run of one subject, as sent to each of its processes.
 
     ``rows`` are joint positions [rad] or [m] in the order of ``joints``: a smooth motion that the writer
-    goes through again and again. ``base`` and ``tip`` are the ends of the question that readers answer,
-    ``links`` all links of the robot. ``rate_hz`` is 0 for as fast as possible.
+    repeats. ``base`` and ``tip`` are the target and source of the readers' lookups, ``links`` all links of
+    the robot. ``rate_hz`` is 0 for as fast as possible.
 
-    ``robots`` are all robots on the network, by name; a writer process writes those in ``mine``, one
-    ``Writer`` each. ``load`` is "none", "busy" (a thread of the reader holds the GIL) or "slow" (the
+    ``robots`` are all robots on the network, by name; a writer process publishes the robots in ``mine``, with
+    one ``Writer`` each. ``load`` is "none", "busy" (a thread of the reader holds the GIL) or "slow" (the
     reader sleeps 10 ms after each answer).
 
-    ``ports`` are free ones on loopback, for this run alone; ``folder`` is an empty one that goes with it.
+    ``ports`` are free loopback ports reserved for this run; ``folder`` is an empty temporary folder.
     """
 
     subject: str
@@ -40,20 +40,20 @@ class Job:
 
     @property
     def robot(self) -> str:
-        """The robot this writer writes; the only one, but in a fleet."""
+        """The first robot of this writer; the only one, except in a fleet."""
         return self.mine[0]
 
-    def of(self, *mine: str) -> Job:
-        """The same, for who writes these robots."""
+    def for_robots(self, *mine: str) -> Job:
+        """The same job for a writer of the robots ``mine``."""
         return replace(self, mine=mine)
 
     def to_json(self) -> str:
-        """On one line."""
+        """The job as one line of JSON."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> Job:
-        """What ``to_json`` wrote."""
+        """The job written by ``to_json``."""
         read = json.loads(text)
         rows = tuple(tuple(row) for row in read.pop("rows"))
         lists = {name: tuple(value) for name, value in read.items() if isinstance(value, list)}

@@ -1,4 +1,4 @@
-"""Markdown: tables, and numbers with as many digits as they deserve."""
+"""Markdown tables, and numbers rounded to three or four significant digits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """The lines of a table, with an empty one behind it; the first column is text, the others numbers."""
+    """The lines of a table and an empty line after it; the first column is text, the others are numbers."""
     yield _line(head)
     yield _line(["---", *["--:"] * (len(head) - 1)])
     yield from map(_line, rows)
@@ -21,7 +21,7 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def number(value: float) -> str:
-    """Three or four digits, more only before the point: 0.513, 12.3, 123.4, 12,345."""
+    """Three or four significant digits, more only before the point: 0.513, 12.3, 123.4, 12,345."""
     if abs(value) >= 1000:
         return f"{value:,.0f}"
     if abs(value) >= 100:
@@ -30,5 +30,5 @@ def number(value: float) -> str:
 
 
 def dash(value: T | None, text: Callable[[T], str]) -> str:
-    """``text(value)``, or a dash where there is none: nothing is ever filled in."""
+    """``text(value)``, or a dash if the value is None; missing values are never filled in."""
     return "-" if value is None else text(value)

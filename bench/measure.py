@@ -1,8 +1,8 @@
-"""What a process costs, seen from outside: CPU time, memory, bytes on loopback. Linux only.
+"""CPU time and memory of processes and bytes on loopback, measured from outside. Linux only.
 
-CPU time is read from each process's own clock, as ``clock_getcpuclockid(3)`` gives it: nanoseconds, of all
-its threads, also of those that have ended. Bytes and packets are those of the interface ``lo`` as a whole,
-with the heads of IP and TCP; what goes through shared memory is not seen.
+CPU time is read from the clock of each process (``clock_getcpuclockid(3)``): nanoseconds of all its threads,
+ended threads included. Bytes and packets are those of the interface ``lo`` as a whole,
+with IP and TCP headers; shared memory is not counted.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _SCHEDULED = 2
 
 
 def cpu_ns(pid: int) -> int:
-    """CPU time of a process since it began [ns]. Raises OSError when it is not there."""
+    """CPU time of a process since its start [ns]. Raises OSError if it does not exist."""
     return time.clock_gettime_ns((~pid << 3) | _SCHEDULED)
 
 
 def peak_memory_kb(pid: int) -> int:
-    """The most memory that was resident at once [kB]; 0 when the process is gone."""
+    """Peak resident memory [kB]; 0 if the process has ended."""
     try:
         lines = (PROC / str(pid) / "status").read_text().splitlines()
     except OSError:
@@ -32,8 +32,8 @@ def peak_memory_kb(pid: int) -> int:
     return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM:")), 0)
 
 
-def family(pid: int) -> list[int]:
-    """A process and all that descend from it, as of now."""
+def process_tree(pid: int) -> list[int]:
+    """A process and its current descendants."""
     children: dict[int, list[int]] = {}
     for entry in PROC.iterdir():
         if entry.name.isdigit():
@@ -47,42 +47,42 @@ def family(pid: int) -> list[int]:
 def _parent(entry: Path) -> int:
     try:
         return int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:  # it has ended meanwhile
+    except OSError:  # the process has ended since
         return 0
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """What loopback has carried since the machine started."""
+    """Loopback traffic since the machine started."""
 
     bytes: int
     packets: int
 
     @classmethod
     def now(cls) -> Traffic:
-        """What the interface has counted."""
+        """The current counters of the interface ``lo``."""
         lines = (PROC / "net" / "dev").read_text().splitlines()
         numbers = next(line.partition(":")[2].split() for line in lines if line.strip().startswith("lo:"))
         return cls(int(numbers[0]), int(numbers[1]))
 
 
 class Costs:
-    """CPU and traffic between ``begin()`` and ``end()``; ``roles`` are the processes by what they do."""
+    """CPU and traffic between ``start()`` and ``stop()``; ``roles`` are process ids by role."""
 
     def __init__(self, roles: dict[str, list[int]]) -> None:
-        # Who a service starts counts as that service.
+        # Processes started by a service count as that service.
         self._roles = {
-            role: [one for pid in pids for one in family(pid)] for role, pids in sorted(roles.items())
+            role: [one for pid in pids for one in process_tree(pid)] for role, pids in sorted(roles.items())
         }
 
-    def begin(self) -> None:
-        """The window begins."""
+    def start(self) -> None:
+        """Starts the measured window."""
         self._began = self._reading()
 
-    def end(self) -> None:
-        """The window ends."""
+    def stop(self) -> None:
+        """Ends the measured window."""
         self._ended = self._reading()
-        # Now: by the time anybody asks, some of them are gone.
+        # Read now: some processes have ended when figures() is called.
         self._peaks_kb = {pid: peak_memory_kb(pid) for pid in self._pids()}
 
     def _reading(self) -> tuple[float, dict[int, int], Traffic, float]:
@@ -93,7 +93,7 @@ class Costs:
         return (pid for pids in self._roles.values() for pid in pids)
 
     def figures(self) -> dict[str, object]:
-        """CPU of each role [% of a core], of everybody else on the machine, traffic a second, memory [MB]."""
+        """CPU per role and of the rest of the machine [% of a core], traffic per second, peak memory [MB]."""
         seconds = self._ended[0] - self._began[0]
         used = {pid: (after - self._began[1][pid]) * 1e-9 for pid, after in self._ended[1].items()}
         before, after = self._began[2], self._ended[2]
@@ -114,7 +114,7 @@ class Costs:
 
 
 def _machine_busy_s() -> float:
-    """CPU seconds that all cores together have spent on anything, in steps of 10 ms."""
+    """CPU seconds spent by all cores together, in steps of 10 ms."""
     numbers = (PROC / "stat").read_text().split("\n", 1)[0].split()[1:9]
     user, nice, system, _idle, _io, irq, soft_irq, _steal = map(int, numbers)
     return (user + nice + system + irq + soft_irq) / os.sysconf("SC_CLK_TCK")

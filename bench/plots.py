@@ -1,10 +1,10 @@
-"""The plots of a run, as SVG and PNG: which there are."""
+"""Selects and writes the plots of a run, as SVG and PNG."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from bench.outcome import find
+from bench.aggregate import find_scenarios
 from bench.results import Results
 
 ROBOT = "talos"
@@ -12,26 +12,28 @@ TALK_RATE_HZ = 1000.0
 
 
 class PlotsMissing(Exception):
-    """There is no matplotlib."""
+    """matplotlib is not installed."""
 
 
 def write_plots(results: Results) -> list[Path]:
-    """Every plot that the run has figures for, into its folder, the one for a talk first.
+    """Writes every plot that the run has figures for into its folder; the overview comes first.
 
-    Raises PlotsMissing where matplotlib is not installed.
+    Raises PlotsMissing if matplotlib is not installed.
     """
     try:
-        from bench import charts, drawing  # noqa: PLC0415 - tables can be had without matplotlib
+        from bench import charts, drawing  # noqa: PLC0415 - tables need no matplotlib
     except ImportError as error:
-        raise PlotsMissing(
-            f"there are no plots without matplotlib ({error}): pip install -e '.[robots,bench]'"
-        ) from error
-    rates = [one for one in find(results, group="rate", robot=ROBOT) if one.rate_hz]
+        raise PlotsMissing(f"plots need matplotlib ({error}): pip install -e '.[robots,bench]'") from error
+    rates = [one for one in find_scenarios(results, group="rate", robot=ROBOT) if one.rate_hz]
     talk = [one for one in rates if one.rate_hz == TALK_RATE_HZ]
-    robots = [one for group in ("rate", "robot") for one in find(results, group=group, rate_hz=100.0)]
-    readers = find(results, group="readers")
-    late = find(results, group="late")
-    single = [find(results, group="rate", robot=one.robot, rate_hz=one.rate_hz) for one in readers[:1]]
+    robots = [
+        one for group in ("rate", "robot") for one in find_scenarios(results, group=group, rate_hz=100.0)
+    ]
+    readers = find_scenarios(results, group="readers")
+    late = find_scenarios(results, group="late")
+    single = [
+        find_scenarios(results, group="rate", robot=one.robot, rate_hz=one.rate_hz) for one in readers[:1]
+    ]
     drawn = {
         "overview": charts.overview(results, talk[0]) if talk else None,
         "rates": charts.rates(results, rates) if len(rates) > 1 else None,

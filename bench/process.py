@@ -1,4 +1,4 @@
-"""Process: one that the harness has started, and ends."""
+"""Worker and service processes started and stopped by the harness."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from bench.measure import family
+from bench.measure import process_tree
 
 ROOT = Path(__file__).parents[1]
 END_WITHIN_S = 4.0
 
 
 class RunFailed(Exception):
-    """A process did not do its part; the text says which, and what it said last."""
+    """A process failed; the text names it and quotes its last output."""
 
 
 class Process:
-    """A process whose lines are heard; when it is ended, so is everything it has started.
+    """A process whose output lines are read; ``stop`` also ends all its descendants.
 
-    A worker is talked with in lines of JSON, and ends when its input does. A service is only listened to,
-    and ended by a signal.
+    A worker exchanges lines of JSON and ends when its input closes. A service only writes lines and is
+    stopped by a signal.
     """
 
     def __init__(
@@ -48,33 +48,33 @@ class Process:
             stderr=subprocess.STDOUT if is_service else subprocess.PIPE,
             text=True,
             errors="replace",
-            start_new_session=True,  # Ctrl-C is for the harness, which then ends everybody in order
+            start_new_session=True,  # Ctrl-C reaches only the harness, which stops the processes in order
         )
-        threading.Thread(target=self._hear, args=(self._process.stdout,), daemon=True).start()
+        threading.Thread(target=self._read_output, args=(self._process.stdout,), daemon=True).start()
         if not is_service:
-            threading.Thread(target=self._hear_errors, args=(self._process.stderr,), daemon=True).start()
+            threading.Thread(target=self._read_errors, args=(self._process.stderr,), daemon=True).start()
 
     @property
     def pid(self) -> int:
-        """Its number."""
+        """Process id."""
         return self._process.pid
 
-    def _hear(self, stream: IO[str]) -> None:
+    def _read_output(self, stream: IO[str]) -> None:
         for line in stream:
             self._lines.put(line.rstrip("\n"))
             if self._is_service:
                 self._last.append(line.strip())
         self._lines.put(None)
 
-    def _hear_errors(self, stream: IO[str]) -> None:
+    def _read_errors(self, stream: IO[str]) -> None:
         self._last.extend(line.strip() for line in stream)
 
-    def tell(self, **command: object) -> None:
-        """A command for a worker."""
-        self.say(json.dumps(command))
+    def send_command(self, **command: object) -> None:
+        """Sends a command to a worker."""
+        self.send_line(json.dumps(command))
 
-    def say(self, line: str) -> None:
-        """A line on its standard input."""
+    def send_line(self, line: str) -> None:
+        """Writes a line to its standard input."""
         assert self._process.stdin
         try:
             self._process.stdin.write(line + "\n")
@@ -82,16 +82,16 @@ class Process:
         except BrokenPipeError:
             raise self.failed("has ended") from None
 
-    def expect(self, event: str, within_s: float) -> dict[str, Any]:
-        """A worker's next line, which must be this event."""
+    def wait_for_event(self, event: str, within_s: float) -> dict[str, Any]:
+        """A worker's next message. Raises RunFailed if it is not ``event`` or does not arrive in time."""
         line = self._line(within_s, repr(event))
-        said: dict[str, Any] = json.loads(line)
-        if said["event"] != event:
-            raise self.failed(f"failed: {said.get('error', line)}")
-        return said
+        message: dict[str, Any] = json.loads(line)
+        if message["event"] != event:
+            raise self.failed(f"failed: {message.get('error', line)}")
+        return message
 
-    def expect_text(self, text: str, within_s: float) -> None:
-        """A service's line that contains ``text``."""
+    def wait_for_text(self, text: str, within_s: float) -> None:
+        """Waits for a service's line that contains ``text``. Raises RunFailed if none arrives in time."""
         deadline = time.monotonic() + within_s
         while text not in self._line(deadline - time.monotonic(), repr(text)):
             pass
@@ -100,19 +100,19 @@ class Process:
         try:
             line = self._lines.get(timeout=max(0.0, within_s))
         except queue.Empty:
-            raise self.failed(f"did not say {what} in time") from None
+            raise self.failed(f"did not send {what} within {within_s:.1f} s") from None
         if line is None:
-            raise self.failed(f"ended before it said {what}")
+            raise self.failed(f"ended before it sent {what}")
         return line
 
     def failed(self, why: str) -> RunFailed:
-        """The reason, with what it said last."""
-        last = f"; it said last: {' / '.join(self._last)}" if self._last else ""
+        """An error with ``why`` and the last lines of output."""
+        last = f"; its last output: {' / '.join(self._last)}" if self._last else ""
         return RunFailed(f"the {self.role} {why}{last}")
 
-    def end(self) -> None:
-        """Its input ends, then it is asked to, then it and its descendants are made to."""
-        descendants = _handles(family(self.pid)[1:])
+    def stop(self) -> None:
+        """Closes its input, then sends SIGINT, then kills it; finally kills its descendants."""
+        descendants = _handles(process_tree(self.pid)[1:])
         assert self._process.stdin
         with suppress(BrokenPipeError):
             self._process.stdin.close()
@@ -133,7 +133,7 @@ class Process:
 
 
 def _handles(pids: Sequence[int]) -> list[int]:
-    """What stands for these processes even after their numbers were given to others."""
+    """Process file descriptors, which stay valid after a process id is reused."""
     handles: list[int] = []
     for pid in pids:
         with suppress(ProcessLookupError):

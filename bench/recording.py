@@ -1,4 +1,4 @@
-"""Recording: what a process has written down, and the figures of one reader made of it."""
+"""Stamps and times recorded by a process, and the figures of one reader."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 Numbers = NDArray[np.int64]
 
 GRID = (*range(100), 99.1, 99.2, 99.3, 99.4, 99.5, 99.6, 99.7, 99.8, 99.9, 99.95, 99.99, 100)
-"""The percentiles that are kept of each distribution, so that it can be drawn later."""
+"""The percentiles stored of each distribution, for later plots."""
 
-# More robots than any scenario has.
+# Larger than the number of robots of any scenario.
 _ROBOTS = 1024
 
 
@@ -24,26 +24,26 @@ def _none() -> Numbers:
 
 @dataclass(frozen=True)
 class Window:
-    """What counts: from ``begin`` on, until just before ``end`` [ns]."""
+    """The measured half-open interval [begin, end) [ns]."""
 
     begin: int
     end: int
 
     @property
     def seconds(self) -> float:
-        """Its length [s]."""
+        """Length [s]."""
         return (self.end - self.begin) * 1e-9
 
     def holds(self, stamps: Numbers) -> NDArray[np.bool_]:
-        """Which of them are in it."""
+        """Mask of the stamps inside."""
         return (stamps >= self.begin) & (stamps < self.end)
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Samples in the order they were sent or answered: stamp [ns] and number of the robot.
+    """Samples in the order of sending or answering: stamp [ns] and robot index.
 
-    ``times`` [ns] are when they were answered. ``ticks`` is how many of the same robot were sent before.
+    ``times`` [ns] are the times of the answers; ``ticks`` count the earlier samples of the same robot.
     """
 
     stamps: Numbers
@@ -52,13 +52,13 @@ class Recording:
     ticks: Numbers = field(default_factory=_none)
 
     @classmethod
-    def of_reader(cls, folder: str, label: str) -> Recording:
-        """What a reader has left."""
+    def read_reader(cls, folder: str, label: str) -> Recording:
+        """The files of a reader."""
         return cls(*(_numbers(folder, label, name) for name in ("stamps", "robots", "times")))
 
     @classmethod
-    def of_writers(cls, folder: str, shares: dict[str, Sequence[int]]) -> Recording:
-        """What writers have left, by label, each with the numbers of the robots it wrote in turn."""
+    def read_writers(cls, folder: str, shares: dict[str, Sequence[int]]) -> Recording:
+        """The files of writers; ``shares`` maps each label to its robot indices, in sending order."""
         parts: list[tuple[Numbers, ...]] = []
         for label, mine in shares.items():
             stamps = _numbers(folder, label, "stamps")
@@ -68,7 +68,7 @@ class Recording:
         return cls(stamps, robots, ticks=ticks)
 
     def keys(self, begin: int) -> Numbers:
-        """A number for each sample, unlike that of any other stamp or robot within minutes of ``begin``."""
+        """A key per sample, unique per stamp and robot within minutes of ``begin``."""
         return (self.stamps - begin) * _ROBOTS + self.robots
 
 
@@ -77,30 +77,30 @@ def _numbers(folder: str, label: str, name: str) -> Numbers:
 
 
 def reader_figures(
-    sent: Recording, heard: Recording, window: Window, rate_hz: float
+    sent: Recording, answered: Recording, window: Window, rate_hz: float
 ) -> dict[str, float | int | list[float] | None]:
-    """How one reader did.
+    """Figures of one reader.
 
-    ``rate_hz`` is that of the answers made within the window; the others are about the samples that were
-    stamped in it: ``lost`` were never answered, ``late`` later than a period after their stamp.
+    ``rate_hz`` counts answers made within the window. The other figures count samples stamped in the window:
+    ``lost`` were never answered, ``late`` were answered more than a period after their stamp.
     """
     asked = sent.keys(window.begin)[window.holds(sent.stamps)]
-    latencies = (heard.times - heard.stamps)[window.holds(heard.stamps)] * 1e-3
+    latencies = (answered.times - answered.stamps)[window.holds(answered.stamps)] * 1e-3
     period_us = 1e6 / rate_hz if rate_hz else None
     return {
-        "rate_hz": round(rate_in(heard.times, window), 3),
+        "rate_hz": round(rate_in(answered.times, window), 3),
         "answered": len(latencies),
-        "lost": int((~np.isin(asked, heard.keys(window.begin))).sum()),
+        "lost": int((~np.isin(asked, answered.keys(window.begin))).sum()),
         "late": None if period_us is None else int((latencies > period_us).sum()),
         "latency_us": latency_grid(latencies),
     }
 
 
 def rate_in(times: Numbers, window: Window) -> float:
-    """How many a second [Hz]: from the first in the window to the first behind it, both known to the ns.
+    """Rate [Hz] from the first event in the window to the first event after it, both exact to the ns.
 
-    Their number over the window's length would be wrong by up to one, which is much where there are few.
-    Where nothing comes after the window, it is that.
+    The count divided by the window's length would be wrong by up to one event, which matters for few events;
+    it is used only if no event follows the window.
     """
     ordered = np.sort(times)
     first, after = np.searchsorted(ordered, (window.begin, window.end))
@@ -110,15 +110,15 @@ def rate_in(times: Numbers, window: Window) -> float:
 
 
 def latency_grid(latencies_us: NDArray[np.float64]) -> list[float]:
-    """The percentiles of ``GRID``, each of them a latency that was seen: so many percent are no longer."""
+    """The percentiles of ``GRID``, each an observed latency: that percentage is not larger."""
     if not latencies_us.size:
         return []
-    # 99.9 % of 1000 are 999, which floating point takes for a little more.
+    # 99.9 % of 1000 is 999; floating point yields slightly more.
     ranks = np.ceil(np.round(np.array(GRID) * latencies_us.size / 100.0, 9)).astype(int)
     grid = np.sort(latencies_us)[np.maximum(ranks, 1) - 1]
     return [round(float(value), 1) for value in grid]
 
 
 def percentile(grid: Sequence[float], percent: float) -> float:
-    """One of the percentiles that are kept."""
+    """One percentile of ``GRID``."""
     return grid[GRID.index(percent)]

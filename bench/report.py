@@ -1,4 +1,4 @@
-"""The report: all tables of a run, in Markdown, beside its raw figures."""
+"""The Markdown report of a run: all tables."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from bench.aggregate import Aggregate, aggregate, aggregates, find_scenarios
 from bench.markdown import dash, number, table
-from bench.outcome import Outcome, find, outcome, outcomes
 from bench.results import Results
 from bench.scenario import Scenario
 
@@ -17,7 +17,7 @@ RATIO_RATES = (100.0, 1000.0)
 
 
 def write_report(results: Results, plots: Sequence[Path]) -> Path:
-    """Write all tables into the results' folder, and show those plots in it that are SVG; the file."""
+    """Writes the report with all tables and the SVG plots into the results folder; returns its path."""
     path = results.folder / REPORT
     shown = [plot.name for plot in plots if plot.suffix == ".svg"]
     path.write_text("\n".join(report_lines(results, shown)) + "\n", encoding="utf-8")
@@ -25,7 +25,7 @@ def write_report(results: Results, plots: Sequence[Path]) -> Path:
 
 
 def report_lines(results: Results, plots: Sequence[str]) -> Iterator[str]:
-    """The whole report."""
+    """The lines of the report."""
     yield from _head(results)
     for plot in plots:
         yield from (f"![{plot.removesuffix('.svg')}]({plot})", "")
@@ -59,23 +59,23 @@ def _ratios(results: Results) -> Iterator[str]:
     for scenario in results.scenarios:
         if scenario.group != "rate" or scenario.rate_hz not in RATIO_RATES:
             continue
-        ours = outcome(results, REFERENCE, scenario)
+        ours = aggregate(results, REFERENCE, scenario)
         if ours is None:
             continue
         yield f"## Times zstate's figure: {scenario.robot} at {scenario.rate}"
         yield ""
-        yield "Above 1 the other has more of it: a higher rate, more latency, more CPU, more bytes."
+        yield "Above 1 the other system has more: a higher rate, more latency, more CPU, more bytes."
         yield ""
         rows = [
-            [_title(results, name), *_times(one, ours)]
-            for name, one in outcomes(results, scenario).items()
+            [_title(results, name), *_ratio_cells(one, ours)]
+            for name, one in aggregates(results, scenario).items()
             if name != REFERENCE
         ]
         yield from table(["", "rate", "p50", "p99", "CPU, all processes", "bytes"], rows)
 
 
-def _times(one: Outcome, ours: Outcome) -> list[str]:
-    figures: list[Callable[[Outcome], float | None]] = [
+def _ratio_cells(one: Aggregate, ours: Aggregate) -> list[str]:
+    figures: list[Callable[[Aggregate], float | None]] = [
         lambda at: at.rate_hz,
         lambda at: at.latency_us(50),
         lambda at: at.latency_us(99),
@@ -90,29 +90,29 @@ def _quotient(value: float | None, by: float | None) -> str:
 
 
 def _rates(results: Results) -> Iterator[str]:
-    for robot in dict.fromkeys(one.robot for one in find(results, group="rate")):
-        scenarios = find(results, group="rate", robot=robot)
+    for robot in dict.fromkeys(one.robot for one in find_scenarios(results, group="rate")):
+        scenarios = find_scenarios(results, group="rate", robot=robot)
         yield f"## Rate at the reader: {robot}"
         yield ""
-        yield "Samples a second that the reader's own buffer answered; in brackets, those that it never did."
+        yield "Samples per second answered by the reader's own buffer; in brackets, samples never answered."
         yield ""
         rows = [
-            [_title(results, name), *(_rate(outcome(results, name, one)) for one in scenarios)]
+            [_title(results, name), *(_rate(aggregate(results, name, one)) for one in scenarios)]
             for name in results.subjects
         ]
         yield from table(["commanded", *(one.rate for one in scenarios)], rows)
 
 
-def _rate(one: Outcome | None) -> str:
+def _rate(one: Aggregate | None) -> str:
     if one is None:
         return "-"
     return number(one.rate_hz) + (f" ({one.lost} of {one.sent})" if one.lost else "")
 
 
 def _costs(results: Results, title: str, group: str) -> Iterator[str]:
-    for scenario in find(results, group=group):
+    for scenario in find_scenarios(results, group=group):
         if group == "rate" and not scenario.rate_hz:
-            continue  # a latency flat out is the length of a queue
+            continue  # flat out, latency is the length of a queue
         yield f"## {title}: {scenario.robot} at {scenario.rate}"
         yield ""
         yield from table(*_cost_table(results, scenario))
@@ -122,20 +122,26 @@ def _cost_table(results: Results, scenario: Scenario) -> tuple[list[str], list[l
     head = ["", "Hz", "p50 us", "p99", "p99.9", "max", "late", "lost"]
     head += ["CPU %: writer", "reader", "others", "B/sample", "kB/s", "peak MB: writer", "reader"]
     return head, [
-        [_title(results, name), number(one.rate_hz), *_latencies(one), *_counts(one), *_spent(one)]
-        for name, one in outcomes(results, scenario).items()
+        [
+            _title(results, name),
+            number(one.rate_hz),
+            *_latency_cells(one),
+            *_count_cells(one),
+            *_cost_cells(one),
+        ]
+        for name, one in aggregates(results, scenario).items()
     ]
 
 
-def _latencies(one: Outcome) -> list[str]:
+def _latency_cells(one: Aggregate) -> list[str]:
     return [dash(one.latency_us(percent), number) for percent in (50, 99, 99.9, 100)]
 
 
-def _counts(one: Outcome) -> list[str]:
+def _count_cells(one: Aggregate) -> list[str]:
     return [dash(one.late, str), str(one.lost)]
 
 
-def _spent(one: Outcome) -> list[str]:
+def _cost_cells(one: Aggregate) -> list[str]:
     cpu, memory = one.cpu_percent(), one.memory_mb()
     others = [f"{role} {percent:.1f}" for role, percent in cpu.items() if role not in ("reader", "writer")]
     return [
@@ -153,7 +159,7 @@ def _readers(results: Results) -> Iterator[str]:
     titles = {
         "readers": "{0.readers} readers of {0.robot} at {0.rate}; their CPU is the sum",
         "busy": "A thread holds the reader's GIL: {0.robot} at {0.rate}",
-        "slow": "The reader sleeps 10 ms after each answer: {0.robot} at {0.rate}; lost: those passed over",
+        "slow": "The reader sleeps 10 ms after each answer: {0.robot} at {0.rate}; lost: samples passed over",
         "fleet": "{0.fleet} x {0.robot} at {0.rate} each, through one router, one reader of all",
     }
     for scenario in results.scenarios:
@@ -165,12 +171,12 @@ def _readers(results: Results) -> Iterator[str]:
 
 
 def _late(results: Results) -> Iterator[str]:
-    for scenario in find(results, group="late"):
+    for scenario in find_scenarios(results, group="late"):
         yield f"## Late joiners: {scenario.robot} at {scenario.rate}"
         yield ""
         yield (
-            "From the opening of the session until every link could be placed [ms], everything imported "
-            "before; and how much of that it took until the reader was made."
+            "From opening the session until every link could be placed [ms], all modules imported "
+            "before; and the part of it until the reader was created."
         )
         yield ""
         rows = [
@@ -180,7 +186,7 @@ def _late(results: Results) -> Iterator[str]:
                 *_spread(one.connections_ms),
                 str(len(one.joins_ms)),
             ]
-            for name, one in outcomes(results, scenario).items()
+            for name, one in aggregates(results, scenario).items()
         ]
         yield from table(["", "whole tree: median", "max", "made: median", "max", "joins"], rows)
 
@@ -192,11 +198,11 @@ def _spread(values: Sequence[float]) -> list[str]:
 def _correctness(results: Results) -> Iterator[str]:
     yield "## Are the answers right?"
     yield ""
-    yield "Some answers of each run beside zstate's forward kinematics of the positions that were sent."
+    yield "Some answers of each run compared with zstate's forward kinematics of the sent positions."
     yield ""
     rows: list[list[str]] = []
     for name in results.subjects:
-        poses = [one for scenario in results.scenarios for one in _poses(outcome(results, name, scenario))]
+        poses = [one for scenario in results.scenarios for one in _poses(aggregate(results, name, scenario))]
         compared = sum(one["compared"] for one in poses)
         if not compared and not any(one["errors"] for one in poses):
             continue
@@ -205,10 +211,10 @@ def _correctness(results: Results) -> Iterator[str]:
         rows.append(
             [_title(results, name), str(compared), *most, str(sum(o["errors"] for o in poses)), first]
         )
-    yield from table(["", "answers", "most m", "most rad", "errors", "the first of them"], rows)
+    yield from table(["", "answers", "most m", "most rad", "errors", "first error"], rows)
 
 
-def _poses(one: Outcome | None) -> list[dict[str, Any]]:
+def _poses(one: Aggregate | None) -> list[dict[str, Any]]:
     return [] if one is None else one.poses()
 
 

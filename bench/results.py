@@ -1,7 +1,7 @@
-"""Results: a folder of raw figures, and where they come from.
+"""A results folder: raw figures and their origin.
 
-``about.json`` says what was measured, on what and how; ``runs.jsonl`` has one line for each run, written as
-soon as it is done. Tables and plots are made of these two, and can be made again.
+``about.json`` describes the machine, subjects and scenarios; ``runs.jsonl`` has one line per run, appended as
+soon as the run is done. Tables and plots are generated from these two files only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ABOUT, RUNS = "about.json", "runs.jsonl"
 
 @dataclass(frozen=True)
 class Results:
-    """What a folder holds."""
+    """The content of a results folder."""
 
     folder: Path
     about: Facts
@@ -37,27 +37,27 @@ class Results:
 
     @classmethod
     def read(cls, folder: Path) -> Results:
-        """The folder's two files. Raises OSError, and ValueError for what is not JSON."""
+        """Reads both files. Raises OSError, or ValueError if a file is not JSON."""
         about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
         lines = (folder / RUNS).read_text(encoding="utf-8").splitlines()
         return cls(folder, about, tuple(json.loads(line) for line in lines))
 
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:
-        """Those that were run, in their order."""
+        """The scenarios of the run, in order."""
         return tuple(Scenario(**one) for one in self.about["scenarios"])
 
     @cached_property
     def subjects(self) -> dict[str, Facts]:
-        """Those that were run, by name: title, settings, versions, ``floor``."""
+        """The installed subjects by name: title, settings, versions, ``floor``."""
         return {name: one for name, one in self.about["subjects"].items() if one["installed"]}
 
     @cached_property
     def missing(self) -> dict[str, Facts]:
-        """Those that were not installed: title, ``install``."""
+        """The subjects that were not installed: title, ``install``."""
         return {name: one for name, one in self.about["subjects"].items() if not one["installed"]}
 
-    def of(self, subject: str, scenario: Scenario) -> list[Facts]:
+    def completed_runs(self, subject: str, scenario: Scenario) -> list[Facts]:
         """The runs of one subject in one scenario that did not fail."""
         name = scenario.name
         return [
@@ -67,12 +67,12 @@ class Results:
         ]
 
     def failures(self) -> list[Facts]:
-        """The runs that failed, with their reason."""
+        """The failed runs, with reasons."""
         return [run for run in self.runs if "failed" in run]
 
 
 def newest() -> Path:
-    """The folder of the last run. Raises FileNotFoundError when there was none."""
+    """The folder of the last run. Raises FileNotFoundError if there is none."""
     folders = sorted(path.parent for path in FOLDER.glob(f"*/{ABOUT}"))
     if not folders:
         raise FileNotFoundError("there are no results yet; `python -m bench run` makes some")
@@ -80,7 +80,7 @@ def newest() -> Path:
 
 
 def new_folder() -> Path:
-    """One for a run that begins now: its date and the commit."""
+    """Creates the folder of a new run, named by date and commit."""
     folder = FOLDER / f"{time.strftime('%Y-%m-%d')}-{commit()}"
     number = 1
     while folder.exists():
@@ -90,10 +90,10 @@ def new_folder() -> Path:
     return folder
 
 
-def begin(
+def write_about(
     folder: Path, command: str, subjects: Sequence[Subject], scenarios: Iterable[Scenario], seed: int
 ) -> None:
-    """Write down what is going to be measured."""
+    """Writes ``about.json`` and an empty ``runs.jsonl``."""
     chosen = tuple(scenarios)
     about = {
         "command": command,
@@ -110,8 +110,8 @@ def begin(
     (folder / RUNS).touch()
 
 
-def add(folder: Path, run: Facts) -> None:
-    """Write down one run."""
+def append_run(folder: Path, run: Facts) -> None:
+    """Appends one run to ``runs.jsonl``."""
     with (folder / RUNS).open("a", encoding="utf-8") as file:
         file.write(json.dumps(run) + "\n")
 
@@ -140,7 +140,7 @@ def _subject(subject: Subject) -> Facts:
 
 
 def commit() -> str:
-    """The commit that is checked out, with ``-dirty`` when the code of zstate or of bench differs from it."""
+    """The checked-out commit, with ``-dirty`` if the code of zstate or bench differs from it."""
     try:
         head = _git("rev-parse", "--short", "HEAD")
         changed = _git(

@@ -1,4 +1,4 @@
-"""What the processes of a run are told of a robot, and what they should answer; worked out by zstate."""
+"""A robot's motion for a run and the expected poses, computed by zstate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MODELS = {"panda": "panda", "g1": "g1", "talos": "talos_full_v2", "tiago_dual": 
 
 @dataclass(frozen=True)
 class BenchRobot:
-    """A robot, six seconds of a smooth motion, and where that puts the tip.
+    """A robot, six seconds of a smooth motion, and the resulting poses of the tip.
 
     ``rows`` (N, n_joints) [rad] or [m]; ``poses`` (N, 7) are ``base_from_tip``. The tip is the link with the
     most moving joints between it and the root, the last of them in the order of the URDF.
@@ -34,24 +34,24 @@ class BenchRobot:
 
     @property
     def moving_edges(self) -> int:
-        """How many transforms /tf has of it: its joints that move, mimics included."""
+        """Number of transforms on /tf: moving joints, mimics included."""
         return sum(joint.type != "fixed" for joint in self.model.joints)
 
 
 @lru_cache
 def bench_robot(name: str) -> BenchRobot:
-    """One of ``MODELS``. Only joints of one number each, for ROS's joint states hold no others."""
+    """One of ``MODELS``. Only joints with one coordinate, because ROS joint states hold no others."""
     model = load_model(MODELS[name])
     source, kinematics = SineSource(model), Kinematics(model)
     rows = np.array([source.read(n * ROW_NS).positions for n in range(ROWS)])
     tip = deepest_link(model)
-    place = model.links.index(tip)
-    poses = np.array([kinematics.link_poses(row)[place] for row in rows])
+    tip_row = model.links.index(tip)
+    poses = np.array([kinematics.link_poses(row)[tip_row] for row in rows])
     return BenchRobot(name, model, tip, rows, poses)
 
 
 def deepest_link(model: RobotModel) -> str:
-    """The link with the most moving joints above it; of several, the last."""
+    """The link with the most moving joints above it; if several, the last."""
     above = {joint.child: joint for joint in model.joints}
 
     def depth(link: str) -> int:

@@ -1,4 +1,4 @@
-"""The run: every subject in every scenario, in turns."""
+"""Runs every subject in every scenario, interleaved."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from bench import results
 from bench.scenario import Scenario
 from bench.subjects.subject import Subject
-from bench.trial import Facts, try_subject
+from bench.trial import Facts, run_trial
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,13 @@ class Turn:
     round: int
 
 
-def turns(subjects: Sequence[Subject], scenarios: Sequence[Scenario], repeat: int, seed: int) -> list[Turn]:
-    """Every turn, in its order.
+def plan_turns(
+    subjects: Sequence[Subject], scenarios: Sequence[Scenario], repeat: int, seed: int
+) -> list[Turn]:
+    """Every turn, in order.
 
-    Within a round of a scenario the subjects come one after the other, so that whoever is compared was
-    measured within the same minutes, in an order that is shuffled anew each time. A fleet is for those
-    subjects that can carry one.
+    Within a round of a scenario the subjects follow each other in a shuffled order, so that compared figures
+    come from the same minutes. Fleet scenarios run only subjects with ``fleet``.
     """
     order = random.Random(seed)
     return [turn for turn_set in _rounds(subjects, scenarios, repeat, order) for turn in turn_set]
@@ -37,8 +38,8 @@ def turns(subjects: Sequence[Subject], scenarios: Sequence[Scenario], repeat: in
 def _rounds(
     subjects: Sequence[Subject], scenarios: Sequence[Scenario], repeat: int, order: random.Random
 ) -> Iterator[list[Turn]]:
-    most = max((one.repeats for one in scenarios), default=0) * repeat
-    for number in range(most):
+    rounds = max((one.repeats for one in scenarios), default=0) * repeat
+    for number in range(rounds):
         for scenario in scenarios:
             if number < scenario.repeats * repeat:
                 able = [one for one in subjects if one.fleet or scenario.fleet == 1]
@@ -46,18 +47,18 @@ def _rounds(
 
 
 def run(folder: Path, planned: Sequence[Turn], on_turn: Callable[[int, Turn, Facts | None], None]) -> None:
-    """Take every turn and write down what came of it; ``on_turn`` is called before each and after it."""
+    """Runs every turn and appends its result; ``on_turn`` is called before and after each turn."""
     for number, turn in enumerate(planned):
         on_turn(number, turn, None)
         load = os.getloadavg()[0]
-        facts = try_subject(turn.subject, turn.scenario)
+        facts = run_trial(turn.subject, turn.scenario)
         head = {"subject": turn.subject.name, "scenario": turn.scenario.name, "round": turn.round}
-        results.add(folder, {**head, "turn": number, "load_before": round(load, 2), **facts})
+        results.append_run(folder, {**head, "turn": number, "load_before": round(load, 2), **facts})
         on_turn(number, turn, facts)
 
 
-def seconds(planned: Sequence[Turn]) -> float:
-    """About how long all of it takes [s]; starting a router, ROS or twenty readers takes most of it."""
+def estimated_seconds(planned: Sequence[Turn]) -> float:
+    """Estimated duration [s], dominated by starting a router, ROS or twenty readers."""
     return sum(
         3.5 + one.scenario.seconds + 0.4 * one.scenario.readers + 1.2 * one.scenario.joins for one in planned
     )

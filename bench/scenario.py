@@ -1,4 +1,4 @@
-"""Scenarios: what every subject is asked to do."""
+"""Scenarios: the workloads that every subject runs."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ FLAT_OUT = 0.0
 
 @dataclass(frozen=True)
 class Scenario:
-    """One thing to measure: a robot at a rate, and who reads it.
+    """One workload: a robot at a rate, and its readers.
 
-    ``rate_hz`` is 0 for as fast as possible; ``seconds`` is the window that counts; ``fleet`` is the number
-    of robots, written by ``writers`` processes; ``joins`` the number of late joiners. In ``repeats`` rounds
-    of its own, each with fresh processes.
+    ``rate_hz`` is 0 for as fast as possible; ``seconds`` is the measured window; ``fleet`` is the number
+    of robots, published by ``writers`` processes; ``joins`` the number of late joiners. Runs in ``repeats``
+    rounds, each with fresh processes.
     """
 
     group: Group
@@ -35,7 +35,7 @@ class Scenario:
 
     @property
     def name(self) -> str:
-        """Short, unique, fit for a command line: ``talos-1000``, ``talos-100-readers5``."""
+        """Short, unique and usable on a command line: ``talos-1000``, ``talos-100-readers5``."""
         parts = [self.robot, f"{self.rate_hz:g}" if self.rate_hz else "flat"]
         if self.readers > 1:
             parts.append(f"readers{self.readers}")
@@ -54,7 +54,7 @@ class Scenario:
 
 
 def _rates(robot: str, rates: Sequence[float], repeats: int) -> list[Scenario]:
-    """Those of 100 Hz and 1 kHz, which ratios are made of, in so many rounds."""
+    """Rate scenarios; those of 100 Hz and 1 kHz, which ratios use, run in ``repeats`` rounds."""
     return [
         Scenario(
             "rate",
@@ -78,7 +78,7 @@ FULL: tuple[Scenario, ...] = (
     Scenario("late", "talos", 100.0, joins=7),
     Scenario("fleet", "panda", 50.0, fleet=100, writers=4, seconds=8.0),
 )
-"""Everything; about three quarters of an hour with every subject installed."""
+"""All scenarios: about three quarters of an hour with every subject installed."""
 
 QUICK: tuple[Scenario, ...] = (
     Scenario("rate", "panda", 100.0, seconds=1.5),
@@ -86,11 +86,11 @@ QUICK: tuple[Scenario, ...] = (
     Scenario("rate", "talos", 1000.0, seconds=1.5),
     Scenario("late", "talos", 100.0, joins=2),
 )
-"""Enough to see that everything works, and roughly how it compares."""
+"""A functional check and a rough comparison."""
 
 
-def named(scenarios: Sequence[Scenario], words: Sequence[str]) -> tuple[Scenario, ...]:
-    """Those whose name or group is among ``words``, all without any; ValueError for a word that fits none."""
+def select_scenarios(scenarios: Sequence[Scenario], words: Sequence[str]) -> tuple[Scenario, ...]:
+    """Scenarios with a name or group in ``words``; all if empty. Raises ValueError for an unknown word."""
     known = {word for one in scenarios for word in (one.name, one.group)}
     unknown = [word for word in words if word not in known]
     if unknown:

@@ -1,12 +1,12 @@
-"""The process of one writer, one reader or one late joiner; nothing but the standard library.
+"""The process of one writer, reader or late joiner; standard library only.
 
     PYTHON -m bench.worker SUBJECT writer|reader|joiner LABEL
 
 On standard input: the job as a line of JSON, then ``{"do": "go"}``, ``{"do": "stop", ...}`` and
-``{"do": "close"}``. On standard output, as lines of JSON: ``ready`` when it is connected; ``first`` when a
-reader has an answer from every robot; ``result`` at the end; ``failed`` with the error instead of any of
-them. What was recorded is left in the job's folder as int64: ``LABEL.stamps`` (sent, or answered),
-``LABEL.times`` (when) and ``LABEL.robots``.
+``{"do": "close"}``. On standard output, as lines of JSON: ``ready`` when connected; ``first`` when a reader
+has an answer for every robot; ``result`` at the end; ``failed`` with the error instead of any of them. The
+log is written to the job's folder as int64: ``LABEL.stamps`` (sent or answered), ``LABEL.times`` (of answers)
+and ``LABEL.robots``.
 """
 
 from __future__ import annotations
@@ -31,97 +31,97 @@ NAP_S = 0.010
 CHECKS = 20
 JOIN_WITHIN_S = 20.0
 POLL_S = 0.0005
-# A writer that is behind catches up, but not for ever.
-MOST_BEHIND_NS = 50_000_000
+# A late writer catches up at most this much; then its schedule restarts.
+MAX_BEHIND_NS = 50_000_000
 
 
-class Told:
-    """The runner's side of the conversation: the job, its commands, and lines for it."""
+class RunnerConnection:
+    """The connection to the runner: job and commands from it, messages to it."""
 
     def __init__(self, commands: TextIO, out: TextIO) -> None:
-        self._said = commands
+        self._input = commands
         self._out = out
         self.job = Job.from_json(commands.readline())
-        self.ended = threading.Event()
+        self.stopped = threading.Event()
         self._commands: queue.Queue[dict[str, Any]] = queue.Queue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        threading.Thread(target=self._read_commands, daemon=True).start()
 
-    def _listen(self) -> None:
-        for line in self._said:
+    def _read_commands(self) -> None:
+        for line in self._input:
             command = json.loads(line)
             if command["do"] == "stop":
-                self.ended.set()
+                self.stopped.set()
             self._commands.put(command)
-        self.ended.set()
-        for _ in range(3):  # nobody waits for more than go, stop and close
+        self.stopped.set()
+        for _ in range(3):  # at most go, stop and close are waited for
             self._commands.put({"do": "close"})
 
     def wait_for(self, do: str) -> dict[str, Any]:
-        """The next command of that name; at the end of the input, to close."""
+        """The next command named ``do``, or ``close`` at the end of input."""
         while (command := self._commands.get())["do"] not in (do, "close"):
             pass
         return command
 
-    def say(self, event: str, **facts: object) -> None:
-        """A line for the runner."""
+    def send(self, event: str, **facts: object) -> None:
+        """Writes one message to the runner."""
         self._out.write(json.dumps({"event": event, **facts}) + "\n")
         self._out.flush()
 
 
-class Record:
-    """Stamps and times [ns], as they come; kept without objects that the collector would visit."""
+class SampleLog:
+    """Stamps, times [ns] and robot indices in arrays, which the garbage collector does not visit."""
 
     def __init__(self, job: Job) -> None:
         self.stamps, self.times, self.robots = array("q"), array("q"), array("q")
         self.complete = threading.Event()
-        self._heard: set[int] = set()
-        self._wanted = len(job.robots)
+        self._answered_robots: set[int] = set()
+        self._robot_count = len(job.robots)
         self._is_slow = job.load == "slow"
 
-    def answered(self, stamp: int, robot: int = 0) -> None:
-        """The reader's own buffer has just answered at ``stamp``."""
+    def on_answer(self, stamp: int, robot: int = 0) -> None:
+        """Records that the reader's buffer has answered at ``stamp``."""
         self.times.append(time.time_ns())
         self.stamps.append(stamp)
         self.robots.append(robot)
-        if len(self._heard) < self._wanted:
-            self._heard.add(robot)
-            if len(self._heard) == self._wanted:
+        if len(self._answered_robots) < self._robot_count:
+            self._answered_robots.add(robot)
+            if len(self._answered_robots) == self._robot_count:
                 self.complete.set()
         if self._is_slow:
             time.sleep(NAP_S)
 
     def save(self, folder: str, label: str) -> None:
-        """Leave all of it in files."""
+        """Writes the arrays to files."""
         for name in ("stamps", "times", "robots"):
             with (Path(folder) / f"{label}.{name}").open("wb") as file:
                 getattr(self, name).tofile(file)
 
-    def some(self, begin: int, end: int) -> list[tuple[int, int]]:
-        """Stamps from ``begin`` to ``end``, spread evenly, with the robot of each."""
+    def choose(self, begin: int, end: int) -> list[tuple[int, int]]:
+        """Up to ``CHECKS`` pairs of stamp and robot between ``begin`` and ``end``, spread evenly."""
         within = [n for n, stamp in enumerate(self.stamps) if begin <= stamp <= end]
         chosen = within[:: max(1, len(within) // CHECKS)][:CHECKS]
         return [(self.stamps[n], self.robots[n]) for n in chosen]
 
 
-def write(roles: Roles, told: Told, label: str) -> None:
-    """Send at the rate, from "go" to "stop"."""
-    job, record = told.job, Record(told.job)
-    writers = [roles[0](job.of(robot)) for robot in job.mine]
-    told.say("ready")
-    told.wait_for("go")
+def write(roles: Roles, runner: RunnerConnection, label: str) -> None:
+    """Sends at the rate, from ``go`` to ``stop``."""
+    job, record = runner.job, SampleLog(runner.job)
+    writers = [roles[0](job.for_robots(robot)) for robot in job.mine]
+    runner.send("ready")
+    runner.wait_for("go")
     if job.rate_hz:
-        send_at_rate(writers, job, told.ended, record.stamps)
+        send_at_rate(writers, job, runner.stopped, record.stamps)
     else:
-        send_flat_out(writers, job, told.ended, record.stamps)
+        send_flat_out(writers, job, runner.stopped, record.stamps)
     record.save(job.folder, label)
-    told.say("result")
-    told.wait_for("close")  # those who read may still be asked
+    runner.send("result")
+    runner.wait_for("close")  # readers may still look up poses
     for writer in writers:
         writer.close()
 
 
 def send_at_rate(writers: Sequence[Writer], job: Job, ended: threading.Event, stamps: array[int]) -> None:
-    """One sample of every robot at each deadline; the deadlines are absolute."""
+    """Sends one sample of every robot at each absolute deadline."""
     period_ns, rows = 1e9 / job.rate_hz, len(job.rows)
     begin, tick = time.monotonic_ns(), 0
     while not ended.is_set():
@@ -130,12 +130,12 @@ def send_at_rate(writers: Sequence[Writer], job: Job, ended: threading.Event, st
         left_ns = begin + tick * period_ns - time.monotonic_ns()
         if left_ns > 0:
             time.sleep(left_ns * 1e-9)
-        elif left_ns < -MOST_BEHIND_NS:
+        elif left_ns < -MAX_BEHIND_NS:
             begin -= round(left_ns)
 
 
 def send_flat_out(writers: Sequence[Writer], job: Job, ended: threading.Event, stamps: array[int]) -> None:
-    """One sample after the other."""
+    """Sends samples without pauses."""
     tick, rows = 0, len(job.rows)
     while not ended.is_set():
         send_all(writers, tick % rows, stamps)
@@ -143,79 +143,79 @@ def send_flat_out(writers: Sequence[Writer], job: Job, ended: threading.Event, s
 
 
 def send_all(writers: Sequence[Writer], row: int, stamps: array[int]) -> None:
-    """One sample of each robot, with a stamp of its own."""
+    """Sends one sample of each robot, each with its own stamp."""
     for writer in writers:
         stamp = time.time_ns()
         writer.send(row, stamp)
         stamps.append(stamp)
 
 
-def read(roles: Roles, told: Told, label: str) -> None:
-    """Record every answer until told to stop; then show some of them."""
-    job, record = told.job, Record(told.job)
-    reader = roles[1](job, record.answered)
-    told.say("ready")
+def read(roles: Roles, runner: RunnerConnection, label: str) -> None:
+    """Logs every answer until ``stop``; then returns some poses for comparison."""
+    job, record = runner.job, SampleLog(runner.job)
+    reader = roles[1](job, record.on_answer)
+    runner.send("ready")
     while not record.complete.wait(0.2):
-        if told.ended.is_set():
+        if runner.stopped.is_set():
             break
     else:
         if job.load == "busy":
             threading.Thread(target=spin, daemon=True).start()
-        told.say("first")
-    stop = told.wait_for("stop")
+        runner.send("first")
+    stop = runner.wait_for("stop")
     record.save(job.folder, label)
-    asked = record.some(stop.get("begin", 0), stop.get("end", 0))
-    told.say("result", poses=[(stamp, robot, pose_of(reader, stamp, robot)) for stamp, robot in asked])
+    checks = record.choose(stop.get("begin", 0), stop.get("end", 0))
+    runner.send("result", poses=[(stamp, robot, pose_of(reader, stamp, robot)) for stamp, robot in checks])
     reader.close()
 
 
 def spin() -> None:
-    """Pure Python that never waits: it gives the GIL up only when asked to, every 5 ms."""
+    """A busy loop in pure Python, which releases the GIL only at the switch interval of 5 ms."""
     count = 0
     while True:
         count += 1
 
 
 def pose_of(reader: Reader, stamp: int, robot: int) -> list[float] | str | None:
-    """What the reader's buffer says at a stamp, or its error."""
+    """The pose from the reader's buffer at a stamp, or the error text."""
     try:
         pose = reader.pose(stamp, robot)
-    except Exception as error:  # whatever a system raises belongs in the result
+    except Exception as error:  # any error of the system belongs in the result
         return f"{type(error).__name__}: {error}"
     return None if pose is None else [float(number) for number in pose]
 
 
-def join(roles: Roles, told: Told, label: str) -> None:
-    """From the opening of the session until every link has its place; everything was imported before."""
-    job = told.job
-    told.say("ready")
-    told.wait_for("go")
+def join(roles: Roles, runner: RunnerConnection, label: str) -> None:
+    """Measures from opening the session until every link has a pose; all imports come before."""
+    job = runner.job
+    runner.send("ready")
+    runner.wait_for("go")
     begin = time.monotonic()
     reader = roles[1](job, ignore)
     connected = time.monotonic()
     while not (whole := reader.has_tree()) and time.monotonic() < begin + JOIN_WITHIN_S:
         time.sleep(POLL_S)
     end = time.monotonic()
-    told.say("result", connected_s=connected - begin, whole_s=end - begin if whole else None)
+    runner.send("result", connected_s=connected - begin, whole_s=end - begin if whole else None)
     reader.close()
 
 
 def ignore(stamp: int, robot: int = 0) -> None:
-    """A late joiner's answers are not counted."""
+    """Ignores the answers of a late joiner."""
 
 
 def main() -> None:
-    """Be what the command line says."""
+    """Runs the role named on the command line."""
     name, role, label = sys.argv[1:]
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints must not come between the lines of JSON
-    told = Told(sys.stdin, out)
+    os.dup2(2, 1)  # library output must not mix with the lines of JSON
+    runner = RunnerConnection(sys.stdin, out)
     try:
         roles = subject_named(name).load()
-        {"writer": write, "reader": read, "joiner": join}[role](roles, told, label)
+        {"writer": write, "reader": read, "joiner": join}[role](roles, runner, label)
     except Exception:
         traceback.print_exc()
-        told.say("failed", error=traceback.format_exc().strip().splitlines()[-1])
+        runner.send("failed", error=traceback.format_exc().strip().splitlines()[-1])
         sys.exit(1)
 
 

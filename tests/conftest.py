@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from helpers.processes import Child, a_free_port
+from helpers.processes import Child, find_free_port
 
 from zstate.net.session import Session, connect
 
@@ -20,13 +20,13 @@ if ROOT not in sys.path:
 
 @pytest.fixture
 def free_port() -> int:
-    return a_free_port()
+    return find_free_port()
 
 
 @pytest.fixture(autouse=True)
 def rendezvous(monkeypatch: pytest.MonkeyPatch) -> str:
     """Each test, with the processes it starts, meets nobody else."""
-    address = f"127.0.0.1:{a_free_port()}"
+    address = f"127.0.0.1:{find_free_port()}"
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", address)
     for variable in ("ZENOH_CONFIG", "ZSTATE_MODE", "ZSTATE_CONNECT", "ZSTATE_LISTEN", "ZSTATE_CONFIG"):
         monkeypatch.delenv(variable, raising=False)

@@ -22,7 +22,7 @@ from urllib.request import urlopen
 import click
 import pytest
 import zenoh
-from helpers.processes import Child, again_and_again, until
+from helpers.processes import Child, repeated, until
 
 import zstate.errors
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
@@ -119,7 +119,7 @@ def talking(writer: Session, reader: Session, wire: str) -> Iterator[None]:
             publisher.publish([0.0, 0.0])
             clock.publish(1)
 
-        with again_and_again(publish):
+        with repeated(publish):
             yield
 
 
@@ -217,7 +217,7 @@ def standing_robot(wire: str = "native") -> Iterator[None]:
             session, load_model(RRBOT), "rrbot", (wire,), streams=EVERYTHING, program="driver"
         ) as publisher,
         StaticPublisher(session, "rrbot", "camera", (wire,), program="driver") as statics,
-        again_and_again(lambda: publisher.publish([0.5, -0.2], [0.1, 0.2], [1.0, 2.0])),
+        repeated(lambda: publisher.publish([0.5, -0.2], [0.1, 0.2], [1.0, 2.0])),
     ):
         statics.set(Transform("tool", "lens", (0.0, 0.0, 0.1), UPRIGHT))
         yield

@@ -7,8 +7,8 @@ from importlib import metadata, resources
 
 import pytest
 from helpers.processes import DEADLINE_S
-from helpers.recording_builder import START, S, Tale, swing
-from helpers.robots import settle
+from helpers.recording_builder import START, RecordingBuilder, S, swing_positions
+from helpers.robots import wait_for_stream_readers
 
 import zstate
 
@@ -218,7 +218,7 @@ def test_a_repr_is_one_short_line_that_tells_one_object_from_another(sessions, t
         zstate.TransformListener(sessions[1], "r1") as listener,
     ):
         statics.set(zstate.Transform("tool", "camera", (0, 0, 1), (0, 0, 0, 1)))
-        settle(sessions[0], "r1")
+        wait_for_stream_readers(sessions[0], "r1")
         publisher.publish([0.0, 0.0])
         listener.buffer.lookup("world", "camera", timeout_s=DEADLINE_S)
         watch = listener.buffer.watch("world", "camera", lambda transform: None)
@@ -238,9 +238,9 @@ def test_a_repr_is_one_short_line_that_tells_one_object_from_another(sessions, t
         assert "writes joint_states, robot_description, tf, tf_static" in repr(robot)
         watch.close()
     assert repr(publisher) == "<StatePublisher of 'r1' on native: 1 samples, closed>"
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
-        tale.joints("arm", START + S, swing(0), heard=START + S)
+        tale.joints("arm", START + S, swing_positions(0), log_time=START + S)
     with zstate.Recording(tmp_path / "r.mcap") as recording:
         assert repr(recording) == f"<Recording '{tmp_path}/r.mcap': 1 s, robots 'arm'>"
         assert repr(recording.buffer()).endswith("frames of 'arm', of a recording>")

@@ -1,7 +1,7 @@
 import threading
 
 import pytest
-from helpers.processes import Stepping
+from helpers.processes import SteppingClock
 
 from zstate.clock import SystemClock
 from zstate.errors import InvalidInput
@@ -29,7 +29,7 @@ def test_a_duration_is_a_positive_number(seconds: float):
 
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(3.0, 7.0), (1000.0, 2.5), (0.3, 100.0), (10_000.0, 0.01)])
 def test_the_kth_tick_is_k_periods_after_the_first_to_the_nanosecond(rate_hz: float, seconds: float):
-    clock = Stepping()
+    clock = SteppingClock()
     rate = Rate(rate_hz, clock, threading.Event(), seconds)
     stamps = list(rate)
     assert stamps == [5 + round(tick * SECOND / rate_hz) for tick in range(round(seconds * rate_hz))]
@@ -39,7 +39,7 @@ def test_the_kth_tick_is_k_periods_after_the_first_to_the_nanosecond(rate_hz: fl
 
 def test_a_late_tick_does_not_delay_the_next():
     late = 30_000_000
-    clock = Stepping(0, lateness={2: late})
+    clock = SteppingClock(0, lateness={2: late})
     stamps = list(Rate(100.0, clock, threading.Event(), 0.08))
     period = SECOND // 100
     # The third tick is 30 ms late; the next three follow it at once; then all is as planned.
@@ -47,7 +47,7 @@ def test_a_late_tick_does_not_delay_the_next():
 
 
 def test_after_a_long_delay_the_ticks_that_passed_are_skipped_and_counted():
-    clock = Stepping(0, lateness={1: SECOND})
+    clock = SteppingClock(0, lateness={1: SECOND})
     rate = Rate(10.0, clock, threading.Event(), 3.0)
     stamps = list(rate)
     # The tick of 0.1 s came at 1.1 s: those of 0.1 to 1.0 s are given up, that of 1.1 s is due now.
@@ -56,13 +56,13 @@ def test_after_a_long_delay_the_ticks_that_passed_are_skipped_and_counted():
 
 
 def test_ticks_and_skipped_ticks_add_up():
-    rate = Rate(10.0, Stepping(0, lateness={1: 100 * SECOND}), threading.Event(), 3.0)
+    rate = Rate(10.0, SteppingClock(0, lateness={1: 100 * SECOND}), threading.Event(), 3.0)
     list(rate)
     assert rate.report().ticks + rate.report().skipped == 30
 
 
 def test_a_clock_that_is_set_back_is_followed_at_the_same_rate():
-    clock = Stepping(1000 * SECOND)
+    clock = SteppingClock(1000 * SECOND)
     stamps = []
     for stamp in Rate(10.0, clock, threading.Event(), 1.0):
         stamps.append(stamp)
@@ -74,7 +74,7 @@ def test_a_clock_that_is_set_back_is_followed_at_the_same_rate():
 
 def test_stop_ends_the_rate_and_the_report_has_its_ticks():
     stop = threading.Event()
-    rate = Rate(10.0, Stepping(), stop)
+    rate = Rate(10.0, SteppingClock(), stop)
     for number, _ in enumerate(rate, 1):
         if number == 4:
             stop.set()
@@ -82,7 +82,7 @@ def test_stop_ends_the_rate_and_the_report_has_its_ticks():
 
 
 def test_a_report_before_the_second_tick_has_rate_zero():
-    rate = Rate(10.0, Stepping(), threading.Event(), 0.1)
+    rate = Rate(10.0, SteppingClock(), threading.Event(), 0.1)
     assert rate.report().rate_hz == 0.0
     list(rate)
     assert (rate.report().rate_hz, rate.report().ticks) == (0.0, 1)

@@ -1,4 +1,4 @@
-"""The README is executed: each of its blocks runs here, or in .ci/run."""
+"""The README's blocks run here or in .ci/run; files named in docs/architecture.md exist."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from zstate import TransformListener, connect
 
 pytestmark = pytest.mark.processes
 
-README = Path(__file__).parent.parent / "README.md"
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
 TEXT = README.read_text()
 
 
@@ -28,7 +29,7 @@ PROGRAMS = {block.split("\n", 1)[0].removeprefix("# "): block for block in block
 
 
 def commands(section: str) -> list[list[str]]:
-    """Every ``$ zstate ...`` line of a section, without its comment."""
+    """Every ``$ zstate ...`` line of a section, without comments."""
     text = TEXT.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     lines = [line for block in blocks("console", text) for line in block.splitlines()]
     return [line.split("#")[0].split()[1:] for line in lines]
@@ -50,11 +51,11 @@ def start() -> Iterator[Callable[[list[str]], subprocess.Popen[str]]]:
         process.communicate()
 
 
-def test_every_python_block_is_a_named_program_that_is_run_below() -> None:
+def test_every_python_block_is_a_program_tested_here() -> None:
     assert set(PROGRAMS) == {"publish.py", "lookup.py", "driver.py", "buffer.py", "recording.py"}
 
 
-def test_the_publisher_and_the_lookup_find_each_other_in_two_processes(
+def test_publisher_and_lookup_connect_from_two_processes(
     spawn: Callable[..., Child],
 ) -> None:
     spawn(PROGRAMS["publish.py"])
@@ -63,7 +64,7 @@ def test_the_publisher_and_the_lookup_find_each_other_in_two_processes(
     assert lookup.wait() == 0, lookup.stderr
 
 
-def test_the_publisher_has_twelve_lines_and_the_lookup_five() -> None:
+def test_publisher_has_twelve_lines_and_lookup_five() -> None:
     def lines_of(name: str) -> int:
         return sum(1 for line in PROGRAMS[name].splitlines() if line.strip() and not line.startswith("#"))
 
@@ -71,20 +72,22 @@ def test_the_publisher_has_twelve_lines_and_the_lookup_five() -> None:
     assert lines_of("lookup.py") <= 5
 
 
-def test_the_driver_keeps_its_rate(spawn: Callable[..., Child]) -> None:
+def test_driver_keeps_its_rate(spawn: Callable[..., Child]) -> None:
     driver = spawn(PROGRAMS["driver.py"])
     assert "commanded_hz=500.0" in driver.line()
     assert driver.wait() == 0, driver.stderr
 
 
-def test_the_buffer_answers_without_a_network(spawn: Callable[..., Child]) -> None:
+def test_buffer_works_without_a_network(spawn: Callable[..., Child]) -> None:
     buffer = spawn(PROGRAMS["buffer.py"])
     assert "500.0 ms after the newest sample of 'map' -> 'base'" in buffer.line()
     assert buffer.wait() == 0, buffer.stderr
 
 
 @pytest.mark.robots
-def test_the_three_terminals_show_the_hand(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
+def test_three_terminals_print_the_pose_of_the_hand(
+    start: Callable[[list[str]], subprocess.Popen[str]],
+) -> None:
     joints, publish, tf = commands("Three terminals")
     first, second, third = start(joints), start(publish), start(tf)
     lines: list[str] = []
@@ -101,14 +104,14 @@ def test_the_three_terminals_show_the_hand(start: Callable[[list[str]], subproce
 
 
 @pytest.mark.robots
-def test_the_view_with_sliders_tells_its_address(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
+def test_view_with_sliders_prints_its_address(start: Callable[[list[str]], subprocess.Popen[str]]) -> None:
     _, sliders, _ = commands("See it")
     view = start([*sliders, "--port", "0"])
     assert view.stdout is not None
     assert view.stdout.readline().startswith("the view is at http://127.0.0.1:")
 
 
-def test_the_commands_for_routers_work_with_this_host_in_place_of_another(
+def test_router_commands_work_with_this_host_as_the_other(
     start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
 ) -> None:
     router, publish, tf = (
@@ -126,7 +129,7 @@ def test_the_commands_for_routers_work_with_this_host_in_place_of_another(
 
 
 @pytest.mark.robots
-def test_the_commands_for_ros_work_at_any_router(
+def test_ros_commands_work_with_another_router_address(
     start: Callable[[list[str]], subprocess.Popen[str]], free_port: int
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port}"
@@ -142,7 +145,7 @@ def test_the_commands_for_ros_work_at_any_router(
 
 
 @pytest.mark.robots
-def test_a_recording_is_made_described_asked_and_played_again(
+def test_recording_commands_record_describe_look_up_and_replay(
     start: Callable[[list[str]], subprocess.Popen[str]],
     spawn: Callable[..., Child],
     tmp_path: Path,
@@ -157,16 +160,16 @@ def test_a_recording_is_made_described_asked_and_played_again(
     robot.wait(DEADLINE_S)
     described = start(info)
     assert "panda" in described.communicate(timeout=DEADLINE_S)[0]
-    asked = spawn(PROGRAMS["recording.py"])
-    assert asked.line().startswith("<pose of panda_hand in panda_link0 at ")
-    assert asked.line() == "(1000, 7)"
-    assert asked.wait() == 0, asked.stderr
+    lookup = spawn(PROGRAMS["recording.py"])
+    assert lookup.line().startswith("<pose of panda_hand in panda_link0 at ")
+    assert lookup.line() == "(1000, 7)"
+    assert lookup.wait() == 0, lookup.stderr
     replayed = start(replay)
     assert replayed.wait(DEADLINE_S) == 0, replayed.communicate()[1]
 
 
 @pytest.mark.robots
-def test_the_robots_of_the_picture_stand_in_their_hall(
+def test_robots_of_the_picture_are_published_in_the_hall(
     start: Callable[[list[str]], subprocess.Popen[str]],
 ) -> None:
     (command,) = re.findall(r"`(zstate up docs/\S+)`", TEXT)
@@ -179,10 +182,20 @@ def test_the_robots_of_the_picture_stand_in_their_hall(
     assert hall.wait(DEADLINE_S) == 130, hall.communicate()[1]
 
 
-def test_every_command_of_the_table_exists() -> None:
+def test_every_command_named_exists() -> None:
     named = set(re.findall(r"`zstate (\w+)", TEXT))
     listed = subprocess.run(
         [sys.executable, "-m", "zstate", "--help"], capture_output=True, text=True, check=True
     ).stdout
     known = set(re.findall(r"^  (\w+) ", listed, re.MULTILINE))
     assert named <= known, named - known
+
+
+def test_every_file_named_in_the_architecture_page_exists() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    named = set(re.findall(r"`((?:\w+/)*\w+\.(?:py|c)|(?:\w+/)+)`", text))
+    assert len(named) > 50
+    assert (
+        sorted(name for name in named if not any((top / name).exists() for top in (ROOT / "zstate", ROOT)))
+        == []
+    )

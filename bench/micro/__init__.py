@@ -1,1 +1,1 @@
-"""One operation at a time, in one process."""
+"""Micro benchmarks: one operation each."""

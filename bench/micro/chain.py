@@ -3,14 +3,14 @@
     python -m bench.micro.chain [--robot panda] [--rates 50 100 500 1000] [--seconds 10]
 
 For each rate a fresh publisher process runs ``StatePublisher.run`` with a sine, and a fresh reader
-process follows it in one of two ways:
+process listens in one of two ways:
 
-- ``awake``: woken by every sample, it looks the tip up at that instant. Latency is from the stamp that
-  the publisher gave the sample to the moment the answer is in hand;
-- ``idle``: it looks the tip up once a second, which is what most programs do.
+- ``awake``: woken by every sample, it looks up the tip at that instant. Latency is measured from the stamp of
+  the sample to the return of the lookup;
+- ``idle``: it looks up the tip once a second, as most programs do.
 
-CPU is the process's own (all threads) over the measured window, in % of one core; the window begins
-when the reader has its first answer.
+CPU is the process's own (all threads) over the measured window, in % of one core; the window starts
+with the first answer of the reader.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.micro.others import free_port
+from bench.micro.processes import free_port
 from zstate import SineSource, StatePublisher, TransformListener, connect, load_model
 
 SETTLE_S = 1.0
@@ -63,11 +63,11 @@ def _run(options: argparse.Namespace, rate: float, role: str) -> list[str]:
     command += ["--rates", str(rate), "--seconds", str(options.seconds), "--role"]
     reader = subprocess.Popen([*command, role], env=environment, stdout=subprocess.PIPE, text=True)
     publisher = subprocess.Popen([*command, "publisher"], env=environment, stdout=subprocess.PIPE, text=True)
-    sent, heard = (json.loads(process.communicate()[0]) for process in (publisher, reader))
+    sent, received = (json.loads(process.communicate()[0]) for process in (publisher, reader))
     error = 100.0 * (sent["rate_hz"] / rate - 1.0)
     row = [f"{rate:g}", role, f"{sent['rate_hz']:.3f}", f"{error:+.4f}", f"{sent['cpu']:.1f}"]
-    row += [f"{heard['cpu']:.1f}", _or_dash(heard["p50_us"]), _or_dash(heard["p99_us"])]
-    return [*row, str(heard["lost"])]
+    row += [f"{received['cpu']:.1f}", _or_dash(received["p50_us"]), _or_dash(received["p99_us"])]
+    return [*row, str(received["lost"])]
 
 
 def _or_dash(value: float | None) -> str:

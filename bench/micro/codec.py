@@ -1,12 +1,12 @@
-"""What it costs to write and to read ROS 2's messages, beside rosbags.
+"""Cost of encoding and decoding ROS 2 messages, compared with rosbags.
 
     pip install rosbags
     python -m bench.micro.codec
 
 A JointState of 30 joints, positions only and with velocities and efforts, and a TFMessage of 40 edges.
-Each side starts from what it keeps its numbers in and ends there: zstate in blocks of float64, rosbags in
-message objects, made once and not counted. Thread CPU time [us] per call in rounds that take turns; both
-sides' bytes are compared first. "first" is zstate reading a message unlike any before it, value by value.
+Each side starts and ends with its own representation: zstate with blocks of float64, rosbags with message
+objects, created once and not counted. Thread CPU time [us] per call in interleaved rounds; the bytes of both
+sides are compared first. "first" is zstate decoding a message of a new layout, value by value.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ Call = Callable[[], object]
 
 
 def header(frame_id: str) -> Any:
-    """A header of rosbags at the stamp."""
+    """A rosbags header at the stamp."""
     stamp = STORE.types["builtin_interfaces/msg/Time"](*to_time(STAMP))
     return STORE.types["std_msgs/msg/Header"](stamp, frame_id)
 
 
 def rosbags_calls(name: str, message: Any, payload: bytes) -> dict[str, Call]:
-    """The calls of rosbags for a message whose bytes are ``payload``."""
+    """The rosbags calls for a message with the bytes ``payload``."""
     assert bytes(STORE.serialize_cdr(message, name)) == payload
     return {
         "rosbags encode": lambda: STORE.serialize_cdr(message, name),
@@ -50,8 +50,8 @@ def rosbags_calls(name: str, message: Any, payload: bytes) -> dict[str, Call]:
     }
 
 
-def of_joints(count: int, rows: int) -> dict[str, Call]:
-    """What is compared, for positions and ``rows - 1`` more numbers for each joint."""
+def joint_state_calls(count: int, rows: int) -> dict[str, Call]:
+    """The compared calls for a JointState with ``rows`` numbers per joint, positions first."""
     names = [f"left_arm_joint_{number}" for number in range(count)]
     arrays = np.random.default_rng(1).normal(size=(rows, count))
     blocks = [to_block(array) for array in arrays]
@@ -67,8 +67,8 @@ def of_joints(count: int, rows: int) -> dict[str, Call]:
     } | rosbags_calls(JOINT_STATE.name, message, payload)
 
 
-def of_edges(count: int) -> dict[str, Call]:
-    """What is compared, for transforms of one instant."""
+def tf_message_calls(count: int) -> dict[str, Call]:
+    """The compared calls for a TFMessage of one instant."""
     edges = tuple(pairwise(f"link_number_{number}" for number in range(count + 1)))
     poses = np.random.default_rng(1).normal(size=(count, 7))
     block = to_block(poses)
@@ -86,7 +86,7 @@ def of_edges(count: int) -> dict[str, Call]:
 
 
 def stamped(parent: str, child: str, pose: np.ndarray) -> Any:
-    """A transform of rosbags."""
+    """A rosbags TransformStamped."""
     x, y, z, *rotation = pose.tolist()
     transform = STORE.types["geometry_msgs/msg/Transform"](
         STORE.types["geometry_msgs/msg/Vector3"](x, y, z),
@@ -115,25 +115,25 @@ def main() -> None:
     print(f"{platform.machine()}; {ROUNDS} rounds of {CALLS} calls, us of thread CPU time, median (minimum)")
     print(f"{'message':<26}{'does':<8}{'zstate':>16}{'rosbags':>18}{'ratio':>7}{'first':>18}")
     cases = {
-        "30 joints, positions": of_joints(30, 1),
-        "30 joints, all three": of_joints(30, 3),
-        "40 edges": of_edges(40),
-        "1 edge": of_edges(1),
+        "30 joints, positions": joint_state_calls(30, 1),
+        "30 joints, all three": joint_state_calls(30, 3),
+        "40 edges": tf_message_calls(40),
+        "1 edge": tf_message_calls(1),
     }
     for what, calls in cases.items():
         times = measure(calls)
         for does in ("encode", "decode"):
             ours, theirs = times[does], times[f"rosbags {does}"]
             ratio = float(np.median(theirs) / np.median(ours))
-            first = spread(times["first"]) if does == "decode" else ""
+            first = median_and_minimum(times["first"]) if does == "decode" else ""
             print(
-                f"{what:<26}{does:<8}{spread(ours):>16}{spread(theirs):>18}{ratio:>7.1f}{first:>18}",
+                f"{what:<26}{does:<8}{median_and_minimum(ours):>16}{median_and_minimum(theirs):>18}{ratio:>7.1f}{first:>18}",
                 flush=True,
             )
 
 
-def spread(times: np.ndarray) -> str:
-    """The median, and the minimum behind it."""
+def median_and_minimum(times: np.ndarray) -> str:
+    """The median, and the minimum in brackets."""
     return f"{np.median(times):.2f} ({times.min():.2f})"
 
 

@@ -1,11 +1,11 @@
-"""What a tick of forward kinematics costs, beside reading Pinocchio pose by pose.
+"""Cost of one forward-kinematics call, compared with reading Pinocchio pose by pose.
 
     python -m bench.micro.kinematics
 
-Figures are medians over rounds of CPU time of the measuring thread, per call, checks of the input
-included on our side and left out on the other; the ways take turns within each round, so that a slow
-moment hits all of them. Needs example-robot-data. A loop in C++, or one that keeps Pinocchio's matrices,
-would cost less than the loop shown here.
+Figures are medians over rounds of thread CPU time per call. zstate's calls include input checks, the
+Pinocchio loop has none. The cases are interleaved within each round, so that a slow moment affects all of
+them. Needs example-robot-data. A loop in C++, or one that keeps Pinocchio's matrices, would cost less than
+this loop.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CALLS = 100
 
 
 def pose_by_pose(model: RobotModel) -> Callable[[], np.ndarray]:
-    """Forward kinematics by Pinocchio, and each link's pose read by its documented calls."""
+    """Forward kinematics by Pinocchio, reading each link's pose with its documented calls."""
     robot = pin.buildModelFromXML(model.urdf.removeprefix("\ufeff").strip(), False)
     data, q = robot.createData(), pin.neutral(robot)
     frames = [robot.getFrameId(link, pin.BODY) for link in model.links]
@@ -44,8 +44,8 @@ def pose_by_pose(model: RobotModel) -> Callable[[], np.ndarray]:
     return tick
 
 
-def ways(model: RobotModel) -> dict[str, Callable[[], np.ndarray]]:
-    """What is compared, by name."""
+def cases(model: RobotModel) -> dict[str, Callable[[], np.ndarray]]:
+    """The compared calls by name."""
     kinematics, positions = Kinematics(model), model.neutral + 0.1
     edges, links = np.empty((len(model.joints), 7)), np.empty((len(model.links), 7))
     return {
@@ -64,7 +64,7 @@ def cpu_us(call: Callable[[], np.ndarray]) -> float:
 
 
 def measure(calls: dict[str, Callable[[], np.ndarray]]) -> dict[str, float]:
-    """The median cost of each way [us]."""
+    """The median cost of each case [us]."""
     for call in calls.values():
         cpu_us(call)
     rounds = [{name: cpu_us(call) for name, call in calls.items()} for _ in range(ROUNDS)]
@@ -79,7 +79,7 @@ def main() -> None:
     print(f"{'loop/edge':>11}{'loop/link':>11}")
     for name in ROBOTS:
         model = load_model(name)
-        cost = measure(ways(model))
+        cost = measure(cases(model))
         print(f"{name:<15}{len(model.links):>6}{model.position_count:>8}", end="")
         print(f"{cost['edge_poses']:>12.1f}{cost['link_poses']:>12.1f}{cost['loop']:>8.1f}", end="")
         print(f"{cost['loop'] / cost['edge_poses']:>11.1f}{cost['loop'] / cost['link_poses']:>11.1f}")

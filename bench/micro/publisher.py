@@ -1,11 +1,11 @@
-"""What one tick of a publisher costs: positions to bytes handed to Zenoh.
+"""Cost of one publisher tick: positions to bytes passed to Zenoh.
 
     python -m bench.micro.publisher
 
 Thread CPU time of ``StatePublisher.publish`` for robots of several sizes, in interleaved rounds, with a
-reader on loopback that takes the samples: without and with velocities, and with the ``tf`` stream read
-as well. Medians and 99th percentiles in us. The put of ready bytes on a bare Zenoh publisher is the floor.
-Each call comes after a pause, as in a control loop: back to back they cost less.
+reader on loopback: without and with velocities, and with a reader of the ``tf`` stream.
+Medians and 99th percentiles in us. The put of ready bytes on a plain Zenoh publisher is the floor.
+Each call follows a pause, as in a control loop: back to back they cost less.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def measure(model: RobotModel, name: str) -> dict[str, list[float]]:
-    """Thread CPU times [us] of each way to tick."""
+    """Thread CPU times [us] of each case."""
     reading = SineSource(model).read(time.time_ns())
     payload = bytes(54 + 8 * model.position_count)
     with connect() as session, connect() as other, StatePublisher(session, model, name) as publisher:
@@ -55,7 +55,7 @@ def measure(model: RobotModel, name: str) -> dict[str, list[float]]:
 
 
 def interleaved(cases: dict[str, Callable[[], object]]) -> dict[str, list[float]]:
-    """Thread CPU times [us] of each call, the cases taking turns."""
+    """Thread CPU times [us] of each call, cases interleaved."""
     times: dict[str, list[float]] = {what: [] for what in cases}
     for _ in range(ROUNDS):
         for what, tick in cases.items():

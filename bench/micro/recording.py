@@ -1,12 +1,12 @@
-"""What a recording costs, and how late a replay is.
+"""Cost of recording and lateness of replay.
 
     python -m bench.micro.recording [--robots panda talos] [--seconds 10]
 
-For each robot another process publishes a sine at 100 Hz, all streams. First two bare subscriptions take
-what it says, then a recorder: CPU of this process for each tick, which is a joint state and the transforms
-of all moving edges, written as ROS 2's messages, compressed, flushed twice a second. Then the recording is
-replayed at its rate: how late its samples are by the recording's clock, beside a loop that does nothing but
-sleep until the next is due.
+For each robot another process publishes a sine at 100 Hz, all streams. First two plain subscriptions receive
+the samples, then a recorder: CPU of this process per tick, which is a joint state and the transforms of all
+moving edges, written as ROS 2 messages, compressed, flushed twice a second. Then the recording is replayed at
+its rate: lateness of the samples by the recording's clock, compared with a loop that only sleeps until the
+next sample is due.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.micro.others import meet_nobody_else, running
+from bench.micro.processes import running_command, use_own_rendezvous
 from zstate import connect
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber
@@ -37,60 +37,62 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=["panda", "talos"])
     parser.add_argument("--seconds", type=float, default=10.0)
     options = parser.parse_args()
-    meet_nobody_else()
+    use_own_rendezvous()
     for robot in options.robots:
         measure(robot, options.seconds)
 
 
 def measure(robot: str, seconds: float) -> None:
-    """Print the lines of one robot."""
+    """Prints the lines of one robot."""
     with tempfile.TemporaryDirectory() as folder, connect() as session:
         path = Path(folder) / "run.mcap"
-        with running("publish", robot, "--source", "sine", "--rate", f"{RATE_HZ:g}"):
-            bare_ms = bare_cost(session, robot, seconds)
+        with running_command("publish", robot, "--source", "sine", "--rate", f"{RATE_HZ:g}"):
+            subscription_ms = subscription_cost(session, robot, seconds)
             recorder_ms, size = recorder_cost(session, robot, path, seconds)
         print(f"{robot}, {RATE_HZ:g} Hz: recorder {recorder_ms:.3f} ms CPU a tick, {size:.0f} bytes a tick")
-        print(f"  two bare subscriptions: {bare_ms:.3f} ms CPU a tick")
+        print(f"  two plain subscriptions: {subscription_ms:.3f} ms CPU a tick")
         with Player(session, path) as replayer:
             report = replayer.run()
-        print(late("replay", np.array([report.lateness_p50, report.lateness_p99, report.lateness_max])))
-        print(late("a sleep loop", np.quantile(asleep(path), (0.5, 0.99, 1.0))), flush=True)
+        print(
+            lateness_line("replay", np.array([report.lateness_p50, report.lateness_p99, report.lateness_max]))
+        )
+        print(lateness_line("a sleep loop", np.quantile(sleep_lateness(path), (0.5, 0.99, 1.0))), flush=True)
 
 
-def bare_cost(session: Session, robot: str, seconds: float) -> float:
-    """CPU [ms] of a tick for who only takes the bytes."""
+def subscription_cost(session: Session, robot: str, seconds: float) -> float:
+    """CPU [ms] per tick of two subscriptions that only receive the bytes."""
     counts = {"joint_states": 0, "tf": 0}
 
     def count(stream: str) -> StreamSubscriber:
-        def take(arrivals: list[object]) -> None:
+        def on_samples(arrivals: list[object]) -> None:
             counts[stream] += len(arrivals)
 
-        return StreamSubscriber(session, f"zstate/{robot}/{stream}", take)
+        return StreamSubscriber(session, f"zstate/{robot}/{stream}", on_samples)
 
     with count("joint_states"), count("tf"):
-        return cpu_of(lambda: counts["tf"], seconds)
+        return cpu_per_tick(lambda: counts["tf"], seconds)
 
 
 def recorder_cost(session: Session, robot: str, path: Path, seconds: float) -> tuple[float, float]:
-    """CPU [ms] and bytes of a tick of a recorder."""
+    """CPU [ms] and bytes per tick of a recorder."""
     with Recorder(session, path) as recorder:
-        cost = cpu_of(lambda: recorder.stats.messages.get((robot, "tf"), 0), seconds)
+        cost = cpu_per_tick(lambda: recorder.stats.messages.get((robot, "tf"), 0), seconds)
     stats = recorder.stats
     if stats.missed or stats.dropped or stats.refused:
         print(f"  missed {stats.missed}, dropped {stats.dropped}, refused {dict(stats.refused)}")
     return cost, stats.bytes / stats.messages[robot, "tf"]
 
 
-def cpu_of(ticks: Callable[[], int], seconds: float) -> float:
-    """CPU [ms] of this process for each of the ``ticks`` of so many seconds."""
+def cpu_per_tick(ticks: Callable[[], int], seconds: float) -> float:
+    """CPU [ms] of this process per tick, over ``seconds``."""
     time.sleep(SETTLE_S)
     began, before = time.process_time(), ticks()
     time.sleep(seconds)
     return 1e3 * (time.process_time() - began) / (ticks() - before)
 
 
-def asleep(path: Path) -> np.ndarray:
-    """How late [ns] each joint state is for who sleeps until it is due."""
+def sleep_lateness(path: Path) -> np.ndarray:
+    """Lateness [ns] of each joint state in a loop that sleeps until it is due."""
     with RecordingReader(path) as reader:
         due = np.array([record.log_time for record in reader.records(["/joint_states"])])
     lateness = np.empty(len(due), dtype=np.int64)
@@ -101,7 +103,7 @@ def asleep(path: Path) -> np.ndarray:
     return lateness
 
 
-def late(what: str, quantiles_ns: np.ndarray) -> str:
+def lateness_line(what: str, quantiles_ns: np.ndarray) -> str:
     """One line of the table."""
     p50, p99, most = quantiles_ns * 1e-6
     return f"  {what} at 1x is late by {p50:.2f} ms median, {p99:.2f} p99, {most:.2f} at most"

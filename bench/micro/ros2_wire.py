@@ -1,12 +1,12 @@
-"""What speaking to ROS 2 costs: a JointState of 30 joints from arrays to bytes handed to Zenoh, and back.
+"""Cost of the ROS 2 wire: a JointState of 30 joints from arrays to bytes passed to Zenoh, and back.
 
     python -m bench.micro.ros2_wire
 
-Thread CPU time [us] in interleaved rounds: medians, 99th percentiles, and what the median is above the put
-of the same bytes on a bare Zenoh publisher, as a difference and as a ratio. Somebody on loopback reads all
-of it. Each write comes after a pause, as in a control loop, and once more back to back. Reading is measured
-without a network: from payload and attachment to a message, and on into a listener's buffer. The native
-wire does the same beside it.
+Thread CPU time [us] in interleaved rounds: medians, 99th percentiles, and the difference and ratio of the
+median to the put of the same bytes on a plain Zenoh publisher, with a reader on loopback. Each write follows
+a pause, as in a control loop, and is repeated back to back. Reading is measured without a network: from
+payload and attachment to a message, and on into a listener's buffer. The native wire is measured in the same
+way.
 """
 
 from __future__ import annotations
@@ -51,43 +51,43 @@ def main() -> None:
         for wire in ("ros2", "native"):
             for pause_s in (PAUSE_S, 0.0):
                 how = "after a pause" if pause_s else "back to back"
-                show(f"{wire}, writing {how}", interleaved(writing(wire, session, model), pause_s))
-            show(f"{wire}, reading", interleaved(reading(wire, model), 0.0))
+                print_table(f"{wire}, writing {how}", interleaved(write_cases(wire, session, model), pause_s))
+            print_table(f"{wire}, reading", interleaved(read_cases(wire, model), 0.0))
         reader.undeclare()
 
 
 def chain(joints: int) -> RobotModel:
-    """A robot of hinges in a row."""
+    """A chain of revolute joints."""
     links = "".join(f'<link name="link_{number}"/>' for number in range(joints + 1))
-    hinges = "".join(
+    revolute = "".join(
         f'<joint name="left_arm_joint_{number}" type="continuous"><parent link="link_{number}"/>'
         f'<child link="link_{number + 1}"/><axis xyz="0 0 1"/></joint>'
         for number in range(joints)
     )
-    return load_model(f'<robot name="chain">{links}{hinges}</robot>')
+    return load_model(f'<robot name="chain">{links}{revolute}</robot>')
 
 
-def writing(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
-    """The ways to write one sample of positions and velocities; what they open, the session closes."""
+def write_cases(wire: str, session: Session, model: RobotModel) -> dict[str, Call]:
+    """The cases of publishing one sample of positions and velocities; the session closes what they open."""
     numbers, state = np.linspace(-1.0, 1.0, JOINTS), sample(model, STAMP)
     publisher = StatePublisher(session, model, "whole", (wire,), streams=["joint_states"])
     wire_writer = WireWriter(session, get_wire(wire), "alone", local_writer(1), sample_names(model))
     writer = wire_writer.open_stream("joint_states")
-    payload, beside = writer.encoder.encode(state), bytes(33)
+    payload, attachment = writer.encoder.encode(state), bytes(33)
     bare = session.zenoh.declare_publisher(f"bench/{wire}")
     return {
         "raw put": lambda: bare.put(payload),
-        "raw put, attachment": lambda: bare.put(payload, attachment=beside),
+        "raw put, attachment": lambda: bare.put(payload, attachment=attachment),
         "SampleWriter: encode, write": lambda: writer.write(writer.encoder.encode(state)),
         "StatePublisher.publish": lambda: publisher.publish(numbers, numbers, stamp=STAMP),
     }
 
 
-def reading(wire: str, model: RobotModel) -> dict[str, Call]:
-    """The ways into a message, and into a buffer, of samples that follow each other."""
-    spoken = get_wire(wire)
+def read_cases(wire: str, model: RobotModel) -> dict[str, Call]:
+    """The cases of decoding consecutive samples, and of inserting them into a buffer."""
+    wire_format = get_wire(wire)
     node, names = EntityId("1", 0), sample_names(model)
-    encoder = spoken.stream_encoder(
+    encoder = wire_format.stream_encoder(
         "r1", local_writer(1), "joint_states", node=node, number=1, sample_names=names
     )
     stamps = count(STAMP, 10_000_000)
@@ -104,18 +104,18 @@ def reading(wire: str, model: RobotModel) -> dict[str, Call]:
     plain, whole = iter(arrivals()), iter(arrivals())
 
     def into_buffer() -> None:
-        for message in spoken.decode("joint_states", next(whole), "r1"):
+        for message in wire_format.decode("joint_states", next(whole), "r1"):
             assert isinstance(message, Sample)
             ingest.insert_sample(message, overflowed=False)
 
     return {
-        "decode": lambda: spoken.decode("joint_states", next(plain), "r1"),
+        "decode": lambda: wire_format.decode("joint_states", next(plain), "r1"),
         "decode, into a buffer": into_buffer,
     }
 
 
 def sample_names(model: RobotModel) -> SampleLayout:
-    """What the numbers are called."""
+    """The names of a sample's numbers."""
     return SampleLayout(coordinate_names(model), velocity_columns_by_position(model))
 
 
@@ -126,7 +126,7 @@ def sample(model: RobotModel, stamp: int) -> JointState:
 
 
 def interleaved(cases: dict[str, Call], pause_s: float) -> dict[str, list[float]]:
-    """Thread CPU times [us] of each call, the cases taking turns; the first round is not counted."""
+    """Thread CPU times [us] of each call, cases interleaved; the first round is not counted."""
     times: dict[str, list[float]] = {what: [] for what in cases}
     for number in range(ROUNDS + 1):
         for what, call in cases.items():
@@ -140,8 +140,8 @@ def interleaved(cases: dict[str, Call], pause_s: float) -> dict[str, list[float]
     return times
 
 
-def show(what: str, times: dict[str, list[float]]) -> None:
-    """One table: the first row is what the others are compared with."""
+def print_table(what: str, times: dict[str, list[float]]) -> None:
+    """Prints one table; all rows are compared with the first."""
     print(f"\n{what:<36}{'median':>9}{'p99':>9}{'above':>9}{'ratio':>9}")
     floor = float(np.median(next(iter(times.values()))))
     for case, values in times.items():

@@ -1,11 +1,10 @@
-"""How soon a command answers: `ls` and `tree` on a running fleet, and light ones beside a bare program.
+"""Duration of commands: `ls` and `tree` on a running fleet, and light ones compared with a minimal program.
 
     python -m bench.micro.startup [--robots 10] [--robot panda] [--rate 50] [--rounds 10]
 
-Each robot is a `zstate publish` of its own, a peer of this host. A command's time is from its start until
-it has ended, so all of its answer is there. By turns with the commands that are only help there runs a
-program of one command made with click; ratios are of the medians. Modules are compiled before, as those
-of an installed package are.
+Each robot is a `zstate publish` of its own, a peer of this host. A command's time is from its start to
+its exit. The light commands are interleaved with a click program of one command; ratios are of the medians.
+Modules are compiled beforehand, as in an installed package.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from statistics import median
 
-from bench.micro.others import meet_nobody_else, running
+from bench.micro.processes import running_command, use_own_rendezvous
 
-LOOKING = (("ls",), ("tree",), ("ls", "--json"), ("tree", "--json"))
+NETWORK = (("ls",), ("tree",), ("ls", "--json"), ("tree", "--json"))
 LIGHT = (("--version",), ("--help",), ("tree", "--help"), ("up", "--help"))
 
-BARE = """\
+MINIMAL = """\
 import click
 
 @click.group()
@@ -50,35 +49,35 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=50.0)
     parser.add_argument("--rounds", type=int, default=10)
     options = parser.parse_args()
-    meet_nobody_else()
+    use_own_rendezvous()
     with tempfile.TemporaryDirectory() as folder:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         os.environ["PYTHONPYCACHEPREFIX"] = folder
         _light_table(options.rounds, Path(folder))
-        _looking_table(options)
+        _network_table(options)
 
 
 def _light_table(rounds: int, folder: Path) -> None:
-    bare = folder / "bare.py"
-    bare.write_text(BARE)
-    commands = [(str(bare), "command", "--help"), *(("-m", "zstate", *light) for light in LIGHT)]
+    minimal = folder / "minimal.py"
+    minimal.write_text(MINIMAL)
+    commands = [(str(minimal), "command", "--help"), *(("-m", "zstate", *light) for light in LIGHT)]
     times = _times(commands, rounds)
     print(f"{'light commands':24}{'median ms':>12}{'longest ms':>12}{'ratio':>8}")
-    for name, taken in zip(["a bare program", *map(_name, LIGHT)], times, strict=True):
-        ratio = median(taken) / median(times[0])
-        print(f"{name:24}{median(taken) * 1e3:12.0f}{max(taken) * 1e3:12.0f}{ratio:8.2f}", flush=True)
+    for name, durations in zip(["minimal program", *map(_name, LIGHT)], times, strict=True):
+        ratio = median(durations) / median(times[0])
+        print(f"{name:24}{median(durations) * 1e3:12.0f}{max(durations) * 1e3:12.0f}{ratio:8.2f}", flush=True)
 
 
-def _looking_table(options: argparse.Namespace) -> None:
+def _network_table(options: argparse.Namespace) -> None:
     with ExitStack() as fleet:
         for number in range(options.robots):
-            what = ("publish", options.robot, "--source", "sine", "--rate", str(options.rate))
-            fleet.enter_context(running(*what, "--name", f"r{number}"))
-        times = _times([("-m", "zstate", *command) for command in LOOKING], options.rounds)
+            publish = ("publish", options.robot, "--source", "sine", "--rate", str(options.rate))
+            fleet.enter_context(running_command(*publish, "--name", f"r{number}"))
+        times = _times([("-m", "zstate", *command) for command in NETWORK], options.rounds)
     title = f"{options.robots} x {options.robot}, {options.rate:g} Hz"
     print(f"\n{title:24}{'median ms':>12}{'longest ms':>12}")
-    for command, taken in zip(LOOKING, times, strict=True):
-        print(f"{_name(command):24}{median(taken) * 1e3:12.0f}{max(taken) * 1e3:12.0f}")
+    for command, durations in zip(NETWORK, times, strict=True):
+        print(f"{_name(command):24}{median(durations) * 1e3:12.0f}{max(durations) * 1e3:12.0f}")
 
 
 def _name(command: Sequence[str]) -> str:
@@ -86,7 +85,7 @@ def _name(command: Sequence[str]) -> str:
 
 
 def _times(commands: Sequence[Sequence[str]], rounds: int) -> list[list[float]]:
-    """Seconds of each of ``commands``, by turns, ``rounds`` times after one that does not count."""
+    """Durations [s] of each of ``commands``, interleaved; one more round comes first and is not counted."""
     all_rounds = [[_time_s(command) for command in commands] for _ in range(rounds + 1)]
     return [list(times) for times in zip(*all_rounds[1:], strict=True)]
 

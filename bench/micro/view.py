@@ -1,17 +1,17 @@
-"""What the browser view costs: its own process, and those that publish and listen beside it.
+"""Cost of the browser view: its own process, and its effect on a publisher and a listener.
 
     python -m bench.micro.view [--seconds 10] [--robots panda talos]
 
 A publisher process (``zstate publish --source sine``, 100 Hz) and ``zstate view`` at 30 pictures a second,
-looked at by a client that takes everything a browser is sent and draws nothing: drawing is the business
-of another machine. Beside it, in the same run, viser's own ViserUrdf moves the same robot at 30 Hz, where
-its environment is there:
+read by a client that receives all messages of a browser and draws nothing, since drawing happens on
+another machine. In the same run, viser's own ViserUrdf moves the same robot at 30 Hz, if its environment is
+installed:
 
     python -m venv .bench/viser-urdf && .bench/viser-urdf/bin/pip install 'viser[urdf]>=1.1,<2' pycollada
 
 Then ten robots of 30 links at 10 Hz; rate, CPU and latency of a publisher at 100 Hz and a listener that is
-woken by each sample, without a view and with one; and the time from `zstate view panda --sliders` until a
-browser that is open already (headless chromium, no graphics card) shows the robot.
+woken by each sample, without a view and with one; and the time from `zstate view panda --sliders` until an
+open browser (headless chromium, no graphics card) shows the robot.
 
 CPU is the process's own (all threads) over the window, in % of one core.
 """
@@ -40,9 +40,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect as connect_websocket
 from websockets.typing import Subprotocol
 
-from bench.home import venv_python
+from bench.environments import venv_python
 from bench.measure import cpu_ns
-from bench.micro.others import meet_nobody_else
+from bench.micro.processes import use_own_rendezvous
 from zstate import SineSource, StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import SystemClock
 from zstate.rate import Rate
@@ -69,50 +69,50 @@ def main() -> None:
     if options.role:
         _publish_fleet()
         return
-    meet_nobody_else()
+    use_own_rendezvous()
     for robot in options.robots:
         with _commands(("publish", robot, "--source", "sine")):
-            _report(f"{robot} at 30 Hz, zstate view", *_viewed(options.seconds, "view", robot))
-        _report(f"{robot} at 30 Hz, ViserUrdf", *_urdf_viewed(options.seconds, robot))
+            _report(f"{robot} at 30 Hz, zstate view", *_measure_zstate_view(options.seconds, "view", robot))
+        _report(f"{robot} at 30 Hz, ViserUrdf", *_measure_viser_urdf(options.seconds, robot))
     with _process(sys.executable, "-m", "bench.micro.view", "--role", "fleet"):
         what = f"{FLEET} robots of {LINKS} links at {FLEET_HZ:g} Hz, zstate view"
-        _report(what, *_viewed(options.seconds, "view"))
+        _report(what, *_measure_zstate_view(options.seconds, "view"))
     for is_viewed in (False, True, False, True):
-        _chain(options.seconds, is_viewed=is_viewed)
+        _measure_chain(options.seconds, is_viewed=is_viewed)
     _first_picture()
 
 
 def _report(what: str, cpu_percent: float | None, kilobytes_s: float = 0.0) -> None:
-    said = "not installed" if cpu_percent is None else f"{cpu_percent:5.1f} % CPU  {kilobytes_s:6.0f} kB/s"
-    print(f"{what:52}  {said}", flush=True)
+    figures = "not installed" if cpu_percent is None else f"{cpu_percent:5.1f} % CPU  {kilobytes_s:6.0f} kB/s"
+    print(f"{what:52}  {figures}", flush=True)
 
 
-def _viewed(seconds: float, *command: str) -> tuple[float, float]:
-    with _process(sys.executable, "-m", "zstate", *command, "--port", "0") as (pid, said):
-        return _watched(seconds, pid, said.rpartition(" ")[2].strip())
+def _measure_zstate_view(seconds: float, *command: str) -> tuple[float, float]:
+    with _process(sys.executable, "-m", "zstate", *command, "--port", "0") as (pid, first_line):
+        return _measure_page(seconds, pid, first_line.rpartition(" ")[2].strip())
 
 
-def _urdf_viewed(seconds: float, robot: str) -> tuple[float | None, float]:
+def _measure_viser_urdf(seconds: float, robot: str) -> tuple[float | None, float]:
     python = venv_python("viser-urdf")
     if python is None:
         return None, 0.0
     script = str(Path(__file__).with_name("view_urdf.py"))
-    with _process(python, script, job=_job(robot)) as (pid, said):
-        return _watched(seconds, pid, f"http://127.0.0.1:{int(said)}")
+    with _process(python, script, job=_job(robot)) as (pid, first_line):
+        return _measure_page(seconds, pid, f"http://127.0.0.1:{int(first_line)}")
 
 
-def _watched(seconds: float, pid: int, url: str) -> tuple[float, float]:
-    """CPU of a process [%] while somebody looks at its page, and what that is sent [kB/s]."""
-    with Spectator(url) as spectator:
+def _measure_page(seconds: float, pid: int, url: str) -> tuple[float, float]:
+    """CPU of a process [%] with one client of its page, and the data sent to the client [kB/s]."""
+    with ViewerClient(url) as client:
         time.sleep(SETTLE_S)
-        begin, cpu, taken = time.monotonic(), cpu_ns(pid), spectator.bytes
+        begin, cpu, received = time.monotonic(), cpu_ns(pid), client.bytes
         time.sleep(seconds)
         lasted = time.monotonic() - begin
-        return (cpu_ns(pid) - cpu) / lasted / 1e7, (spectator.bytes - taken) / lasted / 1e3
+        return (cpu_ns(pid) - cpu) / lasted / 1e7, (client.bytes - received) / lasted / 1e3
 
 
-class Spectator:
-    """A browser as the server sees it: says where its camera is, and takes what it is sent."""
+class ViewerClient:
+    """A client that behaves like a browser: sends its camera and receives all messages."""
 
     def __init__(self, url: str) -> None:
         address = urllib.parse.urlsplit(url)._replace(scheme="ws").geturl()
@@ -120,15 +120,15 @@ class Spectator:
         self._socket = connect_websocket(address, subprotocols=[protocol], compression=None, max_size=None)
         self.bytes = 0
         self._socket.send(msgspec.msgpack.encode(_CAMERA))
-        self._thread = threading.Thread(target=self._take, daemon=True)
+        self._thread = threading.Thread(target=self._receive, daemon=True)
         self._thread.start()
 
-    def _take(self) -> None:
+    def _receive(self) -> None:
         with suppress(ConnectionClosed):
-            for taken in self._socket:
-                self.bytes += len(taken)
+            for message in self._socket:
+                self.bytes += len(message)
 
-    def __enter__(self) -> Spectator:
+    def __enter__(self) -> ViewerClient:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -151,7 +151,7 @@ _CAMERA = {
 
 
 def _job(robot: str) -> str:
-    """What ``view_urdf.py`` needs: the meshes where they are, and a motion."""
+    """The job of ``view_urdf.py``: the URDF with absolute mesh paths, and a motion."""
     model = load_model(robot)
     paths = MeshPaths(None)
     urdf = re.sub(r'(?<=filename=")[^"]+', lambda uri: str(paths.find(uri[0])), model.urdf)
@@ -162,7 +162,7 @@ def _job(robot: str) -> str:
 
 @contextmanager
 def _process(*command: str, job: str | None = None) -> Iterator[tuple[int, str]]:
-    """A process from its first line on: its number, and that line."""
+    """Runs a process; yields its id and its first line of output."""
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdin is not None
     assert process.stdout is not None
@@ -170,10 +170,10 @@ def _process(*command: str, job: str | None = None) -> Iterator[tuple[int, str]]
         if job is not None:
             process.stdin.write(job)
             process.stdin.close()
-        said = process.stdout.readline().strip()
-        if not said:
+        first_line = process.stdout.readline().strip()
+        if not first_line:
             raise SystemExit(f"`{' '.join(command[:4])} ...` has ended")
-        yield process.pid, said
+        yield process.pid, first_line
     finally:
         process.terminate()
         process.wait()
@@ -188,7 +188,7 @@ def _commands(*commands: tuple[str, ...]) -> Iterator[None]:
 
 
 def _publish_fleet() -> None:
-    """Ten robots from one process, each a chain of hinges with a box on every link."""
+    """Publishes ten robots, each a chain of revolute joints with a box on every link."""
     model = load_model(_chain_urdf(LINKS))
     source = SineSource(model)
     with connect() as session, ExitStack() as opened:
@@ -217,30 +217,31 @@ def _chain_urdf(links: int) -> str:
     return f'<robot name="chain">{"".join(parts)}</robot>'
 
 
-def _chain(seconds: float, *, is_viewed: bool) -> None:
+def _measure_chain(seconds: float, *, is_viewed: bool) -> None:
     """A publisher at 100 Hz and a listener that is woken by each sample, with a view or without."""
     command = (sys.executable, "-m", "bench.micro.chain", "--rates", str(LATENCY_RATE_HZ))
     command += ("--seconds", str(seconds + SETTLE_S), "--role")
     with ExitStack() as opened:
         if is_viewed:
             view = _process(sys.executable, "-m", "zstate", "view", "--port", "0")
-            _, said = opened.enter_context(view)
-            opened.enter_context(Spectator(said.rpartition(" ")[2].strip()))
+            _, first_line = opened.enter_context(view)
+            opened.enter_context(ViewerClient(first_line.rpartition(" ")[2].strip()))
         roles = {
             role: subprocess.Popen([*command, role], stdout=subprocess.PIPE, text=True)
             for role in ("awake", "publisher")
         }
-        said_of = {role: json.loads(process.communicate()[0]) for role, process in roles.items()}
-    heard, sent = said_of["awake"], said_of["publisher"]
+        reports = {role: json.loads(process.communicate()[0]) for role, process in roles.items()}
+    listener, publisher = reports["awake"], reports["publisher"]
     print(
         f"panda at {LATENCY_RATE_HZ:g} Hz, {'with' if is_viewed else 'without'} an open view: "
-        f"publisher {sent['rate_hz']:.3f} Hz, {sent['cpu']:.1f} % CPU; listener {heard['cpu']:.1f} % CPU, "
-        f"latency p50 {heard['p50_us']:.0f} us, p99 {heard['p99_us']:.0f} us, lost {heard['lost']}",
+        f"publisher {publisher['rate_hz']:.3f} Hz, {publisher['cpu']:.1f} % CPU; "
+        f"listener {listener['cpu']:.1f} % CPU, "
+        f"latency p50 {listener['p50_us']:.0f} us, p99 {listener['p99_us']:.0f} us, lost {listener['lost']}",
         flush=True,
     )
 
 
-# One says that there is no graphics card, and lies over the picture.
+# A notice about the missing graphics card covers the picture.
 _WITHOUT_NOTICES = """addEventListener("DOMContentLoaded", () => {
     const style = document.createElement("style");
     style.textContent = ".mantine-Notifications-root { display: none !important }";
@@ -249,13 +250,13 @@ _WITHOUT_NOTICES = """addEventListener("DOMContentLoaded", () => {
 
 
 def _shows_robot(pixels: NDArray[np.uint8]) -> bool:
-    """Whether something dark stands in the left half, where else is a floor with light lines."""
+    """Whether the left half has dark pixels; without a robot it shows a floor with light lines."""
     picture = pixels[:, : pixels.shape[1] // 2, :3]
     return bool((picture.max(axis=2) < 90).mean() > 0.005)
 
 
 def _first_picture() -> None:
-    """How long it takes from the command until the robot is seen."""
+    """Prints the time from the command to the first picture of the robot."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=FLAGS)
         tab = browser.new_page(viewport={"width": 800, "height": 500})
@@ -263,9 +264,9 @@ def _first_picture() -> None:
         tab.add_init_script(_WITHOUT_NOTICES)
         begin = time.monotonic()
         command = (sys.executable, "-m", "zstate", "view", "panda", "--sliders", "--port", "0")
-        with _process(*command) as (_, said):
+        with _process(*command) as (_, first_line):
             address_s = time.monotonic() - begin
-            tab.goto(said.rpartition(" ")[2].strip())
+            tab.goto(first_line.rpartition(" ")[2].strip())
             while not _shows_robot(imageio.v3.imread(tab.screenshot(), extension=".png")):
                 time.sleep(0.02)
             picture_s = time.monotonic() - begin

@@ -1,1 +1,1 @@
-"""The soak: a fleet through one router for a long time (``python -m bench.soak``)."""
+"""Soak test: a fleet through one router for a long time (``python -m bench.soak``)."""

@@ -1,16 +1,16 @@
-"""A fleet through one router, for a long time: does anything grow, and is anything lost?
+"""Soak test of a fleet through one router: growth of resources and lost samples.
 
     python -m bench.soak [--robots 100] [--rate 50] [--minutes 10] [--processes 4] [--model panda]
                          [--fresh-s 60] [--warm-up-s 120] [--bare]
 
-One router process; publisher processes that share the robots, each robot with a session of its own; one
-reader of all. Every robot also has a static edge, whose value is the number of the present half minute:
-within it the reader must see each robot's new value, and so must a fresh reader that joins every minute.
+One router process; publisher processes that share the robots, each robot with its own session; one reader
+of all. Every robot also has a static edge, whose value is the number of the current half minute: within it
+the reader must receive each robot's new value, and so must a fresh reader that joins every minute.
 
-Sampled every 5 s from outside, out of /proc: resident memory, threads, file descriptors and CPU of each
-process. The result goes to bench/results as JSON, with a table beside it.
+Sampled every 5 s from /proc: resident memory, threads, file descriptors and CPU of each process. The result
+is written to bench/results as JSON, with a table in Markdown.
 
-With --bare publishers and readers are bare Zenoh with the same traffic: what grows then is Zenoh's. Its
+With --bare publishers and readers use Zenoh alone with the same traffic: growth is then Zenoh's own. Its
 routers keep some kilobytes of each reader that has left (eclipse-zenoh 1.10.2); without fresh readers,
 --fresh-s 0, they keep nothing.
 """
@@ -26,8 +26,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from bench.soak import bare, roles
-from bench.soak.report import result_of, write
+from bench.soak import roles, zenoh_control
+from bench.soak.report import build_result, write
 from bench.soak.roles import Report
 from bench.soak.task import Task
 from bench.soak.usage import usage
@@ -40,7 +40,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 def main() -> None:
     """Run one role of the soak, or the whole of it."""
     task = Task.parse(str(__doc__))
-    parts = bare if task.bare else roles
+    parts = zenoh_control if task.bare else roles
     run = {"router": roles.route, "publisher": parts.publish, "reader": parts.read}
     if task.role:
         print(json.dumps(run[task.role](task)))
@@ -49,9 +49,9 @@ def main() -> None:
 
 
 def soak(task: Task) -> None:
-    """Start everybody, look at them for the time given, and write down what was seen."""
+    """Starts all processes, samples them for ``task.minutes`` and writes the result."""
     running = replace(task, endpoint=f"tcp/127.0.0.1:{_free_port()}")
-    parts = bare if task.bare else roles
+    parts = zenoh_control if task.bare else roles
     named = {"router": ("router", 0), "reader": ("reader", 0)}
     named |= {f"publisher {share}": ("publisher", share) for share in range(task.processes)}
     processes: dict[str, subprocess.Popen[str]] = {}
@@ -71,8 +71,8 @@ def soak(task: Task) -> None:
                 joins.append(parts.join_fresh(running))
     finally:
         for name, process in reversed(processes.items()):
-            ended[name] = _end(process)
-    result = result_of(task, time.monotonic() - began, ended, samples, joins)
+            ended[name] = _stop(process)
+    result = build_result(task, time.monotonic() - began, ended, samples, joins)
     what = "soak-bare" if task.bare else "soak"
     write(result, RESULTS / f"{what}-{time.strftime('%Y-%m-%d')}")
 
@@ -90,9 +90,9 @@ def _start(task: Task) -> subprocess.Popen[str]:
     return process
 
 
-def _end(process: subprocess.Popen[str]) -> Report:
-    said, _ = process.communicate(timeout=30.0)
-    return json.loads(said)
+def _stop(process: subprocess.Popen[str]) -> Report:
+    output, _ = process.communicate(timeout=30.0)
+    return json.loads(output)
 
 
 def _every(period_s: float, seconds: float) -> Iterator[float]:

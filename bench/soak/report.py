@@ -1,4 +1,4 @@
-"""The result of a soak: JSON with every sample, and a table for people."""
+"""The result of a soak test: JSON with every sample, and a Markdown table."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from bench.soak.task import Task
 from bench.soak.usage import COLUMNS, growth
 
 
-def result_of(
+def build_result(
     task: Task,
     seconds: float,
     ended: Mapping[str, Report],
     samples: Mapping[str, Sequence[Sequence[float]]],
     joins: Sequence[Report],
 ) -> Report:
-    """Everything that was measured."""
+    """All measured figures."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpu = next((line.partition(":")[2].strip() for line in lines if "model name" in line), "")
     sent = sum(report.get("sent", 0) for report in ended.values())
@@ -49,7 +49,7 @@ def result_of(
 
 
 def write(result: Report, path: Path) -> None:
-    """Both files, ``path`` with the endings .json and .md; the table is printed, too."""
+    """Writes ``path`` as .json and .md, and prints the table."""
     path.parent.mkdir(exist_ok=True)
     table = "\n".join([*_head(result), *map(_row, result["processes"].items()), "", *_findings(result), ""])
     path.with_suffix(".json").write_text(json.dumps(result) + "\n", encoding="utf-8")
@@ -63,8 +63,8 @@ def _head(result: Report) -> list[str]:
         f"# `{result['command']}`",
         "",
         f"{result['machine']}; {versions}; {result['seconds']} s, load {result['load_1_5_15'][1]:.2f}.",
-        f"Memory, threads and file descriptors are those after {result['warm_up_s']:g} s and at the end;",
-        "the growth between is that of a line through the means of half minutes, with its standard error.",
+        f"Memory, threads and file descriptors are given after {result['warm_up_s']:g} s and at the end;",
+        "growth is the slope of a line through means of half minutes, with its standard error.",
         "",
         "| process | CPU % | memory MB | growth kB/min | threads | fds | Hz |",
         "|---|---|---|---|---|---|---|",
@@ -86,12 +86,12 @@ def _findings(result: Report) -> Iterator[str]:
         losses = ", ".join(f"{what} {reader[what]}" for what in ("missed", "dropped", "late", "refused"))
         yield f"{received}; {losses}"
         yield (
-            f"- age of the newest sample at {reader['looks']} looks, median, p99, largest: "
+            f"- age of the newest sample in {reader['looks']} checks, median, p99, largest: "
             f"{reader['age_ms_p50_p99_max']} ms; older than a second: {reader['stale_looks']}"
         )
         yield (
             f"- latched values: {reader['latched_rounds']} rounds of {result['robots']} robots, lost "
-            f"{reader['latched_lost']}; all there after "
+            f"{reader['latched_lost']}; all received after "
             f"{reader['latched_within_s_median_max']} s (median, max)"
         )
     else:

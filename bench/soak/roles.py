@@ -1,4 +1,4 @@
-"""The processes of a soak: each says a line when it is ready, and reports when its standard input ends."""
+"""The processes of a soak test: each prints ``ready``, and a report when its standard input ends."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, TypeAlias
 
+from bench.soak.fleet_monitor import FleetMonitor, all_available, count_missing_marks, frame_names
 from bench.soak.task import Task, epoch
-from bench.soak.watching import Watching, all_answer, ends_of, missing
 from zstate import (
     SineSource,
     StatePublisher,
@@ -26,28 +26,28 @@ from zstate.transform import Transform
 Report: TypeAlias = "dict[str, Any]"
 
 
-def until_told() -> threading.Event:
-    """What is set when standard input ends."""
-    told = threading.Event()
+def stop_at_end_of_input() -> threading.Event:
+    """An event that is set when standard input ends."""
+    stop = threading.Event()
 
-    def listen() -> None:
+    def read_input() -> None:
         sys.stdin.read()
-        told.set()
+        stop.set()
 
-    threading.Thread(target=listen, daemon=True).start()
-    return told
+    threading.Thread(target=read_input, daemon=True).start()
+    return stop
 
 
 def route(task: Task) -> Report:
-    """The router."""
+    """Runs the router."""
     with connect(mode="router", listen=task.endpoint):
         print("ready", flush=True)
-        until_told().wait()
+        stop_at_end_of_input().wait()
     return {}
 
 
 def publish(task: Task) -> Report:
-    """A share of the robots, each with a session of its own."""
+    """Publishes a share of the robots, each with its own session."""
     model = load_model(task.model)
     source = SineSource(model)
     with ExitStack() as opened:
@@ -57,45 +57,47 @@ def publish(task: Task) -> Report:
             publisher = opened.enter_context(StatePublisher(session, model, name))
             robots.append((publisher, opened.enter_context(StaticPublisher(session, name, "mark"))))
 
-        def say(stamp: int) -> None:
+        def publish_samples(stamp: int) -> None:
             reading = source.read(stamp)
             for publisher, _ in robots:
                 publisher.publish(reading.positions, reading.velocities, stamp=stamp)
 
-        def tell(number: int) -> None:
+        def publish_mark(number: int) -> None:
             mark = Transform.from_rpy(model.root, "mark", (float(number), 0.0, 0.0), (0.0, 0.0, 0.0))
             for _, statics in robots:
                 statics.set(mark)
 
-        return paced(task, len(robots), say, tell)
+        return publish_at_rate(task, len(robots), publish_samples, publish_mark)
 
 
-def paced(task: Task, robots: int, say: Callable[[int], None], tell: Callable[[int], None]) -> Report:
-    """``say(stamp)`` at each tick, and ``tell(number)`` in each half minute, until told to end."""
-    stop = until_told()
+def publish_at_rate(
+    task: Task, robots: int, publish_samples: Callable[[int], None], publish_mark: Callable[[int], None]
+) -> Report:
+    """Calls ``publish_samples(stamp)`` each tick and ``publish_mark(number)`` each half minute."""
+    stop = stop_at_end_of_input()
     print("ready", flush=True)
     rate = Rate(task.rate, SystemClock(), stop)
-    told = 0
+    published = 0
     for stamp in rate:
-        say(stamp)
-        if epoch() != told:
-            told = epoch()
-            tell(told)
+        publish_samples(stamp)
+        if epoch() != published:
+            published = epoch()
+            publish_mark(published)
     report = rate.report()
     return {"sent": report.ticks * robots, "achieved_hz": report.rate_hz, "skipped": report.skipped}
 
 
 def read(task: Task) -> Report:
-    """The reader of all."""
-    stop = until_told()
+    """Listens to all robots and monitors them twice a second."""
+    stop = stop_at_end_of_input()
     with (
         connect(mode="client", endpoints=task.endpoint) as session,
         TransformListener(session) as listener,
     ):
-        watching = Watching(listener.buffer, ends_of(task))
+        monitor = FleetMonitor(listener.buffer, frame_names(task))
         print("ready", flush=True)
         for _ in Rate(2.0, SystemClock(), stop):
-            watching.look()
+            monitor.sample()
         stats = listener.stats
     return {
         "received": stats.received,
@@ -103,24 +105,26 @@ def read(task: Task) -> Report:
         "dropped": stats.dropped,
         "late": stats.late,
         "refused": stats.refused,
-        **watching.report(),
+        **monitor.report(),
     }
 
 
 def join_fresh(task: Task) -> Report:
-    """A reader that joins now: after how long it has every model and every present static edge."""
-    ends, began = ends_of(task), time.monotonic()
+    """A reader that joins: time until it has every model and every current static edge."""
+    ends, began = frame_names(task), time.monotonic()
     with (
         connect(mode="client", endpoints=task.endpoint) as session,
         TransformListener(session) as listener,
     ):
         buffer = listener.buffer
-        complete = within(10.0, lambda: not missing(buffer, ends) and all_answer(buffer, ends))
+        complete = becomes_true(
+            10.0, lambda: not count_missing_marks(buffer, ends) and all_available(buffer, ends)
+        )
         return {"complete": complete, "seconds": round(time.monotonic() - began, 3)}
 
 
-def within(timeout_s: float, condition: Callable[[], bool]) -> bool:
-    """Whether ``condition`` comes to hold."""
+def becomes_true(timeout_s: float, condition: Callable[[], bool]) -> bool:
+    """Whether ``condition()`` becomes true in time; checked every 10 ms."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         if condition():

@@ -1,4 +1,4 @@
-"""Task: how much of what, the same for every process of a soak."""
+"""The workload of a soak test, shared by all its processes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ EPOCH_S = 30
 
 @dataclass(frozen=True)
 class Task:
-    """What is run: ``robots`` at ``rate`` [Hz] by so many publisher ``processes``.
+    """``robots`` at ``rate`` [Hz], shared by ``processes`` publishers.
 
-    With ``bare`` everybody is bare Zenoh with the same traffic: the control. ``role`` and ``share`` say
-    which of the processes this is; none is the one that starts the others.
+    ``bare`` selects the control run with Zenoh alone. ``role`` and ``share`` name one of the processes; an
+    empty role is the process that starts the others.
     """
 
     robots: int = 100
@@ -31,7 +31,7 @@ class Task:
 
     @classmethod
     def parse(cls, description: str) -> Task:
-        """What the command line says."""
+        """The task of the command line."""
         parser = ArgumentParser(description=description, formatter_class=RawTextHelpFormatter)
         for field in fields(cls):
             name = f"--{field.name.replace('_', '-')}"
@@ -44,24 +44,24 @@ class Task:
 
     @property
     def names(self) -> list[str]:
-        """The robots."""
+        """The names of the robots."""
         return [f"r{number:03}" for number in range(self.robots)]
 
     @property
     def options(self) -> list[str]:
-        """The command line that says this again, without what is as it always is."""
-        said: list[str] = []
+        """The command line of this task, without default values."""
+        options: list[str] = []
         for name, value in asdict(self).items():
             if value != getattr(Task, name):
                 option = f"--{name.replace('_', '-')}"
-                said += (
+                options += (
                     [option]
                     if value is True
                     else [option, f"{value:g}" if isinstance(value, float) else str(value)]
                 )
-        return said
+        return options
 
 
 def epoch() -> int:
-    """The number of the present half minute, which the latched value of every robot says."""
+    """The number of the current half minute, published as the latched value of every robot."""
     return int(time.time()) // EPOCH_S

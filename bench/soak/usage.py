@@ -1,4 +1,4 @@
-"""What a process uses, out of /proc, and how fast that grows."""
+"""Resource usage of a process from /proc, and its growth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def usage(pid: int) -> list[float]:
 
 
 def growth(samples: Sequence[Sequence[float]], warm_up_s: float) -> dict[str, Any]:
-    """How ``samples`` (rows of ``COLUMNS``) go on after the warm-up; no more than half the time is that."""
+    """Growth of ``samples`` (rows of ``COLUMNS``) after the warm-up, which is at most half of the time."""
     rows = np.array(samples)
     steady = rows[rows[:, 0] >= min(warm_up_s, rows[-1, 0] / 2)]
     first, last = steady[0], steady[-1]
@@ -47,8 +47,8 @@ def growth(samples: Sequence[Sequence[float]], warm_up_s: float) -> dict[str, An
 def _line(seconds: np.ndarray, kb: np.ndarray) -> tuple[float, float | None]:
     """Slope of the line through the means of half minutes [kB/min], and its standard error.
 
-    Of means, because what a process had allocated a moment ago says most of what it has now: single
-    samples would make the error look smaller than it is.
+    Means are used because successive samples are correlated: with single samples the standard error would
+    be too small.
     """
     points = (seconds - seconds[0]) // _POINT_S
     mean = [(seconds[points == n].mean() / 60.0, kb[points == n].mean()) for n in np.unique(points)]

@@ -1,4 +1,4 @@
-"""The systems under test: one file each, found by name."""
+"""The systems under test, one module each, found by name."""
 
 from __future__ import annotations
 

@@ -6,14 +6,13 @@ import functools
 import subprocess
 from collections.abc import Mapping
 
-from bench.home import place, venv_python
+from bench.environments import environment_path, venv_python
 from bench.job import Job
-from bench.subjects.dds import NO_STATE_PUBLISHER, free_domain
+from bench.subjects.dds import DOMAIN_VARIABLE, NO_STATE_PUBLISHER, free_domain
 from bench.subjects.subject import Roles, Subject
 
-DOMAIN_VARIABLE = "BENCH_DDS_DOMAIN"
 PACKAGE = "cyclonedds==11.0.1"
-# This host only, and as many participants as a run may have.
+# Loopback only; enough participants for any run.
 CONFIG = """
 <CycloneDDS><Domain Id="any">
   <General>
@@ -29,11 +28,11 @@ CONFIG = """
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    ask = "from importlib.metadata import version; print(version('cyclonedds'))"
-    said = subprocess.run(
-        [str(venv_python("cyclone")), "-c", ask], check=True, capture_output=True, text=True
+    code = "from importlib.metadata import version; print(version('cyclonedds'))"
+    result = subprocess.run(
+        [str(venv_python("cyclone")), "-c", code], check=True, capture_output=True, text=True
     )
-    return {"cyclonedds": said.stdout.strip()}
+    return {"cyclonedds": result.stdout.strip()}
 
 
 def _environment(job: Job) -> Mapping[str, str]:
@@ -41,7 +40,7 @@ def _environment(job: Job) -> Mapping[str, str]:
 
 
 def _load() -> Roles:
-    from bench.subjects import cyclone_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects import cyclone_roles as roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     return roles.Writer, roles.Reader
 
@@ -56,12 +55,12 @@ SUBJECT = Subject(
         "reliable, keep last 10) and TFMessage (reliable, keep last 100), static edges transient local; "
         "XCDR1",
         *NO_STATE_PUBLISHER,
-        "reader: a listener's on_data_available, in Cyclone's own receiving thread, takes what is there; it "
+        "reader: a listener's on_data_available, in Cyclone's own receiving thread, takes the samples; it "
         "does not subscribe to the joint states",
     ),
     install=(
-        f"python -m venv {place('cyclone')}",
-        f"{place('cyclone')}/bin/python -m pip install {PACKAGE}",
+        f"python -m venv {environment_path('cyclone')}",
+        f"{environment_path('cyclone')}/bin/python -m pip install {PACKAGE}",
     ),
     python=lambda: venv_python("cyclone"),
     versions=_versions,

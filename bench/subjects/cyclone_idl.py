@@ -1,6 +1,6 @@
 """The IDL of ROS 2's JointState and TFMessage, as dataclasses of Cyclone DDS."""
 
-# Cyclone evaluates the annotations as they are written: they must not be postponed.
+# Cyclone evaluates the annotations: they must not be postponed.
 from dataclasses import dataclass
 
 from cyclonedds.idl import IdlStruct

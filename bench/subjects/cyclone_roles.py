@@ -13,17 +13,17 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from bench.job import Job
-from bench.subjects.cyclone import DOMAIN_VARIABLE
 from bench.subjects.cyclone_idl import Header, JointState, TFMessage, Time
+from bench.subjects.dds import DOMAIN_VARIABLE
 from bench.subjects.subject import Answered
 from bench.subjects.tf_messages import TfBytes
 from bench.subjects.tf_reader import TfReader
 
-MOST_TAKEN = 100
+MAX_SAMPLES = 100
 
 
 def qos(depth: int, durability: Any = Policy.Durability.Volatile) -> Qos:
-    """Reliable, as ROS 2 publishes."""
+    """Reliable QoS, as in ROS 2 publishers."""
     return Qos(
         Policy.Reliability.Reliable(duration(seconds=1)),
         Policy.History.KeepLast(depth),
@@ -37,18 +37,18 @@ LATCHED = qos(1, Policy.Durability.TransientLocal)
 
 
 class Serialized(TFMessage):
-    """A message whose bytes are there already; a writer takes them as its own."""
+    """A message with ready bytes, which the writer sends unchanged."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
 
     def serialize(self, *_: object, **__: object) -> bytes:
-        """As they are."""
+        """The ready bytes."""
         return self._content
 
 
 def participant() -> DomainParticipant:
-    """In the domain of this run."""
+    """A participant in the domain of this run."""
     return DomainParticipant(int(os.environ[DOMAIN_VARIABLE]))
 
 
@@ -65,36 +65,36 @@ class Writer:
         self._message = JointState(Header(Time()), list(job.joints), [], [], [])
         self._static.write(Serialized(self._bytes.static))
 
-    def _writer(self, topic: str, kind: type, of: Qos) -> Any:
-        return DataWriter(self._participant, Topic(self._participant, topic, kind), qos=of)
+    def _writer(self, topic: str, kind: type, qos_: Qos) -> Any:
+        return DataWriter(self._participant, Topic(self._participant, topic, kind), qos=qos_)
 
     def send(self, row: int, stamp: int) -> None:
-        """Joint states first, as they would be."""
+        """Joint states first, as in a real chain."""
         message, at = self._message, self._message.header.stamp
         at.sec, at.nanosec = divmod(stamp, 10**9)
         message.position = self._rows[row]
         self._joints.write(message)
-        self._tf.write(Serialized(self._bytes.row(row, stamp)))
+        self._tf.write(Serialized(self._bytes.message(row, stamp)))
 
     def close(self) -> None:
-        """The process's end closes the domain."""
+        """Nothing: the end of the process closes the domain."""
 
 
-class Taking(Listener):
-    """Gives every message to a function, in the thread that received it."""
+class CallbackListener(Listener):
+    """Calls a function with every message, in the receiving thread."""
 
-    def __init__(self, take: Any) -> None:
+    def __init__(self, callback: Any) -> None:
         super().__init__()
-        self._take = take
+        self._callback = callback
 
     def on_data_available(self, reader: Any) -> None:
-        """All of them: one call may stand for several."""
-        for message in reader.take(MOST_TAKEN):
-            self._take(message)
+        """Takes all available messages: one call may stand for several."""
+        for message in reader.take(MAX_SAMPLES):
+            self._callback(message)
 
 
 class Reader(TfReader):
-    """Hears the messages of one domain."""
+    """Receives the messages of one domain."""
 
     def __init__(self, job: Job, answered: Answered) -> None:
         super().__init__(job, answered)
@@ -104,6 +104,6 @@ class Reader(TfReader):
             self._reader("rt/tf", TF, self._on_transforms),
         ]
 
-    def _reader(self, topic: str, of: Qos, take: Any) -> Any:
-        into = Topic(self._participant, topic, TFMessage)
-        return DataReader(self._participant, into, qos=of, listener=Taking(take))
+    def _reader(self, topic: str, qos_: Qos, callback: Any) -> Any:
+        source = Topic(self._participant, topic, TFMessage)
+        return DataReader(self._participant, source, qos=qos_, listener=CallbackListener(callback))

@@ -1,6 +1,6 @@
-"""A robot's edges as ROS names them, out of its URDF, and their poses; nothing but the standard library.
+"""A robot's edges, read from its URDF, and their poses; standard library only.
 
-For systems that have no state publisher; apart from zstate on purpose, as a second opinion.
+For systems without a state publisher; deliberately independent of zstate, as a second implementation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ IDENTITY: Pose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Edge:
-    """A joint of the URDF; ``joint`` is the one whose position moves it, itself or the one it mimics."""
+    """A joint of the URDF; ``joint`` is the joint that drives it: itself or the mimicked joint."""
 
     parent: str
     child: str
@@ -38,7 +38,7 @@ class Edge:
         return self.kind != "fixed"
 
     def pose(self, positions: Mapping[str, float]) -> Pose:
-        """Of the child in the parent."""
+        """The pose of the child in the parent."""
         if not self.moves:
             return self.origin
         position = self.multiplier * positions[self.joint] + self.offset
@@ -49,10 +49,10 @@ class Edge:
         return product(self.origin, (0.0, 0.0, 0.0, x, y, z, math.cos(position / 2)))
 
 
-def edges_of(urdf: str) -> list[Edge]:
-    """All of them, in the order of the file ``urdf``."""
+def read_edges(urdf: str) -> list[Edge]:
+    """All edges, in the order of the file ``urdf``."""
     joints = {joint.get("name", ""): joint for joint in ET.parse(urdf).getroot().findall("joint")}
-    return [_edge(joint, *_mover(name, joints)) for name, joint in joints.items()]
+    return [_edge(joint, *_driving_joint(name, joints)) for name, joint in joints.items()]
 
 
 def path_between(edges: Sequence[Edge], base: str, tip: str) -> list[str]:
@@ -65,8 +65,8 @@ def path_between(edges: Sequence[Edge], base: str, tip: str) -> list[str]:
     return path[::-1]
 
 
-def composed(poses: Sequence[Pose]) -> Pose:
-    """Of the last one's child in the first one's parent."""
+def compose(poses: Sequence[Pose]) -> Pose:
+    """The pose of the last edge's child in the first edge's parent."""
     found = IDENTITY
     for pose in poses:
         found = product(found, pose)
@@ -89,8 +89,8 @@ def product(a: Pose, b: Pose) -> Pose:
     )
 
 
-def _mover(name: str, joints: Mapping[str, ET.Element]) -> tuple[str, float, float]:
-    """The joint whose position moves this one, with multiplier and offset; a mimic may follow another."""
+def _driving_joint(name: str, joints: Mapping[str, ET.Element]) -> tuple[str, float, float]:
+    """The joint that drives ``name``, with multiplier and offset; mimic joints may be chained."""
     multiplier, offset = 1.0, 0.0
     while (mimic := joints[name].find("mimic")) is not None:
         offset += multiplier * float(mimic.get("offset", 0.0))
@@ -99,14 +99,14 @@ def _mover(name: str, joints: Mapping[str, ET.Element]) -> tuple[str, float, flo
     return name, multiplier, offset
 
 
-def _edge(joint: ET.Element, mover: str, multiplier: float, offset: float) -> Edge:
+def _edge(joint: ET.Element, driver: str, multiplier: float, offset: float) -> Edge:
     return Edge(
         parent=_child(joint, "parent").get("link", ""),
         child=_child(joint, "child").get("link", ""),
         kind=joint.get("type", ""),
         origin=_origin(joint.find("origin")),
         axis=_axis(joint.find("axis")),
-        joint=mover,
+        joint=driver,
         multiplier=multiplier,
         offset=offset,
     )
@@ -138,13 +138,13 @@ def _origin(element: ET.Element | None) -> Pose:
 
 def _from_rpy(roll: float, pitch: float, yaw: float) -> Rotation:
     """URDF's order: about the fixed x, then y, then z."""
-    turns = ((2, yaw), (1, pitch), (0, roll))
-    found = composed([_turn(place, angle) for place, angle in turns])
+    rotations = ((2, yaw), (1, pitch), (0, roll))
+    found = compose([_axis_rotation(axis, angle) for axis, angle in rotations])
     return found[3:]
 
 
-def _turn(place: int, angle: float) -> Pose:
+def _axis_rotation(axis: int, angle: float) -> Pose:
     rotation = [0.0, 0.0, 0.0, math.cos(angle / 2)]
-    rotation[place] = math.sin(angle / 2)
+    rotation[axis] = math.sin(angle / 2)
     x, y, z, w = rotation
     return (0.0, 0.0, 0.0, x, y, z, w)

@@ -1,4 +1,4 @@
-"""The floor: eclipse-zenoh alone. The bytes of zstate's joint states, and nothing is done with them."""
+"""The floor: eclipse-zenoh alone, with payloads as long as zstate's joint states and no processing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bench.subjects.subject import Roles, Subject
 
 
 def _load() -> Roles:
-    from bench.subjects import raw_zenoh_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects import raw_zenoh_roles as roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     return roles.Writer, roles.Reader
 
@@ -19,7 +19,7 @@ SUBJECT = Subject(
     title="raw Zenoh (floor)",
     settings=(
         "eclipse-zenoh from Python, peer to peer over TCP on loopback, with its default settings otherwise",
-        "the payload is as long as zstate's message, with the stamp in its first eight; the reader's "
+        "the payload is as long as zstate's message, with the stamp in its first eight bytes; the reader's "
         "callback unpacks that stamp and counts it as an answer: no model, no buffer, no lookup",
     ),
     install=("pip install eclipse-zenoh",),

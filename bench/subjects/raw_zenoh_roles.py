@@ -10,13 +10,13 @@ import zenoh
 from bench.job import Job
 from bench.subjects.subject import Answered
 
-# What zstate's joint states have besides their numbers: stamp, seq, session, digest and the heads of these.
+# Bytes of zstate's joint states besides the numbers: stamp, seq, session, digest and their headers.
 OVERHEAD = 34
 STAMP = struct.Struct("<q")
 
 
 def settings(job: Job, *, listens: bool) -> dict[str, object]:
-    """Of the session: a peer that listens at the job's first port, or one that connects to it."""
+    """Settings of a peer that listens at the job's first port, or connects to it."""
     endpoint = f"tcp/127.0.0.1:{job.ports[0]}"
     return {
         "mode": "peer",
@@ -27,29 +27,29 @@ def settings(job: Job, *, listens: bool) -> dict[str, object]:
 
 
 def through_router(job: Job) -> dict[str, object]:
-    """Of the session: a client of the router at the job's first port."""
+    """Settings of a client of the router at the job's first port."""
     return {"mode": "client", "connect/endpoints": [f"tcp/127.0.0.1:{job.ports[0]}"]}
 
 
-def open_session(told: dict[str, object]) -> zenoh.Session:
-    """A session with these settings and no others."""
-    config = zenoh.Config()
-    for path, value in told.items():
-        config.insert_json5(path, json.dumps(value))
-    return zenoh.open(config)
+def open_session(config: dict[str, object]) -> zenoh.Session:
+    """A session with exactly these settings."""
+    zenoh_config = zenoh.Config()
+    for path, value in config.items():
+        zenoh_config.insert_json5(path, json.dumps(value))
+    return zenoh.open(zenoh_config)
 
 
 class Writer:
-    """Puts bytes."""
+    """Publishes bytes."""
 
-    def __init__(self, job: Job, told: dict[str, object] | None = None) -> None:
-        self._session = open_session(settings(job, listens=True) if told is None else told)
+    def __init__(self, job: Job, config: dict[str, object] | None = None) -> None:
+        self._session = open_session(settings(job, listens=True) if config is None else config)
         self._publisher = self._session.declare_publisher(f"bench/{job.robot}/joint_states")
         numbers = [struct.pack(f"<{len(row)}d", *row) for row in job.rows]
         self._tails = [bytes(OVERHEAD - STAMP.size) + block for block in numbers]
 
     def send(self, row: int, stamp: int) -> None:
-        """A stamp and the rest."""
+        """Publishes the stamp and the prepared bytes."""
         self._publisher.put(STAMP.pack(stamp) + self._tails[row])
 
     def close(self) -> None:
@@ -58,31 +58,31 @@ class Writer:
 
 
 class Reader:
-    """Takes the stamp out of the bytes."""
+    """Reads the stamp from the bytes."""
 
-    def __init__(self, job: Job, answered: Answered, told: dict[str, object] | None = None) -> None:
-        self._session = open_session(settings(job, listens=False) if told is None else told)
+    def __init__(self, job: Job, answered: Answered, config: dict[str, object] | None = None) -> None:
+        self._session = open_session(settings(job, listens=False) if config is None else config)
         self._answered = answered
-        self._heard: set[int] = set()
-        self._wanted = len(job.robots)
+        self._received: set[int] = set()
+        self._robot_count = len(job.robots)
         self._subscribers = [
             self._session.declare_subscriber(f"bench/{robot}/joint_states", self._on_sample(number))
             for number, robot in enumerate(job.robots)
         ]
 
     def _on_sample(self, number: int) -> zenoh.handlers.Callback[zenoh.Sample]:
-        def take(sample: zenoh.Sample) -> None:
-            self._heard.add(number)
+        def on_sample(sample: zenoh.Sample) -> None:
+            self._received.add(number)
             self._answered(STAMP.unpack_from(sample.payload.to_bytes())[0], number)
 
-        return zenoh.handlers.Callback(take)
+        return zenoh.handlers.Callback(on_sample)
 
     def pose(self, stamp: int, robot: int = 0) -> None:
-        """It has no answers."""
+        """None: it computes no poses."""
 
     def has_tree(self) -> bool:
-        """It has no tree: whether a sample of each robot has come."""
-        return len(self._heard) == self._wanted
+        """Whether a sample of each robot has been received; it has no tree."""
+        return len(self._received) == self._robot_count
 
     def close(self) -> None:
         """Close the session."""

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 from bench.job import Job
 from bench.subjects import raw_zenoh
-from bench.subjects.ours import router
 from bench.subjects.subject import Answered, Roles, Service
+from bench.subjects.zstate_common import router
 
 
 def _load() -> Roles:
-    from bench.subjects import raw_zenoh_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects import raw_zenoh_roles as roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     def reader(job: Job, answered: Answered) -> roles.Reader:
         return roles.Reader(job, answered, roles.through_router(job))

@@ -1,8 +1,8 @@
-"""ROS 1 from Debian: robot_state_publisher and tf2_ros in Python, with the best settings we know."""
+"""ROS 1 from Debian: robot_state_publisher and tf2_ros in Python, with the best known settings."""
 
 from __future__ import annotations
 
-from bench.subjects import ros1_world
+from bench.subjects import ros1_master
 from bench.subjects.subject import Roles, Subject
 
 CHAIN = (
@@ -17,12 +17,12 @@ BEST = (
 )
 READER = (
     "reader: tf2_ros.Buffer and TransformListener, which queues without limit; a second subscriber of /tf, "
-    "called right after the listener's, asks lookup_transform_core(base, tip, stamp): no polling"
+    "called right after the listener's, calls lookup_transform_core(base, tip, stamp): no polling"
 )
 
 
 def _load() -> Roles:
-    from bench.subjects import ros1_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects import ros1_roles as roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     return roles.Writer, roles.Reader
 
@@ -31,10 +31,10 @@ SUBJECT = Subject(
     name="ros1",
     title="ROS 1, Python reader",
     settings=(CHAIN, *BEST, READER),
-    install=ros1_world.INSTALL,
-    python=ros1_world.python,
-    versions=ros1_world.versions,
+    install=ros1_master.INSTALL,
+    python=ros1_master.python,
+    versions=ros1_master.versions,
     load=_load,
-    services=ros1_world.services(*ros1_world.BEST),
-    environment=ros1_world.environment,
+    services=ros1_master.services(*ros1_master.BEST),
+    environment=ros1_master.environment,
 )

@@ -1,16 +1,16 @@
-"""The same ROS 1 as it comes: robot_state_publisher, publisher and listener with their default settings."""
+"""ROS 1 with default settings of robot_state_publisher, publisher and listener."""
 
 from __future__ import annotations
 
 from functools import partial
 
-from bench.subjects import ros1_world
+from bench.subjects import ros1_master
 from bench.subjects.ros1 import CHAIN, READER
 from bench.subjects.subject import Roles, Subject
 
 
 def _load() -> Roles:
-    from bench.subjects import ros1_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects import ros1_roles as roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     writer = partial(roles.Writer, nodelay=False, queue_size=10)
     return writer, partial(roles.Reader, nodelay=False)
@@ -21,16 +21,16 @@ SUBJECT = Subject(
     title="ROS 1, Python reader, default settings",
     settings=(
         CHAIN,
-        "robot_state_publisher: publish_frequency 50, ignore_timestamp false: it leaves out joint states "
-        "that come sooner than that, by design; they count as lost here",
-        "without tcpNoDelay, but for robot_state_publisher's subscription, which asks for it; the writer "
+        "robot_state_publisher: publish_frequency 50, ignore_timestamp false: it drops joint states "
+        "above that rate, by design; they count as lost here",
+        "without tcpNoDelay, except in robot_state_publisher's subscription, which requests it; the writer "
         "publishes with queue_size=10, as the tutorials do",
         READER,
     ),
-    install=ros1_world.INSTALL,
-    python=ros1_world.python,
-    versions=ros1_world.versions,
+    install=ros1_master.INSTALL,
+    python=ros1_master.python,
+    versions=ros1_master.versions,
     load=_load,
-    services=ros1_world.services(),
-    environment=ros1_world.environment,
+    services=ros1_master.services(),
+    environment=ros1_master.environment,
 )

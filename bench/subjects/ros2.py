@@ -7,7 +7,7 @@ import os
 import subprocess
 from collections.abc import Mapping
 
-from bench.home import place, venv_python
+from bench.environments import environment_path, venv_python
 from bench.job import Job
 from bench.subjects.dds import NO_STATE_PUBLISHER, free_domain
 from bench.subjects.subject import Roles, Subject
@@ -20,14 +20,16 @@ for name in ("ros-kilted-rclpy", "ros-rmw-fastrtps-cpp", "ros-fastdds"):
 
 
 def _python() -> str | None:
-    """The environment of the tests with ROS 2 serves as well."""
+    """The benchmark's environment, or that of the tests with ROS 2."""
     return venv_python("ros2") or os.environ.get("ZSTATE_KILTED_PYTHON")
 
 
 @functools.cache
 def _versions() -> dict[str, str]:
-    said = subprocess.run([str(_python()), "-c", VERSIONS], check=True, capture_output=True, text=True).stdout
-    return dict(line.split() for line in said.splitlines())
+    output = subprocess.run(
+        [str(_python()), "-c", VERSIONS], check=True, capture_output=True, text=True
+    ).stdout
+    return dict(line.split() for line in output.splitlines())
 
 
 def _environment(job: Job) -> Mapping[str, str]:
@@ -40,7 +42,7 @@ def _environment(job: Job) -> Mapping[str, str]:
 
 
 def _load() -> Roles:
-    from bench.subjects import ros2_roles as roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects import ros2_roles as roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     return roles.Writer, roles.Reader
 
@@ -50,17 +52,17 @@ SUBJECT = Subject(
     title="ROS 2 messages, rclpy on Fast DDS",
     settings=(
         "ROS 2 Kilted's own rclpy and Fast DDS, discovery LOCALHOST, Fast DDS's default transports: shared "
-        "memory on, so that most bytes are not seen on loopback",
+        "memory on, so that most bytes do not appear on loopback",
         "the writer publishes sensor_msgs/JointState (rclpy, one message object for all samples, reliable, "
         "depth 10) and tf2_msgs/TFMessage on /tf (reliable, depth 100) and /tf_static (transient local)",
         *NO_STATE_PUBLISHER,
-        "reader: rclpy.spin of the default single-threaded executor; /tf reliable, depth 100, as tf2_ros "
-        "asks for; it does not subscribe to the joint states. Kilted's experimental EventsExecutor is not "
-        "used: spun in a thread beside the main one, it blocked the process",
+        "reader: rclpy.spin of the default single-threaded executor; /tf reliable, depth 100, as in "
+        "tf2_ros; it does not subscribe to the joint states. Kilted's experimental EventsExecutor is not "
+        "used: spun outside the main thread, it blocked the process",
     ),
     install=(
         "apt-get install -y --no-install-recommends g++",
-        f"python tests/helpers/ros2/oracles.py kilted {place('ros2')}",
+        f"python tests/helpers/ros2/oracles.py kilted {environment_path('ros2')}",
     ),
     python=_python,
     versions=_versions,

@@ -24,7 +24,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Writer:
-    """Publishes joint states as messages and transforms as bytes, which rclpy takes as well."""
+    """Publishes joint states as messages and transforms as bytes, which rclpy accepts as well."""
 
     def __init__(self, job: Job) -> None:
         rclpy.init()
@@ -38,21 +38,21 @@ class Writer:
         static.publish(self._bytes.static)
 
     def send(self, row: int, stamp: int) -> None:
-        """Joint states first, as they would be."""
+        """Joint states first, as in a real chain."""
         message = self._message
         at = message.header.stamp
         at.sec, at.nanosec = divmod(stamp, 10**9)
         message.position = self._rows[row]
         self._joints.publish(message)
-        self._tf.publish(self._bytes.row(row, stamp))
+        self._tf.publish(self._bytes.message(row, stamp))
 
     def close(self) -> None:
-        """Leave the domain."""
+        """Leaves the domain."""
         rclpy.shutdown()
 
 
 class Reader(TfReader):
-    """Hears the messages of one domain."""
+    """Receives the messages of one domain."""
 
     def __init__(self, job: Job, answered: Answered) -> None:
         super().__init__(job, answered)
@@ -70,7 +70,7 @@ class Reader(TfReader):
             rclpy.spin(node)
 
     def close(self) -> None:
-        """Leave the domain."""
+        """Leaves the domain."""
         super().close()
         rclpy.shutdown()
         self._thread.join()

@@ -1,6 +1,6 @@
-"""What a state publisher would put on /tf and /tf_static, as CDR, and how a reader keeps it.
+"""The /tf and /tf_static messages of a state publisher, as CDR, and a reader's history of them.
 
-For systems without robot_state_publisher. The standard library alone, for it runs in their environments.
+For systems without robot_state_publisher. Standard library only, because it runs in their environments.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bench.job import Job
-from bench.subjects.edges import Edge, Pose, composed, edges_of, path_between
+from bench.subjects.edges import Edge, Pose, compose, path_between, read_edges
 
 STAMP = struct.Struct("<iI")
 HISTORY_NS = 10_000_000_000
@@ -19,21 +19,21 @@ _LITTLE_ENDIAN = bytes((0, 1, 0, 0))
 
 
 class TfBytes:
-    """TFMessages of one row each, worked out and serialized beforehand; only the stamps are left to say."""
+    """TFMessages of one row each, computed and serialized beforehand except for the stamps."""
 
     def __init__(self, job: Job) -> None:
-        edges = edges_of(job.urdf)
+        edges = read_edges(job.urdf)
         moving = [edge for edge in edges if edge.moves]
         self._rows = [_pieces(moving, dict(zip(job.joints, row, strict=True))) for row in job.rows]
         self.static = bytes(STAMP.size).join(_pieces([edge for edge in edges if not edge.moves], {}))
 
-    def row(self, row: int, stamp: int) -> bytes:
+    def message(self, row: int, stamp: int) -> bytes:
         """The message of all moving edges at ``stamp`` [ns]."""
         return STAMP.pack(*divmod(stamp, 10**9)).join(self._rows[row])
 
 
 def _pieces(edges: Sequence[Edge], positions: Mapping[str, float]) -> list[bytes]:
-    """tf2_msgs/msg/TFMessage in little-endian CDR, cut out where the stamps belong."""
+    """tf2_msgs/msg/TFMessage in little-endian CDR, cut at the stamps."""
     message, cuts = bytearray(struct.pack("<I", len(edges))), [0]
     for edge in edges:
         message += bytes(STAMP.size)
@@ -48,14 +48,14 @@ def _pieces(edges: Sequence[Edge], positions: Mapping[str, float]) -> list[bytes
 
 
 class TfHistory:
-    """The last 10 s of the edges between base and tip, out of messages as they come.
+    """The last 10 s of the edges between base and tip, from received messages.
 
-    Messages are those of ROS 2, whoever made their classes. What the question does not need is not kept,
-    and the way from base to tip is known beforehand: less than a transform buffer does.
+    Accepts ROS 2 messages of any binding. Other edges are not kept, and the path from base to tip is computed
+    beforehand: less work than a transform buffer does.
     """
 
     def __init__(self, job: Job) -> None:
-        edges = edges_of(job.urdf)
+        edges = read_edges(job.urdf)
         moving = {edge.child for edge in edges if edge.moves}
         self._path = path_between(edges, job.base, job.tip)
         self._moving = [child for child in self._path if child in moving]
@@ -66,13 +66,13 @@ class TfHistory:
         self._stamps: deque[int] = deque()
 
     def add_statics(self, message: Any) -> None:
-        """From /tf_static."""
+        """Adds a message of /tf_static."""
         for stamped in message.transforms:
             self._statics[stamped.child_frame_id] = _pose(stamped.transform)
         self._known.update(self._statics)
 
     def add(self, message: Any) -> int:
-        """From /tf; its stamp."""
+        """Adds a message of /tf; returns its stamp."""
         by_child = {stamped.child_frame_id: stamped.transform for stamped in message.transforms}
         at = message.transforms[0].header.stamp
         stamp: int = at.sec * 10**9 + at.nanosec
@@ -85,12 +85,12 @@ class TfHistory:
         return stamp
 
     def pose(self, stamp: int) -> Pose:
-        """Of the tip in the base; KeyError when an edge is not known at that stamp."""
+        """The pose of the tip in the base. Raises KeyError if an edge is unknown at that stamp."""
         moving, statics = self._poses[stamp], self._statics
-        return composed([moving[child] if child in moving else statics[child] for child in self._path])
+        return compose([moving[child] if child in moving else statics[child] for child in self._path])
 
-    def answers(self, stamp: int) -> bool:
-        """Whether it has just given the pose at ``stamp``; not so before the static edges have come."""
+    def has_pose(self, stamp: int) -> bool:
+        """Whether the pose at ``stamp`` is known; False until the static edges have arrived."""
         try:
             self.pose(stamp)
         except KeyError:
@@ -98,7 +98,7 @@ class TfHistory:
         return True
 
     def has_tree(self) -> bool:
-        """Whether every link was heard of."""
+        """Whether every link has been received."""
         return self._known >= self._links
 
 

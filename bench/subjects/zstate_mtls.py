@@ -1,4 +1,4 @@
-"""zstate through a router, everything encrypted and everybody checked by certificate."""
+"""zstate through a router with mutual TLS."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from bench.job import Job
-from bench.subjects.ours import HOW_READ, here, our_versions, router
 from bench.subjects.subject import Roles, Service, Subject
+from bench.subjects.zstate_common import ROLE_SETTINGS, router, this_python, zstate_versions
 
 if TYPE_CHECKING:
     from zstate.net.session import Session
@@ -18,7 +18,7 @@ LIBRARY = "cryptography"
 
 
 def _load() -> Roles:
-    from bench.subjects.zstate_roles import roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects.zstate_roles import roles  # noqa: PLC0415 - imported late, as the protocol requires
 
     return roles(_connect)
 
@@ -42,13 +42,13 @@ SUBJECT = Subject(
     name="zstate_mtls",
     title="zstate, mutual TLS",
     settings=(
-        "writer and reader are clients of one `zstate router` on loopback over TLS 1.3; each shows a "
-        "certificate of `zstate certs`, and checks the other's; native wire",
-        *HOW_READ,
+        "writer and reader are clients of one `zstate router` on loopback over TLS 1.3; each presents a "
+        "certificate of `zstate certs` and verifies the peer; native wire",
+        *ROLE_SETTINGS,
     ),
     install=("pip install -e '.[robots,bench,certs]'",),
-    python=lambda: here() if find_spec(LIBRARY) else None,
-    versions=lambda: {**our_versions(), LIBRARY: version(LIBRARY)},
+    python=lambda: this_python() if find_spec(LIBRARY) else None,
+    versions=lambda: {**zstate_versions(), LIBRARY: version(LIBRARY)},
     load=_load,
     services=_services,
 )

@@ -1,4 +1,4 @@
-"""A writer and a reader of zstate, whatever they are connected by and whichever wire they speak."""
+"""A writer and a reader of zstate, for any connection and wire format."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Connect = Callable[[Job, str], Session]
 
 
 def roles(connect: Connect, wire: str = "native") -> Roles:
-    """Both roles, connected like this."""
+    """Writer and Reader that open their session with ``connect``."""
     return partial(Writer, connect, wire), partial(Reader, connect, wire)
 
 
 class Writer(Closeable):
-    """A ``StatePublisher`` that is given positions and a stamp."""
+    """Publishes positions and a stamp with a ``StatePublisher``."""
 
     def __init__(self, connect: Connect, wire: str, job: Job) -> None:
         model = load_model(Path(job.urdf))
@@ -44,9 +44,9 @@ class Writer(Closeable):
 
 
 class Reader(Closeable):
-    """A ``TransformListener``; its buffer's ``watch`` wakes it, and it asks for that stamp.
+    """A ``TransformListener``; its buffer's ``watch`` calls it, and it looks up that stamp.
 
-    The watch already hands over the answer; the lookup is made nevertheless, as by everybody else.
+    The watch already delivers the answer; the lookup is repeated for comparability with other systems.
     """
 
     def __init__(self, connect: Connect, wire: str, job: Job, answered: Answered) -> None:
@@ -66,13 +66,13 @@ class Reader(Closeable):
                 for number, ends in enumerate(self._ends)
             ]
 
-    def _answer(self, ends: tuple[str, str], robot: int, news: Transform) -> None:
-        assert news.stamp is not None
-        self._buffer.lookup(*ends, news.stamp)
-        self._answered(news.stamp, robot)
+    def _answer(self, ends: tuple[str, str], robot: int, newest: Transform) -> None:
+        assert newest.stamp is not None
+        self._buffer.lookup(*ends, newest.stamp)
+        self._answered(newest.stamp, robot)
 
     def _loop(self) -> None:
-        """A loop that takes its time with each answer: it waits for a newer sample, and takes the newest."""
+        """The loop of a slow user: waits for a newer sample, then looks up the newest."""
         ends, newest = self._ends[0], None
         while not self._closed.is_set():
             try:

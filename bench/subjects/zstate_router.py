@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from bench.job import Job
-from bench.subjects.ours import HOW_READ, INSTALL, here, our_versions, router
 from bench.subjects.subject import Roles, Service, Subject
+from bench.subjects.zstate_common import INSTALL, ROLE_SETTINGS, router, this_python, zstate_versions
 
 
 def _load() -> Roles:
-    from bench.subjects.zstate_roles import roles  # noqa: PLC0415 - as late as the protocol asks
+    from bench.subjects.zstate_roles import roles  # noqa: PLC0415 - imported late, as the protocol requires
     from zstate import connect  # noqa: PLC0415
 
     return roles(lambda job, role: connect(mode="client", endpoints=f"tcp/127.0.0.1:{job.ports[0]}"))
@@ -23,10 +23,13 @@ def _services(job: Job) -> Sequence[Service]:
 SUBJECT = Subject(
     name="zstate_router",
     title="zstate, router",
-    settings=("writer and reader are clients of one `zstate router` on loopback; native wire", *HOW_READ),
+    settings=(
+        "writer and reader are clients of one `zstate router` on loopback; native wire",
+        *ROLE_SETTINGS,
+    ),
     install=INSTALL,
-    python=here,
-    versions=our_versions,
+    python=this_python,
+    versions=zstate_versions,
     load=_load,
     services=_services,
     fleet=True,

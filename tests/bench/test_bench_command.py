@@ -1,4 +1,4 @@
-"""``python -m bench``, as far as it measures nothing."""
+"""``python -m bench`` without measurements."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     return lambda *arguments: CliRunner().invoke(command.main, arguments)
 
 
-def test_setup_shows_what_is_there_and_how_the_rest_is_installed(
+def test_setup_lists_installed_subjects_and_install_commands_of_missing_ones(
     bench: Callable[..., Result], capsys
 ) -> None:
     command._show_installed(list(SUBJECTS.values()))
@@ -42,14 +42,14 @@ def test_setup_shows_what_is_there_and_how_the_rest_is_installed(
     assert "absent: python -m bench setup absent, which is\n  echo made it\n  false\n" in shown
 
 
-def test_setup_stops_at_the_first_command_that_fails(bench: Callable[..., Result]) -> None:
+def test_setup_stops_at_the_first_failing_command(bench: Callable[..., Result]) -> None:
     result = bench("setup", "absent")
     assert result.exit_code == 1
     assert "absent: this command failed" in result.output
 
 
 @pytest.mark.parametrize(("option", "value"), [("--subject", "ros9"), ("--scenario", "talos-7")])
-def test_a_name_that_does_not_exist_is_refused_with_those_that_do(
+def test_unknown_subject_or_scenario_error_lists_known_names(
     bench: Callable[..., Result], option: str, value: str
 ) -> None:
     result = bench("run", option, value)

@@ -1,4 +1,4 @@
-"""The report of a run that never was."""
+"""The report of synthetic results."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from helpers.fake_results import SCENARIOS, TITLES, write_results
 
 import bench
+from bench.aggregate import aggregate
 from bench.markdown import dash, number
-from bench.outcome import outcome
 from bench.plots import PlotsMissing, write_plots
 from bench.report import report_lines, write_report
 from bench.results import Results
@@ -37,29 +37,29 @@ def _next_heading(lines: list[str], begin: int) -> int:
     return next((at for at in range(begin + 1, len(lines)) if lines[at].startswith("## ")), len(lines))
 
 
-def test_a_subject_that_is_not_installed_is_shown_as_such_with_its_command(results: Results) -> None:
+def test_missing_subject_is_listed_with_its_install_command(results: Results) -> None:
     assert rows(results, "Not installed")["Absent DDS"] == ["`pip install absent-dds`"]
     assert "Absent DDS" not in rows(results, "Rate at the reader: talos")
 
 
-def test_a_run_that_failed_is_shown_with_its_reason_and_no_figure(results: Results) -> None:
+def test_failed_run_is_listed_with_its_reason_and_no_figures(results: Results) -> None:
     assert rows(results, "Failed")["ROS 1"] == ["talos-100-busy", "roscore was not ready"]
     assert "ROS 1" not in rows(results, "A thread holds the reader's GIL")
 
 
-def test_what_was_not_measured_is_a_dash(tmp_path: Path) -> None:
+def test_unmeasured_figure_is_a_dash(tmp_path: Path) -> None:
     results = write_results(tmp_path, {"zstate_peer": 1.0, "ros1": 4.0}, TITLES)
     assert rows(results, "Rate at the reader: talos")["raw Zenoh (floor)"] == ["-", "-"]
 
 
-def test_rates_stand_beside_those_that_were_commanded_and_losses_are_told(results: Results) -> None:
+def test_rate_table_shows_commanded_rates_achieved_rates_and_losses(results: Results) -> None:
     table = rows(results, "Rate at the reader: talos")
     assert table["commanded"] == ["100 Hz", "1000 Hz"]
     assert table["zstate"] == ["100", "1,000"]
     assert table["ROS 1"] == ["100", "500 (4000 of 8000)"]
 
 
-def test_ratios_are_the_others_figure_by_that_of_zstate(results: Results) -> None:
+def test_ratio_is_the_other_systems_figure_divided_by_that_of_zstate(results: Results) -> None:
     table = rows(results, "Times zstate's figure: talos at 1000 Hz")
     # CPU: 3 % of a core each 100 Hz and factor, and the state publisher's 3 % by its factor of 4.
     assert table["ROS 1"] == ["0.5", "4", "4", f"{(120 + 12) / 30:.3g}", "4"]
@@ -67,30 +67,30 @@ def test_ratios_are_the_others_figure_by_that_of_zstate(results: Results) -> Non
     assert "zstate" not in table
 
 
-def test_a_fleet_is_told_by_the_rate_of_each_robot(results: Results) -> None:
+def test_fleet_table_shows_the_rate_per_robot(results: Results) -> None:
     assert rows(results, "100 x panda at 50 Hz")["zstate"][0] == "50"
 
 
-def test_late_joiners_are_told_by_the_middle_one_and_the_worst(results: Results) -> None:
+def test_late_joiner_table_shows_median_and_maximum(results: Results) -> None:
     assert rows(results, "Late joiners: talos at 100 Hz")["ROS 1"] == ["120", "160", "60", "80", "3"]
 
 
-def test_several_readers_cost_together_and_are_as_quick_as_the_middle_one(results: Results) -> None:
-    five = outcome(results, "zstate_peer", SCENARIOS[3])
-    one = outcome(results, "zstate_peer", RATE)
+def test_cpu_of_several_readers_is_summed_and_latency_is_the_median(results: Results) -> None:
+    five = aggregate(results, "zstate_peer", SCENARIOS[3])
+    one = aggregate(results, "zstate_peer", RATE)
     assert five is not None
     assert one is not None
     assert five.cpu_percent()["reader"] == pytest.approx(5 * one.cpu_percent()["reader"])
     assert five.latency_us(50) == one.latency_us(50)
 
 
-def test_the_settings_of_everybody_stand_in_the_report(results: Results) -> None:
+def test_report_lists_the_settings_of_every_subject(results: Results) -> None:
     text = "\n".join(report_lines(results, []))
     for name, title in TITLES.items():
         assert f"- **{title}** ({name} 1.0): how {name} is set." in text
 
 
-def test_plots_are_written_beside_the_tables_and_shown_there(results: Results) -> None:
+def test_plots_are_written_next_to_the_report_and_shown_in_it(results: Results) -> None:
     pytest.importorskip("matplotlib")
     plots = write_plots(results)
     names = {"overview", "rates", "latency", "cpu", "joints", "readers", "late"}
@@ -100,11 +100,11 @@ def test_plots_are_written_beside_the_tables_and_shown_there(results: Results) -
     assert "Rate at the reader" in (results.folder / "overview.svg").read_text()
 
 
-def test_without_matplotlib_there_are_tables_and_a_hint(
+def test_report_without_matplotlib_has_tables_and_names_the_package(
     results: Results, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(bench, "charts", raising=False)
-    monkeypatch.setitem(sys.modules, "bench.charts", None)  # what imports it fails, as without matplotlib
+    monkeypatch.setitem(sys.modules, "bench.charts", None)  # importing it fails, as without matplotlib
     with pytest.raises(PlotsMissing, match="pip install"):
         write_plots(results)
     assert write_report(results, []).exists()
@@ -114,9 +114,9 @@ def test_without_matplotlib_there_are_tables_and_a_hint(
     ("value", "text"),
     [(0.51349, "0.513"), (12.34, "12.3"), (123.44, "123.4"), (100.0, "100"), (12345.6, "12,346")],
 )
-def test_numbers_have_the_digits_they_deserve(value: float, text: str) -> None:
+def test_number_is_rounded_to_three_or_four_digits(value: float, text: str) -> None:
     assert number(value) == text
 
 
-def test_a_missing_value_is_a_dash() -> None:
+def test_missing_value_is_a_dash() -> None:
     assert dash(None, number) == "-"

@@ -1,4 +1,4 @@
-"""What the subjects that are not ours share; and ROS 1 itself, where it is installed."""
+"""Shared code of the foreign subjects, and ROS 1 itself if it is installed."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from rosbags.typesys import Stores, get_typestore
 from bench import robot
 from bench.job import Job
 from bench.scenario import Scenario
-from bench.subjects import dds, ros1, ros1_world
-from bench.subjects.awakening import Awakening
+from bench.subjects import dds, ros1, ros1_master
 from bench.subjects.tf_messages import HISTORY_NS, TfBytes, TfHistory
-from bench.trial import try_subject
+from bench.subjects.wakeup_reader import WakeupReader
+from bench.trial import run_trial
 from zstate import load_model
 from zstate.model.kinematics import Kinematics
 
@@ -31,7 +31,7 @@ STAMP = 1_234_567_890_123_456_789
 
 
 def a_job(name: str) -> Job:
-    """The way from the root to the last link, for three rows of positions."""
+    """A job from the root to the last link with three rows of positions."""
     urdf = MODELS / f"{name}.urdf"
     model = load_model(urdf)
     rows = np.random.default_rng(5).uniform(-1.5, 1.5, (3, len(model.joint_names)))
@@ -52,83 +52,83 @@ def read(content: bytes) -> Any:
 
 
 @pytest.mark.parametrize("name", ["rrbot", "gripper", "diffbot"])
-def test_what_stands_in_for_a_state_publisher_puts_the_tip_where_zstate_does(name: str):
+def test_precomputed_transforms_give_the_same_tip_pose_as_zstate(name: str):
     job = a_job(name)
     tfs, history = TfBytes(job), TfHistory(job)
     history.add_statics(read(tfs.static))
     for number, row in enumerate(job.rows):
-        assert history.add(read(tfs.row(number, STAMP + number))) == STAMP + number
+        assert history.add(read(tfs.message(number, STAMP + number))) == STAMP + number
         expected = Kinematics(load_model(job.urdf)).link_poses(row)[-1]
         found = np.array(history.pose(STAMP + number))
         assert np.allclose(found[:3], expected[:3], atol=1e-12)
         assert abs(found[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_every_edge_of_a_message_has_its_stamp():
-    transforms = read(TfBytes(a_job("rrbot")).row(0, STAMP)).transforms
+def test_every_edge_of_a_message_has_the_stamp():
+    transforms = read(TfBytes(a_job("rrbot")).message(0, STAMP)).transforms
     stamps = {at.sec * 10**9 + at.nanosec for at in (edge.header.stamp for edge in transforms)}
     assert stamps == {STAMP}
 
 
-def test_a_tree_is_whole_once_moving_and_static_edges_have_come():
+def test_tree_is_complete_after_moving_and_static_edges():
     job = a_job("rrbot")
     tfs, history = TfBytes(job), TfHistory(job)
-    history.add(read(tfs.row(0, STAMP)))
+    history.add(read(tfs.message(0, STAMP)))
     assert not history.has_tree()
-    assert not history.answers(STAMP)
+    assert not history.has_pose(STAMP)
     history.add_statics(read(tfs.static))
     assert history.has_tree()
-    assert history.answers(STAMP)
+    assert history.has_pose(STAMP)
 
 
-def test_a_history_forgets_what_is_older_than_ten_seconds():
+def test_history_keeps_ten_seconds():
     job = a_job("rrbot")
     tfs, history = TfBytes(job), TfHistory(job)
     history.add_statics(read(tfs.static))
     for stamp in (STAMP, STAMP + HISTORY_NS, STAMP + HISTORY_NS + 1):
-        history.add(read(tfs.row(0, stamp)))
-    assert not history.answers(STAMP)
-    assert history.answers(STAMP + HISTORY_NS)
+        history.add(read(tfs.message(0, stamp)))
+    assert not history.has_pose(STAMP)
+    assert history.has_pose(STAMP + HISTORY_NS)
 
 
-def test_a_quick_user_is_called_in_the_thread_that_heard():
+def test_fast_user_is_called_in_the_receiving_thread():
     threads: list[int] = []
-    Awakening(a_job("rrbot"), lambda _: threads.append(threading.get_ident())).heard(1)
+    WakeupReader(a_job("rrbot"), lambda _: threads.append(threading.get_ident())).on_sample(1)
     assert threads == [threading.get_ident()]
 
 
-def test_a_slow_user_takes_the_newest_sample_and_holds_nobody_up():
-    taken: list[int] = []
+def test_slow_user_answers_the_newest_sample_without_blocking_the_receiver():
+    answered: list[int] = []
     is_in, may_go, is_done = threading.Event(), threading.Event(), threading.Event()
 
     def user(stamp: int) -> None:
-        taken.append(stamp)
+        answered.append(stamp)
         is_in.set()
         may_go.wait(10)
         if stamp == 4:
             is_done.set()
 
-    awakening = Awakening(replace(a_job("rrbot"), load="slow"), user)
-    awakening.heard(1)
+    wakeup = WakeupReader(replace(a_job("rrbot"), load="slow"), user)
+    wakeup.on_sample(1)
     assert is_in.wait(10)
     for stamp in (2, 3, 4):
-        awakening.heard(stamp)  # returns while the user is at 1
+        wakeup.on_sample(stamp)  # returns while the user is at 1
     may_go.set()
     assert is_done.wait(10)
-    awakening.close()
-    assert taken == [1, 4]
+    wakeup.close()
+    assert answered == [1, 4]
 
 
-def test_a_domain_that_somebody_is_in_is_left_alone():
-    wished = dds.free_domain((1,))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-        somebody.bind(("", 7400 + 250 * wished + 10))
+def test_free_domain_skips_a_used_domain():
+    first = dds.free_domain((1,))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(("", 7400 + 250 * first + 10))
         dds.free_domain.cache_clear()
-        assert dds.free_domain((1,)) != wished
+        assert dds.free_domain((1,)) != first
     dds.free_domain.cache_clear()
 
 
-def test_subjects_are_read_without_what_they_need():
+def test_subject_modules_import_only_the_standard_library():
     code = f"""
 import sys
 from importlib import import_module
@@ -138,23 +138,23 @@ for name in {FOREIGN}:
 outside = {{name.partition(".")[0] for name in sys.modules}} - sys.stdlib_module_names
 print(*sorted(outside - {{"__main__", "bench"}}))
 """
-    # -S: without site-packages there is nothing but the standard library to import
-    said = subprocess.run(
+    # -S: without site-packages only the standard library can be imported
+    result = subprocess.run(
         [sys.executable, "-S", "-c", code],
         cwd=MODELS.parent,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert said.returncode == 0, said.stderr
-    assert said.stdout.split() == []
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == []
 
 
 @pytest.mark.ros1
-@pytest.mark.skipif(ros1_world.python() is None, reason=f"ROS 1 is not there: {ros1_world.INSTALL[0]}")
-def test_ros_1_answers_with_the_poses_that_zstate_computes(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.skipif(ros1_master.python() is None, reason=f"ROS 1 is not installed: {ros1_master.INSTALL[0]}")
+def test_ros_1_answers_equal_the_poses_of_zstate(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(robot.MODELS, "rrbot", str(MODELS / "rrbot.urdf"))
-    facts = try_subject(ros1.SUBJECT, Scenario("rate", "rrbot", 50.0, seconds=0.5))
+    facts = run_trial(ros1.SUBJECT, Scenario("rate", "rrbot", 50.0, seconds=0.5))
     assert "failed" not in facts, facts["failed"]
     assert facts["readers"][0]["answered"] > 0
     assert facts["poses"]["compared"] > 0

@@ -1,4 +1,4 @@
-"""Tables of the benchmark in documents are those of the results they name."""
+"""Benchmark tables in documents match the results they name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.fake_results import TITLES, write_results
 
-from bench.readme import END, renewed, short_table
+from bench.readme import END, short_table, with_current_tables
 
 ROOT = Path(__file__).parents[2]
 FOLDER = "bench/results/2026-01-02-abc1234"
@@ -15,25 +15,25 @@ FACTORS = {"zstate_peer": 1.0, "ros1": 4.0, "raw_zenoh": 0.8}
 
 
 @pytest.mark.parametrize("name", ["README.md", "bench/README.md"])
-def test_the_tables_of_our_documents_are_those_of_the_results_they_name(name: str) -> None:
+def test_tables_in_documents_match_the_results_they_name(name: str) -> None:
     text = (ROOT / name).read_text(encoding="utf-8")
-    assert renewed(text, ROOT) == text, "python -m bench report --readme writes them anew"
+    assert with_current_tables(text, ROOT) == text, "python -m bench report --readme rewrites them"
 
 
-def test_every_results_folder_that_a_document_names_is_there() -> None:
+def test_every_bench_mark_has_an_end_mark() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert text.count("<!-- bench: ") == text.count(END)
 
 
-def test_a_table_between_the_marks_is_made_anew_and_nothing_else_is_touched(tmp_path: Path) -> None:
+def test_only_the_table_between_the_marks_is_rewritten(tmp_path: Path) -> None:
     results = write_results(tmp_path / FOLDER, FACTORS, TITLES)
     before = f"# Title\n<!-- bench: {FOLDER} -->\nan old table\n{END}\nthe rest\n"
-    after = renewed(before, tmp_path)
+    after = with_current_tables(before, tmp_path)
     assert after == f"# Title\n<!-- bench: {FOLDER} -->\n\n{short_table(results)}\n{END}\nthe rest\n"
-    assert renewed(after, tmp_path) == after
+    assert with_current_tables(after, tmp_path) == after
 
 
-def test_the_short_table_has_a_row_for_everybody_that_was_measured(tmp_path: Path) -> None:
+def test_short_table_has_a_row_per_measured_subject(tmp_path: Path) -> None:
     lines = short_table(write_results(tmp_path, FACTORS, TITLES)).splitlines()
     cells = {
         line.split("|")[1].strip(): [one.strip() for one in line.split("|")[2:-1]] for line in lines if line
@@ -44,5 +44,5 @@ def test_the_short_table_has_a_row_for_everybody_that_was_measured(tmp_path: Pat
     assert cells["raw Zenoh (floor)"][-1] == "24 ms"
 
 
-def test_a_document_without_marks_stays_as_it_is(tmp_path: Path) -> None:
-    assert renewed("no table\n", tmp_path) == "no table\n"
+def test_document_without_marks_is_unchanged(tmp_path: Path) -> None:
+    assert with_current_tables("no table\n", tmp_path) == "no table\n"

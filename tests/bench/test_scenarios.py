@@ -1,4 +1,4 @@
-"""What is run, and in which order."""
+"""Scenarios and the order of the runs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from bench.run import turns
-from bench.scenario import FULL, QUICK, Scenario, named
+from bench.run import plan_turns
+from bench.scenario import FULL, QUICK, Scenario, select_scenarios
 from bench.subjects import raw_zenoh
 
 ALONE = raw_zenoh.SUBJECT
@@ -16,11 +16,11 @@ SUBJECTS = [replace(ALONE, name=name, fleet=name == "c") for name in ("a", "b", 
 
 
 @pytest.mark.parametrize("scenarios", [FULL, QUICK])
-def test_every_scenario_has_a_name_of_its_own(scenarios: tuple[Scenario, ...]) -> None:
+def test_scenario_names_are_unique(scenarios: tuple[Scenario, ...]) -> None:
     assert len({one.name for one in scenarios}) == len(scenarios)
 
 
-def test_the_full_run_has_every_robot_rate_and_load_that_was_promised() -> None:
+def test_full_run_covers_all_robots_rates_and_loads() -> None:
     rates = {one.rate_hz for one in FULL if one.group == "rate" and one.robot == "talos"}
     assert rates == {50.0, 100.0, 200.0, 500.0, 1000.0, 0.0}
     assert {one.robot for one in FULL if one.rate_hz == 1000.0} == {"panda", "g1", "talos", "tiago_dual"}
@@ -30,20 +30,26 @@ def test_the_full_run_has_every_robot_rate_and_load_that_was_promised() -> None:
     assert any(one.joins for one in FULL)
 
 
-def test_a_word_chooses_a_scenario_or_a_group_of_them() -> None:
-    assert [one.name for one in named(FULL, ["readers"])] == ["talos-100-readers5", "talos-100-readers20"]
-    assert [one.name for one in named(FULL, ["talos-1000", "late"])] == ["talos-1000", "talos-100-late"]
-    assert named(FULL, []) == FULL
+def test_word_selects_a_scenario_or_a_group() -> None:
+    assert [one.name for one in select_scenarios(FULL, ["readers"])] == [
+        "talos-100-readers5",
+        "talos-100-readers20",
+    ]
+    assert [one.name for one in select_scenarios(FULL, ["talos-1000", "late"])] == [
+        "talos-1000",
+        "talos-100-late",
+    ]
+    assert select_scenarios(FULL, []) == FULL
 
 
-def test_a_word_that_fits_nothing_is_refused_with_those_that_would() -> None:
+def test_unknown_word_error_lists_known_words() -> None:
     with pytest.raises(ValueError, match=r"no scenario is called talos-7; there are .*talos-1000"):
-        named(FULL, ["talos-7"])
+        select_scenarios(FULL, ["talos-7"])
 
 
-def test_every_subject_has_every_round_of_every_scenario_but_fleets_are_for_those_that_can() -> None:
+def test_every_subject_runs_every_round_except_fleets_it_cannot_run() -> None:
     scenarios = [Scenario("rate", "panda", 100.0, repeats=3), Scenario("fleet", "panda", 50.0, fleet=9)]
-    planned = turns(SUBJECTS, scenarios, 2, seed=1)
+    planned = plan_turns(SUBJECTS, scenarios, 2, seed=1)
     count = Counter((turn.subject.name, turn.scenario.name) for turn in planned)
     assert count == {
         **{(name, "panda-100"): 6 for name in "abcd"},
@@ -51,8 +57,8 @@ def test_every_subject_has_every_round_of_every_scenario_but_fleets_are_for_thos
     }
 
 
-def test_who_is_compared_is_measured_one_after_the_other_in_an_order_of_each_round() -> None:
-    planned = turns(SUBJECTS, [Scenario("rate", "panda", 100.0, repeats=20)], 1, seed=5)
+def test_subjects_of_a_round_run_consecutively_in_shuffled_order() -> None:
+    planned = plan_turns(SUBJECTS, [Scenario("rate", "panda", 100.0, repeats=20)], 1, seed=5)
     rounds = [planned[at : at + 4] for at in range(0, len(planned), 4)]
     assert [{turn.round for turn in one} for one in rounds] == [{number} for number in range(20)]
     orders = {"".join(turn.subject.name for turn in one) for one in rounds}
@@ -60,9 +66,9 @@ def test_who_is_compared_is_measured_one_after_the_other_in_an_order_of_each_rou
     assert len(orders) > 5
 
 
-def test_the_same_seed_gives_the_same_order() -> None:
+def test_equal_seeds_give_equal_orders() -> None:
     first, second, other = (
-        [(turn.subject.name, turn.scenario.name) for turn in turns(SUBJECTS, QUICK, 1, seed)]
+        [(turn.subject.name, turn.scenario.name) for turn in plan_turns(SUBJECTS, QUICK, 1, seed)]
         for seed in (3, 3, 4)
     )
     assert first == second

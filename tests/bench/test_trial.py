@@ -1,4 +1,4 @@
-"""A real run, a second long, and what is measured from outside."""
+"""A real run of one second, and the measurements from outside."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from helpers.processes import Child, until
 
-from bench.measure import Traffic, cpu_ns, family, peak_memory_kb
+from bench.measure import Traffic, cpu_ns, peak_memory_kb, process_tree
 from bench.process import Process, RunFailed
 from bench.recording import percentile
 from bench.scenario import Scenario
 from bench.subjects import subject_named
-from bench.trial import free_ports, try_subject
+from bench.trial import free_ports, run_trial
 
 pytestmark = [
     pytest.mark.processes,
@@ -25,8 +25,8 @@ pytestmark = [
 
 
 @pytest.mark.robots
-def test_the_floor_at_50_hz_loses_nothing_and_tells_what_it_costs() -> None:
-    facts = try_subject(subject_named("raw_zenoh"), Scenario("rate", "panda", 50.0, seconds=1.0))
+def test_floor_at_50_hz_loses_nothing_and_reports_its_costs() -> None:
+    facts = run_trial(subject_named("raw_zenoh"), Scenario("rate", "panda", 50.0, seconds=1.0))
     assert "failed" not in facts, facts
     [reader] = facts["readers"]
     assert (reader["lost"], reader["answered"]) == (0, facts["sent"])
@@ -39,44 +39,44 @@ def test_the_floor_at_50_hz_loses_nothing_and_tells_what_it_costs() -> None:
 
 
 @pytest.mark.robots
-def test_zstate_answers_right_and_a_late_joiner_has_the_whole_tree() -> None:
+def test_zstate_answers_correctly_and_a_late_joiner_gets_the_whole_tree() -> None:
     subject = subject_named("zstate_peer")
-    facts = try_subject(subject, Scenario("rate", "panda", 50.0, seconds=1.0))
+    facts = run_trial(subject, Scenario("rate", "panda", 50.0, seconds=1.0))
     assert "failed" not in facts, facts
     assert facts["readers"][0]["lost"] == 0
     assert facts["poses"]["compared"] >= 10
     assert facts["poses"]["errors"] == 0
     assert facts["poses"]["most_m"] < 1e-12
     assert facts["poses"]["most_rad"] < 1e-12
-    joins = try_subject(subject, Scenario("late", "panda", 100.0, joins=1))
+    joins = run_trial(subject, Scenario("late", "panda", 100.0, joins=1))
     assert 0.0 < joins["connected_ms"][0] <= joins["whole_ms"][0]
 
 
 @pytest.mark.robots
-def test_a_worker_that_fails_is_a_failed_run_with_its_last_words() -> None:
+def test_failed_worker_fails_the_run_with_its_last_output() -> None:
     subject = replace(subject_named("raw_zenoh"), name="no_such_subject")
-    facts = try_subject(subject, Scenario("rate", "panda", 50.0, seconds=1.0))
+    facts = run_trial(subject, Scenario("rate", "panda", 50.0, seconds=1.0))
     assert "No module named 'bench.subjects.no_such_subject'" in facts["failed"]
 
 
-def test_cpu_time_of_another_process_is_what_it_tells_of_itself(spawn: Callable[..., Child]) -> None:
+def test_cpu_time_of_a_process_equals_its_own_measurement(spawn: Callable[..., Child]) -> None:
     child = spawn(
         """
         import sys, threading, time
         def work():
             end = time.thread_time() + 0.2
             while time.thread_time() < end: pass
-        thread = threading.Thread(target=work); thread.start(); thread.join()  # it counts though it has ended
+        thread = threading.Thread(target=work); thread.start(); thread.join()  # an ended thread counts too
         print(time.process_time_ns(), flush=True)
         sys.stdin.readline()
         """
     )
-    told = int(child.line())
-    assert 200_000_000 <= told <= cpu_ns(child.process.pid) <= told + 50_000_000
+    own_ns = int(child.line())
+    assert 200_000_000 <= own_ns <= cpu_ns(child.process.pid) <= own_ns + 50_000_000
     assert peak_memory_kb(child.process.pid) > 1000
 
 
-def test_loopback_counts_what_is_sent_over_it() -> None:
+def test_loopback_traffic_is_counted() -> None:
     before = Traffic.now()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(10):
@@ -86,30 +86,30 @@ def test_loopback_counts_what_is_sent_over_it() -> None:
     assert after.packets - before.packets >= 10
 
 
-def test_the_end_of_a_process_is_that_of_everything_it_started() -> None:
+def test_stopping_a_process_ends_its_descendants() -> None:
     script = "sleep 60 & echo started; wait"
     process = Process("shell", ["sh", "-c", script], {}, is_service=True)
-    process.expect_text("started", 10.0)
-    members = family(process.pid)
+    process.wait_for_text("started", 10.0)
+    members = process_tree(process.pid)
     assert len(members) == 2
-    process.end()
-    until(lambda: not any(_lives(pid) for pid in members))
+    process.stop()
+    until(lambda: not any(_is_alive(pid) for pid in members))
 
 
-def _lives(pid: int) -> bool:
+def _is_alive(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
 
 
-def test_a_service_that_ends_before_it_is_ready_is_told_with_its_last_words() -> None:
+def test_service_that_ends_early_is_reported_with_its_last_output() -> None:
     process = Process("router", ["sh", "-c", "echo port is busy; exit 1"], {}, is_service=True)
     with pytest.raises(
-        RunFailed, match="the router ended before it said 'listens'; it said last: port is busy"
+        RunFailed, match="the router ended before it sent 'listens'; its last output: port is busy"
     ):
-        process.expect_text("listens", 10.0)
-    process.end()
+        process.wait_for_text("listens", 10.0)
+    process.stop()
 
 
 def test_free_ports_differ() -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from helpers.processes import a_free_port, until
+from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT, STAMP, UPRIGHT
 
 from zstate.bridges.ros2 import Bridge
@@ -51,7 +51,7 @@ class World:
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     with ExitStack() as opened:
         opened.enter_context(connect(mode="router", listen=endpoint))
 

@@ -20,17 +20,17 @@ from helpers.tf2_scenarios import (
     Answer,
     S,
     a_scenario,
-    ask_tf2,
-    ask_us,
-    kind_of_ours,
-    kind_of_theirs,
-    why_no_tf2,
+    missing_tf2_reason,
+    tf2_answers,
+    tf2_error_kind,
+    zstate_answers,
+    zstate_error_kind,
 )
 
 from zstate.errors import NoData
 from zstate.transform import Transform
 
-pytestmark = [pytest.mark.tf2, pytest.mark.skipif(bool(why_no_tf2()), reason=why_no_tf2())]
+pytestmark = [pytest.mark.tf2, pytest.mark.skipif(bool(missing_tf2_reason()), reason=missing_tf2_reason())]
 
 SCENARIOS, QUESTIONS = 700, 48
 TOLERANCE = 1e-9
@@ -86,10 +86,10 @@ def test_random_lookups_agree_with_tf2_except_for_the_listed_differences() -> No
     scenarios = [a_scenario(rng, QUESTIONS) for _ in range(SCENARIOS)]
     agreed: Counter[str] = Counter()
     differed: Counter[str] = Counter()
-    for scenario, their_answers in zip(scenarios, ask_tf2(scenarios), strict=True):
+    for scenario, their_answers in zip(scenarios, tf2_answers(scenarios), strict=True):
         questions = [step[1:] for step in scenario["steps"] if step[0] == "ask"]
-        for question, ours, theirs in zip(questions, ask_us(scenario), their_answers, strict=True):
-            pair = kind_of_ours(ours), kind_of_theirs(theirs)
+        for question, ours, theirs in zip(questions, zstate_answers(scenario), their_answers, strict=True):
+            pair = zstate_error_kind(ours), tf2_error_kind(theirs)
             if pair[0] != pair[1]:
                 reason = reason_for(question, ours, pair)
                 assert reason is not None, (question, pair, str(ours), theirs)
@@ -150,7 +150,7 @@ INSERTS: dict[str, tuple[list[list[Any]], list[Any], float | str, float | str]] 
 def test_insert_differs_from_tf2_as_listed(claim: str) -> None:
     inserts, question, our_answer, their_answer = INSERTS[claim]
     scenario = {"history": 10 * S, "steps": [*inserts, ["ask", *question]]}
-    (ours,), ((theirs,),) = ask_us(scenario), ask_tf2([scenario])
-    assert (ours.translation[0] if isinstance(ours, Transform) else kind_of_ours(ours)) == our_answer
-    their_x = theirs["pose"][0] if "pose" in theirs else kind_of_theirs(theirs)
+    (ours,), ((theirs,),) = zstate_answers(scenario), tf2_answers([scenario])
+    assert (ours.translation[0] if isinstance(ours, Transform) else zstate_error_kind(ours)) == our_answer
+    their_x = theirs["pose"][0] if "pose" in theirs else tf2_error_kind(theirs)
     assert ("nan" if str(their_x) == "nan" else their_x) == their_answer

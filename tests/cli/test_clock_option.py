@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started, zstate
-from helpers.processes import again_and_again, until
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started, zstate
+from helpers.processes import repeated, until
 
 from zstate import StatePublisher, TransformListener, connect, load_model
 from zstate.clock import ManualClock
@@ -31,7 +31,7 @@ def simulation(start: int = 5 * SECOND, speed: float = 10.0) -> Iterator[None]:
         def tell() -> None:
             publisher.publish(start + round(speed * (time.monotonic_ns() - began)))
 
-        with again_and_again(tell):
+        with repeated(tell):
             yield
 
 
@@ -96,7 +96,7 @@ def test_tf_measures_ages_with_the_clock_of_the_robot():
 
 
 def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
-    with simulation(), standing():
+    with simulation(), published_robot():
         listening = started(spawn, "monitor", "--robots", "--clock", "sim", "--json")
 
         def is_followed() -> bool:
@@ -108,7 +108,7 @@ def test_robots_on_another_clock_are_received_without_ages(spawn: Spawn):
 
 
 def test_first_robot_on_another_clock_does_not_exclude_others():
-    with standing("a1", clock=ManualClock(5 * SECOND, "sim")), standing("b1"):
+    with published_robot("a1", clock=ManualClock(5 * SECOND, "sim")), published_robot("b1"):
         for _ in range(3):
             assert json.loads(zstate("tf", "b1/world", "b1/tool", "--once", "--json").stdout)["age_s"] < 60.0
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, started, zstate
-from helpers.processes import again_and_again
+from helpers.processes import repeated
 
 from zstate import StatePublisher, connect, load_model
 from zstate.net.presence import local_writer
@@ -32,7 +32,7 @@ def fleet() -> Iterator[None]:
             ):
                 opened.callback(session.zenoh.liveliness().declare_token(token).undeclare)
         publisher = opened.enter_context(StatePublisher(session, load_model(RRBOT), robot="rrbot"))
-        opened.enter_context(again_and_again(lambda: publisher.publish([0.0, 0.0])))
+        opened.enter_context(repeated(lambda: publisher.publish([0.0, 0.0])))
         yield
 
 

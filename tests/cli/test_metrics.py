@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started
 from helpers.processes import Child, until
 from helpers.prometheus_text import Row, row, scraped
 
@@ -46,7 +46,7 @@ def test_publisher_serves_its_metrics(spawn: Spawn):
 def test_listener_serves_its_counts(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json", "--metrics", "0")
     url = url_of(command)
-    with standing():
+    with published_robot():
         until(lambda: row("zstate_listener_received_total", robot="rrbot") in scraped(url))
         rows = grown(url, row("zstate_listener_received_total", robot="rrbot"))
         received = rows[row("zstate_listener_received_total", robot="rrbot")]
@@ -65,7 +65,7 @@ def test_router_serves_its_connections_and_writers(spawn: Spawn, free_port: int)
     command = started(spawn, "router", "--listen", endpoint, "--metrics", "0")
     url = url_of(command)
     assert scraped(url)[row("zstate_router_sessions", mode="client")] == 0
-    with standing(router=endpoint):
+    with published_robot(router=endpoint):
         until(lambda: scraped(url).get(row("zstate_writers", robot="rrbot", stream="joint_states")) == 1)
         rows = scraped(url)
     assert rows[row("zstate_router_sessions", mode="client")] == 1
@@ -74,7 +74,7 @@ def test_router_serves_its_connections_and_writers(spawn: Spawn, free_port: int)
 
 
 def test_recorder_serves_its_metrics(spawn: Spawn, tmp_path: Path):
-    with standing():
+    with published_robot():
         command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot", "--metrics", "0")
         url = url_of(command)
         messages = row("zstate_recorder_messages_total", robot="rrbot", stream="joint_states")
@@ -90,7 +90,7 @@ def test_bridge_serves_the_carried_robots(spawn: Spawn, ros_router: str, monkeyp
     monkeypatch.delenv("ZSTATE_WIRE")
     command = started(spawn, "bridge", "rrbot", "--ros", ros_router, "--metrics", "0")
     url = url_of(command)
-    with standing():
+    with published_robot():
         carried = row("zstate_bridge_carried", robot="rrbot", way="native to ROS")
         until(lambda: scraped(url).get(carried) == 1)
     interrupted(command)

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from helpers.cli_runner import RRBOT, failure, standing, zstate
+from helpers.cli_runner import RRBOT, failure, published_robot, zstate
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
 from zstate.cli.plot import joint_series, path_series
@@ -78,7 +78,7 @@ def test_path_is_sampled_evenly_over_its_history():
 def test_live_joint_states_are_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "joints.svg"
-    with standing():
+    with published_robot():
         ended = zstate("plot", "--seconds", "0.5", "--output", str(file))
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.decode().startswith(f"wrote {file}: 2 curves, ")
@@ -89,7 +89,7 @@ def test_live_joint_states_are_drawn(tmp_path: Path):
 def test_the_path_of_a_frame_is_drawn(tmp_path: Path):
     needs_matplotlib()
     file = tmp_path / "path.png"
-    with standing():
+    with published_robot():
         ended = zstate("plot", "--path", "base", "tool", "--seconds", "0.5", "--output", str(file))
     assert ended.returncode == 0, ended.stderr
     assert file.read_bytes().startswith(b"\x89PNG")
@@ -99,7 +99,7 @@ def test_the_path_of_a_frame_is_drawn(tmp_path: Path):
 def test_a_recording_is_drawn_whole_or_in_part(tmp_path: Path):
     needs_matplotlib()
     recording, joints, path = (tmp_path / name for name in ("run.mcap", "joints.svg", "path.svg"))
-    with standing():
+    with published_robot():
         assert zstate("record", str(recording), "--duration", "1.5").returncode == 0
     ended = zstate("plot", "--file", str(recording), "--joint", "elbow", "--output", str(joints))
     assert "1 curve, " in ended.stdout.decode(), ended.stderr
@@ -121,7 +121,7 @@ def test_mistakes_are_reported(tmp_path: Path):
     assert "--start is for recordings" in failure("plot", "rrbot", "--start", "1", code=2)
     assert "a duration is" in failure("plot", "--file", "x.mcap", "--start", "nan", code=2)
     assert "no robot is announced" in failure("plot")
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         assert "which robot? announced: 'left', 'right'" in failure("plot")
         nowhere = tmp_path / "nowhere" / "plot.png"
         assert "cannot write" in failure("plot", "left", "--seconds", "0.2", "--output", str(nowhere))

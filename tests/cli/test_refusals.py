@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, started
-from helpers.processes import a_free_port, until
+from helpers.processes import find_free_port, until
 
 pytestmark = pytest.mark.processes
 
@@ -22,7 +22,7 @@ def test_wrong_user_gets_the_settings_to_check(
     started(spawn, "router", "--listen", fleet, "--users", str(users)).line()
     monkeypatch.setenv("ZSTATE_PASSWORD", "wander")
     who = ("--user", "alice", "--users", str(users)) if command == ("router",) else ("--user", "alice")
-    here = f"tcp/127.0.0.1:{a_free_port()}"
+    here = f"tcp/127.0.0.1:{find_free_port()}"
     child = started(spawn, *command, "--connect", fleet, "--listen", here, *who)
     child.line()
     until(lambda: "does not let this session in" in child.stderr)

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 pytestmark = pytest.mark.processes
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.processes
 def test_each_robot_has_a_line_a_second(spawn: Spawn):
     command = started(spawn, "monitor", "--robots")
     heard: set[str] = set()
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         until(lambda: heard.add(command.line().split()[0]) or heard == {"left", "right"})
     assert "following zstate/left/joint_states" in command.stderr
     interrupted(command)
@@ -22,7 +22,7 @@ def test_each_robot_has_a_line_a_second(spawn: Spawn):
 
 def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--json")
-    with standing():
+    with published_robot():
         command.line()
         facts = json.loads(command.line())
     assert facts["robot"] == "rrbot"
@@ -36,7 +36,7 @@ def test_json_has_rate_age_latency_and_every_count(spawn: Spawn):
 
 def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--json")
-    with standing(streams=("tf", "tf_static", "robot_description")):
+    with published_robot(streams=("tf", "tf_static", "robot_description")):
         until(lambda: json.loads(command.line())["received"] > 0)
     assert "following zstate/rrbot/tf" in command.stderr
 
@@ -44,7 +44,7 @@ def test_robot_that_publishes_only_transforms_is_monitored(spawn: Spawn):
 def test_the_missing_robot_is_reported(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
-    with standing():
+    with published_robot():
         assert command.line().startswith("rrbot  ")
     interrupted(command)
 
@@ -59,12 +59,12 @@ def test_many_robots_share_one_listener(spawn: Spawn):
 
     heard: set[str] = set()
     with ExitStack() as opened:
-        opened.enter_context(standing("bot0"))
+        opened.enter_context(published_robot("bot0"))
         command = started(spawn, "monitor", "--robots", "--json")
         until(lambda: json.loads(command.line())["received"] > 0)
         before = threads()
         for number in range(1, 6):
-            opened.enter_context(standing(f"bot{number}"))
+            opened.enter_context(published_robot(f"bot{number}"))
         until(lambda: heard.add(json.loads(command.line())["robot"]) or len(heard) == 6)
         # Links of Zenoh's come to six processes' sessions, but no listeners.
         assert threads() < before + 4 * 5
@@ -72,7 +72,7 @@ def test_many_robots_share_one_listener(spawn: Spawn):
 
 
 def test_once_prints_one_line_for_each_robot():
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         lines = zstate("monitor", "--robots", "--once").stdout.decode().splitlines()
     assert [line.split()[0] for line in lines] == ["left", "right"]
     assert all(" Hz  age " in line for line in lines)
@@ -85,7 +85,7 @@ def test_once_gives_up_with_the_reason():
 
 def test_a_robot_that_stops_is_silent(spawn: Spawn):
     command = started(spawn, "monitor", "--robots")
-    with standing():
+    with published_robot():
         until(lambda: " Hz  " in command.line())
     until(lambda: command.line().startswith("rrbot  silent  age "))
     interrupted(command)

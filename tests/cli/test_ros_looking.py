@@ -4,9 +4,9 @@ import json
 import math
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
-from helpers.robots import await_reader
+from helpers.robots import wait_for_reader
 
 from zstate import StaticPublisher, Transform, connect
 from zstate.wire.identity import WriterId
@@ -23,7 +23,7 @@ BASE_FROM_LOWER = (0.7 * math.sin(SHOULDER), 0.1 + 0.07, 1.05 + 0.7 * math.cos(S
 
 
 def test_tf_needs_no_model_and_calls_frames_as_ros_does(ros_router: str):
-    with standing(wire="ros2", router=ros_router, streams=("tf", "tf_static")):
+    with published_robot(wire="ros2", router=ros_router, streams=("tf", "tf_static")):
         answer = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
     assert (answer["target"], answer["source"]) == ("base", "lower")
     assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
@@ -33,7 +33,7 @@ def test_tf_reports_missing_topics_in_ros_terms(spawn: Spawn, ros_router: str):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     until(lambda: "waiting: no node publishes /tf in domain 0" in command.stderr)
     assert "`zstate ls --wire ros2`" in command.stderr
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         assert command.line() == "pose of lower in base"
         assert command.line().startswith("At time ")
         until(lambda: "receiving /tf: " in command.stderr)
@@ -45,7 +45,7 @@ def test_tf_reports_missing_topics_in_ros_terms(spawn: Spawn, ros_router: str):
 
 def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str):
     with (
-        standing(wire="ros2", router=ros_router),
+        published_robot(wire="ros2", router=ros_router),
         connect(mode="client", endpoints=ros_router) as session,
         StaticPublisher(session, "ros", wires="ros2") as statics,
     ):
@@ -56,7 +56,7 @@ def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str)
 
 def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros_router: str):
     spoken = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
-    with standing("r1", wire=spoken, router=ros_router):
+    with published_robot("r1", wire=spoken, router=ros_router):
         lines = zstate("tree").stdout.decode().splitlines()
     assert lines[1].split() == ["r1/world", "root"]
     (upper,) = (line for line in lines if "r1/upper" in line)
@@ -69,7 +69,7 @@ def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros
 
 def test_tree_names_a_node_that_sends_nothing(ros_router: str):
     with (
-        standing(wire="ros2", router=ros_router, streams=("tf_static",)),
+        published_robot(wire="ros2", router=ros_router, streams=("tf_static",)),
         connect(mode="client", endpoints=ros_router) as session,
     ):
         token = "@ros2_lv/0/{zid}/7/8/MP/%/%/mute/%tf/tf2_msgs::msg::dds_::TFMessage_/{hash}/::,100:,:,:,,"
@@ -84,7 +84,7 @@ def test_tree_of_nobody_is_a_failure(ros_router: str):
 
 
 def test_echo_needs_no_robot_and_no_description(ros_router: str):
-    with standing(wire="ros2", router=ros_router, streams=("joint_states",)):
+    with published_robot(wire="ros2", router=ros_router, streams=("joint_states",)):
         document = json.loads(zstate("echo", "--once", "--json").stdout)
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
 
@@ -100,7 +100,7 @@ def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router
         encoder = wire.stream_encoder(
             "r", writer, "joint_states", node=node, number=1, sample_names=SampleLayout()
         )
-        await_reader(session, encoder.key)
+        wait_for_reader(session, encoder.key)
         session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))
         document = json.loads(command.line(), parse_constant=pytest.fail)
     assert document["positions"] == {"a": 0.5}
@@ -109,8 +109,8 @@ def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router
 
 def test_echo_reads_one_namespace_or_the_selected_robot(ros_router: str):
     with (
-        standing("r1", wire="ros2:namespace=*", router=ros_router),
-        standing("r2", (0.0, 0.25), wire="ros2:namespace=*", router=ros_router),
+        published_robot("r1", wire="ros2:namespace=*", router=ros_router),
+        published_robot("r2", (0.0, 0.25), wire="ros2:namespace=*", router=ros_router),
     ):
         first = zstate("echo", "--wire", "ros2:namespace=r1", "--once", "--field", "elbow")
         second = zstate("echo", "r2", "--wire", "ros2:namespace=*", "--once", "--field", "elbow")
@@ -125,7 +125,7 @@ def test_missing_robot_argument_is_reported(ros_router: str):
 
 
 def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
-    with standing(wire="ros2", router=ros_router), standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router), published_robot(wire="ros2", router=ros_router):
         for stream in ("tf", "joint_states"):
             measured = json.loads(zstate("hz", "--stream", stream, "--once", "--json").stdout)
             # Two writers wait a hundredth of a second between samples; they may be slower, never faster.
@@ -135,7 +135,7 @@ def test_hz_measures_all_nodes_of_a_topic_together(ros_router: str):
 
 
 def test_robots_are_monitored_by_tf_and_a_selected_one_by_its_joints(spawn: Spawn, ros_router: str):
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         monitor = ("monitor", "--robots", "--json")
         everybody, one = started(spawn, *monitor), started(spawn, *monitor, "--robot", "rrbot")
         until(lambda: json.loads(everybody.line())["received"] > 0)
@@ -164,7 +164,7 @@ def test_ros_commands_join_the_router_of_this_host(
     spawn: Spawn, ros_router: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.delenv("ZSTATE_CONNECT")
-    with standing(wire="ros2:node=driver", router=ros_router):
+    with published_robot(wire="ros2:node=driver", router=ros_router):
         command = spawn(ELSEWHERE, ros_router, "ls")
         assert [command.line(), command.line()] == ["1 node in domain 0", "  /driver"]
 

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, interrupted, standing, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import TransformListener, connect, discover, load_model
@@ -37,7 +37,7 @@ def test_publish_takes_the_place_of_robot_state_publisher(spawn: Spawn, ros_rout
     assert streams(client) == EVERYTHING - {"joint_states"}
     with (
         TransformListener(client, wire="ros2", follow="tf") as listener,
-        standing("driver", (0.5, 0.0), wire="ros2", router=ros_router, streams=("joint_states",)),
+        published_robot("driver", (0.5, 0.0), wire="ros2", router=ros_router, streams=("joint_states",)),
     ):
         placed = listener.buffer.wait("base", "upper", timeout_s=10.0)
     assert math.isclose(placed.rpy[1], 0.5, abs_tol=1e-12)  # the shoulder turns about y
@@ -54,7 +54,7 @@ def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_r
     assert streams(client, "native") == EVERYTHING - {"joint_states"}
     assert streams(client) == EVERYTHING
     with (
-        standing(router=ros_router, positions=(0.5, -0.25), streams=("joint_states",)),
+        published_robot(router=ros_router, positions=(0.5, -0.25), streams=("joint_states",)),
         SubscribedSource(client, load_model(RRBOT), wire="ros2") as source,
     ):
         heard = next(iter(source))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.micro.startup import BARE
+from bench.micro.startup import MINIMAL
 from zstate.cli.main import group
 
 pytestmark = pytest.mark.processes
@@ -34,7 +34,7 @@ def test_a_light_command_takes_at_most_two_and_a_half_times_a_bare_program(
     tmp_path: Path, arguments: tuple[str, ...]
 ):
     bare = tmp_path / "bare.py"
-    bare.write_text(BARE)
+    bare.write_text(MINIMAL)
     rounds = [
         (processor_s(str(bare), "command", "--help"), processor_s("-m", "zstate", *arguments))
         for _ in range(ROUNDS)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from helpers.cli_runner import Spawn, failure, started, zstate
 from helpers.processes import Child
-from helpers.tutorial_terminal import FILES, FOLDER, blocks, masked, terminal, told
+from helpers.tutorial_terminal import FILES, FOLDER, blocks, masked, terminal, terminal_steps
 
 pytestmark = pytest.mark.processes
 
@@ -107,9 +107,9 @@ def test_a_stamp_is_masked_whatever_the_uptime_of_the_machine(uptime_s: int):
 
 def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None):
     with terminal(folder) as shell:
-        for one in told():
-            said, expected = masked(shell.does(one)), masked(one.lines)
-            assert said == expected or (one.goes_on and sorted(said) == sorted(expected)), one.command
+        for one in terminal_steps():
+            said, expected = masked(shell.run(one)), masked(one.lines)
+            assert said == expected or (one.is_background and sorted(said) == sorted(expected)), one.command
 
 
 def test_the_robot_runs_and_can_be_looked_at(cell: Child, driver):

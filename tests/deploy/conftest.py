@@ -1,4 +1,4 @@
-"""What the tests of deployments have: identities, and the parts of compose.yaml as processes."""
+"""Identities, and the services of compose.yaml as processes."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from zstate.net.security.credentials import Credentials
 pytestmark = pytest.mark.processes
 
 
-def test_its_robot_moves_through_its_router_and_the_reader_sees_it(deployment: Deployment, spawn: Any):
+def test_reader_of_the_compose_file_receives_its_moving_robot(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     deployment.start(spawn, "robot").line()
     until(lambda: deployment.is_healthy("robot"))
@@ -22,13 +22,13 @@ def test_its_robot_moves_through_its_router_and_the_reader_sees_it(deployment: D
     assert "r1" in deployment.start(spawn, "reader").line()
 
 
-def test_a_health_check_fails_without_the_router_and_without_the_robot(deployment: Deployment, spawn: Any):
+def test_health_checks_fail_without_router_and_without_robot(deployment: Deployment, spawn: Any):
     assert not deployment.is_healthy("robot")
     deployment.start_router(spawn).line()
     assert not deployment.is_healthy("reader")
 
 
-def test_its_router_lets_nobody_else_write(deployment: Deployment, spawn: Any):
+def test_compose_router_refuses_writes_of_other_identities(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     endpoint = f"tls/localhost:{deployment.port}"
 
@@ -46,14 +46,14 @@ def test_its_router_lets_nobody_else_write(deployment: Deployment, spawn: Any):
             assert discover(other, 0.3) == ()  # r2 is nobody here
 
 
-def test_nobody_comes_in_without_a_certificate(deployment: Deployment, spawn: Any):
+def test_client_without_certificate_is_refused(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     ca = Credentials(ca=deployment.certs / "ca.pem")
-    with pytest.raises(AccessDenied, match="requires a certificate"):
+    with pytest.raises(AccessDenied, match="demands a certificate"):
         connect(mode="client", endpoints=f"tls/localhost:{deployment.port}", credentials=ca)
 
 
-def test_every_service_starts_again_and_waits_for_the_router(deployment: Deployment):
+def test_every_service_restarts_and_waits_for_the_router(deployment: Deployment):
     for name, service in deployment.services.items():
         assert service["restart"] == "unless-stopped"
         if name != "router":
@@ -61,7 +61,7 @@ def test_every_service_starts_again_and_waits_for_the_router(deployment: Deploym
             assert service["build"] == ".."
 
 
-def test_each_container_has_its_own_key_only(deployment: Deployment):
+def test_each_container_has_only_its_own_key(deployment: Deployment):
     for name, service in deployment.services.items():
         identity = service.get("environment", {}).get("ZSTATE_IDENTITY", "router")
         keys = [volume for volume in service["volumes"] if volume.split(":")[0].endswith(".key")]
@@ -70,5 +70,5 @@ def test_each_container_has_its_own_key_only(deployment: Deployment):
 
 
 @pytest.mark.parametrize("name", ["router.json5", "site-router.json5"])
-def test_zenoh_takes_every_configuration(name: str):
+def test_zenoh_accepts_every_configuration(name: str):
     zenoh.Config.from_json5((DEPLOY / name).read_text())

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from helpers.deployment import DEPLOY
-from helpers.processes import a_free_port
+from helpers.processes import find_free_port
 
 UNITS = sorted(path.name for path in DEPLOY.glob("*.service"))
 
@@ -24,7 +24,7 @@ def unit(name: str) -> RawConfigParser:
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_systemd_takes_the_unit(name: str, tmp_path):
+def test_systemd_accepts_the_unit(name: str, tmp_path):
     if not shutil.which("systemd-analyze"):
         pytest.skip("needs systemd-analyze: apt-get install systemd")
     program = tmp_path / "zstate"
@@ -38,7 +38,7 @@ def test_systemd_takes_the_unit(name: str, tmp_path):
 
 
 @pytest.mark.parametrize("name", UNITS)
-def test_it_is_started_again_and_may_do_little(name: str):
+def test_unit_restarts_and_has_few_permissions(name: str):
     service = unit(name)["Service"]
     assert service["Restart"] == "always"
     assert service["ProtectSystem"] == "strict"
@@ -46,8 +46,8 @@ def test_it_is_started_again_and_may_do_little(name: str):
 
 
 @pytest.mark.processes
-def test_the_units_programs_meet_and_end_as_the_units_expect(spawn: Any, tmp_path):
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+def test_programs_of_the_units_connect_and_exit_as_expected(spawn: Any, tmp_path):
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     config = tmp_path / "router.json5"
     config.write_text(f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }} }}')
     values = {"${ROBOT_MODEL}": "rrbot", "%i": "r1", "/etc/zstate/router.json5": str(config)}
@@ -70,7 +70,7 @@ def test_the_units_programs_meet_and_end_as_the_units_expect(spawn: Any, tmp_pat
         assert str(child.wait()) == unit(name)["Service"]["SuccessExitStatus"]
 
 
-def test_the_environment_file_in_the_readme_has_what_the_unit_takes():
+def test_environment_file_in_the_readme_has_the_variables_of_the_unit():
     text = (DEPLOY / "README.md").read_text()
     environment = text.partition("```ini\n")[2].partition("```")[0]
     assert "ROBOT_MODEL=" in environment

@@ -1,4 +1,4 @@
-"""Routers that let some in and others not."""
+"""Routers with different access control."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from zstate.net.security.credentials import Credentials
 
-ROUTERS = """
+ROUTERS_PROGRAM = """
     import sys
     from pathlib import Path
     from zstate.net.security.credentials import Credentials
@@ -29,8 +29,8 @@ ROUTERS = """
 
 
 @dataclass(frozen=True)
-class Fleet:
-    """Routers, by what they are, and the folders of two authorities."""
+class AccessRouters:
+    """Running routers by kind, and the folders of two certificate authorities."""
 
     folder: Path
     strangers: Path

@@ -1,4 +1,4 @@
-"""What the tests of the buffer build with: stamps, transforms, and a robot with every type of joint."""
+"""Stamps, transforms, buffers, and a robot with every type of joint."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from zstate.transform import Transform
 MS = 1_000_000
 S = 1_000_000_000
 NOW = 1_790_000_000_123_456_789
-"""A stamp of these years, with digits that float seconds would lose."""
+"""A realistic stamp with digits that float seconds would lose."""
 
 
 def turned(yaw: float) -> tuple[float, float, float, float]:
-    """The quaternion of a yaw, which may be any number of turns."""
+    """The quaternion of a yaw angle of any size."""
     return quaternion_from_rpy(0.0, 0.0, yaw)
 
 
@@ -35,7 +35,7 @@ def x_of(transform: Transform) -> float:
 
 
 def filled(*transforms: Transform, history_s: float = 10.0) -> TransformBuffer:
-    """A buffer that was told these; those without a stamp are static."""
+    """A buffer with these transforms; transforms without a stamp are static."""
     buffer = TransformBuffer(history_s)
     for transform in transforms:
         if transform.stamp is None:
@@ -48,7 +48,7 @@ def filled(*transforms: Transform, history_s: float = 10.0) -> TransformBuffer:
 def failure(
     buffer: TransformBuffer, target: str, source: str, stamp: int | None = None, **options: float
 ) -> LookupFailed:
-    """The error that a lookup raises; ``explain`` says the same when there are no options."""
+    """The error that a lookup raises; without options ``explain`` must return an equal one."""
     with pytest.raises(LookupFailed) as caught:
         buffer.lookup(target, source, stamp, **options)
     if not options:
@@ -97,7 +97,7 @@ EVERY_JOINT = """
 
 
 def every_joint(interpolation: str = "linear") -> tuple[TransformBuffer, JointTrack]:
-    """A buffer with the robot of one joint of each type."""
+    """A buffer with a robot that has one joint of each type."""
     buffer = TransformBuffer()
     return buffer, buffer.add_robot(load_model(EVERY_JOINT), interpolation=interpolation)  # type: ignore[arg-type]
 
@@ -111,6 +111,6 @@ def pose_of_every(
     lift: float = 0.0,
     slide: tuple[float, ...] = (0, 0, 0),
 ):
-    """Its positions, from numbers by joint."""
+    """The positions of that robot, given by joint."""
     values = {"free": free, "spin": spin, "bend": bend, "raise": lift, "slide": slide}
     return track.model.positions(values)

@@ -132,14 +132,14 @@ class Fuzz:
     def outcome(self, kind: str, old: Callable[[bytes], object], data: bytes) -> str:
         """What became of it: "read", or why it was not."""
         try:
-            new, known = answer(NEW[kind](), data), answer(old, data)
+            new, known = decode_outcome(NEW[kind](), data), decode_outcome(old, data)
         except Exception as error:
             raise AssertionError(f"{type(error).__name__} from {kind} on {data.hex()}") from error
         assert new == known, f"{kind} reads {new}, but knows {known}: {data.hex()}"
         return new[0]
 
 
-def answer(decode: Callable[[bytes], object], data: bytes) -> tuple[str, object]:
+def decode_outcome(decode: Callable[[bytes], object], data: bytes) -> tuple[str, object]:
     try:
         return "read", decode(data)
     except MessageError as error:

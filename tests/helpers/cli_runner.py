@@ -18,7 +18,7 @@ from zstate.clock import Clock
 from zstate.wire.keys import Stream
 
 RRBOT = str(Path(__file__).parents[2] / "models" / "rrbot.urdf")
-EVERYTHING: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
+ALL_STREAMS: tuple[Stream, ...] = ("joint_states", "tf", "tf_static", "robot_description")
 SHOULDER, ELBOW = 0.5, -0.2
 
 Spawn = Callable[..., Child]
@@ -54,11 +54,11 @@ def interrupted(child: Child) -> None:
 
 
 @contextmanager
-def standing(
+def published_robot(
     robot: str = "rrbot",
     positions: Sequence[float] = (SHOULDER, ELBOW),
     *,
-    streams: Sequence[Stream] = EVERYTHING,
+    streams: Sequence[Stream] = ALL_STREAMS,
     velocities: Sequence[float] | None = None,
     model: str = RRBOT,
     wire: str = "native",

@@ -1,6 +1,6 @@
 """An independent reference: rigid motions in decimals of 50 digits, times as fractions.
 
-Written with matrices and power series, unlike what it checks. Every input is a float taken at its
+Written with matrices and power series, unlike the code under test. Every input is a float, used at its
 exact value.
 """
 
@@ -26,7 +26,7 @@ def exact(value: float | Fraction) -> Decimal:
 
 
 def sin_cos(angle: Decimal) -> tuple[Decimal, Decimal]:
-    """Power series of a small part of the angle, doubled up again."""
+    """Power series of a small fraction of the angle, then angle doubling."""
     doublings = 0
     while abs(angle) > Decimal("0.1"):
         angle /= 2
@@ -43,7 +43,7 @@ def sin_cos(angle: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def arc_tangent(value: Decimal) -> Decimal:
-    """For values of zero or more: halved until the power series is short."""
+    """For values >= 0: halved until the power series is short."""
     factor = 1
     while value > Decimal("0.05"):
         value = value / (1 + (1 + value * value).sqrt())
@@ -105,7 +105,7 @@ def as_floats(a: Matrix) -> np.ndarray:
 
 
 def ratio_in(stamps: Sequence[int], stamp: int) -> tuple[int, int, Fraction]:
-    """The stamps around an instant that they cover, and how far between them it lies, exactly."""
+    """The neighbouring stamps of a covered instant, and its exact ratio between them."""
     before = max(other for other in stamps if other <= stamp)
     after = min(other for other in stamps if other >= stamp)
     return before, after, Fraction(stamp - before, max(1, after - before))
@@ -122,7 +122,7 @@ def pose_between(samples: Mapping[int, Sequence[float]], stamp: int) -> Matrix:
 
 
 def turned(axis: Sequence[float], angle: Decimal) -> Matrix:
-    """A turn about an axis, by Rodrigues' formula."""
+    """A rotation about an axis, by Rodrigues' formula."""
     x, y, z = unit(axis)
     sine, cosine = sin_cos(angle)
     hat = [[ZERO, -z, y], [z, ZERO, -x], [-y, x, ZERO]]
@@ -135,5 +135,5 @@ def turned(axis: Sequence[float], angle: Decimal) -> Matrix:
 
 
 def moved(axis: Sequence[float], distance: Decimal) -> Matrix:
-    """A move along an axis."""
+    """A translation along an axis."""
     return matrix([value * distance for value in unit(axis)], [ZERO, ZERO, ZERO, ONE])

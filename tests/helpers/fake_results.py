@@ -1,4 +1,4 @@
-"""Results of a run that never was: two rounds of every scenario, with figures that tests can foresee."""
+"""Synthetic results: two rounds of every scenario, with predictable figures."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def about(subjects: dict[str, str], scenarios: Sequence[Scenario]) -> dict[str, 
 
 
 def a_run(subject: str, scenario: Scenario, number: int, factor: float) -> dict[str, Any]:
-    """It costs ``factor`` times what it costs zstate; a factor of 3 or more halves the rate at 1 kHz."""
+    """A run at ``factor`` times the cost of zstate; a factor of 3 or more halves the rate at 1 kHz."""
     head = {"subject": subject, "scenario": scenario.name, "round": number, "turn": 0, "load_before": 0.5}
     if scenario.joins:
         joins = [20.0 * factor, 30.0 * factor, 40.0 * factor][: scenario.joins]
@@ -97,7 +97,7 @@ def a_run(subject: str, scenario: Scenario, number: int, factor: float) -> dict[
 def write_results(
     folder: Path, factors: dict[str, float], titles: dict[str, str], scenarios: Sequence[Scenario] = SCENARIOS
 ) -> Results:
-    """A folder in which ``factors`` says how dear each subject is, and ROS 1 has failed in one scenario."""
+    """Writes a folder with the cost ``factors`` of the subjects; ROS 1 has failed in one scenario."""
     folder.mkdir(parents=True, exist_ok=True)
     runs = [
         a_run(name, one, number, factor)

@@ -22,26 +22,26 @@ _CODE = (
 )
 
 
-class Party:
+class FaultProcess:
     """A process of the suite."""
 
     def __init__(self, child: Child) -> None:
         self.child = child
         self.ready_at = 0
 
-    def ready(self) -> Party:
+    def wait_ready(self) -> FaultProcess:
         assert self.child.line(30.0) == "ready", self.child.stderr
         self.ready_at = time.time_ns()
         return self
 
-    def ask(self, question: str, *arguments: Any, timeout_s: float = DEADLINE_S + 5.0) -> Any:
-        self.tell(question, *arguments)
-        return self.hear(timeout_s)
+    def query(self, question: str, *arguments: Any, timeout_s: float = DEADLINE_S + 5.0) -> Any:
+        self.send(question, *arguments)
+        return self.receive(timeout_s)
 
-    def tell(self, question: str, *arguments: Any) -> None:
-        self.child.tell(json.dumps([question, *arguments]))
+    def send(self, question: str, *arguments: Any) -> None:
+        self.child.send_line(json.dumps([question, *arguments]))
 
-    def hear(self, timeout_s: float = DEADLINE_S + 5.0) -> Any:
+    def receive(self, timeout_s: float = DEADLINE_S + 5.0) -> Any:
         """The answer to a question that was told before."""
         return json.loads(self.child.line(timeout_s))
 
@@ -52,15 +52,15 @@ class Party:
         self.child.kill()
 
 
-Start = Callable[..., Party]
+Start = Callable[..., FaultProcess]
 
 
 def starter(spawn: Callable[..., Child]) -> Start:
     """``start(role, **options)``: a process that is ready; with ``wait=False`` perhaps not yet."""
 
-    def start(role: str, *, wait: bool = True, **options: Any) -> Party:
-        party = Party(spawn(_CODE, role, json.dumps(options)))
-        return party.ready() if wait else party
+    def start(role: str, *, wait: bool = True, **options: Any) -> FaultProcess:
+        party = FaultProcess(spawn(_CODE, role, json.dumps(options)))
+        return party.wait_ready() if wait else party
 
     return start
 
@@ -76,7 +76,7 @@ def assert_no_growth(before: dict[str, int], after: dict[str, int], *, rss_kb: i
     assert after["rss_kb"] <= before["rss_kb"] + rss_kb, (before, after)
 
 
-def figures(title: str, seconds: list[float]) -> None:
+def print_figures(title: str, seconds: list[float]) -> None:
     """What was measured, for `pytest -rP`."""
     ordered = sorted(seconds)
     print(

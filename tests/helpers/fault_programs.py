@@ -1,6 +1,6 @@
-"""The processes that the fault suite breaks: each does its work, and answers questions on its standard input.
+"""The processes of the fault suite: each runs one role and replies to queries on its standard input.
 
-A question is a line of JSON, ``[name, *arguments]``; so is the answer.
+A query is a line of JSON, ``[name, *arguments]``; so is the reply.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.fault_queries import Answers
+from helpers.fault_queries import ReaderQueries
 
 from zstate import (
     SineSource,
@@ -45,22 +45,22 @@ def main() -> None:
 
 
 def _enter(namespace: str) -> None:
-    """Go there before any thread exists: a network namespace is a property of each thread."""
+    """Enters the namespace before any thread exists: a network namespace is a property of each thread."""
     libc = ctypes.CDLL(None, use_errno=True)
     with Path(f"/run/netns/{namespace}").open() as file:
         if libc.setns(file.fileno(), CLONE_NEWNET):
             raise OSError(ctypes.get_errno(), "setns")
 
 
-def _serve(**answers: Answer) -> None:
+def _serve_queries(**answers: Answer) -> None:
     print("ready", flush=True)
     for line in sys.stdin:
         name, *arguments = json.loads(line)
-        print(json.dumps({"census": census, **answers}[name](*arguments)), flush=True)
+        print(json.dumps({"census": resource_counts, **answers}[name](*arguments)), flush=True)
 
 
-def census() -> dict[str, int]:
-    """What must not grow. Threads are those of the process, Zenoh's too."""
+def resource_counts() -> dict[str, int]:
+    """Counts that must not grow. Threads include those of Zenoh."""
     status = Path("/proc/self/status").read_text()
     resident = next(line for line in status.splitlines() if line.startswith("VmRSS"))
     return {
@@ -71,7 +71,7 @@ def census() -> dict[str, int]:
 
 
 class ShiftedClock(SystemClock):
-    """The system's clock, set wrong by ``shift_ns``."""
+    """The system clock with an error of ``shift_ns``."""
 
     shift_ns = 0
 
@@ -82,8 +82,8 @@ class ShiftedClock(SystemClock):
         return super().wait_until(stamp - self.shift_ns, stop)
 
 
-class Pausable:
-    """A sine that remembers the last stamp it was asked for, until it is told to say nothing."""
+class PausableSource:
+    """A sine source that keeps its last stamp, and returns no readings after ``pause``."""
 
     def __init__(self, source: SineSource) -> None:
         self._source = source
@@ -104,9 +104,9 @@ class Pausable:
 def publisher(
     robot: str, session: Session, rate_hz: float = 100.0, mark: float = 0.0, takeover: bool = False
 ) -> None:
-    """A robot that moves, with one static edge besides its model, whose length is the mark."""
+    """Publishes a moving robot and one extra static edge, whose length is the mark."""
     model, clock = load_model("rrbot"), ShiftedClock()
-    source = Pausable(SineSource(model))
+    source = PausableSource(SineSource(model))
 
     def shift(shift_ns: int) -> int:
         clock.shift_ns = shift_ns
@@ -132,7 +132,7 @@ def publisher(
         put_mark(mark)
         running = threading.Thread(target=writing.run, args=(source, rate_hz), daemon=True)
         running.start()
-        _serve(mark=put_mark, shift=shift, pause=source.pause, routers=routers, leave=leave)
+        _serve_queries(mark=put_mark, shift=shift, pause=source.pause, routers=routers, leave=leave)
 
 
 def recorder(session: Session, path: str) -> None:
@@ -141,21 +141,21 @@ def recorder(session: Session, path: str) -> None:
         def ended() -> str | None:
             return f"{type(recording.failure).__name__}: {recording.failure}" if recording.wait(0.0) else None
 
-        _serve(ended=ended, written=lambda: sum(recording.stats.messages.values()))
+        _serve_queries(ended=ended, written=lambda: sum(recording.stats.messages.values()))
 
 
 def router(listen: str, connect_to: list[str] | None = None) -> None:
     with connect(mode="router", listen=listen, endpoints=connect_to or ()) as opened:
-        _serve(zid=lambda: opened.zid)
+        _serve_queries(zid=lambda: opened.zid)
 
 
 def reader(session: Session, robot: str = "*", follow: str = "joint_states", busy_ms: float = 0.0) -> None:
-    """One that follows robots; with ``busy_ms`` each sample costs it so long, and nobody else runs."""
+    """Listens to robots; with ``busy_ms`` each insert blocks the process for that long."""
     with connect(**session) as opened, TransformListener(opened, robot, follow=follow) as listener:
-        answers = Answers(listener)
+        answers = ReaderQueries(listener)
         if busy_ms:
-            _burden(listener, busy_ms)
-        _serve(
+            _slow_down_inserts(listener, busy_ms)
+        _serve_queries(
             after=answers.after,
             newest=answers.newest,
             near=answers.near,
@@ -167,7 +167,7 @@ def reader(session: Session, robot: str = "*", follow: str = "joint_states", bus
         )
 
 
-def _burden(listener: TransformListener, busy_ms: float) -> None:
+def _slow_down_inserts(listener: TransformListener, busy_ms: float) -> None:
     insert = listener.buffer.insert_joints
 
     def slowly(*arguments: Any) -> bool:

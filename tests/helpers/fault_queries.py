@@ -1,4 +1,4 @@
-"""What a reader of the fault suite can say of the robots it follows."""
+"""Queries that a reader of the fault suite replies to."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from zstate.model.kinematics import Kinematics
 from zstate.transform import Transform
 
 MAX_AGE_S = 0.5
-"""What is called fresh."""
+"""The age limit of a fresh lookup [s]."""
 
 
-def comes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Whether ``condition()`` becomes true in time. It is looked at each millisecond."""
+def becomes_true(condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Whether ``condition()`` becomes true in time; checked every millisecond."""
     deadline = time.monotonic() + timeout_s
     while not (is_true := condition()) and time.monotonic() < deadline:
         time.sleep(0.001)
     return is_true
 
 
-class Answers:
-    """What a reader can say of the robots it follows. An answer that is not the sine's is an error."""
+class ReaderQueries:
+    """Queries about the robots of a listener. A pose that is not on the sine is an error."""
 
     def __init__(self, listener: TransformListener) -> None:
         self._listener = listener
@@ -35,11 +35,11 @@ class Answers:
         self._model = load_model("rrbot")
         self._kinematics = Kinematics(self._model)
         self._source = SineSource(self._model)
-        self._watching: dict[str, Watching] = {}
+        self._watching: dict[str, FreshnessMonitor] = {}
 
     def near(self, robot: str, stamp: int, timeout_s: float = 10.0) -> bool:
-        """Whether the newest sample comes to be within half a minute of a stamp."""
-        is_near = comes_true(lambda: abs(self.newest(robot) - stamp) <= 30_000_000_000, timeout_s)
+        """Whether the newest sample gets within half a minute of a stamp in time."""
+        is_near = becomes_true(lambda: abs(self.newest(robot) - stamp) <= 30_000_000_000, timeout_s)
         if is_near:
             self._check(robot)
         return is_near
@@ -52,12 +52,12 @@ class Answers:
             return 0
 
     def after(self, robot: str, stamp: int, timeout_s: float = 15.0) -> int | None:
-        """When [ns] there was an answer with a later stamp; it is checked."""
-        if not comes_true(lambda: self.newest(robot) > stamp, timeout_s):
+        """The time [ns] of the first lookup with a later stamp; its pose is checked."""
+        if not becomes_true(lambda: self.newest(robot) > stamp, timeout_s):
             return None
-        heard_at = time.time_ns()
+        received_at = time.time_ns()
         self._check(robot)
-        return heard_at
+        return received_at
 
     def _check(self, robot: str) -> None:
         answer = self._buffer.lookup(f"{robot}/world", f"{robot}/tool")
@@ -68,8 +68,8 @@ class Answers:
         assert np.allclose(answer.matrix, expected.matrix, rtol=0.0, atol=1e-9), (answer, expected)
 
     def mark(self, robot: str, value: float, timeout_s: float = 10.0) -> int | None:
-        """When [ns] the robot's static edge had this length."""
-        return time.time_ns() if comes_true(lambda: self._mark(robot) == value, timeout_s) else None
+        """The time [ns] when the robot's static edge had this length."""
+        return time.time_ns() if becomes_true(lambda: self._mark(robot) == value, timeout_s) else None
 
     def _mark(self, robot: str) -> float | None:
         try:
@@ -78,7 +78,7 @@ class Answers:
             return None
 
     def fresh(self, robot: str) -> Transform:
-        """The newest answer, if that is not too old."""
+        """The newest pose, if it is not older than ``MAX_AGE_S``."""
         return self._buffer.lookup(f"{robot}/world", f"{robot}/tool", max_age_s=MAX_AGE_S)
 
     def stats(self) -> dict[str, Any]:
@@ -87,13 +87,13 @@ class Answers:
         return {name: getattr(stats, name) for name in names}
 
     def watch(self, robot: str) -> None:
-        self._watching[robot] = Watching(self, robot)
+        self._watching[robot] = FreshnessMonitor(self, robot)
 
     def watched(self, robot: str) -> dict[str, Any]:
         return self._watching.pop(robot).report()
 
     def latencies(self, robot: str, count: int) -> list[int]:
-        """How old [ns] each of the next samples is when it can be looked up."""
+        """Ages [ns] of the next samples at their first lookup."""
         ages: list[int] = []
         newest = self.newest(robot)
         while len(ages) < count:
@@ -104,10 +104,10 @@ class Answers:
         return ages
 
 
-class Watching:
-    """Looks at one robot every few milliseconds: newest must never go back, nor old be called fresh."""
+class FreshnessMonitor:
+    """Checks one robot every 3 ms: the newest stamp never goes back, no old pose passes as fresh."""
 
-    def __init__(self, answers: Answers, robot: str) -> None:
+    def __init__(self, answers: ReaderQueries, robot: str) -> None:
         self._answers = answers
         self._robot = robot
         self._stop = threading.Event()

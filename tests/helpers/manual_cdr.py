@@ -1,7 +1,7 @@
-"""CDR by other hands: a plain encoder of the specification, and rosbags.
+"""Independent CDR encoders: one written from the specification, and rosbags.
 
-XCDR1, section 7.4.1 of the DDS-XTypes specification: a value stands at a multiple of its size, counted
-from the end of the four bytes of header; a string is a uint32 length that counts its NUL, then the bytes;
+XCDR1, section 7.4.1 of the DDS-XTypes specification: a value is aligned to its size, counted
+from the end of the four-byte header; a string is a uint32 length including its NUL, then the bytes;
 a sequence is a uint32 count, then the items.
 """
 
@@ -25,7 +25,7 @@ def zeros(size: int) -> bytes:
 
 
 def cdr(values: Iterator[Value], order: str = "<", fill: Callable[[int], bytes] = zeros) -> bytes:
-    """The payload of these values; ``fill`` makes what stands in the gaps."""
+    """The payload of these values; ``fill`` makes the padding."""
     data = b""
     for kind, value in values:
         if kind == "s":
@@ -68,7 +68,7 @@ def tf_message(stamps: Sequence[int], edges: Edges, poses: Sequence[Sequence[flo
 
 
 def rosbags_cdr(name: str, *fields: object, little_endian: bool = True) -> bytes:
-    """What rosbags makes of a message with these fields."""
+    """The rosbags encoding of a message with these fields."""
     return bytes(STORE.serialize_cdr(STORE.types[name](*fields), name, little_endian=little_endian))
 
 

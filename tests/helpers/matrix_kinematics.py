@@ -1,4 +1,4 @@
-"""Kinematics of a second make, for tests to compare with: numpy and the XML, nothing of zstate."""
+"""Independent kinematics for comparison: numpy and XML, without zstate."""
 
 from math import cos, sin
 from xml.etree import ElementTree
@@ -17,7 +17,7 @@ def matrices(poses: np.ndarray) -> np.ndarray:
     return result
 
 
-def turn(axis: np.ndarray, angle: float) -> np.ndarray:
+def rotation_matrix(axis: np.ndarray, angle: float) -> np.ndarray:
     """The rotation about a unit axis as a 4 x 4 matrix, by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -26,14 +26,14 @@ def turn(axis: np.ndarray, angle: float) -> np.ndarray:
     return matrix
 
 
-def shift(vector: np.ndarray) -> np.ndarray:
+def translation_matrix(vector: np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, 3] = vector
     return matrix
 
 
 class MatrixKinematics:
-    """Poses of links: 4 x 4 matrices straight from the XML, a link at a time."""
+    """Poses of links: 4 x 4 matrices from the XML, one link at a time."""
 
     def __init__(self, urdf: str) -> None:
         self.joints = {
@@ -51,8 +51,8 @@ class MatrixKinematics:
     def origin(self, joint: ElementTree.Element) -> np.ndarray:
         roll, pitch, yaw = self.vector(joint, "origin", "rpy", "0 0 0")
         x, y, z = np.eye(3)
-        place = shift(self.vector(joint, "origin", "xyz", "0 0 0"))
-        return place @ turn(z, yaw) @ turn(y, pitch) @ turn(x, roll)
+        place = translation_matrix(self.vector(joint, "origin", "xyz", "0 0 0"))
+        return place @ rotation_matrix(z, yaw) @ rotation_matrix(y, pitch) @ rotation_matrix(x, roll)
 
     def motion(self, joint: ElementTree.Element, positions: dict[str, np.ndarray]) -> np.ndarray:
         kind = joint.get("type")
@@ -62,10 +62,16 @@ class MatrixKinematics:
         if kind == "floating":
             return matrices(numbers[None])[0]
         if kind == "planar":
-            return shift(np.array([*numbers[:2], 0.0])) @ turn(np.array([0.0, 0.0, 1.0]), numbers[2])
+            return translation_matrix(np.array([*numbers[:2], 0.0])) @ rotation_matrix(
+                np.array([0.0, 0.0, 1.0]), numbers[2]
+            )
         axis = self.vector(joint, "axis", "xyz", "1 0 0")
         axis /= np.linalg.norm(axis)
-        return shift(axis * numbers[0]) if kind == "prismatic" else turn(axis, numbers[0])
+        return (
+            translation_matrix(axis * numbers[0])
+            if kind == "prismatic"
+            else rotation_matrix(axis, numbers[0])
+        )
 
     def numbers(self, joint: ElementTree.Element, positions: dict[str, np.ndarray]) -> np.ndarray:
         mimic = joint.find("mimic")

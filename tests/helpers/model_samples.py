@@ -1,4 +1,4 @@
-"""Robots to compute with: one with every type of joint, and our own."""
+"""Robots for kinematics: one with every type of joint, and the models of this repository."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def every_joint() -> Kinematics:
     return Kinematics(parse_urdf(EVERY_JOINT, "every_joint.urdf"))
 
 
-def own(name: str) -> Kinematics:
+def local_model(name: str) -> Kinematics:
     path = Path(__file__).parents[2] / "models" / f"{name}.urdf"
     return Kinematics(parse_urdf(path.read_text(), path.name))
 
 
 def random_positions(model: RobotModel, seed: int, spread: float = 20.0) -> np.ndarray:
-    """Three turns either way and then some, with unit quaternions where a joint floats."""
+    """Random positions over several turns, with unit quaternions for floating joints."""
     positions = np.random.default_rng(seed).uniform(-spread, spread, model.position_count)
     for start in floating_columns(model):
         positions[start + 3 : start + 7] /= np.linalg.norm(positions[start + 3 : start + 7])

@@ -1,6 +1,6 @@
-"""Several hosts on one machine: network namespaces around a router that can be told to swallow all.
+"""Several hosts on one machine: network namespaces around a router that can drop packets.
 
-Each host has a cable of its own to the middle. Needs root and iproute2.
+Each host has its own cable to the router. Needs root and iproute2.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from types import TracebackType
 REASON = "needs root, iproute2 and network namespaces"
 
 
-def possible() -> bool:
+def can_create_namespaces() -> bool:
     if os.geteuid() != 0 or shutil.which("ip") is None:
         return False
     name = f"zstate-probe-{os.getpid()}"
@@ -28,30 +28,30 @@ def _ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)
 
 
-class Hosts:
+class NamespaceHosts:
     """``names`` are hosts that reach each other; a context manager."""
 
     def __init__(self, *names: str) -> None:
         self._mark = f"zs{os.getpid()}"
         self._numbers = {name: number for number, name in enumerate(names, 1)}
 
-    def __enter__(self) -> Hosts:
-        _ip("netns", "add", self._middle)
-        self._in_middle("echo 1 > /proc/sys/net/ipv4/ip_forward")
+    def __enter__(self) -> NamespaceHosts:
+        _ip("netns", "add", self._router)
+        self._run_in_router("echo 1 > /proc/sys/net/ipv4/ip_forward")
         for name in self._numbers:
-            self._lay_cable(name)
+            self._add_host(name)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for namespace in (*map(self.namespace, self._numbers), self._middle):
+        for namespace in (*map(self.namespace, self._numbers), self._router):
             if Path(f"/run/netns/{namespace}").exists():
                 _ip("netns", "del", namespace)
 
     @property
-    def _middle(self) -> str:
-        return f"{self._mark}-middle"
+    def _router(self) -> str:
+        return f"{self._mark}-router"
 
     def namespace(self, name: str) -> str:
         return f"{self._mark}-{name}"
@@ -60,38 +60,38 @@ class Hosts:
         return f"10.77.{self._numbers[name]}.2"
 
     def _port(self, name: str) -> str:
-        """The middle's end of a host's cable."""
+        """The router's end of a host's cable."""
         return f"port{self._numbers[name]}"
 
-    def _lay_cable(self, name: str) -> None:
+    def _add_host(self, name: str) -> None:
         host, port, net = self.namespace(name), self._port(name), f"10.77.{self._numbers[name]}"
         _ip("netns", "add", host)
         _ip(
-            "link", "add", "cable", "netns", host, "type", "veth", "peer", "name", port, "netns", self._middle
+            "link", "add", "cable", "netns", host, "type", "veth", "peer", "name", port, "netns", self._router
         )
-        _ip("-n", self._middle, "address", "add", f"{net}.1/24", "dev", port)
-        _ip("-n", self._middle, "link", "set", port, "up")
+        _ip("-n", self._router, "address", "add", f"{net}.1/24", "dev", port)
+        _ip("-n", self._router, "link", "set", port, "up")
         _ip("-n", host, "address", "add", f"{net}.2/24", "dev", "cable")
         for device in ("lo", "cable"):
             _ip("-n", host, "link", "set", device, "up")
         _ip("-n", host, "route", "add", "default", "via", f"{net}.1")
 
-    def _in_middle(self, command: str) -> None:
-        _ip("netns", "exec", self._middle, "sh", "-c", command)
+    def _run_in_router(self, command: str) -> None:
+        _ip("netns", "exec", self._router, "sh", "-c", command)
 
     def unplug(self, name: str) -> None:
-        """Both ends see that the cable is out."""
-        _ip("-n", self._middle, "link", "set", self._port(name), "down")
+        """Takes the link down; both ends notice it."""
+        _ip("-n", self._router, "link", "set", self._port(name), "down")
 
     def plug(self, name: str) -> None:
-        _ip("-n", self._middle, "link", "set", self._port(name), "up")
+        _ip("-n", self._router, "link", "set", self._port(name), "up")
 
-    def swallow(self, name: str) -> None:
-        """From now on whatever is sent to this host or by it vanishes, and nobody is told."""
-        self._in_middle(f"echo 0 > /proc/sys/net/ipv4/conf/{self._port(name)}/forwarding")
-        _ip("-n", self._middle, "route", "add", "blackhole", f"{self.address(name)}/32")
+    def drop_packets(self, name: str) -> None:
+        """Drops all packets to and from this host without any error."""
+        self._run_in_router(f"echo 0 > /proc/sys/net/ipv4/conf/{self._port(name)}/forwarding")
+        _ip("-n", self._router, "route", "add", "blackhole", f"{self.address(name)}/32")
 
-    def carry(self, name: str) -> None:
-        """The end of ``swallow``."""
-        self._in_middle(f"echo 1 > /proc/sys/net/ipv4/conf/{self._port(name)}/forwarding")
-        _ip("-n", self._middle, "route", "del", "blackhole", f"{self.address(name)}/32")
+    def pass_packets(self, name: str) -> None:
+        """Ends ``drop_packets``."""
+        self._run_in_router(f"echo 1 > /proc/sys/net/ipv4/conf/{self._port(name)}/forwarding")
+        _ip("-n", self._router, "route", "del", "blackhole", f"{self.address(name)}/32")

@@ -1,4 +1,4 @@
-"""What tests build with: free ports, other processes, and deadlines."""
+"""Free ports, child processes, deadlines and a stepping clock."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pathlib import Path
 
 DEADLINE_S = 15.0
 SOON_S = 3.0
-"""Well within a second, and what a busy machine adds to that."""
+"""A limit for actions that take less than a second, with slack for a busy machine."""
 
 
 _TURNS = Path(tempfile.gettempdir(), f"zstate-test-ports-{os.getuid()}")
 
 
-def a_free_port() -> int:
-    """One that nobody else gets: the system hands out higher ones, and tests that run beside take turns."""
+def find_free_port() -> int:
+    """An unused port: below the system's ephemeral range, and unique among parallel test processes."""
     with _TURNS.open("a+") as turns:
         fcntl.flock(turns, fcntl.LOCK_EX)
         turns.seek(0)
@@ -45,7 +45,7 @@ def _is_free(port: int) -> bool:
 
 
 def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> None:
-    """Return as soon as ``condition()`` is true; fail when it is not within ``timeout_s``."""
+    """Waits until ``condition()`` is true; fails after ``timeout_s``."""
     deadline = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline, f"not so within {timeout_s} s"
@@ -53,8 +53,8 @@ def until(condition: Callable[[], object], timeout_s: float = DEADLINE_S) -> Non
 
 
 @contextmanager
-def again_and_again(action: Callable[[], object], every_s: float = 0.01) -> Iterator[None]:
-    """Meanwhile ``action`` is done, a hundred times a second unless said otherwise."""
+def repeated(action: Callable[[], object], every_s: float = 0.01) -> Iterator[None]:
+    """Calls ``action`` every ``every_s`` inside the block, in a thread."""
     stop = threading.Event()
 
     def repeat() -> None:
@@ -70,8 +70,8 @@ def again_and_again(action: Callable[[], object], every_s: float = 0.01) -> Iter
         thread.join()
 
 
-class Stepping:
-    """A clock that goes at once to where it is waited for, plus the lateness of that wait."""
+class SteppingClock:
+    """A clock that jumps to the awaited stamp, plus the lateness given for that wait."""
 
     domain = "system"
 
@@ -90,7 +90,7 @@ class Stepping:
 
 
 class Child:
-    """A Python process that runs ``code``; it says lines, and is told lines."""
+    """A Python process that runs ``code`` and exchanges lines with the test."""
 
     def __init__(self, code: str, *arguments: str) -> None:
         self.process = subprocess.Popen(
@@ -117,24 +117,24 @@ class Child:
         self._errors.extend(self.process.stderr or ())
 
     def line(self, timeout_s: float = DEADLINE_S) -> str:
-        """The next line it says."""
+        """The next line of its output."""
         try:
             return self._lines.get(timeout=timeout_s)
         except queue.Empty:
             raise AssertionError(f"silent for {timeout_s} s; stderr: {self.stderr!r}") from None
 
-    def tell(self, line: str = "") -> None:
+    def send_line(self, line: str = "") -> None:
         assert self.process.stdin
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
     def kill(self) -> None:
-        """As ``kill -9`` does."""
+        """Kills the process, as ``kill -9`` does."""
         self.process.kill()
         self.process.wait(DEADLINE_S)
 
     def wait(self, timeout_s: float = DEADLINE_S) -> int:
-        """Its exit code, once it and its output have ended."""
+        """Waits for the end of the process and its output; returns the exit code."""
         code = self.process.wait(timeout_s)
         for reader in self._readers:
             reader.join(timeout_s)

@@ -1,4 +1,4 @@
-"""What the tests of metrics share: a scrape, read back by Prometheus' own parser."""
+"""Scrapes of metrics, read by Prometheus' own parser."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scraped(url: str) -> dict[Row, float]:
 
 
 def collected(collector: Collector) -> dict[Row, float]:
-    """As ``scraped``, without a network."""
+    """The rows of a collector, without a network."""
     registry = CollectorRegistry()
     registry.register(collector)
     return parsed(generate_latest(registry).decode())

@@ -1,6 +1,6 @@
-"""ROS 2 nodes by other hands: literal keys and tokens on a bare Zenoh session, bytes of rosbags.
+"""Independent ROS 2 nodes: literal keys and tokens on a plain Zenoh session, bytes of rosbags.
 
-Nothing here asks zstate how it is done, so that both can be wrong only apart.
+Nothing here uses zstate's implementation of the ROS wires.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ def _transient_local() -> dict[str, Any]:
     }
 
 
-# A publisher that nobody holds any more would take its latched value with it.
-_ALIVE: list[RosPublisher] = []
+# Keeps publishers alive: a collected publisher would withdraw its latched value.
+_OPEN_PUBLISHERS: list[RosPublisher] = []
 
 
 class RosPublisher:
-    """One topic of one node: announced on its own, which may be later than what it says."""
+    """One topic of one node; ``announce`` is separate and may follow the first messages."""
 
     def __init__(self, session: Session, topic: Topic, key: str, token: str, *, latched: bool) -> None:
         self.key, self.token, self.gid, self.seq = key, token, gid_of(token), 0
@@ -82,23 +82,23 @@ class RosPublisher:
         self.publisher = zenoh.ext.declare_advanced_publisher(
             session.zenoh, key, **(_transient_local() if latched else {})
         )
-        _ALIVE.append(self)
+        _OPEN_PUBLISHERS.append(self)
 
     def announce(self) -> RosPublisher:
         self._alive = self._session.zenoh.liveliness().declare_token(self.token)
         return self
 
-    def await_reader(self) -> RosPublisher:
+    def wait_for_reader(self) -> RosPublisher:
         with StreamPublisher(self._session, self.key, "") as probe:
             until(lambda: probe.has_readers)
         return self
 
-    def put(self, payload: bytes, beside: bytes | str | None = "next") -> None:
-        """Say ``payload`` with the next attachment, or with what is given ``beside`` it."""
-        if beside == "next":
+    def put(self, payload: bytes, extra: bytes | str | None = "next") -> None:
+        """Publishes ``payload`` with the next attachment, or with the attachment ``extra``."""
+        if extra == "next":
             self.seq += 1
-            beside = attachment(self.seq, self.gid)
-        self.publisher.put(payload, attachment=beside)
+            extra = attachment(self.seq, self.gid)
+        self.publisher.put(payload, attachment=extra)
 
     def joints(self, stamp: int, names: Sequence[str], *blocks: Sequence[float]) -> None:
         self.put(rosbags_joint_state(stamp, "", names, *blocks, *[()] * (3 - len(blocks))))
@@ -112,16 +112,16 @@ class RosPublisher:
     def text(self, text: str) -> None:
         self.put(rosbags_cdr("std_msgs/msg/String", text))
 
-    def leave(self) -> None:
-        """As a node does that ends."""
+    def close(self) -> None:
+        """Undeclares token and publisher, as a node does at its end."""
         if self._alive is not None:
             self._alive.undeclare()
         self.publisher.undeclare()
-        _ALIVE.remove(self)
+        _OPEN_PUBLISHERS.remove(self)
 
 
 class RosNode:
-    """A node that says what it is told to, on as many topics."""
+    """A node with publishers on any number of topics."""
 
     def __init__(self, session: Session, name: str, namespace: str = "/", domain: int = 0) -> None:
         self._session, self._domain = session, domain
@@ -140,8 +140,8 @@ class RosNode:
         return RosPublisher(self._session, topic, key, token, latched=topic in (TF_STATIC, DESCRIPTION))
 
 
-class Ear:
-    """What a ROS node's subscription hears on one key, as Zenoh delivers it."""
+class KeySubscriber:
+    """The samples of one key, subscribed as a ROS node does."""
 
     def __init__(self, session: Session, key: str, *, latched: bool = False) -> None:
         self.samples: list[zenoh.Sample] = []
@@ -157,16 +157,16 @@ class Ear:
         else:
             self._subscriber = session.zenoh.declare_subscriber(key, self.samples.append)
 
-    def heard(self, number: int) -> list[zenoh.Sample]:
+    def wait_for(self, number: int) -> list[zenoh.Sample]:
         until(lambda: len(self.samples) >= number)
         return list(self.samples)
 
     def messages(self, number: int, name: str) -> list:
-        return [STORE.deserialize_cdr(sample.payload.to_bytes(), name) for sample in self.heard(number)]
+        return [STORE.deserialize_cdr(sample.payload.to_bytes(), name) for sample in self.wait_for(number)]
 
     def attachments(self, number: int) -> list[tuple[int, int, bytes]]:
         """Sequence number, source time and gid of each."""
-        return [read_attachment(sample) for sample in self.heard(number)]
+        return [read_attachment(sample) for sample in self.wait_for(number)]
 
 
 def read_attachment(sample: zenoh.Sample) -> tuple[int, int, bytes]:
@@ -179,13 +179,13 @@ def read_attachment(sample: zenoh.Sample) -> tuple[int, int, bytes]:
 
 
 def tokens(session: Session, domain: int = 0) -> list[str]:
-    """The keys of all tokens that are alive in a domain."""
+    """The keys of all live tokens of a domain."""
     replies = session.zenoh.liveliness().get(f"@ros2_lv/{domain}/**", timeout=5.0)
     return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
 
 def moved(x: float) -> tuple[float, ...]:
-    """A pose that is ``x`` along the parent's axis."""
+    """A pose at ``x`` along the parent's x axis."""
     return (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Recordings built by hand: robot messages through a RecordingEncoder, and bags as ROS leaves them."""
+"""Builders of recordings: robot messages through a RecordingEncoder, and ROS 2 bags by rosbags."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MS = 1_000_000
 S = 1_000_000_000
 START = 1_700_000_000 * S
 LATENCY = 200_000
-"""From the stamp of a sample until it is recorded [ns]."""
+"""The delay from the stamp of a sample to its log time [ns]."""
 
 Edge = tuple[str, str]
 
@@ -41,18 +41,18 @@ def recorded_buffer(path: Path, robot: str | None = None) -> TransformBuffer:
         return recording.buffer()
 
 
-class Tale:
-    """A recording in the making; everything is heard a little after its stamp."""
+class RecordingBuilder:
+    """Writes a recording; every message is logged ``LATENCY`` after its stamp by default."""
 
     def __init__(self, path: Path, alone: str | None = None, programs: dict[int, str] | None = None) -> None:
         self.writer = RecordingWriter(path)
         self.refused: list[str] = []
-        self.scribe = RecordingEncoder(
+        self.encoder = RecordingEncoder(
             self.writer, lambda reason, _: self.refused.append(reason), alone=alone, programs=programs or {}
         )
         self._seqs: dict[tuple[str, int], int] = {}
 
-    def __enter__(self) -> Tale:
+    def __enter__(self) -> RecordingBuilder:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -65,8 +65,8 @@ class Tale:
         return seq
 
     def describe(self, robot: str, model: RobotModel = RRBOT, session: int = 1, at: int = START) -> None:
-        said = RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
-        self.scribe.write_message(robot, said, at)
+        message = RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
+        self.encoder.write_message(robot, message, at)
 
     def joints(
         self,
@@ -77,7 +77,7 @@ class Tale:
         *,
         session: int = 1,
         model: RobotModel = RRBOT,
-        heard: int | None = None,
+        log_time: int | None = None,
     ) -> JointState:
         state = JointState(
             stamp,
@@ -87,7 +87,7 @@ class Tale:
             to_block(positions),
             None if velocities is None else to_block(velocities),
         )
-        self.scribe.write_message(robot, state, stamp + LATENCY if heard is None else heard)
+        self.encoder.write_message(robot, state, stamp + LATENCY if log_time is None else log_time)
         return state
 
     def edges(
@@ -97,12 +97,12 @@ class Tale:
         poses: dict[Edge, Sequence[float]],
         *,
         session: int = 2,
-        heard: int | None = None,
+        log_time: int | None = None,
     ) -> TransformSample:
         names = tuple(poses)
         block = to_block(list(poses.values()))
         sample = TransformSample(stamp, self._seq(robot, session), session, order_digest(names), block, names)
-        self.scribe.write_message(robot, sample, stamp + LATENCY if heard is None else heard)
+        self.encoder.write_message(robot, sample, stamp + LATENCY if log_time is None else log_time)
         return sample
 
     def statics(
@@ -114,20 +114,20 @@ class Tale:
         session: int = 3,
         writer: str | None = "camera",
     ) -> None:
-        said = StaticTransforms(session, tuple(poses), to_block(list(poses.values())))
-        self.scribe.write_message(robot, said, at, writer)
+        message = StaticTransforms(session, tuple(poses), to_block(list(poses.values())))
+        self.encoder.write_message(robot, message, at, writer)
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> list[float]:
     return [x, y, z, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)]
 
 
-def swing(seconds: float) -> list[float]:
-    """Where the joints of rrbot are, some time after the start."""
+def swing_positions(seconds: float) -> list[float]:
+    """The joint positions of rrbot at a time after the start."""
     return [math.sin(seconds), 0.5 * math.cos(2.0 * seconds)]
 
 
-def swing_rates(seconds: float) -> list[float]:
+def swing_velocities(seconds: float) -> list[float]:
     return [math.cos(seconds), -math.sin(2.0 * seconds)]
 
 
@@ -137,7 +137,7 @@ _DURABLE = {"/tf_static", "/robot_description"}
 
 
 class Bag:
-    """A bag of ROS 2, made by rosbags."""
+    """A ROS 2 bag, written by rosbags."""
 
     def __init__(self, path: Path, storage: StoragePlugin = StoragePlugin.SQLITE3) -> None:
         self._writer = Writer(path, version=9, storage_plugin=storage)
@@ -150,28 +150,28 @@ class Bag:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def say(self, topic: str, log_time: int, message: object, kind: str) -> None:
+    def write(self, topic: str, log_time: int, message: object, kind: str) -> None:
         key = topic, kind
         if key not in self._connections:
             self._connections[key] = self._writer.add_connection(topic, kind, typestore=STORE)
         self._writer.write(self._connections[key], log_time, STORE.serialize_cdr(message, kind))
 
     def describe(self, topic: str = "/robot_description", urdf: str = RRBOT.urdf) -> None:
-        self.say(topic, START, _TYPES["std_msgs/msg/String"](urdf), "std_msgs/msg/String")
+        self.write(topic, START, _TYPES["std_msgs/msg/String"](urdf), "std_msgs/msg/String")
 
     def joints(
-        self, stamp: int, named: dict[str, float], topic: str = "/joint_states", heard: int | None = None
+        self, stamp: int, named: dict[str, float], topic: str = "/joint_states", log_time: int | None = None
     ) -> None:
         empty = np.array([])
         message = _TYPES["sensor_msgs/msg/JointState"](
             _header(stamp, ""), list(named), np.array(list(named.values())), empty, empty
         )
-        heard = stamp + LATENCY if heard is None else heard
-        self.say(topic, heard, message, "sensor_msgs/msg/JointState")
+        log_time = stamp + LATENCY if log_time is None else log_time
+        self.write(topic, log_time, message, "sensor_msgs/msg/JointState")
 
-    def tf(self, heard: int, transforms: Sequence[Transform], topic: str = "/tf") -> None:
+    def tf(self, log_time: int, transforms: Sequence[Transform], topic: str = "/tf") -> None:
         message = _TYPES["tf2_msgs/msg/TFMessage"]([_stamped(transform) for transform in transforms])
-        self.say(topic, heard, message, "tf2_msgs/msg/TFMessage")
+        self.write(topic, log_time, message, "tf2_msgs/msg/TFMessage")
 
 
 def _header(stamp: int, frame: str) -> object:

@@ -1,4 +1,4 @@
-"""Recordings to test with: one robot's description and joint states, written by a RecordingWriter."""
+"""Recordings of one robot's description and joint states, written by a RecordingWriter."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ DESCRIPTION = string_bytes("<robot name='r'/>")
 
 
 def joint_states(count: int, every_ns: int = 10 * MS) -> list[tuple[int, bytes]]:
-    """Log times and payloads, which do not compress well."""
+    """Log times and incompressible payloads."""
     dice = random.Random(5)
     stamps = [START + number * every_ns for number in range(count)]
     return [(stamp, joint_bytes(stamp, [dice.random() for _ in range(7)])) for stamp in stamps]
 
 
-def declared(writer: RecordingWriter) -> tuple[ChannelId, ChannelId]:
+def declare_channels(writer: RecordingWriter) -> tuple[ChannelId, ChannelId]:
     """The channels of a description and of joint states."""
     metadata = {"zstate.robot": "panda"}
     described = writer.channel("/robot_description", STRING, LATCHED, metadata)
@@ -57,7 +57,7 @@ def declared(writer: RecordingWriter) -> tuple[ChannelId, ChannelId]:
 def write_run(path: Path, states: list[tuple[int, bytes]], flush_every: int = 50, **options: object) -> None:
     """A description, latched, and the joint states."""
     with RecordingWriter(path, **options) as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         writer.latch(described, "", DESCRIPTION, START, START)
         for number, (stamp, payload) in enumerate(states):
             writer.write(joints, payload, stamp, stamp - MS, sequence=number)

@@ -1,4 +1,4 @@
-"""What the tests of publishers and listeners share: writers, readers, and answers derived apart."""
+"""Readers, collected samples, and independently derived poses for tests of publishers and listeners."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ STAMP = 1_789_012_345_678_901_234
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
-def await_reader(session: Session, key: str) -> None:
-    """Return when ``session`` knows that somebody reads ``key``: what it puts from now on arrives."""
+def wait_for_reader(session: Session, key: str) -> None:
+    """Waits until ``session`` knows a reader of ``key``: later puts arrive."""
     with StreamPublisher(session, key, "") as probe:
         until(lambda: probe.has_readers)
 
 
-def settle(session: Session, robot: str, *streams: str) -> None:
-    """Return when somebody hears ``streams`` of ``robot``, by default its joint states."""
+def wait_for_stream_readers(session: Session, robot: str, *streams: str) -> None:
+    """Waits until ``streams`` of ``robot`` have readers; default: joint states."""
     for stream in streams or ("joint_states",):
-        await_reader(session, f"zstate/{robot}/{stream}")
+        wait_for_reader(session, f"zstate/{robot}/{stream}")
 
 
-class Tap:
-    """Everything that was heard on one key, as it came."""
+class SampleCollector:
+    """Collects all samples of one key."""
 
     def __init__(self, session: Session, key: str) -> None:
         self.arrivals: list[SerializedSample] = []
         self._subscriber = StreamSubscriber(session, key, self.arrivals.extend)
 
     def payloads(self, count: int) -> list[bytes]:
-        """The first ``count`` payloads, once they are there."""
+        """The first ``count`` payloads, after waiting for them."""
         until(lambda: len(self.arrivals) >= count)
         return [arrival.payload for arrival in self.arrivals]
 

@@ -1,4 +1,4 @@
-"""A real ROS 1 beside zstate: its master, its nodes, and the bridge, each a process of its own.
+"""A real ROS 1: master, nodes and zstate's bridge, each in its own process.
 
     apt-get install -y --no-install-recommends \\
         python3-roslaunch ros-robot-state-publisher python3-tf2-ros python3-sensor-msgs
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from helpers.processes import Child, a_free_port, until
+from helpers.processes import Child, find_free_port, until
 
 from zstate.bridges.ros1.node import Master
 from zstate.errors import Unreachable
@@ -28,7 +28,7 @@ ROSCORE = Path("/usr/bin/roscore")
 RRBOT = Path(__file__).parents[2] / "models" / "rrbot.urdf"
 JOINTS = ("shoulder", "elbow")
 
-# rospy is Python without extensions: behind all else, Debian's serves any Python of the same version.
+# rospy has no extension modules: Debian's packages work with any Python of the same version.
 BRIDGE = f"""
     import sys
     sys.path.append({DEBIAN_PACKAGES!r})
@@ -36,7 +36,7 @@ BRIDGE = f"""
     main()
 """
 
-# Answers lookups by the real tf2_ros: [pose7, stamp], or the text of the error.
+# Replies to lookups with the real tf2_ros: [pose7, stamp], or the text of the error.
 TF2_LISTENER = """
     import json, sys
     import rospy, tf2_ros
@@ -56,7 +56,7 @@ TF2_LISTENER = """
         print(json.dumps([[t.x, t.y, t.z, q.x, q.y, q.z, q.w], at.secs * 10**9 + at.nsecs]))
 """
 
-# Publishes on /joint_states, /tf and /tf_static what it is told; tells what it heard of the first two.
+# Publishes requested messages on /joint_states, /tf and /tf_static; reports received ones of the first two.
 ROS_PEER = """
     import json, sys
     import rospy
@@ -68,28 +68,28 @@ ROS_PEER = """
     joints = rospy.Publisher("joint_states", JointState, queue_size=1000)
     latched = {"latch": True, "queue_size": 10}
     edges = {name: rospy.Publisher(name, TFMessage, **latched) for name in ("/tf", "/tf_static")}
-    heard_joints, heard_edges = [], []
+    joint_messages, edge_messages = [], []
 
     def when(header):
         return header.stamp.secs * 10**9 + header.stamp.nsecs
 
-    def hear(message):
+    def on_joints(message):
         numbers = [message.position, message.velocity, message.effort]
-        heard_joints.append([when(message.header), message.name, numbers])
+        joint_messages.append([when(message.header), message.name, numbers])
 
-    def hear_edges(message):
+    def on_edges(message):
         writer = message._connection_header["callerid"]
         for edge in message.transforms:
             t, q = edge.transform.translation, edge.transform.rotation
             pose = [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
-            heard_edges.append([writer, edge.header.frame_id, edge.child_frame_id, when(edge.header), pose])
+            edge_messages.append([writer, edge.header.frame_id, edge.child_frame_id, when(edge.header), pose])
 
-    def say_joints(stamp, names, positions):
+    def publish_joints(stamp, names, positions):
         message = JointState(name=names, position=positions)
         message.header.stamp = rospy.Time(*divmod(stamp, 10**9))
         joints.publish(message)
 
-    def say_edge(topic, parent, child, pose):
+    def publish_edge(topic, parent, child, pose):
         edge = TransformStamped(child_frame_id=child)
         edge.header.frame_id = parent
         edge.header.stamp = rospy.Time(1)
@@ -97,70 +97,70 @@ ROS_PEER = """
         t.x, t.y, t.z, q.x, q.y, q.z, q.w = pose
         edges[topic].publish(TFMessage([edge]))
 
-    def heard():
-        told = [heard_joints[:], heard_edges[:]]
-        del heard_joints[:len(told[0])], heard_edges[:len(told[1])]
-        return told
+    def received():
+        messages = [joint_messages[:], edge_messages[:]]
+        del joint_messages[:len(messages[0])], edge_messages[:len(messages[1])]
+        return messages
 
-    if "hear" in sys.argv:
-        rospy.Subscriber("joint_states", JointState, hear)
-        rospy.Subscriber("/tf", TFMessage, hear_edges)
+    if "subscribe" in sys.argv:
+        rospy.Subscriber("joint_states", JointState, on_joints)
+        rospy.Subscriber("/tf", TFMessage, on_edges)
     answers = {
-        "joints": say_joints,
-        "edge": say_edge,
-        "heard": heard,
+        "joints": publish_joints,
+        "edge": publish_edge,
+        "received": received,
         "readers": joints.get_num_connections,
         "parameter": lambda name: rospy.get_param(name, None),
     }
     print("ready")
     for line in sys.stdin:
-        what, *told = json.loads(line)
-        print(json.dumps(answers[what](*told)))
+        name, *arguments = json.loads(line)
+        print(json.dumps(answers[name](*arguments)))
 """
 
 
-class Peer:
-    """A node of ROS that talks and listens (``ROS_PEER``)."""
+class RosPeer:
+    """A ROS node that publishes and subscribes (``ROS_PEER``)."""
 
     def __init__(self, child: Child) -> None:
         self._child = child
         self.joints: list[tuple[int, list[str], list[list[float]]]] = []
         self.edges: dict[tuple[str, str, int], tuple[str, list[float]]] = {}
 
-    def ask(self, *question: Any) -> Any:
-        self._child.tell(json.dumps(question))
+    def query(self, *question: Any) -> Any:
+        self._child.send_line(json.dumps(question))
         return json.loads(self._child.line())
 
-    def listen(self) -> None:
-        """Add what was heard since to ``joints`` and to ``edges``: writer and pose, by edge and stamp."""
-        joints, edges = self.ask("heard")
+    def collect(self) -> None:
+        """Adds newly received messages to ``joints`` and ``edges``: writer and pose, by edge and stamp."""
+        joints, edges = self.query("received")
         self.joints += map(tuple, joints)
         for writer, parent, child, stamp, pose in edges:
             self.edges[parent, child, stamp] = (writer, pose)
 
     def counts(self) -> Counter[int]:
-        """How often each stamp was heard on ``joint_states``."""
-        self.listen()
+        """How often each stamp was received on ``joint_states``."""
+        self.collect()
         return Counter(stamp for stamp, *_ in self.joints)
 
 
 @functools.cache
-def why_no_ros() -> str:
-    """Why there is no ROS 1 to test against; empty when there is one."""
+def missing_ros_reason() -> str:
+    """The reason why ROS 1 cannot be used here; empty if it can."""
     for program in (ROSCORE, STATE_PUBLISHER):
         if not program.exists():
-            return f"{program} is not there (Debian's python3-roslaunch, ros-robot-state-publisher)"
-    ask = "import rospy, sensor_msgs, tf2_ros, sys; print(*sys.version_info[:2])"
-    said = subprocess.run([DEBIAN_PYTHON, "-c", ask], capture_output=True, text=True, check=False)
-    if said.returncode:
-        return f"Debian's Python has no ROS 1: {said.stderr.strip().splitlines()[-1]}"
-    if said.stdout.split() != [str(part) for part in sys.version_info[:2]]:
-        return f"ROS 1 is there for Python {'.'.join(said.stdout.split())}"
+            return f"{program} is not installed (Debian's python3-roslaunch, ros-robot-state-publisher)"
+    code = "import rospy, sensor_msgs, tf2_ros, sys; print(*sys.version_info[:2])"
+    result = subprocess.run([DEBIAN_PYTHON, "-c", code], capture_output=True, text=True, check=False)
+    if result.returncode:
+        return f"Debian's Python has no ROS 1: {result.stderr.strip().splitlines()[-1]}"
+    if result.stdout.split() != [str(part) for part in sys.version_info[:2]]:
+        return f"ROS 1 is installed for Python {'.'.join(result.stdout.split())}"
     return ""
 
 
 class Roscore:
-    """A real ``roscore``, on a port of its own."""
+    """A real ``roscore`` on its own port."""
 
     def __init__(self, environment: dict[str, str]) -> None:
         self._master = Master(environment["ROS_MASTER_URI"])
@@ -180,19 +180,19 @@ class Roscore:
             return False
 
     def close(self) -> None:
-        """As Ctrl-C does: it ends its own children, which a kill would leave behind."""
+        """Sends SIGINT: it then ends its own children, which a kill would leave behind."""
         self._process.send_signal(signal.SIGINT)
         self._process.wait(15)
 
 
 def ros_environment(home: Path) -> dict[str, str]:
-    """The environment of ROS programs that write into ``home`` and know no other master."""
+    """The environment of ROS programs: files in ``home``, a master at a free port."""
     return {
         "HOME": str(home),
         "ROS_HOME": str(home / "ros"),
         "ROS_LOG_DIR": str(home / "log"),
         "ROS_IP": "127.0.0.1",
-        "ROS_MASTER_URI": f"http://127.0.0.1:{a_free_port()}",
+        "ROS_MASTER_URI": f"http://127.0.0.1:{find_free_port()}",
     }
 
 

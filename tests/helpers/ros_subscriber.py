@@ -1,4 +1,4 @@
-"""What the tests of listeners among ROS nodes share."""
+"""Helpers for listeners among ROS nodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from zstate.nodes.listener import TransformListener
 
 
 def writers(listener: TransformListener) -> dict[str, str | None]:
-    """Who places each frame, by its bare name."""
+    """The writer of each frame, by its short name."""
     frames = [frame for frame in listener.buffer.frames() if frame.parent is not None]
     return {frame.name.partition("/")[2]: frame.writer for frame in frames}
 
@@ -26,14 +26,14 @@ def x_of(listener: TransformListener, target: str, source: str, at: int | None =
     return None if reason is not None else listener.buffer.lookup(target, source, at).translation[0]
 
 
-def described(session: Session, text: str = RRBOT.urdf) -> RosPublisher:
+def publish_description(session: Session, text: str = RRBOT.urdf) -> RosPublisher:
     publisher = RosNode(session, "robot_state_publisher").publisher(DESCRIPTION).announce()
     publisher.text(text)
     return publisher
 
 
-def following_joints(session: Session, listener: TransformListener, name: str = "driver") -> RosPublisher:
-    """A node that writes joint states of a robot that the listener knows."""
-    driver = RosNode(session, name).publisher(JOINT_STATES).announce().await_reader()
+def publish_known_joints(session: Session, listener: TransformListener, name: str = "driver") -> RosPublisher:
+    """A node that publishes joint states, after the listener has the robot's model."""
+    driver = RosNode(session, name).publisher(JOINT_STATES).announce().wait_for_reader()
     until(lambda: "r1/tool" in {frame.name for frame in listener.buffer.frames()})
     return driver

@@ -1,4 +1,4 @@
-"""Runs the real tf2 under the system's Python: scenarios in, answers out, one JSON line each.
+"""Runs the real tf2 under the system's Python: one JSON line per scenario in, one per list of results out.
 
 Only the standard library and tf2_py are imported here.
 """
@@ -14,7 +14,7 @@ NS = 1_000_000_000
 
 
 class Seconds:
-    """What tf2_py takes for a time or a duration."""
+    """A time or duration as tf2_py accepts it."""
 
     def __init__(self, nanoseconds):
         self.nanoseconds = nanoseconds
@@ -39,12 +39,12 @@ def plain(answer):
     return {"pose": [t.x, t.y, t.z, q.x, q.y, q.z, q.w], "stamp": stamp.secs * NS + stamp.nsecs}
 
 
-def ask(core, question):
+def lookup(core, query):
     try:
-        if len(question) == 3:
-            target, source, stamp = question
+        if len(query) == 3:
+            target, source, stamp = query
             return plain(core.lookup_transform_core(target, source, Seconds(stamp or 0)))
-        target, target_at, source, source_at, fixed = question
+        target, target_at, source, source_at, fixed = query
         times = Seconds(target_at or 0), Seconds(source_at or 0)
         return plain(core.lookup_transform_full_core(target, times[0], source, times[1], fixed))
     except tf2_py.TransformException as error:
@@ -62,7 +62,7 @@ def run(scenario):
         elif name == "clear":
             core.clear()
         else:
-            answers.append(ask(core, values))
+            answers.append(lookup(core, values))
     return answers
 
 

@@ -1,4 +1,4 @@
-"""Random worlds and questions for tf2 and for us, and how both are asked."""
+"""Random frame trees and lookups, evaluated by tf2 and by zstate."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ S = 1_000_000_000
 SYSTEM_PYTHON = "/usr/bin/python3"
 DEEPEST = 8
 
-# The words for kinds of answers, common to both sides.
-THEIR_KINDS = {
+# Kinds of results, common to both sides.
+TF2_KINDS = {
     "LookupException": "unknown",
     "InvalidArgumentException": "name",
     "ConnectivityException": "disconnected",
@@ -39,8 +39,8 @@ THEIR_KINDS = {
 
 
 @cache
-def why_no_tf2() -> str:
-    """Why tf2 cannot be asked here; empty when it can."""
+def missing_tf2_reason() -> str:
+    """The reason why tf2 cannot be used here; empty if it can."""
     try:
         probe = subprocess.run(
             [SYSTEM_PYTHON, "-c", "import tf2_py"], capture_output=True, timeout=30, check=False, text=True
@@ -50,8 +50,8 @@ def why_no_tf2() -> str:
     return "" if probe.returncode == 0 else "tf2 is not installed (apt-get install python3-tf2)"
 
 
-def ask_tf2(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """tf2's answers to every question of every scenario."""
+def tf2_answers(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """The results of tf2 for every lookup of every scenario."""
     lines = "".join(json.dumps(scenario) + "\n" for scenario in scenarios)
     command = [SYSTEM_PYTHON, str(Path(__file__).with_name("tf2_process.py"))]
     done = subprocess.run(command, input=lines, capture_output=True, timeout=60, check=False, text=True)
@@ -59,8 +59,8 @@ def ask_tf2(scenarios: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def kind_of_theirs(answer: dict[str, Any]) -> str:
-    return THEIR_KINDS[answer["error"]] if "error" in answer else "answer"
+def tf2_error_kind(answer: dict[str, Any]) -> str:
+    return TF2_KINDS[answer["error"]] if "error" in answer else "answer"
 
 
 Answer: TypeAlias = Transform | LookupFailed | InvalidInput
@@ -77,12 +77,12 @@ _KINDS = {
 }
 
 
-def kind_of_ours(answer: Answer) -> str:
+def zstate_error_kind(answer: Answer) -> str:
     return _KINDS[type(answer)]
 
 
-def ask_us(scenario: dict[str, Any]) -> list[Answer]:
-    """Our answers to every question of one scenario; what is refused at insert is left out."""
+def zstate_answers(scenario: dict[str, Any]) -> list[Answer]:
+    """The results of zstate for every lookup of one scenario; refused inserts are skipped."""
     buffer = TransformBuffer(scenario["history"] / S)
     answers: list[Answer] = []
     for name, *values in scenario["steps"]:
@@ -120,7 +120,7 @@ def a_pose(rng: random.Random) -> list[float]:
 
 
 def a_scenario(rng: random.Random, questions: int) -> dict[str, Any]:
-    """A forest of up to 14 frames, its samples in any order, and questions between and after them."""
+    """A forest of up to 14 frames, its samples in any order, and lookups between and after them."""
     history = rng.choice([2, 5, 10]) * S
     begin = rng.randrange(1, 900_000) * S + rng.randrange(1000) * MS
     inserts = _inserts(rng, begin)
@@ -149,7 +149,7 @@ def _inserts(rng: random.Random, begin: int) -> list[list[Any]]:
         else:
             stamps = {begin + rng.randrange(12_000) * MS for _ in range(rng.choice([1, 2, 4, 12]))}
             samples = [["insert", parent, child, stamp, a_pose(rng)] for stamp in stamps]
-            # Now and then the same message arrives twice.
+            # Some messages arrive twice.
             inserts += samples + (samples[:1] if rng.random() < 0.3 else [])
     return inserts
 

@@ -41,14 +41,14 @@ _MASKS = {
 }
 
 
-class Told(NamedTuple):
+class TerminalStep(NamedTuple):
     """A command, and the lines that stand below it."""
 
     command: str
     lines: list[str]
 
     @property
-    def goes_on(self) -> bool:
+    def is_background(self) -> bool:
         """Whether it runs in the background; what it prints may come in another order."""
         return self.command.endswith(" &")
 
@@ -57,12 +57,12 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
 
 
-def told() -> Iterator[Told]:
+def terminal_steps() -> Iterator[TerminalStep]:
     """The terminal, from the first command to the last."""
     for block in blocks("console"):
         for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             command, *lines = part.splitlines()
-            yield Told(command, lines)
+            yield TerminalStep(command, lines)
 
 
 def masked(lines: list[str]) -> list[str]:
@@ -93,10 +93,10 @@ class Terminal:
             start_new_session=True,
         )
 
-    def does(self, one: Told) -> list[str]:
+    def run(self, one: TerminalStep) -> list[str]:
         """What is printed; by a program in the background, once it has printed all that is expected."""
         command = one.command.removesuffix(" &")
-        if not one.goes_on:
+        if not one.is_background:
             return self._done(f"{{ {command}; }} </dev/null")
         self._background += 1
         log = self._folder / f".log{self._background}"

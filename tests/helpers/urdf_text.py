@@ -1,4 +1,4 @@
-"""An arm to add faults to, and what parse_urdf says about it."""
+"""An arm for tests of URDF errors, and the findings of parse_urdf."""
 
 import pytest
 

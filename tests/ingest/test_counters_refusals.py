@@ -7,7 +7,7 @@ import logging
 import numpy as np
 import pytest
 from helpers.processes import until
-from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, settle
+from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import StreamPublisher
@@ -45,7 +45,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_logged_once(sessions, cap
         TransformListener(reader, "r1", follow=follow) as listener,
         StatePublisher(writer, RRBOT, "r1") as publisher,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         for key in keys:
             kind, good = KINDS[key]
             ours = ENCODINGS[kind]

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 from helpers.processes import until
-from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, settle
+from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.errors import InFuture
 from zstate.model.load import load_model
@@ -34,7 +34,7 @@ def test_frames_and_errors_name_the_writer(sessions, monkeypatch):
     monkeypatch.setattr("sys.argv", ["/opt/arm_driver.py"])
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0], stamp=STAMP)
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         until(lambda: any("arm_driver@" in (frame.writer or "") for frame in listener.buffer.frames()))
@@ -47,7 +47,7 @@ def test_changed_urdf_replaces_the_robot(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         with StatePublisher(writer, RRBOT, "r1") as publisher:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             publisher.publish([0.5, 0.0], stamp=STAMP)
             listener.buffer.wait("world", "tool", timeout_s=5.0)
         with StatePublisher(writer, LONGER, "r1") as publisher:
@@ -72,7 +72,7 @@ def test_model_places_its_links_and_another_writer_yields(sessions, caplog):
         statics.set(Transform("base", "upper", (9.0, 0.0, 0.0), UPRIGHT))
         listener.buffer.wait("base", "upper", timeout_s=5.0)
         with caplog.at_level(logging.WARNING), StatePublisher(writer, RRBOT, "r1") as publisher:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             publisher.publish([0.5, 0.25], stamp=STAMP)
             until(lambda: listener.buffer.can_lookup("world", "tool", STAMP))
             pose = listener.buffer.lookup("world", "tool", STAMP)
@@ -119,7 +119,7 @@ def test_samples_before_the_description_are_inserted_later(sessions):
         TransformListener(reader, "r1") as listener,
         StatePublisher(writer, RRBOT, "r1", streams=["joint_states"]) as driver,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         for number in range(10):
             driver.publish([0.1 * number, 0.0], stamp=number)
         until(lambda: listener.robots() == ("r1",))
@@ -137,7 +137,7 @@ def test_newer_of_two_writers_is_used_and_the_other_counted(sessions, caplog):
         TransformListener(reader, "r1") as listener,
         StatePublisher(writer, RRBOT, "r1") as first,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         first.publish([1.0, 1.0], stamp=1)
         assert received(listener, 1)
         with StatePublisher(writer, RRBOT, "r1", takeover=True) as second:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from helpers.processes import until
 from helpers.prometheus_text import collected, row
-from helpers.robots import RRBOT, settle
+from helpers.robots import RRBOT, wait_for_stream_readers
 from prometheus_client.core import CounterMetricFamily
 
 from zstate.errors import InFuture, InvalidInput
@@ -89,7 +89,7 @@ def test_listener_stats_age_latency_and_lookups_are_reported(sessions):
         TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener,
         StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as noise,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         noise.put(b"noise")
         for _ in range(4):
             publisher.publish([0.0, 0.0])
@@ -115,7 +115,7 @@ def test_listener_of_all_robots_reports_the_age_of_each(sessions):
         StatePublisher(writer, RRBOT, "r1") as one,
         StatePublisher(writer, RRBOT, "r2") as two,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
 
         def all_received() -> bool:
             for publisher in (one, two):
@@ -136,7 +136,7 @@ def test_listener_of_all_robots_reports_the_age_of_each(sessions):
 def test_restarts_of_a_writer_add_no_rows(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", InstrumentedBuffer(), history_on_join=False) as listener:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         metrics = ListenerMetrics(lambda: [listener])
         writers = WriterMetrics(lambda: discover(reader))
         seen: list[set[object]] = []

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.matrix_kinematics import MatrixKinematics, matrices
-from helpers.model_samples import every_joint, own, random_positions
+from helpers.model_samples import every_joint, local_model, random_positions
 
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.model.kinematics import Kinematics
@@ -103,11 +103,11 @@ def test_every_joint_type_agrees_with_matrices_multiplied_from_the_xml() -> None
 
 @pytest.mark.parametrize("name", ["rrbot", "diffbot", "gripper"])
 def test_our_own_robots_agree_with_matrices_multiplied_from_the_xml(name: str) -> None:
-    assert_agrees_with_matrices(own(name).model)
+    assert_agrees_with_matrices(local_model(name).model)
 
 
 def test_a_thousand_turns_give_the_same_pose_as_none() -> None:
-    kinematics = own("diffbot")
+    kinematics = local_model("diffbot")
     turned = kinematics.link_poses([0.3 + 2000 * pi, -0.4 - 2000 * pi])
     # 2000 pi is rounded to 1e-12 of itself.
     assert np.allclose(matrices(turned), matrices(kinematics.link_poses([0.3, -0.4])), atol=2e-12)
@@ -130,7 +130,7 @@ def test_a_quaternion_far_from_unit_length_is_refused() -> None:
 
 
 def test_wrong_positions_are_refused_with_the_expected_count() -> None:
-    kinematics = own("rrbot")
+    kinematics = local_model("rrbot")
     for answer in (kinematics.edge_poses, kinematics.link_poses):
         with pytest.raises(InvalidInput, match="takes 2 positions"):
             answer([0.0])
@@ -142,13 +142,13 @@ def test_wrong_positions_are_refused_with_the_expected_count() -> None:
 
 def test_an_unknown_link_is_refused_with_a_near_miss() -> None:
     with pytest.raises(InvalidInput, match="no link 'camera_lnk'; did you mean 'camera_link'"):
-        own("rrbot").twist("camera_lnk", [0.0, 0.0], [0.0, 0.0])
+        local_model("rrbot").twist("camera_lnk", [0.0, 0.0], [0.0, 0.0])
     with pytest.raises(InvalidInput, match="no link 'map'"):
-        own("rrbot").twist("tool", [0.0, 0.0], [0.0, 0.0], "map")
+        local_model("rrbot").twist("tool", [0.0, 0.0], [0.0, 0.0], "map")
 
 
 def test_poses_are_written_into_out_which_must_fit() -> None:
-    kinematics = own("rrbot")
+    kinematics = local_model("rrbot")
     for answer, rows in ((kinematics.edge_poses, 6), (kinematics.link_poses, 7)):
         out = np.empty((rows, 7))
         assert answer([0.1, 0.2], out) is out
@@ -159,7 +159,7 @@ def test_poses_are_written_into_out_which_must_fit() -> None:
 
 
 def test_returned_arrays_are_not_reused() -> None:
-    kinematics = own("rrbot")
+    kinematics = local_model("rrbot")
     first = kinematics.link_poses([0.1, 0.2])
     kept = first.copy()
     kinematics.link_poses([1.1, -1.2])
@@ -194,13 +194,13 @@ def test_edge_poses_need_no_pinocchio() -> None:
         "Kinematics(parse_urdf(sys.stdin.read(), 'stdin')).edge_poses([0.1, 0.2])\n"
         "sys.exit('pinocchio' in sys.modules)"
     )
-    urdf = own("rrbot").model.urdf
+    urdf = local_model("rrbot").model.urdf
     assert subprocess.run([sys.executable, "-c", program], input=urdf, text=True, check=False).returncode == 0
 
 
 def test_without_openmp_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    kinematics = own("rrbot")
+    kinematics = local_model("rrbot")
     kinematics.edge_poses([0.0, 0.0])
     with pytest.raises(LibraryMissing, match="apt-get install libgomp1"):
         kinematics.link_poses([0.0, 0.0])

@@ -7,7 +7,7 @@ from math import cos, pi, sin
 import numpy as np
 import pytest
 from helpers.matrix_kinematics import matrices
-from helpers.model_samples import every_joint, own, random_positions
+from helpers.model_samples import every_joint, local_model, random_positions
 
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -72,7 +72,7 @@ def test_the_default_reference_of_a_twist_is_the_root() -> None:
 
 
 def test_the_twist_of_a_swinging_arm_agrees_with_the_textbook() -> None:
-    kinematics = own("rrbot")
+    kinematics = local_model("rrbot")
     shoulder, elbow, shoulder_rate, elbow_rate = 0.4, -1.1, 0.7, 0.2
     twist = kinematics.twist("tool", [shoulder, elbow], [shoulder_rate, elbow_rate])
     total, total_rate = shoulder + elbow, shoulder_rate + elbow_rate

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 
 import pytest
-from helpers.access_routers import ROUTERS, Fleet
-from helpers.processes import Child, a_free_port
+from helpers.access_routers import ROUTERS_PROGRAM, AccessRouters
+from helpers.processes import Child, find_free_port
 
 from zstate.net.security.certificates import issue_identities
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AccessRouters]:
     pytest.importorskip("cryptography", reason="needs cryptography: pip install 'zstate[certs]'")
     now, two_days = datetime.now(timezone.utc), timedelta(days=2)
     folder, strangers = tmp_path_factory.mktemp("fleet"), tmp_path_factory.mktemp("strangers")
@@ -24,10 +24,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     (folder / "users").touch(0o600)
     (folder / "users").write_text("alice:wonder\nbob:build:it\n")
     names = ("mtls", "mtls and users", "expired", "early", "users", "open")
-    fleet = Fleet(folder, strangers, {name: a_free_port() for name in names})
+    fleet = AccessRouters(folder, strangers, {name: find_free_port() for name in names})
     is_plain = {"users", "open"}
     endpoints = [fleet.tcp(name) if name in is_plain else fleet.tls(name) for name in names]
-    child = Child(ROUTERS, str(folder), *endpoints)
+    child = Child(ROUTERS_PROGRAM, str(folder), *endpoints)
     try:
         assert child.line() == "ready"
         yield fleet

@@ -228,7 +228,7 @@ def test_frozen_reader_delays_exit_by_at_most_two_seconds(spawn):
     child: Child = spawn(WITH_A_FROZEN_READER)
     assert child.line() == "matched"
     os.kill(reader.process.pid, signal.SIGSTOP)
-    child.tell()
+    child.send_line()
     assert child.line() == "ending"
     began = time.monotonic()
     assert child.wait() == 3

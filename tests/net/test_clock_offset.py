@@ -6,8 +6,8 @@ import time
 
 import pytest
 import zenoh
-from helpers.processes import SOON_S, a_free_port, until
-from helpers.robots import RRBOT, STAMP, settle
+from helpers.processes import SOON_S, find_free_port, until
+from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InFuture, InPast, InvalidInput, Stale
@@ -51,7 +51,7 @@ def test_offset_error_is_at_most_half_the_round_trip(sessions, ahead_ns):
 
 
 def test_offset_is_measured_through_a_router():
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     with (
         connect(mode="router", listen=endpoint),
         connect(mode="client", endpoints=endpoint) as writer,
@@ -128,7 +128,7 @@ def test_failed_lookup_mentions_a_wrong_writer_clock(sessions):
         TransformListener(reader, "r1") as listener,
         StatePublisher(writer, RRBOT, "r1", clock=clock, program="driver") as publisher,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0])
         stamp = listener.buffer.wait("world", "tool", timeout_s=5.0).stamp
 
@@ -158,7 +158,7 @@ def test_failed_lookup_does_not_mention_a_correct_clock(sessions, follow):
         TransformListener(reader, "r1", follow=follow) as listener,
         StatePublisher(writer, RRBOT, "r1") as publisher,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         publisher.publish([0.0, 0.0])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.access_routers import Fleet
+from helpers.access_routers import AccessRouters
 from helpers.processes import Child, until
 
 from zstate.errors import ConfigError, PortBusy, Unreachable
@@ -109,7 +109,7 @@ def test_unreachable_and_busy_endpoint_errors_name_their_variable(
 
 
 def test_credentials_are_read_with_the_endpoint(
-    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: AccessRouters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("ZSTATE_CONNECT", fleet.tls("mtls and users"))
     monkeypatch.setenv("ZSTATE_CERTS", str(fleet.folder))

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from helpers.processes import Child, a_free_port, until
+from helpers.processes import Child, find_free_port, until
 
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.security.certificates import issue_identities
@@ -75,7 +75,7 @@ def test_client_that_loses_its_router_uses_another(spawn, free_port: int):
             print(session.zid)
             sys.stdin.readline()
     """
-    endpoints = [f"tcp/127.0.0.1:{port}" for port in (free_port, a_free_port())]
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in (free_port, find_free_port())]
     first, second = (spawn(router, endpoint) for endpoint in endpoints)
     zids = {first.line(): first, second.line(): second}
     with connect(mode="client", endpoints=endpoints) as client:
@@ -137,7 +137,7 @@ def _ip(*arguments: str) -> None:
 
 
 def discovers(child: Child, zid: str) -> bool:
-    child.tell()
+    child.send_line()
     return zid in child.line().split()
 
 

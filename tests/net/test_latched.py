@@ -112,7 +112,7 @@ def test_killed_writers_value_stays_with_subscribers_and_is_not_sent_to_late_joi
         until(lambda: late.values)
         assert late.values == {key("alive"): b"alive"}
         assert set(early.values) == {key("alive"), key("killed")}
-        alive.tell()
+        alive.send_line()
         assert alive.wait() == 0
         assert alive.stderr == ""
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import zenoh
-from helpers.processes import Child, a_free_port
+from helpers.processes import Child, find_free_port
 
 from zstate.errors import AccessDenied, PortBusy, Unreachable
 from zstate.net.open import connect_timeout
@@ -33,13 +33,13 @@ def router(spawn: Callable[..., Child], free_port: int) -> str:
     """Endpoint of a router without users, which refuses every user name."""
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = spawn(ROUTER, endpoint)
-    child.tell()
+    child.send_line()
     assert child.line() == "ready"
     return endpoint
 
 
 def nowhere() -> str:
-    return f"tcp/127.0.0.1:{a_free_port()}"
+    return f"tcp/127.0.0.1:{find_free_port()}"
 
 
 def client(endpoints: list[str], **connecting: object) -> dict[str, object]:
@@ -71,7 +71,7 @@ def test_connect_waits_for_a_router_that_starts_later(spawn: Callable[..., Child
     child = spawn(ROUTER, endpoint)
     with pytest.raises(Unreachable):
         connect(mode="client", endpoints=endpoint, timeout_s=0.1)
-    child.tell()
+    child.send_line()
     with connect(mode="client", endpoints=endpoint, timeout_s=LONG_S) as session:
         assert session.zenoh.info.routers_zid()
 

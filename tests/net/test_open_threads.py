@@ -30,7 +30,7 @@ def opened(spawn, *arguments: str) -> tuple[dict[str, int], str | None]:
     left_behind = json.loads(child.line())
     until(lambda: threads_of(child.process.pid)["tx"])  # it may only just be starting
     threads = threads_of(child.process.pid)
-    child.tell()
+    child.send_line()
     assert (child.wait(), child.stderr) == (0, "")
     return threads, left_behind
 

@@ -44,7 +44,7 @@ def test_two_processes_discover_each_other_and_exchange_data(spawn):
     receives(first, "second")
     receives(second, "first")
     for child in (first, second):
-        child.tell()
+        child.send_line()
         assert child.wait() == 0
         assert child.stderr == ""
 

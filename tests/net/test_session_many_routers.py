@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from helpers.processes import Child, a_free_port, until
+from helpers.processes import Child, find_free_port, until
 from helpers.robots import RRBOT, UPRIGHT
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
@@ -18,7 +18,7 @@ Spawn = Callable[..., Child]
 
 
 def endpoint() -> str:
-    return f"tcp/127.0.0.1:{a_free_port()}"
+    return f"tcp/127.0.0.1:{find_free_port()}"
 
 
 def router(spawn: Spawn, listen: str, *options: str) -> Child:

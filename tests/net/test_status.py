@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 import numpy as np
 import pytest
 from helpers.processes import Child, until
-from helpers.robots import RRBOT, await_reader
+from helpers.robots import RRBOT, wait_for_reader
 from msgspec.structs import replace
 
 from zstate.errors import Closed, InvalidInput
@@ -175,7 +175,7 @@ def test_invalid_status_is_counted_and_ignored(sessions):
             encoding: opened.enter_context(StreamPublisher(sessions[0], key, encoding))
             for encoding in ("", ENCODINGS[Status])
         }
-        await_reader(sessions[0], key)
+        wait_for_reader(sessions[0], key)
         for stream in said.values():
             stream.put(b"\xff\x00 noise")
         until(lambda: sum(received.watch.refused.values()) == 2)
@@ -185,7 +185,7 @@ def test_invalid_status_is_counted_and_ignored(sessions):
 
 def test_a_status_counts_only_on_the_key_of_its_own_writer(sessions):
     received = Statuses(sessions[1])
-    await_reader(sessions[0], status_key("r1", ME))
+    wait_for_reader(sessions[0], status_key("r1", ME))
     theirs = WriterId("driver", "nuc", 3, 1, 99).identity
     wrong = [("r1", theirs, OK), ("*", ME, OK), ("r1", ME, replace(OK, rate_hz=float("nan")))]
     wrong += [("r1", "me", OK), ("r1", ME, replace(OK, text="a" * 70_000))]

@@ -2,8 +2,8 @@
 
 import pytest
 from helpers.processes import until
-from helpers.raw_ros_nodes import DESCRIPTION, JOINT_STATES, Ear, key_of, tokens
-from helpers.robots import STAMP, await_reader
+from helpers.raw_ros_nodes import DESCRIPTION, JOINT_STATES, KeySubscriber, key_of, tokens
+from helpers.robots import STAMP, wait_for_reader
 
 from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover, local_writer
@@ -38,15 +38,15 @@ def opened(session, wire: str) -> WireWriter:
 def test_open_streams_are_announced_and_received_until_close(sessions, wire: str):
     writer, reader = sessions
     joints, described = KEYS[wire]
-    ear = Ear(reader, joints)
+    ear = KeySubscriber(reader, joints)
     with opened(writer, wire) as out:
         stream = out.open_stream("joint_states")
         write_all([out.open_latched("robot_description")], DESCRIBED)
-        await_reader(writer, joints)
+        wait_for_reader(writer, joints)
         write_all([stream], STATE)
-        ear.heard(1)
-        late = Ear(reader, described, latched=True)
-        late.heard(1)
+        ear.wait_for(1)
+        late = KeySubscriber(reader, described, latched=True)
+        late.wait_for(1)
         until(lambda: len(discover(reader, wire=wire)) == 1)
         (robot,) = discover(reader, wire=wire)
         assert {said for said, _ in robot.writers} == {"joint_states", "robot_description"}
@@ -57,15 +57,15 @@ def test_open_streams_are_announced_and_received_until_close(sessions, wire: str
 @pytest.mark.parametrize(("wire", "kinds"), [("native", ["PUT", "DELETE"]), ("ros2", ["PUT", "PUT"])])
 def test_value_is_withdrawn_only_if_the_wire_can(sessions, wire: str, kinds: list[str]):
     writer, reader = sessions
-    ear = Ear(reader, KEYS[wire][1])
-    await_reader(writer, KEYS[wire][1])
+    ear = KeySubscriber(reader, KEYS[wire][1])
+    wait_for_reader(writer, KEYS[wire][1])
     with opened(writer, wire) as out:
         latched = out.open_latched("robot_description")
         write_all([latched], DESCRIBED)
         latched.withdraw()
         if wire == "ros2":
             write_all([latched], DESCRIBED)
-        assert [str(sample.kind).rpartition(".")[2] for sample in ear.heard(2)] == kinds
+        assert [str(sample.kind).rpartition(".")[2] for sample in ear.wait_for(2)] == kinds
 
 
 @pytest.mark.parametrize("wire", WIRES)
@@ -74,7 +74,7 @@ def test_has_readers_is_true_with_a_subscriber(sessions, wire: str):
     with opened(writer, wire) as out:
         stream = out.open_stream("joint_states")
         assert not stream.has_readers
-        ear = Ear(reader, KEYS[wire][0])
+        ear = KeySubscriber(reader, KEYS[wire][0])
         until(lambda: stream.has_readers)
     assert ear.samples == []
 

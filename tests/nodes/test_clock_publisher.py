@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.robots import Tap, await_reader
+from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate.errors import Closed, InvalidInput
 from zstate.nodes.clock import ClockPublisher
@@ -16,10 +16,10 @@ ROS = "ros2:domain=7,namespace=*,frame_prefix=*/"
 
 def test_time_is_published_on_both_wires(sessions):
     writer, reader = sessions
-    native, ros = Tap(reader, "zstate/clock"), Tap(reader, "7/clock/**")
+    native, ros = SampleCollector(reader, "zstate/clock"), SampleCollector(reader, "7/clock/**")
     with ClockPublisher(writer, ("native", ROS)) as clock:
-        await_reader(writer, "zstate/clock")
-        await_reader(writer, "7/clock/x/y")
+        wait_for_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "7/clock/x/y")
         for stamp in (0, 5, 1_700_000_000_000_000_001):
             clock.publish(stamp)
         received = [decode(payload, ENCODINGS[ClockMessage], ClockMessage) for payload in native.payloads(3)]
@@ -31,8 +31,8 @@ def test_time_is_published_on_both_wires(sessions):
 
 def test_new_clock_publisher_has_a_new_session(sessions):
     writer, reader = sessions
-    tap = Tap(reader, "zstate/clock")
-    await_reader(writer, "zstate/clock")
+    tap = SampleCollector(reader, "zstate/clock")
+    wait_for_reader(writer, "zstate/clock")
     for _ in range(2):
         with ClockPublisher(writer) as clock:
             clock.publish(1)
@@ -42,9 +42,9 @@ def test_new_clock_publisher_has_a_new_session(sessions):
 
 def test_invalid_time_is_refused_and_not_counted(sessions):
     writer, reader = sessions
-    tap = Tap(reader, "zstate/clock")
+    tap = SampleCollector(reader, "zstate/clock")
     with ClockPublisher(writer, ("native", ROS)) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         for wrong in (0.5, 2**62):
             with pytest.raises(InvalidInput):
                 clock.publish(wrong)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 from helpers.processes import until
-from helpers.robots import await_reader
+from helpers.robots import wait_for_reader
 
 from zstate.errors import Closed, NoClock
 from zstate.model.load import load_model
@@ -64,7 +64,7 @@ def publishing(publisher: ClockPublisher, clock: SimulatedClock) -> Callable[[in
 def test_now_is_the_newest_received_time(sessions, wire, key):
     writer, reader = sessions
     with ClockPublisher(writer, (wire,)) as publisher, SimulatedClock(reader, wire) as clock:
-        await_reader(writer, key)
+        wait_for_reader(writer, key)
         publish_time = publishing(publisher, clock)
         for stamp in (5 * SECOND, 5 * SECOND + 1, 3600 * SECOND):
             publish_time(stamp)
@@ -85,7 +85,7 @@ def test_missing_time_raises_no_clock_after_the_timeout(sessions):
 def test_first_time_ends_the_wait(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         threading.Timer(0.02, publisher.publish, (7,)).start()
         assert clock.now() == 7
 
@@ -93,7 +93,7 @@ def test_first_time_ends_the_wait(sessions):
 def test_wait_ends_when_its_instant_is_reached_and_not_while_time_stands_still(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publish_time = publishing(publisher, clock)
         publish_time(SECOND)
         early, late = Waiting(clock, 2 * SECOND), Waiting(clock, 3 * SECOND)
@@ -126,7 +126,7 @@ def test_wait_ends_at_once_when_stopped_or_the_clock_is_closed(sessions):
 def test_jump_back_ends_waits_and_is_logged_once(sessions, caplog):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publish_time = publishing(publisher, clock)
         with caplog.at_level(logging.WARNING, "zstate"):
             publish_time(100 * SECOND)
@@ -150,7 +150,7 @@ def test_newer_of_two_clock_publishers_is_followed(sessions):
         ClockPublisher(writer) as second,
         SimulatedClock(reader) as clock,
     ):
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publishing(first, clock)(SECOND)
         publishing(second, clock)(50 * SECOND)
         first.publish(2 * SECOND)
@@ -166,7 +166,7 @@ def test_invalid_clock_message_is_counted_and_changes_nothing(sessions):
         StreamPublisher(writer, "zstate/clock", "text/plain") as stranger,
         SimulatedClock(reader) as clock,
     ):
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publishing(publisher, clock)(SECOND)
         stranger.put(b"noon")
         until(lambda: clock.refused == {"foreign": 1})
@@ -179,7 +179,7 @@ def test_rate_has_its_number_of_ticks_per_simulated_second_at_any_speed(sessions
     writer, reader = sessions
     step, start, seconds, rate_hz = round(speed * 10 * MS), 5 * SECOND, 2, 250.0
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publish_time = publishing(publisher, clock)
         publish_time(start)
         ticks: list[int] = []
@@ -199,7 +199,7 @@ def test_rate_has_its_number_of_ticks_per_simulated_second_at_any_speed(sessions
 def test_rate_follows_a_time_that_goes_back_during_a_wait(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publish_time = publishing(publisher, clock)
         publish_time(100 * SECOND)
         ticks: list[int] = []
@@ -218,7 +218,7 @@ def test_rate_follows_a_time_that_goes_back_during_a_wait(sessions):
 def test_jump_ahead_causes_no_burst(sessions):
     writer, reader = sessions
     with ClockPublisher(writer) as publisher, SimulatedClock(reader) as clock:
-        await_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/clock")
         publish_time = publishing(publisher, clock)
         publish_time(0)
         ticks: list[int] = []
@@ -242,8 +242,8 @@ def test_publisher_and_a_listener_on_simulated_time_agree(sessions):
         TransformListener(reader, "r1", clock=reader_clock) as listener,
     ):
         assert robot.description().clock == "sim"
-        await_reader(writer, "zstate/clock")
-        await_reader(writer, "zstate/r1/joint_states")
+        wait_for_reader(writer, "zstate/clock")
+        wait_for_reader(writer, "zstate/r1/joint_states")
         publish_time = publishing(publisher, writer_clock)
         publish_time(SECOND)
         running = threading.Thread(

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, Child, until
-from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, settle
+from helpers.robots import RRBOT, STAMP, UPRIGHT, assert_pose, kinematic_pose, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
@@ -39,7 +39,7 @@ def test_both_follow_modes_agree_with_kinematics_at_every_stamp(sessions, model)
         TransformListener(reader, "r1", history_on_join=False) as joints,
         TransformListener(reader, "r1", follow="tf", history_on_join=False) as transforms,
     ):
-        settle(writer, "r1", "joint_states", "tf")
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         for listener in (joints, transforms):
             # Who does not know yet whose time these are counts none as off the clock.
             until(lambda listener=listener: listener.buffer.domain.domain_of("r1") == "system")
@@ -75,7 +75,7 @@ def test_late_listener_has_model_and_statics_before_any_sample(sessions, follow)
 def test_frames_are_found_by_bare_and_full_names(sessions):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, "r1") as publisher, TransformListener(reader, "r1") as listener:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.5, 0.25], stamp=STAMP)
         bare = listener.buffer.wait("world", "tool", timeout_s=5.0)
         for target, source in (("r1/world", "r1/tool"), ("world", "r1/tool")):
@@ -91,8 +91,8 @@ def test_bare_names_of_two_robots_of_one_model_are_ambiguous(sessions, follow):
         StatePublisher(writer, RRBOT, "r2") as second,
         TransformListener(reader, follow=follow) as listener,
     ):
-        settle(writer, "r1", follow)
-        settle(writer, "r2", follow)
+        wait_for_stream_readers(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r2", follow)
         first.publish([0.5, 0.25], stamp=STAMP)
         second.publish([-1.0, 2.0], stamp=STAMP + 1)
         for robot, positions in (("r1", [0.5, 0.25]), ("r2", [-1.0, 2.0])):
@@ -111,7 +111,7 @@ def test_listener_of_one_robot_receives_nothing_of_another(sessions):
         StatePublisher(writer, RRBOT, "r2") as other,
         TransformListener(reader, "r1") as listener,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         other.publish([0.0, 0.0])
         mine.publish([0.0, 0.0])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
@@ -157,7 +157,7 @@ def test_close_is_fast_ends_reception_and_may_be_repeated(sessions):
     writer, reader = sessions
     listener = TransformListener(reader, "r1")
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0], stamp=STAMP)
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         began = time.monotonic()
@@ -185,7 +185,7 @@ def test_listener_imports_neither_pinocchio_nor_the_view(sessions, spawn, follow
     assert reader.line() == "ready"
     writer = sessions[0]
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         stamp = time.time_ns()
         publisher.publish([0.0, 0.0], stamp=stamp)
         assert reader.line() == str(stamp)
@@ -214,7 +214,7 @@ def test_key_without_a_robot_is_foreign_and_loses_no_sample(sessions):
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "*", history_on_join=False) as listener,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         for number in range(50):
             for key in strange:
                 state = JointState(STAMP + number, number, 99, order_digest(RRBOT.joint_names), bytes(16))
@@ -257,6 +257,6 @@ def test_observers_are_called_after_each_processed_batch(sessions):
     with TransformListener(reader, "r1", history_on_join=False) as listener:
         listener.add_observer(lambda: seen.append(listener.stats.received))
         with StatePublisher(writer, RRBOT, "r1") as publisher:
-            settle(writer, "r1", "joint_states")
+            wait_for_stream_readers(writer, "r1", "joint_states")
             publisher.publish(np.zeros(2), stamp=STAMP)
             until(lambda: 1 in seen)

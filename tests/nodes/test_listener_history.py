@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.processes import DEADLINE_S, Child, until
-from helpers.robots import RRBOT, STAMP, Tap, kinematic_pose, settle
+from helpers.robots import RRBOT, STAMP, SampleCollector, kinematic_pose, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import InPast, InvalidInput
@@ -69,7 +69,7 @@ def test_new_listener_knows_the_last_two_seconds_bit_for_bit(sessions: tuple[Ses
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1", follow=follow) as early,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         publish(publisher, 0, 400)
         until(has_samples(early, 399))
         with TransformListener(reader, "r1", follow=follow) as late:
@@ -101,7 +101,7 @@ def test_history_and_live_samples_join_without_a_gap(sessions: tuple[Session, Se
         StatePublisher(writer, model, "r1") as publisher,
         TransformListener(reader, "r1", follow=follow, history_on_join=False) as early,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         thread = threading.Thread(target=write)
         thread.start()
         until(lambda: len(stamps) > 300)
@@ -196,7 +196,7 @@ def test_samples_published_while_the_router_was_away_are_received_afterwards(
         StatePublisher(writer, RRBOT, "r1", cache_s=100.0) as publisher,
         TransformListener(reader, "r1", history_s=100.0) as listener,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publish(publisher, 0, 10)
         until(has_samples(listener, 0, 9))
         router.kill()
@@ -205,7 +205,7 @@ def test_samples_published_while_the_router_was_away_are_received_afterwards(
         publish(publisher, 10, 500)
         assert not has_samples(listener, 10)()
         spawn(ROUTER, endpoint).line()
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publish(publisher, 500, 501)
         until(has_samples(listener, 500))
         until(lambda: listener.stats.recalled >= 490)
@@ -236,7 +236,7 @@ def test_no_history_without_a_cache_or_with_history_on_join_off(
     with StatePublisher(writer, RRBOT, "r2") as publisher:
         publish(publisher, 0, 10)
         with TransformListener(reader, "r2", history_on_join=False) as listener:
-            settle(writer, "r2")
+            wait_for_stream_readers(writer, "r2")
             publish(publisher, 10, 12)
             until(lambda: has_samples(listener, 10, 11)() and listener.stats.received == 2)
             assert listener.stats.recalled == 0
@@ -259,7 +259,7 @@ def test_gap_in_a_cache_counts_as_no_loss(sessions: tuple[Session, Session]):
     with StatePublisher(writer, RRBOT, "r1") as publisher:
         publish(publisher, 0, 10)
         with TransformListener(reader, "r1") as listener:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             publish(publisher, 10, 20)
             until(lambda: has_samples(listener, 0, 19)() and listener.stats.received == 10)
             assert listener.stats.missed == listener.stats.dropped == 0
@@ -283,7 +283,7 @@ def test_writer_that_joins_later_starts_its_own_history(
     writer, reader = sessions
     with TransformListener(reader, "r1") as listener:
         with StatePublisher(writer, RRBOT, "r1") as first:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             publish(first, 0, 10)
             until(has_samples(listener, 0, 9))
         with StatePublisher(writer, RRBOT, "r1") as second:
@@ -327,9 +327,9 @@ def test_publisher_that_only_derives_transforms_provides_their_history(sessions:
 
 def test_history_equals_the_published_samples_byte_for_byte(sessions: tuple[Session, Session]):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.5, 1.0], [0.1, 0.2], [3.0, 4.0], STAMP)
         publisher.publish([0.5, 1.0], stamp=STAMP + 1)
         assert publisher.cache is not None

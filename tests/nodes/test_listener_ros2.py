@@ -16,8 +16,8 @@ from helpers.raw_ros_nodes import (
     attachment,
     moved,
 )
-from helpers.robots import RRBOT, STAMP, assert_pose, await_reader, kinematic_pose
-from helpers.ros_subscriber import described, following_joints, writers, x_of
+from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_reader
+from helpers.ros_subscriber import publish_description, publish_known_joints, writers, x_of
 
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
@@ -34,7 +34,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_several_transform_writers_build_one_tree_without_conflict(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
-        arm = RosNode(writer, "robot_state_publisher").publisher(TF).announce().await_reader()
+        arm = RosNode(writer, "robot_state_publisher").publisher(TF).announce().wait_for_reader()
         odometry = RosNode(writer, "odometry").publisher(TF).announce()
         for number in range(20):
             odometry.edge(STAMP + number, "odom", "base", 100.0 + number)
@@ -56,7 +56,7 @@ def test_several_transform_writers_build_one_tree_without_conflict(sessions):
 def test_message_may_have_transforms_of_several_instants(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
-        bag = RosNode(writer, "player").publisher(TF).announce().await_reader()
+        bag = RosNode(writer, "player").publisher(TF).announce().wait_for_reader()
         edges = [("odom", "base"), ("base", "tool"), ("odom", "other")]
         for later in (0, 10):
             stamps = [STAMP + later + 1, STAMP + later, STAMP + later + 1]
@@ -72,7 +72,7 @@ def test_writers_are_named_by_their_nodes_even_if_announced_late(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         node = RosNode(writer, "arm", "/fleet/r1")
-        moving, fixed = node.publisher(TF).await_reader(), node.publisher(TF_STATIC)
+        moving, fixed = node.publisher(TF).wait_for_reader(), node.publisher(TF_STATIC)
         moving.edge(STAMP, "base", "tool", 1.0)
         fixed.edge(0, "tool", "camera", 2.0)
         listener.buffer.wait("base", "camera", timeout_s=5.0)
@@ -93,7 +93,7 @@ def test_writers_of_every_distribution_are_received(sessions, written: str):
     with TransformListener(reader, "r1", wire="ros2") as listener:
         described = RosNode(writer, "rsp").publisher(DESCRIPTION, written)
         described.text(RRBOT.urdf)
-        driver = RosNode(writer, "driver").publisher(JOINT_STATES, written).announce().await_reader()
+        driver = RosNode(writer, "driver").publisher(JOINT_STATES, written).announce().wait_for_reader()
         driver.joints(STAMP, NAMES, [0.5, 0.25])
         pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
@@ -104,8 +104,8 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
     writer, reader = sessions
     nan = float("nan")
     with TransformListener(reader, "r1", wire="ros2") as listener:
-        described(writer)
-        driver = following_joints(writer, listener)
+        publish_description(writer)
+        driver = publish_known_joints(writer, listener)
         driver.joints(STAMP, ("lid", "elbow", "shoulder"), [7.0, 0.25, 0.5], [0.0, 2.0, 1.0], [nan] * 3)
         pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
@@ -136,8 +136,8 @@ def test_joints_are_found_by_name_in_any_order_and_among_others(sessions):
 def test_unusable_joint_states_are_counted_by_reason(sessions, joint_state, reason: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
-        described(writer)
-        driver = following_joints(writer, listener)
+        publish_description(writer)
+        driver = publish_known_joints(writer, listener)
         stamp, names, *blocks = joint_state
         driver.put(rosbags_joint_state(stamp, "", names, *blocks))
         driver.joints(STAMP + 1, NAMES, [0.5, 0.25])
@@ -168,14 +168,14 @@ def test_invalid_ros_messages_are_counted_by_reason_on_every_topic(sessions, pay
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2") as listener:
         node = RosNode(writer, "strange")
-        driver = node.publisher(JOINT_STATES).announce().await_reader()
+        driver = node.publisher(JOINT_STATES).announce().wait_for_reader()
         driver.put(payload, raw_attachment)
         until(lambda: listener.stats.refused == {reason: 1})
         for topic in (TF_STATIC, DESCRIPTION):
-            node.publisher(topic).announce().await_reader().put(payload, raw_attachment)
+            node.publisher(topic).announce().wait_for_reader().put(payload, raw_attachment)
         until(lambda: sum(listener.stats.refused.values()) == 3)
-        described(writer)
-        following_joints(writer, listener).joints(STAMP + 1, NAMES, [0.5, 0.25])
+        publish_description(writer)
+        publish_known_joints(writer, listener).joints(STAMP + 1, NAMES, [0.5, 0.25])
         until(lambda: listener.stats.received == 1)
         assert listener.stats.missed == 0
 
@@ -183,7 +183,7 @@ def test_invalid_ros_messages_are_counted_by_reason_on_every_topic(sessions, pay
 def test_gaps_in_attachment_numbers_count_as_missed(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
-        one, other = (RosNode(writer, name).publisher(TF).announce().await_reader() for name in "ab")
+        one, other = (RosNode(writer, name).publisher(TF).announce().wait_for_reader() for name in "ab")
         for node, child in ((one, "x"), (other, "y")):
             for seq in (5, 6, 9):
                 payload = rosbags_tf_message([STAMP + seq], [("base", child)], [moved(1.0)])
@@ -196,10 +196,10 @@ def test_gaps_in_attachment_numbers_count_as_missed(sessions):
 def test_restarted_bag_starts_a_new_epoch(sessions, follow: str):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
-        described(writer)
+        publish_description(writer)
         node = RosNode(writer, "player")
         topic = JOINT_STATES if follow == "joint_states" else TF
-        player = node.publisher(topic).announce().await_reader()
+        player = node.publisher(topic).announce().wait_for_reader()
         until(lambda: follow == "tf" or "r1/tool" in {frame.name for frame in listener.buffer.frames()})
 
         def play(first: float) -> None:
@@ -224,11 +224,11 @@ def test_restarted_bag_starts_a_new_epoch(sessions, follow: str):
 def test_restarted_node_starts_a_new_epoch_whatever_its_clock(sessions, follow, behind: int):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow=follow) as listener:
-        described(writer)
+        publish_description(writer)
         topic = JOINT_STATES if follow == "joint_states" else TF
 
         def live(first: int, angle: float, count: int) -> RosPublisher:
-            node = RosNode(writer, "arm").publisher(topic).announce().await_reader()
+            node = RosNode(writer, "arm").publisher(topic).announce().wait_for_reader()
             until(lambda: follow == "tf" or "r1/tool" in {frame.name for frame in listener.buffer.frames()})
             before = listener.stats.received
             for number in range(5):
@@ -239,7 +239,7 @@ def test_restarted_node_starts_a_new_epoch_whatever_its_clock(sessions, follow, 
             until(lambda: listener.stats.received == before + count)
             return node
 
-        live(STAMP, 1.0, 5).leave()
+        live(STAMP, 1.0, 5).close()
         until(lambda: ("left", follow) in {(event.kind, event.stream) for event in listener.events()})
         live(STAMP - behind, 0.5, 5)
         assert listener.buffer.latest("upper", "lower") == STAMP - behind + 4
@@ -256,7 +256,7 @@ def test_namespace_and_root_are_subscribed_separately(sessions):
         node = RosNode(writer, "rsp", "/r1")
         described = node.publisher(DESCRIPTION, namespace="r1")
         described.text(RRBOT.urdf)
-        driver = node.publisher(JOINT_STATES, namespace="r1").announce().await_reader()
+        driver = node.publisher(JOINT_STATES, namespace="r1").announce().wait_for_reader()
         driver.joints(STAMP, NAMES, [0.5, 0.25])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         assert root.robots() == ()
@@ -268,7 +268,7 @@ def test_all_robots_in_namespaces_are_followed(sessions):
     with TransformListener(reader, wire=wire) as listener:
         publishers = [StatePublisher(writer, RRBOT, robot, (wire,)) for robot in ("r1", "r2")]
         for number, publisher in enumerate(publishers):
-            await_reader(writer, f"0/{publisher.robot}/joint_states/{JOINT_STATES[1]}/{JOINT_STATES[2]}")
+            wait_for_reader(writer, f"0/{publisher.robot}/joint_states/{JOINT_STATES[1]}/{JOINT_STATES[2]}")
             publisher.publish([0.1, 0.5 + number], stamp=STAMP)
         for number, publisher in enumerate(publishers):
             pose = listener.buffer.wait(f"{publisher.robot}/upper", f"{publisher.robot}/lower", timeout_s=5.0)

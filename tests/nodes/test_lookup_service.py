@@ -202,7 +202,7 @@ def test_client_in_another_process_gets_replies_through_a_router(spawn: Callable
         device = spawn(DEVICE, endpoint)
 
         def reply(parameters: str) -> tuple[bool, dict[str, object]]:
-            device.tell(f"{KEY}?{parameters}")
+            device.send_line(f"{KEY}?{parameters}")
             is_answer, encoding, text = device.line().split(" ", 2)
             assert (encoding, device.line()) == ("application/json", "end")
             return is_answer == "True", json.loads(text)

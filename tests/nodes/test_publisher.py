@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.robots import RRBOT, STAMP, Tap, await_reader
+from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
 from zstate.clock import ManualClock
 from zstate.errors import Closed, InvalidInput
@@ -34,9 +34,9 @@ DRONE = load_model(
 
 def test_every_number_arrives_bit_for_bit(sessions):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        await_reader(writer, JOINTS)
+        wait_for_reader(writer, JOINTS)
         publisher.publish(POSITIONS, VELOCITIES, EFFORTS, STAMP)
         publisher.publish(np.array(POSITIONS), stamp=np.int64(-STAMP))
     full, bare = tap.joint_states(2)
@@ -50,9 +50,9 @@ def test_every_number_arrives_bit_for_bit(sessions):
 
 def test_positions_may_be_given_by_name_in_any_order(sessions):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        await_reader(writer, JOINTS)
+        wait_for_reader(writer, JOINTS)
         publisher.publish({"elbow": 2.0, "shoulder": 1.0})
     assert from_block(tap.joint_states(1)[0].positions).tolist() == [1.0, 2.0]
 
@@ -78,9 +78,9 @@ def test_positions_may_be_given_by_name_in_any_order(sessions):
 )
 def test_refused_sample_is_not_sent_and_leaves_no_gap(sessions, arguments, text: str):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        await_reader(writer, JOINTS)
+        wait_for_reader(writer, JOINTS)
         publisher.publish([0.0, 0.0], stamp=1)
         with pytest.raises(InvalidInput, match=text):
             publisher.publish(*arguments)
@@ -90,10 +90,10 @@ def test_refused_sample_is_not_sent_and_leaves_no_gap(sessions, arguments, text:
 
 def test_floating_joint_without_a_unit_quaternion_is_refused_on_every_stream(sessions):
     writer, reader = sessions
-    taps = [Tap(reader, JOINTS), Tap(reader, TF)]
+    taps = [SampleCollector(reader, JOINTS), SampleCollector(reader, TF)]
     with StatePublisher(writer, DRONE, "r1") as publisher:
         for key in (JOINTS, TF):
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         with pytest.raises(InvalidInput, match=r"quaternion of length 0\.5"):
             publisher.publish([0, 0, 0, 0, 0, 0, 0.5])
         publisher.publish([0, 0, 0, 0, 0, 0, 1.0])
@@ -103,10 +103,10 @@ def test_floating_joint_without_a_unit_quaternion_is_refused_on_every_stream(ses
 def test_both_streams_carry_the_same_instant_and_agree_with_kinematics(sessions):
     writer, reader = sessions
     model = load_model("gripper")
-    joints, transforms = Tap(reader, JOINTS), Tap(reader, TF)
+    joints, transforms = SampleCollector(reader, JOINTS), SampleCollector(reader, TF)
     with StatePublisher(writer, model, "r1") as publisher:
         for key in (JOINTS, TF):
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         publisher.publish([0.03, 0.4], stamp=STAMP)
         named = publisher.description().moving_edges
     state = joints.joint_states(1)[0]
@@ -141,7 +141,7 @@ def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions
 
         publisher.publish([0.0, 0.0], stamp=1)
         assert computed == []
-        transforms = Tap(reader, TF)
+        transforms = SampleCollector(reader, TF)
         # A second observer learns of readers a moment later than the first.
         until(lambda: publisher.publish([0.0, 0.0], stamp=2) or transforms.arrivals)
         first = decode(transforms.payloads(1)[0], ENCODINGS[TransformSample], TransformSample)
@@ -153,9 +153,9 @@ def test_transforms_are_computed_and_sent_only_while_they_have_a_reader(sessions
 
 def test_stamp_is_the_time_of_the_clock_by_default(sessions):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1", clock=ManualClock(STAMP)) as publisher:
-        await_reader(writer, JOINTS)
+        wait_for_reader(writer, JOINTS)
         publisher.publish([0.0, 0.0])
         publisher.publish([0.0, 0.0], stamp=0)
     assert [state.stamp for state in tap.joint_states(2)] == [STAMP, 0]
@@ -207,18 +207,18 @@ def test_publisher_announces_the_streams_it_writes_until_it_closes(sessions, str
 def test_robot_without_moving_joints_can_be_published(sessions):
     writer, reader = sessions
     model = load_model('<robot name="stone"><link name="only"/></robot>')
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, model, "r1") as publisher:
-        await_reader(writer, JOINTS)
+        wait_for_reader(writer, JOINTS)
         publisher.publish([], stamp=3)
     assert tap.joint_states(1)[0].positions == b""
 
 
 def test_samples_of_several_threads_are_numbered_without_a_gap(sessions):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        await_reader(writer, JOINTS)
+        wait_for_reader(writer, JOINTS)
 
         def send() -> None:
             for _ in range(50):
@@ -240,9 +240,9 @@ ARM = load_model(
 
 
 def test_positions_outside_limits_are_published_counted_and_logged_once(sessions, caplog):
-    tap = Tap(sessions[1], JOINTS)
+    tap = SampleCollector(sessions[1], JOINTS)
     with caplog.at_level(logging.WARNING, "zstate"), StatePublisher(sessions[0], ARM, "r1") as publisher:
-        await_reader(sessions[0], JOINTS)
+        wait_for_reader(sessions[0], JOINTS)
         for number in range(200):
             # Every second sample is in degrees; one second holds all but the first and the last.
             publisher.publish([45.0 * (number % 2)], stamp=STAMP + number * 1_000_000)

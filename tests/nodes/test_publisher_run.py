@@ -4,8 +4,8 @@ import threading
 
 import numpy as np
 import pytest
-from helpers.processes import Stepping
-from helpers.robots import RRBOT, STAMP, Tap, await_reader
+from helpers.processes import SteppingClock
+from helpers.robots import RRBOT, STAMP, SampleCollector, wait_for_reader
 
 from zstate.clock import SystemClock
 from zstate.errors import InvalidInput
@@ -39,9 +39,9 @@ def test_invalid_rate_is_refused(sessions, rate_hz: float):
 
 def test_run_publishes_one_sample_per_tick_with_its_stamp(sessions):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
-    with StatePublisher(writer, RRBOT, "r1", clock=Stepping(STAMP)) as publisher:
-        await_reader(writer, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
+    with StatePublisher(writer, RRBOT, "r1", clock=SteppingClock(STAMP)) as publisher:
+        wait_for_reader(writer, JOINTS)
         report = publisher.run(ScriptedSource(), 30.0, seconds=2.0)
     assert (report.ticks, report.skipped, report.commanded_hz) == (60, 0, 30.0)
     assert report.rate_hz == pytest.approx(30.0, rel=1e-8)
@@ -52,9 +52,9 @@ def test_run_publishes_one_sample_per_tick_with_its_stamp(sessions):
 
 def test_tick_without_a_reading_publishes_nothing_and_a_reading_keeps_its_stamp(sessions):
     writer, reader = sessions
-    tap = Tap(reader, JOINTS)
-    with StatePublisher(writer, RRBOT, "r1", clock=Stepping(STAMP)) as publisher:
-        await_reader(writer, JOINTS)
+    tap = SampleCollector(reader, JOINTS)
+    with StatePublisher(writer, RRBOT, "r1", clock=SteppingClock(STAMP)) as publisher:
+        wait_for_reader(writer, JOINTS)
         assert publisher.run(ScriptedSource(every=2, stamp=77), 10.0, seconds=1.0).ticks == 10
         publisher.publish([0.0, 0.0], stamp=78)
     assert [state.stamp for state in tap.joint_states(6)] == [77] * 5 + [78]

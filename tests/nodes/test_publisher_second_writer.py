@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 
 import pytest
-from helpers.processes import a_free_port, until
+from helpers.processes import find_free_port, until
 from helpers.robots import RRBOT
 from msgspec.structs import replace
 
@@ -101,19 +101,19 @@ def test_exactly_one_of_two_simultaneous_processes_survives_each_of_20_times(spa
     with ThreadPoolExecutor(2) as pool:
         for _ in range(20):
             for rival in rivals:
-                rival.tell("go")
+                rival.send_line("go")
             answer = {pool.submit(rival.line): rival for rival in rivals}
             (refused, *_), others = wait(answer, return_when=FIRST_COMPLETED)
             (winner,) = [rival for rival in rivals if rival is not answer[refused]]
             assert refused.result() == f"refused by {winner.process.pid}"
             assert others
-            winner.tell("end")
+            winner.send_line("end")
             assert others.pop().result() == "survived"
 
 
 @pytest.mark.parametrize("later_publishes_first", [True, False])
 def test_later_publisher_ends_when_two_networks_are_joined(later_publishes_first):
-    endpoints = [f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2)]
+    endpoints = [f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2)]
     with ExitStack() as opened:
         ours, theirs = (opened.enter_context(connect(listen=endpoint)) for endpoint in endpoints)
         first = opened.enter_context(StatePublisher(ours, RRBOT, "r1"))

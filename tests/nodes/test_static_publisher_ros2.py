@@ -11,7 +11,7 @@ from helpers.raw_ros_nodes import (
     moved,
 )
 from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose
-from helpers.ros_subscriber import described, following_joints, writers, x_of
+from helpers.ros_subscriber import publish_description, publish_known_joints, writers, x_of
 
 from zstate.nodes.listener import TransformListener
 
@@ -28,7 +28,8 @@ def test_ros_static_edges_of_several_writers_accumulate_and_none_is_withdrawn(se
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2", follow="tf") as listener:
         mount, room = (
-            RosNode(writer, name).publisher(TF_STATIC).announce().await_reader() for name in ("mount", "room")
+            RosNode(writer, name).publisher(TF_STATIC).announce().wait_for_reader()
+            for name in ("mount", "room")
         )
         mount.edge(0, "tool", "camera", 1.0)
         mount.edge(0, "tool", "laser", 2.0)
@@ -38,7 +39,7 @@ def test_ros_static_edges_of_several_writers_accumulate_and_none_is_withdrawn(se
         until(lambda: writers(listener) == {"camera": "/mount", "laser": "/mount", "tool": "/room"})
         mount.edge(0, "base", "camera", 8.0)
         assert listener.buffer.wait("base", "camera", timeout_s=5.0).translation[0] == 8.0
-        mount.leave()
+        mount.close()
         room.edge(0, "map", "tool", 5.0)
         until(lambda: x_of(listener, "map", "laser") == 7.0)
         assert listener.stats.refused == {}
@@ -54,7 +55,7 @@ def test_restarted_static_writer_may_reparent_its_child(sessions):
         rival.edge(0, "base", "camera", 5.0)
         until(lambda: listener.stats.refused == {"second parent": 1})
         assert x_of(listener, "tool", "camera") == 1.0
-        old.leave()
+        old.close()
         until(lambda: rival.edge(0, "base", "camera", 5.0) or x_of(listener, "base", "camera") == 5.0)
         assert writers(listener) == {"camera": "/rival"}
         assert x_of(listener, "tool", "camera") is None
@@ -95,14 +96,14 @@ def test_fixed_edges_of_the_model_are_no_second_writer_in_any_order(sessions, or
     with TransformListener(reader, "r1", wire="ros2") as listener:
         statics = RosNode(writer, "robot_state_publisher").publisher(TF_STATIC).announce()
         if order == "model first":
-            described(writer)
+            publish_description(writer)
             listener.buffer.wait("lower", "tool", timeout_s=5.0)
         statics.transforms(0, [*FIXED, ("tool", "camera")], [*FIXED.values(), moved(0.5)])
         if order == "statics first":
             listener.buffer.wait("tool", "camera", timeout_s=5.0)
         if order != "model first":
-            described(writer)
-        driver = following_joints(writer, listener)
+            publish_description(writer)
+        driver = publish_known_joints(writer, listener)
         driver.joints(STAMP, NAMES, [0.5, 0.25])
         pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
         assert_pose(pose, kinematic_pose(RRBOT, [0.5, 0.25], "world", "tool"))
@@ -119,12 +120,12 @@ def test_static_edge_that_contradicts_the_model_is_counted_in_either_order(sessi
     with TransformListener(reader, "r1", wire="ros2") as listener:
         statics = RosNode(writer, "wrong").publisher(TF_STATIC).announce()
         if model_first:
-            described(writer)
+            publish_description(writer)
             listener.buffer.wait(*edge, timeout_s=5.0)
         statics.edge(0, *edge, 9.0)
         if not model_first:
             until(lambda: x_of(listener, *edge) == 9.0)
-            described(writer)
+            publish_description(writer)
         until(lambda: listener.stats.refused == {"second writer": 1})
         until(lambda: x_of(listener, *edge) not in (9.0, None))
         assert_pose(listener.buffer.lookup(*edge), kinematic_pose(RRBOT, [0, 0], *edge))

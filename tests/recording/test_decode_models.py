@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.recording_builder import MS, RRBOT, START, Bag, Tale, swing
+from helpers.recording_builder import MS, RRBOT, START, Bag, RecordingBuilder, swing_positions
 
 from zstate.model.robot import RobotModel
 from zstate.recording.decode import DecodedRecording, first_descriptions, recorded_model
@@ -30,10 +30,10 @@ def models(
 
 
 def test_described_robot_with_recorded_joints_has_a_model(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as tale:
         for robot in ("r1", "r2"):
             tale.describe(robot)
-            tale.joints(robot, START, swing(0))
+            tale.joints(robot, START, swing_positions(0))
     found, refused = models(tmp_path / "r.mcap")
     assert {robot: model and model.digest for robot, model in found.items()} == {
         "r1": RRBOT.digest,
@@ -44,7 +44,7 @@ def test_described_robot_with_recorded_joints_has_a_model(tmp_path: Path):
 
 
 def test_description_without_joint_states_gives_no_model(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
     assert models(tmp_path / "r.mcap") == ({"arm": None}, [])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from helpers.processes import until
-from helpers.recording_builder import MS, START, Tale, pose
+from helpers.recording_builder import MS, START, RecordingBuilder, pose
 from helpers.robots import RRBOT
 
 from zstate.errors import SecondWriter
@@ -27,7 +27,7 @@ CAMERA = Transform("cart/base", "cart/camera", [1, 0, 0], [0, 0, 0, 1])
 def cart(tmp_path: Path) -> Path:
     """A cart without a model, on which two writers have put the same camera."""
     path = tmp_path / "cart.mcap"
-    with Tale(path, "cart") as tale:
+    with RecordingBuilder(path, "cart") as tale:
         for writer in ("mount", "gripper"):
             tale.statics("cart", START, {("cart/base", "cart/camera"): pose(z=0.1)}, writer=writer)
         for n in range(COUNT):

@@ -10,21 +10,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.processes import Stepping, until
+from helpers.processes import SteppingClock, until
 from helpers.recording_builder import (
     LATENCY,
     MS,
     RRBOT,
     START,
     Bag,
+    RecordingBuilder,
     S,
-    Tale,
     pose,
     recorded_buffer,
-    swing,
-    swing_rates,
+    swing_positions,
+    swing_velocities,
 )
-from helpers.robots import Tap, await_reader, settle
+from helpers.robots import SampleCollector, wait_for_reader, wait_for_stream_readers
 from rosbags.rosbag2 import StoragePlugin
 
 from zstate import Recording, StatePublisher, StaticPublisher, TransformBuffer, TransformListener
@@ -49,11 +49,11 @@ PATHS = [("world", "tool"), ("tool", "lens"), ("laser_link", "world")]
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A second of an arm at 100 Hz, with a lens on its tool."""
     path = tmp_path_factory.mktemp("arm") / "arm.mcap"
-    with Tale(path, "arm") as tale:
+    with RecordingBuilder(path, "arm") as tale:
         tale.describe("arm")
         tale.statics("arm", START, {("tool", "lens"): pose(z=0.1)})
         for n in range(COUNT):
-            tale.joints("arm", START + n * 10 * MS + n % 3, swing(n / 50), swing_rates(n / 50))
+            tale.joints("arm", START + n * 10 * MS + n % 3, swing_positions(n / 50), swing_velocities(n / 50))
     return path
 
 
@@ -84,7 +84,7 @@ def replayed(sessions: tuple[Session, Session], path: Path, **options: object) -
     """What a listener's buffer knows after a replay."""
     writer, reader = sessions
     with TransformListener(reader, "arm", history_s=100.0) as listener, Player(writer, path) as whole:
-        settle(writer, "arm")
+        wait_for_stream_readers(writer, "arm")
         last = whole.span[1]
         with Player(writer, path, **options) as replayer:
             report = replayer.run()
@@ -114,9 +114,11 @@ def test_live_played_back_and_recorded_lookups_agree(sessions, tmp_path: Path):
         StaticPublisher(writer, "arm", "lens") as static,
     ):
         static.set(Transform("tool", "lens", [0, 0, 0.1], [0, 0, 0, 1]))
-        settle(writer, "arm", "joint_states", "tf")
+        wait_for_stream_readers(writer, "arm", "joint_states", "tf")
         for n in range(COUNT):
-            publisher.publish(swing(n / 50), swing_rates(n / 50), stamp=START + n * 10 * MS + n % 3)
+            publisher.publish(
+                swing_positions(n / 50), swing_velocities(n / 50), stamp=START + n * 10 * MS + n % 3
+            )
         until(lambda: listener.stats.received == COUNT)
         until(lambda: recorder.stats.messages.get(("arm", "joint_states")) == COUNT)
         until(lambda: recorder.stats.messages.get(("arm", "tf_static"), 0) >= 2)
@@ -128,7 +130,7 @@ def test_live_played_back_and_recorded_lookups_agree(sessions, tmp_path: Path):
         assert_same(live, [recording.lookup_many(*frames, stamps)[0] for frames in PATHS])
     # The publisher of the lens has left since; playback withdraws its edge too.
     with TransformListener(reader, "arm", history_s=100.0) as listener:
-        settle(writer, "arm")
+        wait_for_stream_readers(writer, "arm")
         with Player(writer, path, ["arm"], rate=10.0) as replayer:
             replayer.run()
         until(lambda: listener.stats.received == COUNT)
@@ -137,25 +139,27 @@ def test_live_played_back_and_recorded_lookups_agree(sessions, tmp_path: Path):
     assert np.array_equal(poses, live[0])
 
 
-def joint_states(tap: Tap) -> list[JointState]:
+def joint_states(tap: SampleCollector) -> list[JointState]:
     return [decode(arrival.payload, arrival.encoding, JointState) for arrival in tap.arrivals]
 
 
 def test_playback_keeps_stamps_and_numbers(sessions, arm: Path):
     writer, reader = sessions
-    tap = Tap(reader, "zstate/arm/joint_states")
-    await_reader(writer, "zstate/arm/joint_states")
+    tap = SampleCollector(reader, "zstate/arm/joint_states")
+    wait_for_reader(writer, "zstate/arm/joint_states")
     with Player(writer, arm, rate=math.inf) as replayer:
         replayer.run()
     states = tap.joint_states(COUNT)
     assert [state.stamp for state in states] == [START + n * 10 * MS + n % 3 for n in range(COUNT)]
     assert [state.seq for state in states] == list(range(COUNT))
     assert len({state.session for state in states}) == 1
-    assert [from_block(state.positions).tolist() for state in states] == [swing(n / 50) for n in range(COUNT)]
+    assert [from_block(state.positions).tolist() for state in states] == [
+        swing_positions(n / 50) for n in range(COUNT)
+    ]
 
 
 def test_playback_keeps_the_spacing_of_samples(sessions, arm: Path):
-    clock = Stepping(5)
+    clock = SteppingClock(5)
     with Player(sessions[0], arm, rate=2.0, clock=clock) as replayer:
         report = replayer.run()
     expected = {(LATENCY + n * 10 * MS + n % 3) // 2 + 5 for n in range(COUNT)}
@@ -167,7 +171,7 @@ def test_playback_keeps_the_spacing_of_samples(sessions, arm: Path):
 
 
 def test_lateness_is_reported(sessions, arm: Path):
-    clock = Stepping(5, {50: 40 * MS})
+    clock = SteppingClock(5, {50: 40 * MS})
     with Player(sessions[0], arm, clock=clock) as replayer:
         report = replayer.run()
     # 40 ms late at one wait, which the samples of the next 40 ms, four at most, cannot quite make up for.
@@ -177,27 +181,27 @@ def test_lateness_is_reported(sessions, arm: Path):
 
 def test_start_within_the_recording_has_the_latched_values_of_that_time(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
-    with Tale(path, "arm") as tale:
+    with RecordingBuilder(path, "arm") as tale:
         tale.describe("arm")
         tale.statics("arm", START, {("tool", "lens"): pose(z=0.1)})
         tale.statics("arm", START + S, {("tool", "lens"): pose(z=0.2)})
         for n in range(5):
-            tale.joints("arm", START + n * S, swing(n))
+            tale.joints("arm", START + n * S, swing_positions(n))
         tale.statics("arm", START + 4 * S + MS, {("tool", "lens"): pose(z=0.3)})
     writer, reader = sessions
-    tap = Tap(reader, "zstate/arm/joint_states")
+    tap = SampleCollector(reader, "zstate/arm/joint_states")
     heights: list[float] = []
 
     def collect(arrival: SerializedSample) -> None:
         message = decode(arrival.payload, arrival.encoding, StaticTransforms)
         heights.append(from_block(message.poses)[2])
 
-    await_reader(writer, "zstate/arm/joint_states")
+    wait_for_reader(writer, "zstate/arm/joint_states")
     with (
         LatchedSubscriber(reader, "zstate/arm/tf_static/camera", collect),
         Player(writer, path, rate=math.inf, start_s=2.0, duration_s=2.5) as replayer,
     ):
-        await_reader(writer, "zstate/arm/tf_static/camera")
+        wait_for_reader(writer, "zstate/arm/tf_static/camera")
         assert replayer.run().samples == 3
         until(lambda: len(heights) == 2)
     assert heights == [0.2, 0.3]
@@ -206,9 +210,9 @@ def test_start_within_the_recording_has_the_latched_values_of_that_time(sessions
 
 def test_each_pass_of_a_loop_starts_a_new_epoch(sessions, arm: Path):
     writer, reader = sessions
-    tap, clocks = Tap(reader, "zstate/arm/joint_states"), Tap(reader, "zstate/clock")
+    tap, clocks = SampleCollector(reader, "zstate/arm/joint_states"), SampleCollector(reader, "zstate/clock")
     with TransformListener(reader, "arm", history_s=100.0) as listener:
-        settle(writer, "arm")
+        wait_for_stream_readers(writer, "arm")
         with replaying(Player(writer, arm, rate=100.0, loop=True)):
             until(lambda: len(tap.arrivals) > 3 * COUNT)
         until(lambda: listener.stats.received > 3 * COUNT)
@@ -229,9 +233,9 @@ def test_each_pass_of_a_loop_starts_a_new_epoch(sessions, arm: Path):
 
 def test_recording_time_is_published_on_the_clock(sessions, arm: Path):
     writer, reader = sessions
-    tap = Tap(reader, "zstate/clock")
-    await_reader(writer, "zstate/clock")
-    with Player(writer, arm, rate=5.0, clock=Stepping()) as replayer:
+    tap = SampleCollector(reader, "zstate/clock")
+    wait_for_reader(writer, "zstate/clock")
+    with Player(writer, arm, rate=5.0, clock=SteppingClock()) as replayer:
         replayer.run()
         first, last = replayer.span
         # 100 times a second at five times the speed: every 50 ms of the recording.
@@ -241,13 +245,13 @@ def test_recording_time_is_published_on_the_clock(sessions, arm: Path):
 
 
 def test_recorded_clock_is_published_unchanged(sessions, tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(5):
-            tale.scribe.write_message("ros", ClockMessage(n * MS, n, 9), START + n * S)
+            tale.encoder.write_message("ros", ClockMessage(n * MS, n, 9), START + n * S)
     writer, reader = sessions
-    tap = Tap(reader, "zstate/clock")
-    await_reader(writer, "zstate/clock")
+    tap = SampleCollector(reader, "zstate/clock")
+    wait_for_reader(writer, "zstate/clock")
     with Player(writer, tmp_path / "r.mcap", rate=math.inf) as replayer:
         replayer.run()
     assert [decode(p, ENCODINGS[ClockMessage], ClockMessage).stamp for p in tap.payloads(5)] == [
@@ -256,9 +260,9 @@ def test_recorded_clock_is_published_unchanged(sessions, tmp_path: Path):
 
 
 def test_player_can_be_paused_and_resumed(sessions, arm: Path):
-    tap = Tap(sessions[1], "zstate/arm/joint_states")
-    clocks = Tap(sessions[1], "zstate/clock")
-    await_reader(sessions[0], "zstate/arm/joint_states")
+    tap = SampleCollector(sessions[1], "zstate/arm/joint_states")
+    clocks = SampleCollector(sessions[1], "zstate/clock")
+    wait_for_reader(sessions[0], "zstate/arm/joint_states")
     replayer = Player(sessions[0], arm)
     replayer.pause()
     with replaying(replayer) as reports:
@@ -272,8 +276,8 @@ def test_player_can_be_paused_and_resumed(sessions, arm: Path):
 
 
 def test_player_can_seek(sessions, arm: Path):
-    tap = Tap(sessions[1], "zstate/arm/joint_states")
-    await_reader(sessions[0], "zstate/arm/joint_states")
+    tap = SampleCollector(sessions[1], "zstate/arm/joint_states")
+    wait_for_reader(sessions[0], "zstate/arm/joint_states")
     replayer = Player(sessions[0], arm)
     half = START + 500 * MS
     replayer.seek(half)
@@ -286,8 +290,8 @@ def test_player_can_seek(sessions, arm: Path):
 
 
 def test_seek_during_playback_starts_new_writers(sessions, arm: Path):
-    tap = Tap(sessions[1], "zstate/arm/joint_states")
-    await_reader(sessions[0], "zstate/arm/joint_states")
+    tap = SampleCollector(sessions[1], "zstate/arm/joint_states")
+    wait_for_reader(sessions[0], "zstate/arm/joint_states")
     replayer = Player(sessions[0], arm)
     with replaying(replayer) as reports:
         tap.payloads(10)
@@ -308,13 +312,13 @@ def test_player_ends_when_it_is_closed(sessions, arm: Path):
 
 def test_robot_without_a_model_is_published_unchanged(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
-    with Tale(path, "cart") as tale:
+    with RecordingBuilder(path, "cart") as tale:
         for n in range(20):
             tale.edges("cart", START + n * 10 * MS, {("odom", "base"): pose(n), ("map", "odom"): pose(1.0)})
     writer, reader = sessions
-    tap = Tap(reader, "zstate/cart/tf")
+    tap = SampleCollector(reader, "zstate/cart/tf")
     with TransformListener(reader, "cart", follow="tf") as listener:
-        settle(writer, "cart", "tf")
+        wait_for_stream_readers(writer, "cart", "tf")
         with Player(writer, path, rate=math.inf) as replayer:
             assert replayer.run().samples == 20
         found = listener.buffer.wait("map", "base", START + 55 * MS, timeout_s=5.0)
@@ -332,7 +336,7 @@ def test_ros_bag_is_played_back_natively(sessions, tmp_path: Path, storage: Stor
         bag.tf(START, [Transform("world", "base", [0, 0, 0], [0, 0, 0, 1], 0)], "/tf_static")
         for n in range(50):
             stamp = START + n * 10 * MS
-            bag.joints(stamp, dict(zip(RRBOT.joint_names, swing(n / 50), strict=True)))
+            bag.joints(stamp, dict(zip(RRBOT.joint_names, swing_positions(n / 50), strict=True)))
             bag.tf(stamp, [Transform("map", "world", [n, 0, 0], [0, 0, 0, 1], stamp)])
     writer, reader = sessions
     stamps = np.random.default_rng(4).integers(START, START + 490 * MS, 100)
@@ -341,7 +345,7 @@ def test_ros_bag_is_played_back_natively(sessions, tmp_path: Path, storage: Stor
         TransformListener(reader, "ros") as joints,
         TransformListener(reader, "ros", follow="tf") as edges,
     ):
-        settle(writer, "ros", "joint_states", "tf")
+        wait_for_stream_readers(writer, "ros", "joint_states", "tf")
         with Player(writer, tmp_path / "bag", rate=math.inf) as replayer:
             replayer.run()
         until(lambda: joints.stats.received == edges.stats.received == 50)
@@ -359,7 +363,7 @@ def test_robot_is_played_back_to_ros(sessions, arm: Path):
     wire = "ros2:domain=3,namespace=*,frame_prefix=*/"
     writer, reader = sessions
     with TransformListener(reader, wire=wire, history_s=100.0) as listener:
-        await_reader(writer, RmwKeys(Ros2Options(domain=3, namespace="*")).key("arm", "joint_states"))
+        wait_for_reader(writer, RmwKeys(Ros2Options(domain=3, namespace="*")).key("arm", "joint_states"))
         with Player(writer, arm, wires=("native", wire), rate=math.inf) as replayer:
             assert not replayer.run().refused
         until(lambda: listener.stats.received == COUNT)
@@ -370,15 +374,15 @@ def test_robot_is_played_back_to_ros(sessions, arm: Path):
 
 def test_model_replaced_in_the_recording_is_replaced_in_playback(sessions, tmp_path: Path):
     longer = parse_urdf(RRBOT.urdf.replace('"0 0 0.6"', '"0 0 0.9"'), "longer")
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         for second, model in ((0, RRBOT), (1, longer)):
             tale.describe("arm", model, session=second, at=START + second * S)
             for n in range(10):
                 stamp = START + second * S + n * 10 * MS
-                tale.joints("arm", stamp, swing(n), session=second, model=model)
+                tale.joints("arm", stamp, swing_positions(n), session=second, model=model)
     writer, reader = sessions
     with TransformListener(reader, "arm") as listener:
-        settle(writer, "arm")
+        wait_for_stream_readers(writer, "arm")
         with Player(writer, tmp_path / "r.mcap", rate=5.0) as replayer:
             assert replayer.run().samples == 20
         until(lambda: listener.stats.received == 20)
@@ -401,10 +405,10 @@ def test_unpublishable_messages_are_counted(sessions, tmp_path: Path):
 
 def test_truncated_recording_is_played_as_far_as_possible(sessions, tmp_path: Path):
     path = tmp_path / "r.mcap"
-    with Tale(path, "arm") as tale:
+    with RecordingBuilder(path, "arm") as tale:
         tale.describe("arm")
         for n in range(1000):
-            tale.joints("arm", START + n * MS, swing(n))
+            tale.joints("arm", START + n * MS, swing_positions(n))
             if n % 100 == 0:
                 tale.writer.flush()
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

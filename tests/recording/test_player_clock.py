@@ -6,7 +6,7 @@ import math
 import threading
 
 import pytest
-from helpers.processes import Stepping
+from helpers.processes import SteppingClock
 
 from zstate.errors import InvalidInput
 from zstate.recording.player_clock import Lateness, PlayerClock
@@ -16,7 +16,7 @@ S = 1_000_000_000
 
 
 def test_deadlines_are_absolute_and_divided_by_the_rate():
-    clock = Stepping(1000, {0: 3 * MS, 1: 70 * MS})
+    clock = SteppingClock(1000, {0: 3 * MS, 1: 70 * MS})
     pace, stop = PlayerClock(clock, 2.0), threading.Event()
     pace.start(50 * S)
     for n in range(1, 5):
@@ -27,7 +27,7 @@ def test_deadlines_are_absolute_and_divided_by_the_rate():
 
 
 def test_lateness_is_counted_from_the_deadline():
-    clock = Stepping(0, {0: 3 * MS})
+    clock = SteppingClock(0, {0: 3 * MS})
     pace = PlayerClock(clock, 1.0)
     pace.start(0)
     pace.wait(S, threading.Event())
@@ -35,7 +35,7 @@ def test_lateness_is_counted_from_the_deadline():
 
 
 def test_playback_continues_after_a_long_delay_without_a_burst():
-    clock = Stepping(0, {0: 5 * S})
+    clock = SteppingClock(0, {0: 5 * S})
     pace, stop = PlayerClock(clock, 1.0), threading.Event()
     pace.start(0)
     for second in (1, 2, 3):
@@ -45,7 +45,7 @@ def test_playback_continues_after_a_long_delay_without_a_burst():
 
 
 def test_clock_that_is_set_back_is_followed():
-    clock = Stepping(100 * S)
+    clock = SteppingClock(100 * S)
     pace, stop = PlayerClock(clock, 1.0), threading.Event()
     pace.start(0)
     pace.wait(S, stop)
@@ -55,7 +55,7 @@ def test_clock_that_is_set_back_is_followed():
 
 
 def test_infinite_rate_never_waits():
-    clock = Stepping()
+    clock = SteppingClock()
     pace = PlayerClock(clock, math.inf)
     pace.start(0)
     assert pace.wait(3600 * S, threading.Event())
@@ -67,13 +67,13 @@ def test_wait_returns_false_when_stopped():
     stop = threading.Event()
     stop.set()
     for rate in (1.0, math.inf):
-        pace = PlayerClock(Stepping(), rate)
+        pace = PlayerClock(SteppingClock(), rate)
         pace.start(0)
         assert not pace.wait(S, stop)
 
 
 def test_pauses_do_not_count_into_the_achieved_rate():
-    clock = Stepping(0)
+    clock = SteppingClock(0)
     pace, stop = PlayerClock(clock, 1.0), threading.Event()
     pace.start(0)
     pace.wait(S, stop)
@@ -87,7 +87,7 @@ def test_pauses_do_not_count_into_the_achieved_rate():
 @pytest.mark.parametrize("rate", [0.0, -1.0, math.nan])
 def test_rate_must_be_above_zero(rate: float):
     with pytest.raises(InvalidInput, match="rate above 0"):
-        PlayerClock(Stepping(), rate)
+        PlayerClock(SteppingClock(), rate)
 
 
 def test_quantiles_are_recorded_values():

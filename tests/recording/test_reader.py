@@ -13,7 +13,16 @@ import lz4.frame
 import pytest
 import zstandard
 from helpers.processes import Child
-from helpers.recording_files import DESCRIPTION, MS, START, STORE, S, declared, joint_states, write_run
+from helpers.recording_files import (
+    DESCRIPTION,
+    MS,
+    START,
+    STORE,
+    S,
+    declare_channels,
+    joint_states,
+    write_run,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
@@ -57,7 +66,7 @@ def test_records_come_by_log_time_across_chunks_with_their_contents(tmp_path: Pa
 
 def test_records_of_one_instant_keep_the_order_of_the_file(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap") as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         for number in range(9):
             writer.write((described, joints)[number % 2], bytes([number]), START, START)
             if number == 4:
@@ -77,7 +86,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A message each nanosecond, the number of it as payload."""
     path = tmp_path_factory.mktemp("whole") / "run.mcap"
     with RecordingWriter(path) as writer:
-        _, joints = declared(writer)
+        _, joints = declare_channels(writer)
         for number in range(20):
             writer.write(joints, bytes([number]), START + number, START)
             if number % 4 == 3:
@@ -105,7 +114,7 @@ def test_chunks_outside_the_interval_are_not_read(whole: Path, tmp_path: Path):
 
 def test_empty_recording_has_no_span(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap") as writer:
-        declared(writer)
+        declare_channels(writer)
     with RecordingReader(tmp_path / "run.mcap") as reader:
         assert (reader.span, list(reader.records()), reader.complete) == (None, [], True)
 

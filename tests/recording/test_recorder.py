@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.robots import RRBOT, STAMP, UPRIGHT, Tap, settle
+from helpers.robots import RRBOT, STAMP, UPRIGHT, SampleCollector, wait_for_stream_readers
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -73,7 +73,7 @@ def publish_paced(
     """Publishes samples of a sine as fast as ``reader`` receives those of "r1"; their positions."""
     sine = SineSource(publisher.model)
     sent = [sine.read(STAMP + k * PERIOD * 10).positions for k in range(number)]
-    with closing(Tap(reader, "zstate/r1/tf")) as tap:
+    with closing(SampleCollector(reader, "zstate/r1/tf")) as tap:
         for k, positions in enumerate(sent):
             publisher.publish(positions, stamp=STAMP + k * PERIOD)
             if k % 10 == 9:  # a network whose reader is behind drops samples
@@ -93,7 +93,7 @@ def ten_thousand(sessions, tmp_path: Path, panda: RobotModel) -> tuple[Path, lis
     writer, reader = sessions
     path = tmp_path / "run.mcap"
     with StatePublisher(writer, panda, "r1") as publisher, Recorder(reader, path) as recorder:
-        settle(writer, "r1", "joint_states", "tf")
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         sent = publish_paced(publisher, recorder, reader, 1300)
     assert recorder.failure is None
     stats = recorder.stats
@@ -150,7 +150,7 @@ def test_several_robots_have_a_namespace_and_a_prefix_each(sessions, tmp_path: P
         Recorder(reader, tmp_path / "run.mcap") as recorder,
     ):
         for robot in ("left", "right"):
-            settle(writer, robot, "joint_states", "tf")
+            wait_for_stream_readers(writer, robot, "joint_states", "tf")
         left.publish([0.1, 0.2], stamp=STAMP)
         right.publish(SineSource(GRIPPER).read(STAMP).positions, stamp=STAMP)
         until(lambda: count(recorder, "left", "tf") == count(recorder, "right", "tf") == 1)
@@ -180,7 +180,7 @@ def test_later_robot_gets_its_own_namespace(sessions, tmp_path: Path):
         Recorder(reader, tmp_path / "run.mcap") as recorder,
         StatePublisher(writer, RRBOT, "first") as first,
     ):
-        settle(writer, "first")
+        wait_for_stream_readers(writer, "first")
         first.publish([0.0, 0.0], stamp=STAMP)
         until(lambda: count(recorder, "first") == 1)
         with StatePublisher(writer, RRBOT, "second") as second:
@@ -199,8 +199,8 @@ def test_only_selected_robots_are_recorded_and_a_single_one_in_the_root(sessions
         Recorder(reader, tmp_path / "one.mcap", "left") as one,
         Recorder(reader, tmp_path / "two.mcap", ["left", "right"]) as two,
     ):
-        settle(writer, "left")
-        settle(writer, "right")
+        wait_for_stream_readers(writer, "left")
+        wait_for_stream_readers(writer, "right")
         for publisher in (third, right, left):
             publisher.publish([0.0, 0.0], stamp=STAMP)
         until(lambda: count(one, "left") == count(two, "left") == count(two, "right") == 1)
@@ -213,7 +213,7 @@ def test_only_selected_robots_are_recorded_and_a_single_one_in_the_root(sessions
 def test_samples_before_the_description_are_recorded_after_it(sessions, tmp_path: Path):
     writer, reader = sessions
     with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         with StatePublisher(writer, RRBOT, "r1", streams=("joint_states",)) as publisher:
             publisher.publish([0.25, 0.5], stamp=STAMP)
             until(lambda: recorder.stats.unwritten == 1)
@@ -229,7 +229,7 @@ def test_restarted_writer_has_its_own_channel_and_name(sessions, tmp_path: Path)
     with Recorder(reader, tmp_path / "run.mcap", ["r1"]) as recorder:
         for start in (1, 2):
             with StatePublisher(writer, RRBOT, "r1") as publisher:
-                settle(writer, "r1")
+                wait_for_stream_readers(writer, "r1")
                 publisher.publish([0.0, float(start)], stamp=STAMP + start)
                 until(lambda wanted=start: count(recorder, "r1") == wanted)
     with RecordingReader(tmp_path / "run.mcap") as recording:
@@ -330,7 +330,7 @@ def test_each_file_of_a_split_recording_is_readable_alone(sessions, tmp_path: Pa
         StatePublisher(writer, RRBOT, "r1") as publisher,
         Recorder(reader, path, max_bytes=1 << 16) as recorder,
     ):
-        settle(writer, "r1", "joint_states", "tf")
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         sent = publish_paced(publisher, recorder, reader, 1000)
         files = recorder.stats.files
     assert len(files) > 2
@@ -362,7 +362,7 @@ def test_killed_recorder_loses_at_most_the_last_half_second(sessions, spawn, tmp
     assert child.line() == "ready"
     sent: list[int] = []
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        settle(writer, "r1", "joint_states", "tf")
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         began = time.monotonic()
         sine = iter(range(10**9))
         while time.monotonic() < began + 2.0:
@@ -424,7 +424,7 @@ def test_close_finishes_the_file_within_a_second_and_may_be_repeated(sessions, t
     writer, reader = sessions
     recorder = Recorder(reader, tmp_path / "run.mcap", ["r1"])
     with StatePublisher(writer, RRBOT, "r1") as publisher:
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.0, 0.0], stamp=STAMP)
         until(lambda: count(recorder, "r1") == 1)
         assert not recorder.wait(0.0)
@@ -447,7 +447,7 @@ def test_received_samples_are_written_even_if_the_recording_ends_at_once(session
         StreamPublisher(writer, "zstate/r1/joint_states", ENCODINGS[JointState]) as publisher,
     ):
         until(lambda: publisher.has_readers)
-        with closing(Tap(reader, "zstate/r1/joint_states")) as tap:
+        with closing(SampleCollector(reader, "zstate/r1/joint_states")) as tap:
             for number in range(1, 20):
                 put_state(publisher, number)
                 tap.payloads(number)
@@ -504,7 +504,7 @@ def test_large_latched_values_are_recorded_entirely_on_their_own_thread(
         StatePublisher(writer, RRBOT, "r1") as publisher,
         StaticPublisher(writer, "r1") as statics,
     ):
-        settle(writer, "r1", "joint_states", "tf")
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         for number in range(20):
             publisher.publish([0.1, number / 100], stamp=STAMP + number * PERIOD)
             statics.set(Transform("tool", f"mark_{number}", (0.0, 0.0, 0.1), UPRIGHT))

@@ -4,7 +4,7 @@ import time
 from contextlib import closing
 
 from helpers.processes import SOON_S, until
-from helpers.robots import Tap, await_reader
+from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate.net.latched import LatchedPublisher
 from zstate.net.streams import CAPACITY, StreamPublisher
@@ -27,7 +27,7 @@ def test_several_subscriptions_share_one_queue_with_reception_times(sessions):
         inbox.subscribe("joint_states", "a/samples", "r1")
         inbox.subscribe_latched("robot_description", "a/*", None)
         until(lambda: samples.has_readers)
-        await_reader(writer, "a/value")
+        wait_for_reader(writer, "a/value")
         before = time.time_ns()
         for number in range(5):
             samples.put(b"%d" % number)
@@ -46,7 +46,7 @@ def test_unread_queue_is_bounded_and_its_loss_is_reported(sessions):
     with (
         MessageQueue(reader) as inbox,
         StreamPublisher(writer, "a/samples", "") as samples,
-        closing(Tap(reader, "a/samples")) as tap,
+        closing(SampleCollector(reader, "a/samples")) as tap,
     ):
         inbox.subscribe("joint_states", "a/samples", "r1")
         until(lambda: samples.has_readers)

@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.processes import Child
-from helpers.recording_builder import MS, START, Bag, S, Tale, pose, swing, swing_rates
+from helpers.recording_builder import (
+    MS,
+    START,
+    Bag,
+    RecordingBuilder,
+    S,
+    pose,
+    swing_positions,
+    swing_velocities,
+)
 
 from zstate import Recording, TransformBuffer, UnknownFrame
 from zstate.errors import Disconnected, InPast, InvalidInput, RecordingError
@@ -16,9 +25,9 @@ from zstate.transform import Transform
 
 
 def test_repr_has_duration_and_robots(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as tale:
         tale.describe("r1")
-        tale.joints("r1", START + S, swing(0), heard=START + 2 * S)
+        tale.joints("r1", START + S, swing_positions(0), log_time=START + 2 * S)
         tale.describe("r2", at=START + 3 * S)
     with Recording(tmp_path / "r.mcap") as recording:
         assert recording.robots == ("r1", "r2")
@@ -27,14 +36,14 @@ def test_repr_has_duration_and_robots(tmp_path: Path):
 
 
 def test_unknown_robot_is_refused(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as tale:
         tale.describe("r1")
     with pytest.raises(InvalidInput, match="'r1'"):
         Recording(tmp_path / "r.mcap", "r2")
 
 
 def test_closed_recording_raises(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
     recording = Recording(tmp_path / "r.mcap")
     recording.close()
@@ -46,7 +55,7 @@ def test_closed_recording_raises(tmp_path: Path):
 def wild(path: Path, seed: int) -> None:
     """Two writers after each other, late samples, repeated stamps, clocks set back, edges that move over."""
     dice = random.Random(seed)
-    with Tale(path, "arm") as tale:
+    with RecordingBuilder(path, "arm") as tale:
         tale.describe("arm")
         offset = 0
         for n in range(600):
@@ -55,12 +64,19 @@ def wild(path: Path, seed: int) -> None:
                 offset = -3600 * S
             session = 1 + (n > 300)
             stamp = heard + offset - dice.choice([0, 0, 0, 35 * MS, 70 * MS])
-            tale.joints("arm", stamp, swing(dice.random()), swing_rates(n), session=session, heard=heard)
+            tale.joints(
+                "arm",
+                stamp,
+                swing_positions(dice.random()),
+                swing_velocities(n),
+                session=session,
+                log_time=heard,
+            )
             if n % 3 == 0:
                 world = pose(dice.random(), dice.random(), yaw=dice.random())
-                tale.edges("arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, heard=heard)
+                tale.edges("arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, log_time=heard)
             if n % 50 == 7:
-                tale.edges("arm", stamp, {("map", "odom"): pose(-n)}, heard=heard, session=5)
+                tale.edges("arm", stamp, {("map", "odom"): pose(-n)}, log_time=heard, session=5)
             if n in {20, 400}:
                 tale.statics("arm", heard, {("tool", "tip"): pose(z=n)})
 
@@ -91,9 +107,9 @@ def test_lookup_many_of_no_stamps_is_empty(tmp_path: Path):
 
 
 def test_unknown_and_disconnected_frames_raise(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
-        tale.joints("arm", START, swing(0))
+        tale.joints("arm", START, swing_positions(0))
         tale.statics("arm", START, {("table", "cup"): pose()})
     with Recording(tmp_path / "r.mcap") as recording:
         with pytest.raises(UnknownFrame, match="tol"):
@@ -105,13 +121,13 @@ def test_unknown_and_disconnected_frames_raise(tmp_path: Path):
 
 
 def test_edges_refused_live_are_refused_from_a_recording(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap") as tale:
         tale.statics("thief", START, {("thief/map", "arm/camera"): pose(x=9.0)})
         tale.statics("thief", START, {("arm/base", "arm/laser"): pose(x=9.0)}, writer="laser")
         tale.statics("arm", START + MS, {("lower", "world"): pose(x=9.0)}, writer="mix-up")
         tale.statics("arm", START + 2 * MS, {("tool", "camera"): pose(x=1.0)})
         tale.describe("arm", at=START + 3 * MS)
-        tale.joints("arm", START + 4 * MS, swing(0))
+        tale.joints("arm", START + 4 * MS, swing_positions(0))
     with Recording(tmp_path / "r.mcap") as recording:
         buffer = recording.buffer()
     placed = {frame.name: frame.parent for frame in buffer.frames() if frame.parent is not None}
@@ -150,7 +166,7 @@ def test_lookup_many_memory_does_not_grow_with_the_recording(tmp_path: Path, spa
     # 40 edges of 64 bytes: the large recording would fill a buffer with 50 MB.
     sizes = {"small": 1_000, "large": 20_000}
     for name, count in sizes.items():
-        with Tale(tmp_path / name, "cart") as tale:
+        with RecordingBuilder(tmp_path / name, "cart") as tale:
             for n in range(count):
                 edges = {("odom", f"base{k}"): pose(n, k) for k in range(40)}
                 tale.edges("cart", START + n * 10 * MS, edges)
@@ -173,10 +189,10 @@ def test_buffer_keeps_samples_around_requested_stamps():
 
 
 def test_lookup_before_the_recording_does_not_suggest_a_listener(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(3):
-            tale.joints("arm", START + n * S, swing(n))
+            tale.joints("arm", START + n * S, swing_positions(n))
     with Recording(tmp_path / "r.mcap") as recording:
         buffer = recording.buffer()
     frames = [frame for frame in buffer.frames() if frame.kind == "joint"]

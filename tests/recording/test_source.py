@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.processes import Stepping
-from helpers.recording_builder import MS, START, Bag, S, Tale, swing, swing_rates
+from helpers.processes import SteppingClock
+from helpers.recording_builder import MS, START, Bag, RecordingBuilder, S, swing_positions, swing_velocities
 from helpers.robots import RRBOT
 
 from zstate.errors import InvalidInput
@@ -20,10 +20,12 @@ NOW = 1_900_000_000 * S
 
 
 def arm(path: Path, count: int = 100, **options: object) -> Path:
-    with Tale(path, "arm") as tale:
+    with RecordingBuilder(path, "arm") as tale:
         tale.describe("arm")
         for n in range(count):
-            tale.joints("arm", START + n * 10 * MS + n % 3, swing(n), swing_rates(n), **options)
+            tale.joints(
+                "arm", START + n * 10 * MS + n % 3, swing_positions(n), swing_velocities(n), **options
+            )
     return path
 
 
@@ -33,9 +35,9 @@ def test_readings_are_the_recorded_numbers_shifted_to_the_present(tmp_path: Path
             reading = source.read(NOW + n * 10 * MS + n % 3)
             assert reading is not None
             assert reading.stamp == NOW + n * 10 * MS + n % 3
-            assert reading.positions.tolist() == swing(n)
+            assert reading.positions.tolist() == swing_positions(n)
             assert reading.velocities is not None
-            assert reading.velocities.tolist() == swing_rates(n)
+            assert reading.velocities.tolist() == swing_velocities(n)
         assert source.ended
         assert source.read(NOW + 10 * S) is None
 
@@ -45,7 +47,7 @@ def test_slow_reader_gets_the_newest_due_reading(tmp_path: Path):
         assert source.read(NOW) is not None
         reading = source.read(NOW + 57 * MS)
         assert reading is not None
-        assert reading.positions.tolist() == swing(5)
+        assert reading.positions.tolist() == swing_positions(5)
 
 
 def test_read_returns_none_without_a_new_reading(tmp_path: Path):
@@ -83,11 +85,11 @@ def test_states_that_do_not_fit_the_model_are_counted_and_skipped(tmp_path: Path
 
 
 def test_restarted_writer_continues_at_its_log_times(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
-        tale.joints("arm", 500 * S, [1, 0], session=1, heard=START)
-        tale.joints("arm", 3 * S, [2, 0], session=2, heard=START + 2 * S)
-        tale.joints("arm", 4 * S, [3, 0], session=2, heard=START + 3 * S)
+        tale.joints("arm", 500 * S, [1, 0], session=1, log_time=START)
+        tale.joints("arm", 3 * S, [2, 0], session=2, log_time=START + 2 * S)
+        tale.joints("arm", 4 * S, [3, 0], session=2, log_time=START + 3 * S)
     with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
         stamps = [source.read(NOW + n * S) for n in range(4)]
     told = [None if reading is None else (reading.stamp, reading.positions[0]) for reading in stamps]
@@ -95,10 +97,10 @@ def test_restarted_writer_continues_at_its_log_times(tmp_path: Path):
 
 
 def test_late_sample_does_not_move_the_robot_back(tmp_path: Path):
-    with Tale(tmp_path / "r.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "r.mcap", "arm") as tale:
         tale.describe("arm")
         for number, millisecond in enumerate([0, 20, 10, 30]):
-            tale.joints("arm", START + millisecond * MS, [number, 0], heard=START + number * MS)
+            tale.joints("arm", START + millisecond * MS, [number, 0], log_time=START + number * MS)
     with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
         seen = [source.read(NOW + n * 10 * MS) for n in range(4)]
     assert [None if reading is None else reading.positions[0] for reading in seen] == [0.0, None, 1.0, 3.0]
@@ -109,7 +111,7 @@ def test_publisher_runs_with_a_recorded_source(tmp_path: Path):
     with (
         connect() as session,
         RecordedSource(path, "arm", RRBOT) as source,
-        StatePublisher(session, load_model("rrbot"), "arm", clock=Stepping()) as publisher,
+        StatePublisher(session, load_model("rrbot"), "arm", clock=SteppingClock()) as publisher,
     ):
         report = publisher.run(source, 1000.0, seconds=source.duration_s + 0.001)
         assert source.ended

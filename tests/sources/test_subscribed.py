@@ -3,7 +3,7 @@ import threading
 
 import pytest
 from helpers.processes import until
-from helpers.robots import RRBOT, await_reader
+from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.model.load import load_model
 from zstate.net.session import Session
@@ -22,7 +22,7 @@ FLOATING = load_model(
 
 
 def put(session: Session, payload: bytes, encoding: str = ENCODINGS[JointState]) -> None:
-    await_reader(session, KEY)
+    wait_for_reader(session, KEY)
     with StreamPublisher(session, KEY, encoding) as stream:
         stream.put(payload)
 
@@ -34,7 +34,7 @@ def joint_state(*blocks: list[float], model=RRBOT) -> bytes:
 def test_every_sample_is_read_in_order_with_its_stamp(sessions):
     writer, reader = sessions
     with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
-        await_reader(writer, KEY)
+        wait_for_reader(writer, KEY)
         for number in range(5):
             publisher.publish([number, -number], [1.0, 2.0], [3.0, 4.0], stamp=number)
         readings = [reading for _, reading in zip(range(5), source, strict=False)]
@@ -47,7 +47,7 @@ def test_every_sample_is_read_in_order_with_its_stamp(sessions):
 def test_read_returns_the_newest_once(sessions):
     writer, reader = sessions
     with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
-        await_reader(writer, KEY)
+        wait_for_reader(writer, KEY)
         assert source.read(0) is None
         publisher.publish([1.0, 2.0], stamp=1)
         publisher.publish([3.0, 4.0], stamp=2)
@@ -67,7 +67,7 @@ def test_read_returns_the_newest_once(sessions):
 def test_the_robot_defaults_to_the_models_name(sessions):
     writer, reader = sessions
     with SubscribedSource(reader, RRBOT) as source, StatePublisher(writer, RRBOT) as publisher:
-        await_reader(writer, "zstate/rrbot/joint_states")
+        wait_for_reader(writer, "zstate/rrbot/joint_states")
         publisher.publish([1.0, 2.0], stamp=1)
         assert next(iter(source)).stamp == 1
 
@@ -129,8 +129,8 @@ def test_a_publisher_runs_on_what_another_publishes(sessions):
         StatePublisher(reader, RRBOT, "r2") as echo,
         SubscribedSource(writer, RRBOT, "r2") as echoed,
     ):
-        await_reader(writer, KEY)
-        await_reader(reader, "zstate/r2/joint_states")
+        wait_for_reader(writer, KEY)
+        wait_for_reader(reader, "zstate/r2/joint_states")
         runner = threading.Thread(target=echo.run, args=(source, 200.0))
         runner.start()
         driver.publish([0.25, 0.5], stamp=11)

@@ -1,4 +1,4 @@
-"""Two times that say nothing of each other are kept apart; steps of a clock are followed, and named."""
+"""Clock domains are kept apart; steps of a clock are followed and logged."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 from helpers.processes import until
-from helpers.recording_builder import START, Tale
-from helpers.robots import RRBOT, await_reader, settle
+from helpers.recording_builder import START, RecordingBuilder
+from helpers.robots import RRBOT, wait_for_reader, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock, SystemClock
@@ -41,7 +41,7 @@ def simulated(stamp: int = 5 * SECOND) -> ManualClock:
     return ManualClock(stamp, "sim")
 
 
-def test_a_description_tells_whose_time_a_robot_keeps(sessions):
+def test_description_names_the_clock_domain(sessions):
     writer, _ = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as real,
@@ -52,7 +52,9 @@ def test_a_description_tells_whose_time_a_robot_keeps(sessions):
 
 @FOLLOW
 @pytest.mark.parametrize("given", ["system", "sim", None])
-def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_both_is_refused(sessions, follow, given):
+def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_them_raises_clock_mismatch(
+    sessions, follow, given
+):
     writer, reader = sessions
     clock = None if given is None else ManualClock(NOW, given)
     with (
@@ -64,7 +66,7 @@ def test_robots_of_two_clocks_share_a_buffer_and_a_path_across_both_is_refused(s
         buffer = listener.buffer
         for robot in ("r1", "r2"):
             cell.set(Transform("cell/map", f"{robot}/world", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
-            settle(writer, robot, follow)
+            wait_for_stream_readers(writer, robot, follow)
         until(lambda: (buffer.domain.domain_of("r1"), buffer.domain.domain_of("r2")) == ("system", "sim"))
         for robot in (virtual, real):
             robot.publish([0.5, 0.5])
@@ -106,7 +108,7 @@ def two_clocks() -> TransformBuffer:
     ],
     ids=["newest", "lookup", "lookup_many", "lookup_between", "twist", "plan", "latest", "wait"],
 )
-def test_every_question_across_two_clocks_is_refused(ask):
+def test_every_lookup_across_two_clocks_is_refused(ask):
     buffer = two_clocks()
     with pytest.raises(ClockMismatch):
         ask(buffer)
@@ -116,7 +118,7 @@ def test_every_question_across_two_clocks_is_refused(ask):
 
 
 @pytest.mark.parametrize(("given", "expected"), [(None, "sim"), ("system", "system")])
-def test_a_time_line_is_that_of_one_domain(given, expected):
+def test_path_domain_is_that_of_its_moving_edges(given, expected):
     buffer = two_clocks()
     for robot in ("r2", "r1"):
         buffer.domain.join(robot)
@@ -125,7 +127,7 @@ def test_a_time_line_is_that_of_one_domain(given, expected):
     assert buffer.span() == (start, start + MS)
 
 
-def test_what_was_compiled_before_a_domain_changed_is_asked_again():
+def test_cached_path_is_recompiled_after_a_domain_change():
     buffer = two_clocks()
     buffer.set_domain("r2", "system")
     buffer.lookup_many("r1/tool", "r2/tool", [NOW])
@@ -137,7 +139,7 @@ def test_what_was_compiled_before_a_domain_changed_is_asked_again():
         plan.at(NOW)
 
 
-def test_a_wait_across_two_clocks_ends_when_one_robot_changes_its_clock():
+def test_wait_across_two_clocks_ends_when_one_robot_changes_its_clock():
     buffer = two_clocks()
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(buffer.wait, "r1/tool", "r2/tool", NOW, 10.0)
@@ -147,7 +149,7 @@ def test_a_wait_across_two_clocks_ends_when_one_robot_changes_its_clock():
         assert waiting.result(10.0).stamp == NOW
 
 
-def test_edges_that_a_robot_places_in_frames_of_another_keep_its_own_clock():
+def test_edges_placed_in_frames_of_another_robot_keep_the_clock_of_their_writer():
     buffer = TransformBuffer()
     buffer.set_domain("fleet", "sim")
     buffer.set_domain("r1", "system")
@@ -160,7 +162,7 @@ def test_edges_that_a_robot_places_in_frames_of_another_keep_its_own_clock():
     assert caught.value.robots == ("fleet", "r1")
 
 
-def test_one_domain_where_one_is_needed_is_that_of_most_robots_with_samples(sessions):
+def test_default_domain_is_that_of_most_robots_with_samples(sessions):
     writer, reader = sessions
     names = {"v1": simulated(), "r1": ManualClock(NOW), "r2": ManualClock(NOW), "v2": simulated()}
     with ExitStack() as opened:
@@ -171,7 +173,7 @@ def test_one_domain_where_one_is_needed_is_that_of_most_robots_with_samples(sess
         listener = opened.enter_context(TransformListener(reader))
         domain = listener.buffer.domain
         for name in names:
-            settle(writer, name)
+            wait_for_stream_readers(writer, name)
             until(lambda name=name: domain.domain_of(name) is not None)
         assert domain.name is None
         for name, expected in (("v1", "sim"), ("r1", "sim"), ("r2", "system"), ("v2", "system")):
@@ -186,28 +188,28 @@ def test_one_domain_where_one_is_needed_is_that_of_most_robots_with_samples(sess
         assert domain.domain_of("r1") == "system"
 
 
-def test_a_robot_may_change_its_clock(sessions):
+def test_robot_may_change_its_clock(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener:
         with StatePublisher(writer, RRBOT, "r1") as real:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             real.publish([0.5, 0.5])
             listener.buffer.wait("world", "tool", timeout_s=5.0)
         with StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual:
-            settle(writer, "r1")
+            wait_for_stream_readers(writer, "r1")
             virtual.publish([0.5, 0.5])
             until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
             until(lambda: listener.buffer.latest("world", "tool") == 5 * SECOND)
         assert listener.stats.refused == {}
 
 
-def test_an_age_by_another_time_is_an_error_with_both_names(sessions):
+def test_age_limit_of_another_clock_is_an_error_naming_both(sessions):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1", clock=simulated()) as virtual,
         TransformListener(reader, "r1") as listener,
     ):
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         virtual.publish([0.5, 0.5])
         listener.buffer.wait("world", "tool", timeout_s=5.0)
         until(lambda: listener.buffer.domain.domain_of("r1") == "sim")
@@ -220,14 +222,14 @@ def test_an_age_by_another_time_is_an_error_with_both_names(sessions):
         assert listener.buffer.lookup("world", "tool", max_age_s=1.0).stamp == 5 * SECOND
 
 
-def test_a_buffer_with_a_clock_takes_no_listener_with_another(sessions):
+def test_buffer_refuses_a_listener_with_another_clock(sessions):
     buffer = TransformBuffer(clock=ManualClock(NOW))
     with pytest.raises(InvalidInput, match="given a clock of 'system' time, and now one of 'sim' time"):
         TransformListener(sessions[0], "r1", buffer, clock=simulated())
 
 
 @FOLLOW
-def test_85_us_back_are_a_sorted_sample_and_nothing_else(sessions, caplog, follow):
+def test_sample_85_us_back_is_sorted_in_without_a_restart(sessions, caplog, follow):
     writer, reader = sessions
     clock = ManualClock(NOW)
     with (
@@ -235,7 +237,7 @@ def test_85_us_back_are_a_sorted_sample_and_nothing_else(sessions, caplog, follo
         StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
         TransformListener(reader, "r1", follow=follow, clock=ManualClock(NOW)) as listener,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         stamps = [NOW, NOW + MS, NOW + MS - 85_000, NOW + MS - 85_000 + MS]
         for number, stamp in enumerate(stamps):
             clock.set(stamp)
@@ -250,7 +252,9 @@ def test_85_us_back_are_a_sorted_sample_and_nothing_else(sessions, caplog, follo
 
 
 @FOLLOW
-def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot(sessions, caplog, follow):
+def test_clock_an_hour_ahead_and_back_is_logged_and_followed_without_effect_on_other_robots(
+    sessions, caplog, follow
+):
     writer, reader = sessions
     clock = ManualClock(NOW)
     with (
@@ -259,8 +263,8 @@ def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot
         StatePublisher(writer, RRBOT, "r2", clock=ManualClock(NOW)) as steady,
         TransformListener(reader, follow=follow, clock=ManualClock(NOW)) as listener,
     ):
-        settle(writer, "r1", follow)
-        settle(writer, "r2", follow)
+        wait_for_stream_readers(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r2", follow)
         buffer = listener.buffer
 
         def publish(stamp: int) -> None:
@@ -293,9 +297,7 @@ def test_an_hour_ahead_and_back_is_named_and_followed_and_touches_no_other_robot
 
 
 @FOLLOW
-def test_a_clock_set_back_by_less_than_the_history_begins_a_new_history_of_that_robot(
-    sessions, caplog, follow
-):
+def test_clock_set_back_by_less_than_the_history_starts_a_new_history_of_that_robot(sessions, caplog, follow):
     writer, reader = sessions
     clock = ManualClock(NOW)
     with (
@@ -305,8 +307,8 @@ def test_a_clock_set_back_by_less_than_the_history_begins_a_new_history_of_that_
         TransformListener(reader, follow=follow, clock=ManualClock(NOW), history_s=10.0) as listener,
     ):
         buffer = listener.buffer
-        settle(writer, "r1", follow)
-        settle(writer, "r2", follow)
+        wait_for_stream_readers(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r2", follow)
         steady.publish([0.5, 0.5])
         for number, stamp in enumerate((0, 10, 20, 30, -5_000, -4_990, -4_980)):
             clock.set(NOW + stamp * MS)
@@ -337,21 +339,21 @@ def take(ingest: JointStateIngest, *samples: tuple[int, int]) -> None:
         )
 
 
-def test_samples_that_the_network_reorders_are_sorted_in():
+def test_reordered_samples_are_sorted_in():
     buffer, ingest = a_follower()
     take(ingest, (0, 0), (1, 1_000), (5, 5_000), (2, 2_000), (3, 3_000), (4, 4_000), (6, 6_000))
     for stamp in range(0, 7_000, 1_000):
         assert buffer.lookup("world", "tool", NOW + stamp * MS).kind == "exact"
 
 
-def test_one_wrong_stamp_does_not_end_a_history():
+def test_one_wrong_stamp_does_not_restart_a_history():
     buffer, ingest = a_follower()
     take(ingest, (0, 0), (1, 10), (2, -5_000), (3, 20), (4, 30))
     assert buffer.can_lookup("world", "tool", NOW)
     assert buffer.latest("world", "tool") == NOW + 30 * MS
 
 
-def test_a_clock_set_back_is_noticed_though_samples_are_lost_at_that_moment():
+def test_clock_set_back_is_detected_if_samples_are_lost_at_that_moment():
     buffer, ingest = a_follower()
     take(ingest, (0, 0), (1, 10), (9, -5_000), (10, -4_990))
     assert buffer.latest("world", "tool") == NOW - 4_990 * MS
@@ -359,14 +361,14 @@ def test_a_clock_set_back_is_noticed_though_samples_are_lost_at_that_moment():
 
 
 @FOLLOW
-def test_a_simulation_that_begins_again_soon_is_a_new_epoch_at_its_second_sample(sessions, follow):
+def test_restarted_simulation_is_a_new_epoch_at_its_second_sample(sessions, follow):
     writer, reader = sessions
     clock = simulated(0)
     with (
         StatePublisher(writer, RRBOT, "r1", clock=clock) as publisher,
         TransformListener(reader, "r1", follow=follow, history_s=10.0) as listener,
     ):
-        settle(writer, "r1", follow)
+        wait_for_stream_readers(writer, "r1", follow)
         # Eight seconds, well inside of the history, then the start again.
         for stamp in (0, 4 * SECOND, 8 * SECOND, 0, 10 * MS):
             clock.set(stamp)
@@ -377,7 +379,7 @@ def test_a_simulation_that_begins_again_soon_is_a_new_epoch_at_its_second_sample
         assert not listener.buffer.can_lookup("world", "tool", 4 * SECOND)
 
 
-def test_stamps_far_off_are_used_counted_and_named_once_for_each_program(sessions, caplog):
+def test_stamps_far_off_are_used_counted_and_logged_once_per_program(sessions, caplog):
     writer, reader = sessions
     with (
         caplog.at_level(logging.WARNING, "zstate"),
@@ -387,7 +389,7 @@ def test_stamps_far_off_are_used_counted_and_named_once_for_each_program(session
             with StatePublisher(writer, RRBOT, "r1", program="driver") as publisher:
                 # Its model, and so whose time it keeps, and its name.
                 until(lambda: any("driver@" in (one.writer or "") for one in listener.buffer.frames()))
-                settle(writer, "r1")
+                wait_for_stream_readers(writer, "r1")
                 for number in range(5):
                     publisher.publish([0.5, 0.5], stamp=(time.time_ns() + number) // SECOND)
                 until(lambda start=start: listener.stats.off_clock == 5 * start)
@@ -397,7 +399,7 @@ def test_stamps_far_off_are_used_counted_and_named_once_for_each_program(session
     assert "samples of 'r1', which driver@" in caplog.text
 
 
-def test_a_writer_that_starts_again_with_each_sample_is_named_once(caplog):
+def test_writer_restarting_with_each_sample_is_logged_once(caplog):
     buffer, counters = TransformBuffer(clock=ManualClock(NOW)), Counters()
     buffer.set_domain("r1", "system")
     off_clock = StampCheck(buffer, counters, is_described=True)
@@ -408,14 +410,14 @@ def test_a_writer_that_starts_again_with_each_sample_is_named_once(caplog):
     assert len(caplog.records) == 1
 
 
-def test_a_minute_off_is_not_far_and_a_little_more_is(sessions):
+def test_stamp_check_threshold_is_one_minute(sessions):
     writer, reader = sessions
     with (
         StatePublisher(writer, RRBOT, "r1") as publisher,
         TransformListener(reader, "r1", clock=ManualClock(NOW)) as listener,
     ):
         until(lambda: listener.buffer.domain.domain_of("r1") == "system")
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         for stamp in (NOW - 60 * SECOND, NOW + 60 * SECOND):
             publisher.publish([0.5, 0.5], stamp=stamp)
         until(lambda: listener.stats.received + listener.stats.late == 2)
@@ -425,7 +427,7 @@ def test_a_minute_off_is_not_far_and_a_little_more_is(sessions):
         until(lambda: listener.stats.off_clock == 2)
 
 
-def test_of_a_robot_that_is_never_described_named_transforms_are_looked_at_too(sessions):
+def test_stamps_of_transforms_are_checked_without_a_description(sessions):
     writer, reader = sessions
     edges = (("base", "hand"),)
     pose = to_block([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -447,17 +449,17 @@ def test_simulated_time_is_never_far_off(sessions):
         StatePublisher(writer, RRBOT, "r1", clock=simulated()) as publisher,
         TransformListener(reader, "r1", clock=clock) as listener,
     ):
-        await_reader(writer, "zstate/clock")
-        settle(writer, "r1")
+        wait_for_reader(writer, "zstate/clock")
+        wait_for_stream_readers(writer, "r1")
         told.publish(HOUR)
         publisher.publish([0.5, 0.5])
         until(lambda: listener.stats.received == 1)
         assert listener.stats.off_clock == 0
 
 
-def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
+def test_replay_has_its_own_clock_domain(sessions, tmp_path):
     writer, reader = sessions
-    with Tale(tmp_path / "run.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
         tale.describe("arm")
         for number in range(10):
             tale.joints("arm", START + number * 10 * MS, [0.1 * number, 0.0])
@@ -487,5 +489,5 @@ def test_a_replay_keeps_a_time_of_its_own(sessions, tmp_path):
         (NOW + 700 * SECOND, "never set"),
     ],
 )
-def test_the_likely_cause_is_told_by_the_size(stamp, cause):
+def test_likely_cause_depends_on_the_size_of_the_offset(stamp, cause):
     assert cause in likely_cause(stamp, NOW)

@@ -1,4 +1,4 @@
-"""Publishers, listeners and routers as processes of their own."""
+"""Publishers, listeners and routers in separate processes."""
 
 from __future__ import annotations
 
@@ -82,14 +82,14 @@ TOOL = RRBOT.links.index("tool")
 
 
 def started(child: Child) -> Child:
-    """The child, once it has said what it is doing."""
+    """The child, after its first line."""
     assert child.line() in ("publishing", "listening", "waiting", "routing"), child.stderr
     return child
 
 
 def ask(listener: Child, robot: str = "r1", after: str = "now") -> int:
-    """The stamp of the answer, which is checked against the sine that everybody can compute."""
-    listener.tell(f"{robot} {after}")
+    """The stamp of a lookup; its pose is checked against the known sine."""
+    listener.send_line(f"{robot} {after}")
     stamp, kind, pose7 = json.loads(listener.line())
     assert kind == "exact"
     expected = KINEMATICS.link_poses(SineSource(RRBOT).read(stamp).positions)[TOOL]
@@ -99,7 +99,7 @@ def ask(listener: Child, robot: str = "r1", after: str = "now") -> int:
 
 
 def interrupt(child: Child) -> None:
-    """Ctrl-C ends it within a second, and it leaves no other trace."""
+    """Ctrl-C ends the child within a second without other output."""
     began = time.monotonic()
     child.process.send_signal(signal.SIGINT)
     code = child.process.wait(10.0)
@@ -109,7 +109,7 @@ def interrupt(child: Child) -> None:
     assert child.stderr == ""
 
 
-def test_processes_of_one_host_meet_with_nothing_configured_whoever_comes_first(spawn):
+def test_processes_of_one_host_connect_without_configuration_in_any_order(spawn):
     early = started(spawn(LISTENER, PEER))
     publisher = started(spawn(PUBLISHER, "r1", PEER))
     late = started(spawn(LISTENER, PEER))
@@ -120,7 +120,7 @@ def test_processes_of_one_host_meet_with_nothing_configured_whoever_comes_first(
         interrupt(child)
 
 
-def test_clients_meet_through_a_router_process(spawn, free_port: int):
+def test_clients_exchange_samples_through_a_router_process(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     client = repr({"mode": "client", "endpoints": endpoint})
     router = started(spawn(ROUTER, endpoint))
@@ -133,7 +133,7 @@ def test_clients_meet_through_a_router_process(spawn, free_port: int):
         interrupt(child)
 
 
-def test_everything_ends_within_a_second_when_the_router_died_first(spawn, free_port: int):
+def test_processes_end_within_a_second_after_the_router_died(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     client = repr({"mode": "client", "endpoints": endpoint})
     router = started(spawn(ROUTER, endpoint))
@@ -144,7 +144,7 @@ def test_everything_ends_within_a_second_when_the_router_died_first(spawn, free_
     interrupt(listener)
 
 
-def test_clients_go_on_when_their_router_comes_back(spawn, free_port: int):
+def test_clients_continue_after_their_router_restarts(spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     client = repr({"mode": "client", "endpoints": endpoint})
     router = started(spawn(ROUTER, endpoint))
@@ -161,7 +161,7 @@ def test_clients_go_on_when_their_router_comes_back(spawn, free_port: int):
         assert time.monotonic() < deadline
 
 
-def test_two_robots_of_two_processes_stand_in_one_buffer(spawn):
+def test_one_buffer_holds_two_robots_of_two_processes(spawn):
     for robot in ("r1", "r2"):
         started(spawn(PUBLISHER, robot, PEER))
     listener = started(spawn(LISTENER, PEER))
@@ -169,7 +169,7 @@ def test_two_robots_of_two_processes_stand_in_one_buffer(spawn):
     assert ask(listener, "r2") > 0
 
 
-def test_a_killed_and_restarted_publisher_is_followed_and_the_other_robot_untouched(spawn):
+def test_restarted_publisher_is_received_again_and_other_robots_are_unaffected(spawn):
     with connect() as session, TransformListener(session) as listener:
         buffer = listener.buffer
         killed = started(spawn(PUBLISHER, "r1", PEER))
@@ -184,9 +184,9 @@ def test_a_killed_and_restarted_publisher_is_followed_and_the_other_robot_untouc
         killed.kill()
         killed_at = time.time_ns()
         again = started(spawn(PUBLISHER, "r1", PEER))
-        # A new epoch for r1: nothing is kept that the old one said, though its history is 10 s.
+        # A new epoch for r1: no sample of the old writer is kept, although the history is 10 s.
         until(lambda: (lower("r1").oldest or 0) > killed_at, timeout_s=5.0)
-        # Of r2 all is kept; what it said before it was heard may have been learned since.
+        # All samples of r2 are kept; earlier ones may have been back-filled since.
         assert 0 < (lower("r2").oldest or 0) <= (oldest or 0)
         until(lambda: f"pid {again.process.pid}" in (lower("r1").writer or ""))
         stats = listener.stats
@@ -194,9 +194,9 @@ def test_a_killed_and_restarted_publisher_is_followed_and_the_other_robot_untouc
         assert listener.robots() == ("r1", "r2")
 
 
-def test_a_wait_for_somebody_who_never_comes_can_be_interrupted(spawn):
+def test_wait_for_a_missing_robot_can_be_interrupted(spawn):
     child = started(spawn(WAITER))
-    # Python loses a signal that falls between its last look and the wait itself; that is not the claim.
+    # Python loses a signal between its last check and the wait itself; that is not tested here.
     asleep = Path(f"/proc/{child.process.pid}/stat")
     looks: list[bool] = []
     until(lambda: looks.append(") S " in asleep.read_text()) or (len(looks) >= 20 and all(looks[-20:])))
@@ -204,7 +204,7 @@ def test_a_wait_for_somebody_who_never_comes_can_be_interrupted(spawn):
 
 
 @pytest.mark.parametrize("frozen", ["publisher", "listener"])
-def test_a_frozen_neighbour_does_not_hold_anybody_up(spawn, frozen: str):
+def test_frozen_process_does_not_block_others(spawn, frozen: str):
     publisher = started(spawn(PUBLISHER, "r1", PEER))
     listener = started(spawn(LISTENER, PEER))
     ask(listener)
@@ -214,9 +214,9 @@ def test_a_frozen_neighbour_does_not_hold_anybody_up(spawn, frozen: str):
     interrupt(other)
 
 
-def test_an_unreachable_router_is_said_in_one_line_with_what_to_do(spawn, free_port: int):
+def test_unreachable_router_error_is_one_line_with_the_remedy(spawn, free_port: int):
     child = spawn(UNREACHABLE, f"tcp/127.0.0.1:{free_port}")
-    said = child.line()
-    assert said.startswith(f"True nothing answers at 'tcp/127.0.0.1:{free_port}'")
-    assert "zstate router" in said
+    message = child.line()
+    assert message.startswith(f"True nothing answers at 'tcp/127.0.0.1:{free_port}'")
+    assert "zstate router" in message
     assert (child.wait(), child.stderr) == (0, "")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.processes import until
 from helpers.raw_ros_nodes import JOINT_STATES, key_of
-from helpers.robots import await_reader, settle
+from helpers.robots import wait_for_reader, wait_for_stream_readers
 
 from zstate import SineSource, StatePublisher, Transform, TransformBuffer, load_model
 from zstate.recording.recorder import Recorder
@@ -143,7 +143,7 @@ def test_recording_is_a_source_without_a_session(sessions, tmp_path: Path):
     writing, reading = sessions
     file = tmp_path / "one.mcap"
     with Recorder(reading, file) as recorder, StatePublisher(writing, MODEL, "r1") as publisher:
-        settle(writing, "r1")
+        wait_for_stream_readers(writing, "r1")
         sine = SineSource(MODEL)
         stamps = [publisher.publish(sine.read(n * SECOND).positions) for n in range(3)]
         assert stamps
@@ -160,7 +160,7 @@ def test_robots_of_the_ros2_wire_format_are_received(sessions, monkeypatch: pyte
         StatePublisher(sessions[0], MODEL, wires="ros2") as publisher,
         ViewSource(sessions[1], wire="ros2") as source,
     ):
-        await_reader(sessions[0], key_of(JOINT_STATES))
+        wait_for_reader(sessions[0], key_of(JOINT_STATES))
         publisher.publish([0.5, -0.5])
         until(lambda: source.snapshot().stamp is not None)
         assert [model.digest for model in source.models.values()] == [MODEL.digest]

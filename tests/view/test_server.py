@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("viser")
 
 import viser
-from helpers.processes import SOON_S, a_free_port, until
+from helpers.processes import SOON_S, find_free_port, until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -125,7 +125,7 @@ def test_server_closes_soon_with_an_unresponsive_browser():
 
 
 def test_taken_port_is_an_error_and_the_default_is_the_next_free_one():
-    with ViewServer(port=a_free_port()) as first:
+    with ViewServer(port=find_free_port()) as first:
         with pytest.raises(InvalidInput, match=f"port {first.port} is taken"):
             ViewServer(port=first.port)
         with ViewServer() as second, ViewServer() as third:

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from helpers.processes import SOON_S, until
-from helpers.robots import RRBOT, Tap
+from helpers.robots import RRBOT, SampleCollector
 
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
@@ -45,7 +45,7 @@ def test_sliders_start_at_zero_or_in_the_middle_of_limits_without_zero(arm):
 
 
 def test_slider_value_is_published(arm, sessions):
-    tap = Tap(sessions[1], "zstate/arm1/joint_states")
+    tap = SampleCollector(sessions[1], "zstate/arm1/joint_states")
     arm.set("bent", 1.25)
     until(lambda: any(from_block(state.positions)[0] == 1.25 for state in tap.joint_states(1)))
     tap.close()

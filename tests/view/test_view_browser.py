@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from helpers.processes import DEADLINE_S, again_and_again, until
+from helpers.processes import DEADLINE_S, repeated, until
 from numpy.typing import NDArray
 
 from zstate import StatePublisher, load_model
@@ -37,7 +37,7 @@ def standing(session: Session, robot: str) -> Iterator[None]:
     model = load_model(robot)
     with (
         StatePublisher(session, model, robot) as publisher,
-        again_and_again(lambda: publisher.publish(model.neutral), every_s=0.05),
+        repeated(lambda: publisher.publish(model.neutral), every_s=0.05),
     ):
         yield
 

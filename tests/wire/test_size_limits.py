@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 
 import pytest
-from helpers.processes import again_and_again, until
-from helpers.robots import RRBOT, settle
+from helpers.processes import repeated, until
+from helpers.robots import RRBOT, wait_for_stream_readers
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.errors import MessageError
@@ -88,14 +88,14 @@ def test_too_large_messages_are_counted_and_later_ones_are_inserted(sessions):
         for size in (300_000, 5_000_000):
             # Zenoh drops samples of a stream rather than wait for a busy link.
             before = refused()
-            with again_and_again(partial(stranger.put, bytes(size)), every_s=0.1):
+            with repeated(partial(stranger.put, bytes(size)), every_s=0.1):
                 until(lambda: refused() > before)  # noqa: B023
         before = refused()
         mount.set(bytes(1_100_000))
         mount.set(bytes(17_000_000))
         until(lambda: refused() >= before + 2)
         assert set(listener.stats.refused) == {"too large"}
-        settle(writer, "r1")
+        wait_for_stream_readers(writer, "r1")
         publisher.publish([0.5, 0.5])
         # What was latched before still holds: the value was not withdrawn.
         listener.buffer.wait("r1/world", "r1/camera", timeout_s=5.0)

@@ -1,8 +1,8 @@
-"""Lookups in zstate's buffer and in others, filled with the same motion.
+"""Lookups in zstate's buffer and other transform buffers, filled with the same motion.
 
     python -m bench.micro.lookup [ROW...]
 
-Each buffer is a process of its own; they take turns, so that a slow moment of the machine hits all of them.
+Each buffer is a separate process; they are interleaved, so that a slow moment of the machine affects all.
 Figures are us of thread CPU time for each call, median and 99th percentile over rounds of means of 50 calls.
 See bench/README.md.
 """
@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 import zstate
-from bench.micro.lookup.worlds import FIRST, World, worlds
+from bench.micro.lookup.motions import FIRST, RecordedMotion, recorded_motions
 
 HERE = Path(__file__).parent
 MISSING = "missing"
@@ -35,7 +35,7 @@ class Row:
     """One line of the table."""
 
     what: str
-    world: str
+    motion: str
     case: str
     stamps: str = "anywhere"
     per_call: int = 1
@@ -57,13 +57,13 @@ ROWS = (
 )
 
 SYSTEMS = {
-    "zstate": ([sys.executable, "-m", "bench.micro.lookup.of_zstate"], "pip install -e ."),
+    "zstate": ([sys.executable, "-m", "bench.micro.lookup.zstate_buffer"], "pip install -e ."),
     "transform-tree": (
-        [sys.executable, "-m", "bench.micro.lookup.of_tf_tree"],
+        [sys.executable, "-m", "bench.micro.lookup.transform_tree_buffer"],
         "pip install transform-tree==0.0.9",
     ),
     "tf2": (
-        ["/usr/bin/python3", str(HERE / "of_tf2.py")],
+        ["/usr/bin/python3", str(HERE / "tf2_buffer.py")],
         "apt-get install -y --no-install-recommends python3-tf2 python3-tf2-ros",
     ),
 }
@@ -77,12 +77,12 @@ class Worker:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
 
-    def ask(self, world: Path, case: str, stamps: list[int]) -> list[float] | str:
-        """Times of a round [us], or why there are none."""
+    def measure(self, motion: Path, case: str, stamps: list[int]) -> list[float] | str:
+        """Times of a round [us], or the reason if there are none."""
         assert self._process.stdin and self._process.stdout
         try:
             self._process.stdin.write(
-                json.dumps({"world": str(world), "case": case, "stamps": stamps}) + "\n"
+                json.dumps({"motion": str(motion), "case": case, "stamps": stamps}) + "\n"
             )
             self._process.stdin.flush()
         except BrokenPipeError:
@@ -91,41 +91,43 @@ class Worker:
         return json.loads(line) if line else MISSING
 
     def close(self) -> None:
-        """End it."""
+        """Kills the process."""
         assert self._process.stdin
         self._process.kill()
         self._process.wait()
 
 
-def stamps_of(row: Row, world: World, rng: np.random.Generator) -> list[int]:
-    """When to ask."""
+def stamps_of(row: Row, motion: RecordedMotion, rng: np.random.Generator) -> list[int]:
+    """The stamps to look up."""
     if row.stamps == "newest":
-        return [world.end] * STAMPS
+        return [motion.end] * STAMPS
     if row.stamps == "samples":
-        return (FIRST + rng.integers(0, world.count, STAMPS) * world.step).tolist()
-    return rng.integers(FIRST, world.end, STAMPS).tolist()
+        return (FIRST + rng.integers(0, motion.count, STAMPS) * motion.step).tolist()
+    return rng.integers(FIRST, motion.end, STAMPS).tolist()
 
 
-def measure(row: Row, world: World, path: Path, workers: dict[str, Worker]) -> dict[str, list[float] | str]:
+def measure(
+    row: Row, motion: RecordedMotion, path: Path, workers: dict[str, Worker]
+) -> dict[str, list[float] | str]:
     """Times of all rounds of each buffer [us]."""
     rng = np.random.default_rng(11)
     times: dict[str, list[float] | str] = {name: [] for name in workers}
     for number in range(1 if row.case == "memory" else ROUNDS + 1):
-        stamps = stamps_of(row, world, rng)
+        stamps = stamps_of(row, motion, rng)
         for name, worker in workers.items():
-            known = times[name]
-            if isinstance(known, str):
+            earlier = times[name]
+            if isinstance(earlier, str):
                 continue
-            round_ = worker.ask(path, row.case, stamps)
+            round_ = worker.measure(path, row.case, stamps)
             if isinstance(round_, str):
                 times[name] = round_
             elif number or row.case == "memory":  # the first round warms up
-                known.extend(value / row.per_call for value in round_)
+                earlier.extend(value / row.per_call for value in round_)
     return times
 
 
 def cell(times: list[float] | str, ours: list[float] | str) -> str:
-    """Median, 99th percentile and how often our median goes into theirs."""
+    """Median, 99th percentile and the ratio of the median to that of zstate."""
     if isinstance(times, str):
         return MISSING if times == MISSING else "refused"
     if not times:
@@ -138,17 +140,17 @@ def cell(times: list[float] | str, ours: list[float] | str) -> str:
 def main() -> None:
     """Print the table."""
     chosen = [row for row in ROWS if not sys.argv[1:] or any(word in row.what for word in sys.argv[1:])]
-    known = worlds()
+    motions = recorded_motions()
     print(f"zstate {zstate.__version__} ({zstate.kernel}), Python {platform.python_version()}, ", end="")
     print(f"numpy {version('numpy')}, {platform.machine()}; median and p99 in us, ratio to zstate")
     print(f"{'':<40}" + "".join(f"{name:>28}" for name in SYSTEMS))
     missing: set[str] = set()
     with tempfile.TemporaryDirectory() as folder:
         for row in chosen:
-            world = known[row.world]
-            path = world.write(Path(folder))
+            motion = motions[row.motion]
+            path = motion.write(Path(folder))
             workers = {name: Worker(command) for name, (command, _) in SYSTEMS.items()}
-            times = measure(row, world, path, workers)
+            times = measure(row, motion, path, workers)
             for worker in workers.values():
                 worker.close()
             missing |= {name for name, values in times.items() if values == MISSING}

@@ -1,4 +1,4 @@
-"""A buffer in a process of its own, asked by ``bench.micro.lookup`` over pipes. Standard library only."""
+"""A process with one buffer, measured by ``bench.micro.lookup`` over pipes. Standard library only."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 CHUNK = 50
 
 
-class Recorded:
-    """A world as it was written, read without numpy."""
+class MotionFile:
+    """A motion written by ``RecordedMotion.write``, read without numpy."""
 
     def __init__(self, path: str) -> None:
         self.path = Path(path)
@@ -29,20 +29,20 @@ class Recorded:
         return [self.first + n * self.step for n in range(self.count)]
 
     def doubles(self, kind: str) -> Any:
-        """All positions, or all poses of the moving edges, one after the other."""
+        """All positions, or all poses of the moving edges, as one array."""
         numbers = array.array("d")
         numbers.frombytes(self.path.with_suffix(f".{kind}").read_bytes())
         return numbers
 
 
 def resident_mb() -> float:
-    """How much memory this process has in use."""
+    """Resident memory of this process [MB]."""
     with open("/proc/self/statm") as statm:  # noqa: PTH123 - as short as it gets
         return int(statm.read().split()[1]) * resource.getpagesize() / 1e6
 
 
-def times_of(call: Any, arguments: list[Any]) -> list[float]:
-    """us of thread CPU time for each call, in means over chunks: one call is shorter than the clock's own."""
+def call_times_us(call: Any, arguments: list[Any]) -> list[float]:
+    """Thread CPU time per call [us], as means over chunks: one call is shorter than reading the clock."""
     times = []
     for start in range(0, len(arguments), CHUNK):
         chunk = arguments[start : start + CHUNK]
@@ -54,11 +54,11 @@ def times_of(call: Any, arguments: list[Any]) -> list[float]:
 
 
 def serve(system: Any) -> None:
-    """Answer requests until there are no more.
+    """Serves requests until the input ends.
 
     ``system`` has ``read(recorded) -> samples``, ``fill(recorded, samples) -> state``, and for each case a
-    method of that name, which takes the state and a list of stamps and returns a callable and what to call
-    it with.
+    method of that name, which takes the state and a list of stamps and returns a callable and the list of
+    its arguments.
     """
     state, used_mb = None, 0.0
     for line in sys.stdin:
@@ -66,7 +66,7 @@ def serve(system: Any) -> None:
         case = getattr(system, request["case"], None)
         try:
             if state is None:
-                recorded = Recorded(request["world"])
+                recorded = MotionFile(request["motion"])
                 samples = system.read(recorded)
                 before = resident_mb()
                 state = system.fill(recorded, samples)
@@ -74,7 +74,7 @@ def serve(system: Any) -> None:
             if request["case"] == "memory":
                 reply: Any = [used_mb]
             else:
-                reply = times_of(*case(state, request["stamps"])) if case else []
+                reply = call_times_us(*case(state, request["stamps"])) if case else []
         except Exception as error:
             reply = str(error)
         print(json.dumps(reply), flush=True)

@@ -12,8 +12,8 @@ from helpers.ros1_processes import (
     DEBIAN_PYTHON,
     ROS_PEER,
     TF2_LISTENER,
-    Peer,
     Roscore,
+    RosPeer,
     Spawn,
     ros_environment,
 )
@@ -49,15 +49,15 @@ def ready(spawn: Spawn, code: str, *arguments: str) -> Child:
 
 
 @pytest.fixture
-def peer(namespace: str, spawn: Spawn) -> Callable[..., Peer]:
+def peer(namespace: str, spawn: Spawn) -> Callable[..., RosPeer]:
     """``peer()`` is a publisher node, ``peer("hear")`` also subscribes."""
-    return lambda *arguments: Peer(ready(spawn, ROS_PEER, *arguments))
+    return lambda *arguments: RosPeer(ready(spawn, ROS_PEER, *arguments))
 
 
 @pytest.fixture
-def tf2_listener(namespace: str, spawn: Spawn) -> Callable[[], Peer]:
+def tf2_listener(namespace: str, spawn: Spawn) -> Callable[[], RosPeer]:
     """``tf2_listener().ask(target, source, stamp, wait_s)`` asks the real tf2_ros."""
-    return lambda: Peer(ready(spawn, TF2_LISTENER))
+    return lambda: RosPeer(ready(spawn, TF2_LISTENER))
 
 
 @pytest.fixture

@@ -21,18 +21,18 @@ from helpers.ros1_processes import (
     JOINTS,
     RRBOT,
     STATE_PUBLISHER,
-    Peer,
     Roscore,
+    RosPeer,
     Spawn,
+    missing_ros_reason,
     ros_environment,
-    why_no_ros,
 )
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
 from zstate.bridges.ros1.node import Master
 from zstate.sources import SubscribedSource
 
-pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(why_no_ros()), reason=why_no_ros())]
+pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(missing_ros_reason()), reason=missing_ros_reason())]
 
 Bridge = Callable[..., Child]
 MODEL = load_model(RRBOT)
@@ -47,8 +47,8 @@ def swing(stamp: int) -> list[float]:
     return [0.5 * math.sin(1.5 * t), -0.3 + 0.4 * math.cos(t)]
 
 
-def publish_joints(talker: Peer, stamp: int) -> None:
-    talker.ask("joints", stamp, JOINTS, swing(stamp))
+def publish_joints(talker: RosPeer, stamp: int) -> None:
+    talker.query("joints", stamp, JOINTS, swing(stamp))
 
 
 def answer(listener: TransformListener, target: str, source: str) -> Transform | None:
@@ -69,7 +69,7 @@ def interrupted(child: Child) -> None:
     assert "Traceback" not in child.stderr
 
 
-def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_listener: Callable[[], Peer]):
+def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_listener: Callable[[], RosPeer]):
     listening = tf2_listener()
     with (
         connect() as session,
@@ -88,24 +88,24 @@ def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_liste
             return stamp
 
         # Only after the first sample the connection is complete.
-        until(lambda: isinstance(listening.ask("base", "probe", goes_on(), 0.02), list))
+        until(lambda: isinstance(listening.query("base", "probe", goes_on(), 0.02), list))
         begin = stamp
         end = [goes_on() for _ in range(50)][-1]
         for at in range(begin, end, 17_000_003):
-            theirs, at_theirs = listening.ask("world", "probe", at, 5.0)
+            theirs, at_theirs = listening.query("world", "probe", at, 5.0)
             ours = listener.buffer.lookup("world", "probe", at, timeout_s=5.0)
             assert_same_pose(theirs, ours.pose7.tolist(), NOETIC)
             # Noetic's Python asks at float seconds.
             assert abs(at_theirs - at) < 1_000
         # Whoever comes late has the edges that never move, of the model and of others.
-        theirs, _ = tf2_listener().ask("lower", "probe", 0, 5.0)
+        theirs, _ = tf2_listener().query("lower", "probe", 0, 5.0)
         assert_same_pose(theirs, listener.buffer.lookup("lower", "probe").pose7.tolist(), 1e-12)
         interrupted(carrying)
         assert carrying.line().endswith(" samples to ROS, 0 from there")
 
 
 def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
-    bridge: Bridge, peer: Callable[..., Peer], program: Bridge, namespace: str
+    bridge: Bridge, peer: Callable[..., RosPeer], program: Bridge, namespace: str
 ):
     Master().set_parameter(f"{namespace}/robot_description", RRBOT.read_text())
     program(str(STATE_PUBLISHER), "_publish_frequency:=1000", "_ignore_timestamp:=true")
@@ -117,11 +117,11 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
         lookup = listener.buffer.lookup
         # In ROS the newest parent of a child counts, and its newest pose.
         for parent, pose in (("lower", identity), ("tool", identity), ("tool", probe.pose7.tolist())):
-            talker.ask("edge", "/tf_static", parent, "probe", pose)
+            talker.query("edge", "/tf_static", parent, "probe", pose)
             placed = Transform.from_pose7(parent, "probe", pose)
             until(lambda placed=placed: answer(listener, placed.target, "probe") == placed)
-        talker.ask("edge", "/tf", "odom", "world", identity)
-        until(lambda: talker.ask("readers") == 3)  # the state publisher, the other node, and the bridge
+        talker.query("edge", "/tf", "odom", "world", identity)
+        until(lambda: talker.query("readers") == 3)  # the state publisher, the other node, and the bridge
         stamps: list[int] = []
 
         def have_met() -> bool:
@@ -130,7 +130,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
             return listener.buffer.can_lookup("world", "probe") and len(stamps) > 50
 
         until(have_met)
-        until(lambda: listening.listen() or ("upper", "lower", stamps[-1]) in listening.edges)
+        until(lambda: listening.collect() or ("upper", "lower", stamps[-1]) in listening.edges)
         listener.buffer.wait("world", "tool", stamps[-1], 5.0)
         compared = [key for key in listening.edges if listener.buffer.can_lookup(*key)]
         assert len(compared) >= 20
@@ -150,7 +150,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
     assert carrying.stderr.count("odom") == 1
 
 
-def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., Peer]):
+def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., RosPeer]):
     listening, talker = peer("hear"), peer()
     carrying = bridge("--to-ros", "--from-ros")
     in_zstate: Counter[int] = Counter()
@@ -197,7 +197,7 @@ def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., P
     assert "refused" not in carrying.stderr
 
 
-def test_two_bridges_of_one_robot_make_no_loop(bridge: Bridge, peer: Callable[..., Peer]):
+def test_two_bridges_of_one_robot_make_no_loop(bridge: Bridge, peer: Callable[..., RosPeer]):
     listening = peer("hear")
     bridge("--to-ros")
     back = bridge("--from-ros", "--model", str(RRBOT))
@@ -213,7 +213,7 @@ def test_two_bridges_of_one_robot_make_no_loop(bridge: Bridge, peer: Callable[..
 
 
 def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
-    bridge: Bridge, peer: Callable[..., Peer], namespace: str
+    bridge: Bridge, peer: Callable[..., RosPeer], namespace: str
 ):
     listening = peer("hear")
     bridge("--to-ros", "--frame-prefix", "left_")
@@ -224,7 +224,7 @@ def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
         def is_complete() -> bool:
             sent.add(stamp := next(stamps))
             publisher.publish([0.25, -1.5], [0.5, 1.0], [7.0, -8.0], stamp)
-            listening.listen()
+            listening.collect()
             return bool(listening.joints and listening.edges)
 
         until(is_complete)
@@ -234,24 +234,24 @@ def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
     edges = {(parent, child) for parent, child, _ in listening.edges}
     assert edges == {("left_base", "left_upper"), ("left_upper", "left_lower")}
     # Set by the thread that receives the model, not by the one that carries samples.
-    until(lambda: listening.ask("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
+    until(lambda: listening.query("parameter", f"{namespace}/robot_description") == RRBOT.read_text())
 
 
-def test_unusable_messages_are_counted_and_logged_once(bridge: Bridge, peer: Callable[..., Peer]):
+def test_unusable_messages_are_counted_and_logged_once(bridge: Bridge, peer: Callable[..., RosPeer]):
     talker = peer()
     carrying = bridge("--from-ros", "--model", str(RRBOT))
-    until(lambda: talker.ask("readers") == 1)
+    until(lambda: talker.query("readers") == 1)
     with connect() as session, TransformListener(session, "rrbot") as listener:
         for _ in range(2):
-            talker.ask("joints", 0, JOINTS, [0.0, 0.0])
-            talker.ask("joints", S, JOINTS, [0.0, math.nan])
-            talker.ask("joints", S, ["shoulder"], [0.0])
-            talker.ask("joints", S, JOINTS, [0.0])
+            talker.query("joints", 0, JOINTS, [0.0, 0.0])
+            talker.query("joints", S, JOINTS, [0.0, math.nan])
+            talker.query("joints", S, ["shoulder"], [0.0])
+            talker.query("joints", S, JOINTS, [0.0])
         # It continues; joints that are not in the model are left out.
         stamps = iter(range(2 * S, 3 * S))
 
         def is_carried() -> bool:
-            talker.ask("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
+            talker.query("joints", next(stamps), ["wheel", *reversed(JOINTS)], [9.0, 0.1, 0.2])
             return listener.buffer.can_lookup("world", "tool")
 
         until(is_carried)

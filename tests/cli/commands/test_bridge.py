@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started
 
 from zstate import TransformListener, connect, load_model
 from zstate.model.kinematics import Kinematics
@@ -27,7 +27,7 @@ def test_native_robot_is_carried_to_ros_with_a_line_at_start_and_end(
         connect(mode="client", endpoints=ros) as session,
         TransformListener(session, "rrbot", wire=wire) as listener,
     ):
-        with standing():
+        with published_robot():
             command = started(spawn, "bridge", *given, "--ros", ros)
             assert command.line().startswith(f"bridging {'every robot' if wire == EACH else repr('rrbot')} ")
             assert command.line() == "carrying 'rrbot': native to ROS"
@@ -51,7 +51,7 @@ def test_ros_robot_is_carried_to_native(spawn: Spawn, ros: str):
 
 
 def test_several_robots_do_not_share_the_root_namespace(ros: str):
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         message = failure("bridge", "--ros", ros)
     assert "room for one robot, not for 'left' and 'right'" in message
     assert "zstate bridge panda" in message

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
-from helpers.processes import a_free_port
+from helpers.processes import find_free_port
 
 from zstate import connect
 from zstate.errors import AccessDenied
@@ -104,13 +104,13 @@ def test_only_server_certificates_can_listen(tmp_path):
     )
     router, peer, r1 = (Credentials.from_folder(folder, name) for name in ("router", "peer", "r1"))
     for credentials in (router, peer):
-        endpoint = f"tls/127.0.0.1:{a_free_port()}"
+        endpoint = f"tls/127.0.0.1:{find_free_port()}"
         with (
             connect(mode="router", listen=endpoint, credentials=credentials),
             connect(mode="client", endpoints=endpoint, credentials=r1) as client,
         ):
             assert list(client.zenoh.info.routers_zid())
-    endpoint = f"tls/127.0.0.1:{a_free_port()}"
+    endpoint = f"tls/127.0.0.1:{find_free_port()}"
     with (
         connect(mode="router", listen=endpoint, credentials=r1),
         pytest.raises(AccessDenied, match="one to connect with, not to listen") as caught,

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import failure, standing, zstate
+from helpers.cli_runner import failure, published_robot, zstate
 from helpers.processes import until
 
 pytestmark = pytest.mark.processes
@@ -47,7 +47,7 @@ def test_completion_offers_models_by_name_and_files():
 
 
 def test_robots_are_offered_that_are_announced():
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         assert offered("tree", "le") == ["plain,left"]
         assert offered("snapshot", "save", "a.toml", "r") == ["plain,right"]
 
@@ -127,7 +127,7 @@ def test_tab_completes_commands_options_robots_and_files(
 ):
     (tmp_path / "cell.toml").touch()
     monkeypatch.chdir(tmp_path)
-    with standing("lefty"), Typist(*shell) as typist:
+    with published_robot("lefty"), Typist(*shell) as typist:
         typist.completed("zstate sn", "zstate snapshot ")
         typist.completed("zstate check --f", "zstate check --fix-hints ")
         typist.completed("zstate tree le", "zstate tree lefty ")
@@ -141,7 +141,7 @@ def test_fish_is_offered_the_same_with_all_of_the_help(tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     lines = ("sn", "check --f", "tree le", "publish rr", "up ce")
     asked = "; ".join(f"complete -C 'zstate {line}'" for line in lines)
-    with standing("lefty"):
+    with published_robot("lefty"):
         completed = subprocess.run(
             ["fish", "--no-config", "-c", f"zstate completion fish | source; {asked}"],
             env=with_zstate(),

@@ -9,9 +9,9 @@ from math import nan
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import DEADLINE_S, until
-from helpers.robots import Tap, await_reader
+from helpers.robots import SampleCollector, wait_for_reader
 
 from zstate import connect
 from zstate.cli.output.joint_state_text import ChangeFilter
@@ -30,7 +30,7 @@ FLOATING = """
 
 
 def test_a_joint_state_is_a_yaml_document():
-    with standing(velocities=(0.25, 0.0)):
+    with published_robot(velocities=(0.25, 0.0)):
         lines = zstate("echo", "rrbot", "--once").stdout.decode().splitlines()
     assert lines[0].startswith("stamp: 1")
     assert lines[1].startswith("seq: ")
@@ -47,14 +47,14 @@ def test_a_joint_state_is_a_yaml_document():
 
 def test_documents_follow_each_other_until_ctrl_c(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "seq")
-    with standing():
+    with published_robot():
         first = int(command.line())
         assert [int(command.line()) for _ in range(20)] == list(range(first + 1, first + 21))
         interrupted(command)
 
 
 def test_json_is_one_object_a_line():
-    with standing():
+    with published_robot():
         document = json.loads(zstate("echo", "rrbot", "--once", "--json").stdout)
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
     assert "velocities" not in document
@@ -62,7 +62,7 @@ def test_json_is_one_object_a_line():
 
 def test_csv_has_one_line_of_names(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--csv")
-    with standing():
+    with published_robot():
         names, first, second = csv.reader([command.line() for _ in range(3)])
     assert names == ["stamp", "seq", "positions.shoulder", "positions.elbow"]
     assert first[2:] == second[2:] == [str(SHOULDER), str(ELBOW)]
@@ -74,19 +74,19 @@ def test_csv_has_one_line_of_names(spawn: Spawn):
     [("elbow", f"{ELBOW}"), ("positions.shoulder", f"{SHOULDER}"), ("velocities.elbow", "0.125")],
 )
 def test_a_field_is_printed_alone(field: str, printed: str):
-    with standing(velocities=(0.0, 0.125)):
+    with published_robot(velocities=(0.0, 0.125)):
         assert zstate("echo", "rrbot", "--once", "--field", field).stdout.decode() == f"{printed}\n"
 
 
 def test_changed_prints_only_changed_documents(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--changed", "--json")
-    with standing():
+    with published_robot():
         first = json.loads(command.line())
         with connect() as reader:
-            settle = Tap(reader, "zstate/rrbot/joint_states")
+            settle = SampleCollector(reader, "zstate/rrbot/joint_states")
             settle.payloads(20)
             settle.close()
-    with standing(positions=(SHOULDER, 0.25)):
+    with published_robot(positions=(SHOULDER, 0.25)):
         second = json.loads(command.line())
     assert first["positions"]["elbow"] == ELBOW
     assert second["positions"] == {"shoulder": SHOULDER, "elbow": 0.25}
@@ -113,7 +113,7 @@ def test_an_amount_that_is_none_is_wrong_usage(amount: str):
 
 
 def test_unknown_field_error_lists_the_fields():
-    with standing():
+    with published_robot():
         message = failure("echo", "rrbot", "--once", "--field", "elbo")
     assert "did you mean 'elbow'?" in message
     assert "joints: shoulder, elbow" in message
@@ -124,14 +124,14 @@ def test_a_floating_joint_has_its_seven_numbers_together(tmp_path: Path):
     model.write_text(FLOATING)
     pose = (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
     rates = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-    with standing("drone", (*pose, 0.75), velocities=(*rates, 0.7), model=str(model)):
+    with published_robot("drone", (*pose, 0.75), velocities=(*rates, 0.7), model=str(model)):
         document = json.loads(zstate("echo", "drone", "--once", "--json").stdout)
     assert document["positions"] == {"flight": list(pose), "swing": 0.75}
     assert document["velocities"] == {"flight": list(rates), "swing": 0.7}
 
 
 def test_without_a_description_the_numbers_come_without_names():
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         ended = zstate("echo", "rrbot", "--once", "--json")
     assert json.loads(ended.stdout)["positions"] == [SHOULDER, ELBOW]
     assert b"`zstate publish rrbot` publishes it" in ended.stderr
@@ -140,21 +140,21 @@ def test_without_a_description_the_numbers_come_without_names():
 def test_echo_waits_for_a_robot_and_prints_the_reason(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
-    with standing():
+    with published_robot():
         assert command.line() == str(ELBOW)
     assert "received zstate/rrbot/joint_states" in command.stderr
     interrupted(command)
 
 
 def test_once_gives_up_with_the_reason():
-    with standing(streams=("robot_description",)):
+    with published_robot(streams=("robot_description",)):
         message = failure("echo", "rrbot", "--once", "--timeout", "1")
     assert "zstate: gave up after 1 s: joint_states of 'rrbot' has no writer" in message
 
 
 def test_sigterm_ends_it_as_well(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
-    with standing():
+    with published_robot():
         command.line()
         command.process.send_signal(signal.SIGTERM)
         assert command.wait(2.0) == 128 + signal.SIGTERM
@@ -162,7 +162,10 @@ def test_sigterm_ends_it_as_well(spawn: Spawn):
 
 def test_a_reader_that_leaves_ends_it_quietly():
     command = [sys.executable, "-m", "zstate", "echo", "rrbot"]
-    with standing(), subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with (
+        published_robot(),
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process,
+    ):
         assert process.stdout
         assert process.stderr
         process.stdout.readline()
@@ -173,9 +176,9 @@ def test_a_reader_that_leaves_ends_it_quietly():
 
 def test_undecodable_messages_are_reported_once_and_skipped(spawn: Spawn):
     command = started(spawn, "echo", "rrbot", "--field", "elbow")
-    with standing(), connect() as stranger:
+    with published_robot(), connect() as stranger:
         command.line()
-        await_reader(stranger, "zstate/rrbot/joint_states")
+        wait_for_reader(stranger, "zstate/rrbot/joint_states")
         for _ in range(3):
             stranger.zenoh.put("zstate/rrbot/joint_states", b"hello", encoding="text/plain")
         until(lambda: "text/plain" in command.stderr)
@@ -189,14 +192,14 @@ def test_a_name_that_no_robot_can_have_is_refused():
 
 
 def test_the_robot_may_be_left_out_while_there_is_only_one():
-    with standing():
+    with published_robot():
         assert b"elbow" in zstate("echo", "--once").stdout
         assert zstate("hz", "--once").stdout.startswith(b"average rate: ")
 
 
 @pytest.mark.parametrize("command", ["echo", "hz"])
 def test_with_several_robots_the_candidates_are_named(command: str):
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         assert "which robot? announced: 'left', 'right'" in failure(command, "--once")
 
 

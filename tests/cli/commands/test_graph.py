@@ -6,7 +6,7 @@ import socket
 from xml.etree import ElementTree
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, standing, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import StaticPublisher, TransformListener, connect, discover
@@ -54,7 +54,7 @@ def test_drawings_have_nodes_for_programs_and_stream_groups_and_edges_for_uses()
 @pytest.mark.processes
 def test_writers_and_readers_of_a_robot_are_seen_with_rates():
     here = f"@{socket.gethostname()} pid {os.getpid()}"
-    with standing(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
+    with published_robot(), connect() as session, TransformListener(session, "rrbot", follow="tf"):
         until(lambda: discover(session))
         facts = json.loads(zstate("graph", "--json").stdout)
     streams = {one["stream"]: one for one in facts["streams"]}
@@ -80,7 +80,7 @@ def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
     with (
         connect() as session,
         StaticPublisher(session, "left", "mount"),
-        standing("right"),
+        published_robot("right"),
         TransformListener(session),
     ):
         text = zstate("graph").stdout.decode()
@@ -90,7 +90,7 @@ def test_reader_of_all_robots_appears_at_each_and_static_writers_have_names():
 
 @pytest.mark.processes
 def test_unknown_robot_is_an_error_but_an_empty_network_is_not():
-    with standing():
+    with published_robot():
         assert "did you mean 'rrbot'?" in failure("graph", "rbot")
     ended = zstate("graph")
     assert (ended.returncode, ended.stdout) == (0, b"")
@@ -99,7 +99,7 @@ def test_unknown_robot_is_an_error_but_an_empty_network_is_not():
 
 @pytest.mark.processes
 def test_on_ros_side_topics_have_the_nodes_at_their_ends(ros_router: str):
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         text = zstate("graph").stdout.decode()
     assert text.splitlines()[0] == "/joint_states, /robot_description, /tf, /tf_static"
     assert text.count("written by  /") == 1

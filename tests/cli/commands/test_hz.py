@@ -4,7 +4,7 @@ import json
 import re
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 pytestmark = pytest.mark.processes
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.processes
 
 def test_hz_prints_rostopic_style_figures_once_a_second(spawn: Spawn):
     command = started(spawn, "hz", "rrbot")
-    with standing():
+    with published_robot():
         assert re.fullmatch(r"average rate: \d+\.\d{3}", command.line())
         assert re.fullmatch(
             r"\tmin: \d+\.\d{3}s max: \d+\.\d{3}s std dev: \d+\.\d{5}s window: \d+", command.line()
@@ -24,7 +24,7 @@ def test_hz_prints_rostopic_style_figures_once_a_second(spawn: Spawn):
 
 @pytest.mark.parametrize("stream", ["joint_states", "tf"])
 def test_json_has_the_numbers_of_either_stream(stream: str):
-    with standing():
+    with published_robot():
         measured = json.loads(zstate("hz", "rrbot", "--stream", stream, "--once", "--json").stdout)
     # The publisher waits a hundredth of a second between samples; it may be slower, never faster.
     assert 10.0 < measured["rate_hz"] < 110.0
@@ -33,7 +33,7 @@ def test_json_has_the_numbers_of_either_stream(stream: str):
 
 
 def test_the_window_limits_what_is_measured():
-    with standing():
+    with published_robot():
         measured = json.loads(zstate("hz", "rrbot", "--window", "5", "--once", "--json").stdout)
     assert measured["window"] == 5
 
@@ -44,7 +44,7 @@ def test_once_gives_up_with_the_reason():
 
 
 def test_stream_without_writer_is_named_with_a_command_that_publishes_it():
-    with standing(streams=("robot_description",)):
+    with published_robot(streams=("robot_description",)):
         message = failure("hz", "rrbot", "--once", "--timeout", "1")
     assert "joint_states of 'rrbot' has no writer; start one: `zstate joints rrbot`" in message
 

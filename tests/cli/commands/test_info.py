@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.cli_runner import failure, zstate
 from helpers.processes import until
-from helpers.robots import RRBOT, STAMP, settle
+from helpers.robots import RRBOT, STAMP, wait_for_stream_readers
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -25,7 +25,7 @@ def run(sessions: tuple[Session, Session], tmp_path: Path) -> Path:
     writer, reader = sessions
     path = tmp_path / "run.mcap"
     with StatePublisher(writer, RRBOT, "r1") as publisher, Recorder(reader, path, ["r1"]) as recorder:
-        settle(writer, "r1", "joint_states", "tf")
+        wait_for_stream_readers(writer, "r1", "joint_states", "tf")
         for number in range(50):
             publisher.publish([0.0, 0.0], stamp=STAMP + number)
         until(lambda: all(recorder.stats.messages.get(("r1", s), 0) == 50 for s in ("joint_states", "tf")))

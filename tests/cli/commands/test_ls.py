@@ -5,7 +5,7 @@ import os
 import socket
 
 import pytest
-from helpers.cli_runner import EVERYTHING, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import ALL_STREAMS, Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import StaticPublisher, connect
@@ -19,17 +19,17 @@ pytestmark = pytest.mark.processes
 
 
 def test_each_stream_stands_with_its_writer():
-    with standing():
+    with published_robot():
         robot, *streams = zstate("ls").stdout.decode().splitlines()
     assert robot == "rrbot"
-    assert sorted(line.split()[0] for line in streams) == sorted(EVERYTHING)
+    assert sorted(line.split()[0] for line in streams) == sorted(ALL_STREAMS)
     for line in streams:
         assert f"@{socket.gethostname()} pid {os.getpid()}" in line
         assert "since 20" in line
 
 
 def test_json_names_robots_and_writers():
-    with standing("left", streams=("joint_states",)), standing("right"):
+    with published_robot("left", streams=("joint_states",)), published_robot("right"):
         robots = json.loads(zstate("ls", "--json").stdout)
     assert [robot["robot"] for robot in robots] == ["left", "right"]
     (writer,) = robots[0]["writers"]
@@ -57,7 +57,7 @@ def test_an_endpoint_that_cannot_be_is_named():
 
 
 def test_ls_measures_joint_states_and_starts_no_other_stream():
-    with standing():
+    with published_robot():
         lines = {line.split()[0]: line for line in zstate("ls").stdout.decode().splitlines()}
         (robot,) = json.loads(zstate("ls", "--json").stdout)
     assert " Hz  " in lines["joint_states"]
@@ -70,7 +70,7 @@ def test_ls_measures_joint_states_and_starts_no_other_stream():
 def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
     command = started(spawn, "ls", "--watch")
     assert command.line().startswith("no robot is announced")
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         until(lambda: command.line() == "rrbot")
         assert command.line().split()[0] == "joint_states"
     until(lambda: command.line().startswith("no robot is announced"))
@@ -78,7 +78,7 @@ def test_watch_prints_the_list_again_after_each_change(spawn: Spawn):
 
 
 def test_watched_as_json_it_is_a_document_a_second(spawn: Spawn):
-    with standing():
+    with published_robot():
         command = started(spawn, "ls", "--watch", "--json")
         documents = [json.loads(command.line()) for _ in range(2)]
     assert [robot["robot"] for robot in documents[-1]] == ["rrbot"]
@@ -103,6 +103,6 @@ def test_a_narrow_terminal_has_less_of_when_and_of_age():
 def test_on_ros_side_the_list_is_watched_too(ros_router: str, spawn: Spawn):
     command = started(spawn, "ls", "--watch")
     assert command.line().startswith("no ROS 2 node")
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         until(lambda: "/joint_states" in command.line())
     interrupted(command)

@@ -4,7 +4,7 @@ import json
 import os
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, connect, load_model
@@ -82,7 +82,7 @@ def test_stale_edge_has_its_silence_instead_of_a_rate():
 
 @pytest.mark.processes
 def test_each_edge_has_its_rate_latency_writer_and_clock():
-    with standing(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
+    with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
         statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
         report = json.loads(zstate("monitor", "world", "gauge", "--once", "--json").stdout)
     edges = {edge["child"].partition("/")[2]: edge for edge in report["edges"]}
@@ -101,7 +101,7 @@ def test_each_edge_has_its_rate_latency_writer_and_clock():
 def test_fixed_edges_belong_to_the_writer_of_the_model(spawn: Spawn):
     model = started(spawn, "publish", "rrbot")
     model.line()
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         report = json.loads(zstate("monitor", "world", "tool", "--once", "--json").stdout)
     pids = {(edge["kind"], int(edge["writer"].rpartition(" ")[2])) for edge in report["edges"]}
     assert pids == {("joint", os.getpid()), ("static", model.process.pid)}
@@ -111,7 +111,7 @@ def test_fixed_edges_belong_to_the_writer_of_the_model(spawn: Spawn):
 def test_it_continues_and_reports_silent_writers(spawn: Spawn):
     command = started(spawn, "monitor", "base", "tool")
     until(lambda: "waiting: " in command.stderr)
-    with standing():
+    with published_robot():
         assert command.line().startswith("pose of tool in base: the newest is ")
         lines = [command.line() for _ in range(6)]
         assert [line.split()[0] for line in lines[:5]] == ["frame", "base", "upper", "lower", "tool"]
@@ -145,7 +145,7 @@ def test_once_gives_up_with_the_reason():
 
 @pytest.mark.processes
 def test_each_edge_is_measured_on_a_ros_wire(ros_router: str):
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         report = json.loads(zstate("monitor", "base", "tool", "--once", "--json").stdout)
     assert [edge["kind"] for edge in report["edges"]] == ["pose", "pose", "static"]
     assert all(edge["rate_hz"] > 20.0 for edge in report["edges"][:2])
@@ -169,7 +169,7 @@ def test_overview_has_one_line_for_joints_and_one_for_fixed_edges():
 
 @pytest.mark.processes
 def test_without_frames_all_received_edges_are_monitored():
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         lines = zstate("monitor", "--once").stdout.decode().splitlines()
         edges = json.loads(zstate("monitor", "--once", "--json").stdout)["edges"]
         (only,) = zstate("monitor", "--robot", "left", "--once").stdout.decode().splitlines()[1:2]
@@ -199,6 +199,6 @@ def test_one_frame_is_not_enough():
 
 @pytest.mark.processes
 def test_all_edges_on_ros_side_have_their_ros_names(ros_router: str):
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         lines = zstate("monitor", "--once").stdout.decode().splitlines()
     assert [line.split()[:2] for line in lines[1:4]] == [["lower", "pose"], ["upper", "pose"], ["*", FIXED]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
 from helpers.processes import until
-from helpers.recording_builder import MS, START, Tale, swing
+from helpers.recording_builder import MS, START, RecordingBuilder, swing_positions
 
 from zstate import NoData, StatePublisher, Transform, TransformListener, connect, discover, load_model
 from zstate.errors import Unreachable
@@ -133,10 +133,10 @@ def test_unknown_wire_error_lists_known_wires():
 
 
 def test_a_recording_is_published_as_if_it_were_now(spawn: Spawn, tmp_path: Path):
-    with Tale(tmp_path / "run.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(100):
-            tale.joints("arm", START + n * 10 * MS, swing(n))
+            tale.joints("arm", START + n * 10 * MS, swing_positions(n))
     with connect() as session, TransformListener(session, "rrbot") as listener:
         before = time.time_ns()
         child = started(spawn, "publish", RRBOT, "--source", str(tmp_path / "run.mcap"), "--rate", "200")

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
 
 from zstate import StatePublisher, connect, load_model
 from zstate.recording.info import read_info
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.processes
 
 def test_ctrl_c_ends_a_recording_with_a_complete_file_and_a_summary(spawn: Spawn, tmp_path: Path):
     path = tmp_path / "run.mcap"
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         command = started(spawn, "record", str(path))
         lines = [command.line() for _ in range(2)]
         interrupted(command)
@@ -33,7 +33,7 @@ def test_ctrl_c_ends_a_recording_with_a_complete_file_and_a_summary(spawn: Spawn
 
 def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path):
     path = tmp_path / "run.mcap"
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         ended = zstate("record", str(path), "left", "--duration", "1")
     assert ended.returncode == 0, ended.stderr
     assert read_info(path).robots == ("left",)
@@ -46,7 +46,7 @@ def test_a_duration_ends_it_and_only_the_chosen_robot_is_recorded(tmp_path: Path
 def test_record_prints_the_reason_while_it_waits_and_the_start(spawn: Spawn, tmp_path: Path):
     command = started(spawn, "record", str(tmp_path / "run.mcap"), "rrbot")
     assert command.line().endswith("  no robot yet")
-    with standing("rrbot"):
+    with published_robot("rrbot"):
         while not command.line().endswith("  rrbot"):
             pass
         interrupted(command)
@@ -66,7 +66,7 @@ def test_empty_recording_fails_with_the_reason(tmp_path: Path):
 
 
 def test_the_suffix_is_added_and_a_file_that_exists_is_kept_unless_it_may_be_overwritten(tmp_path: Path):
-    with standing():
+    with published_robot():
         given = ("record", str(tmp_path / "run"), "--duration", "0.7")
         assert f"recording into '{tmp_path}/run.mcap'" in zstate(*given).stderr.decode()
         before = (tmp_path / "run.mcap").read_bytes()
@@ -80,14 +80,14 @@ def test_the_suffix_is_added_and_a_file_that_exists_is_kept_unless_it_may_be_ove
 
 def test_a_recording_is_split_by_time_and_all_files_are_named(tmp_path: Path):
     path = tmp_path / "run.mcap"
-    with standing():
+    with published_robot():
         ended = zstate("record", str(path), "--duration", "2.5", "--split-seconds", "1")
     assert f"into 3 files, {path} to run_2.mcap (" in ended.stdout.decode()
     assert len(read_info(path).files) == 3
 
 
 def test_losses_are_reported(tmp_path: Path):
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         ended = zstate("record", str(tmp_path / "run.mcap"), "rrbot", "--duration", "1")
     assert re.search(r"lost \d+ without a description that fits", ended.stdout.decode())
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
-from helpers.recording_builder import LATENCY, MS, START, Bag, S, Tale, swing
+from helpers.recording_builder import LATENCY, MS, START, Bag, RecordingBuilder, S, swing_positions
 
 from zstate import TransformListener, connect, discover
 
@@ -15,10 +15,10 @@ pytestmark = pytest.mark.processes
 @pytest.fixture
 def file(tmp_path: Path) -> str:
     """Half a second of an arm."""
-    with Tale(tmp_path / "run.mcap", "arm") as tale:
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
         tale.describe("arm")
         for n in range(51):
-            tale.joints("arm", START + n * 10 * MS, swing(n / 50))
+            tale.joints("arm", START + n * 10 * MS, swing_positions(n / 50))
     return str(tmp_path / "run.mcap")
 
 
@@ -67,7 +67,7 @@ def test_replay_prints_progress_each_second(file: str, spawn: Spawn):
 
 
 def test_live_robot_is_not_replayed_without_takeover(file: str):
-    with standing("arm"):
+    with published_robot("arm"):
         message = failure("replay", file)
         assert "already published on the network: 'arm' by " in message
         assert "--takeover" in message

@@ -3,7 +3,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from helpers.cli_runner import standing, zstate
+from helpers.cli_runner import published_robot, zstate
 
 from zstate import connect
 from zstate.wire.ros2.graph import EndpointToken, NodeToken
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.processes
 
 
 def test_each_topic_stands_with_its_publishers_and_their_qos(ros_router: str):
-    with standing(wire="ros2:node=driver", router=ros_router):
+    with published_robot(wire="ros2:node=driver", router=ros_router):
         lines = zstate("ls").stdout.decode().splitlines()
     assert lines[:2] == ["1 node in domain 0", "  /driver"]
     assert lines[lines.index("/joint_states  sensor_msgs/msg/JointState") + 1].split(None, 2) == [
@@ -51,7 +51,7 @@ def test_subscribers_and_nodes_of_others_are_listed_too(ros_router: str):
 
 
 def test_robots_in_namespaces_come_with_how_to_call_for_them(ros_router: str):
-    with standing("r1", wire="ros2:namespace=*,hash=humble", router=ros_router):
+    with published_robot("r1", wire="ros2:namespace=*,hash=humble", router=ros_router):
         ended = zstate("ls")
         called = zstate("ls", "--wire", "ros2:namespace=r1")
     assert b"/r1/joint_states" in ended.stdout
@@ -61,7 +61,7 @@ def test_robots_in_namespaces_come_with_how_to_call_for_them(ros_router: str):
 
 
 def test_topics_behind_a_bridge_of_ros2dds_are_listed(ros_router: str):
-    with standing(wire="ros2dds", router=ros_router):
+    with published_robot(wire="ros2dds", router=ros_router):
         graph = json.loads(zstate("ls", "--wire", "ros2dds", "--json").stdout)
     assert graph["nodes"] == []
     assert {topic["topic"] for topic in graph["topics"]} == {

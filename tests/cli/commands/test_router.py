@@ -8,7 +8,7 @@ import pytest
 import zenoh
 from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, started, zstate
 from helpers.processes import until
-from helpers.robots import Tap
+from helpers.robots import SampleCollector
 
 from zstate import TransformListener, connect
 from zstate.net.security.credentials import Credentials
@@ -152,8 +152,8 @@ def test_peers_are_not_introduced_past_its_access_control(spawn: Spawn, free_por
         join("client", "rb") as own,
         join("client", "desk") as viewer,
     ):
-        direct = Tap(victim, "zstate/rb/joint_commands")
-        routed = Tap(viewer, "zstate/*/tf_static/*")
+        direct = SampleCollector(victim, "zstate/rb/joint_commands")
+        routed = SampleCollector(viewer, "zstate/*/tf_static/*")
 
         def is_routed() -> bool:
             intruder.zenoh.put("zstate/rb/joint_commands", b"go")

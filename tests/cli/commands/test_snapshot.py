@@ -4,7 +4,17 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import ELBOW, RRBOT, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import (
+    ELBOW,
+    RRBOT,
+    SHOULDER,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    started,
+    zstate,
+)
 from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect, discover, load_model
@@ -67,7 +77,7 @@ def test_invalid_snapshot_error_names_the_place_in_the_file(tmp_path: Path, text
 def test_loaded_robot_has_the_saved_poses(spawn: Spawn, tmp_path: Path, suffix: str):
     file = tmp_path / f"cell.{suffix}"
     edge = Transform("lower", "camera", (0.0, 0.1, 0.2), (0.0, 0.0, 0.6, 0.8))
-    with standing(), connect() as session, StaticPublisher(session, "rrbot", "calibration") as static:
+    with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "calibration") as static:
         static.set(edge)
         saved = zstate("snapshot", "save", str(file))
         assert saved.returncode == 0, saved.stderr
@@ -118,7 +128,7 @@ def test_saved_session_options_can_be_used_again(saved, options: str, network: S
 def test_snapshot_is_loaded_on_this_host_unless_as_saved(spawn: Spawn, tmp_path: Path, free_port: int):
     file, router = tmp_path / "cell.toml", f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", router).line()
-    with standing(router=router):
+    with published_robot(router=router):
         assert zstate("snapshot", "save", str(file), "--connect", router).returncode == 0
     here = zstate("snapshot", "load", str(file), "--seconds", "0.1").stderr.decode()
     assert f"with --mode client --connect {router}; --as-saved uses the same options" in here
@@ -133,7 +143,7 @@ def test_snapshot_is_loaded_on_this_host_unless_as_saved(spawn: Spawn, tmp_path:
 @pytest.mark.processes
 def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
     file = tmp_path / "cell.toml"
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         assert "left" in failure("snapshot", "save", str(file), "lef")
         assert zstate("snapshot", "save", str(file), "left").returncode == 0
     assert [shot.name for shot in read_snapshot(file).robot] == ["left"]
@@ -142,7 +152,7 @@ def test_only_the_named_robots_are_saved_and_loaded(tmp_path: Path):
 
 @pytest.mark.processes
 def test_robot_without_joint_states_is_saved_without_positions():
-    with standing(streams=("robot_description", "tf_static")):
+    with published_robot(streams=("robot_description", "tf_static")):
         saved = zstate("snapshot", "save", "-")
     assert b"positions" not in saved.stdout
     assert b"[[robot]]" in saved.stdout
@@ -153,7 +163,7 @@ def test_a_file_that_exists_is_kept_unless_forced(tmp_path: Path):
     file = tmp_path / "cell.json"
     file.write_text("mine")
     assert "--force replaces it" in failure("snapshot", "save", str(file))
-    with standing():
+    with published_robot():
         assert zstate("snapshot", "save", str(file), "--force").returncode == 0
     assert json.loads(file.read_text())["robot"][0]["name"] == "rrbot"
 

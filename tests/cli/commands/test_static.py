@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import Spawn, failure, interrupted, standing, started
+from helpers.cli_runner import Spawn, failure, interrupted, published_robot, started
 from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect
@@ -16,7 +16,7 @@ POSE = ("--xyz", "0.1", "0", "-0.2", "--rpy-deg", "0", "0", "90")
 
 
 def test_an_edge_is_there_until_ctrl_c_and_withdrawn_then(spawn: Spawn):
-    with standing(), connect() as session, TransformListener(session, "rrbot") as listener:
+    with published_robot(), connect() as session, TransformListener(session, "rrbot") as listener:
         child = started(spawn, "static", "lower", "flange", *POSE)
         sentence = child.line()
         assert sentence.startswith(
@@ -64,7 +64,7 @@ def test_a_file_places_all_its_edges(spawn: Spawn, tmp_path: Path):
 
 
 def test_with_a_robot_that_is_named_the_edge_is_that_robots(spawn: Spawn):
-    with standing(), connect() as session, TransformListener(session, placers=["site"]) as listener:
+    with published_robot(), connect() as session, TransformListener(session, placers=["site"]) as listener:
         child = started(spawn, "static", "site/map", "rrbot/world", "--xyz", "1", "0", "0", "--robot", "site")
         assert "(robot 'site'" in child.line()
         assert listener.buffer.wait("site/map", "rrbot/base", timeout_s=10.0).kind == "static"
@@ -80,7 +80,7 @@ def test_without_a_robot_to_belong_to_it_asks_which():
 
 
 def test_with_two_robots_it_asks_which_and_names_them():
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         message = failure("static", "lower", "flange", *POSE)
     assert "--robot NAME (announced: 'left', 'right')" in message
 
@@ -123,7 +123,7 @@ def test_edge_of_a_file_is_published_on_each_of_its_wires(spawn: Spawn, ros_rout
 
 
 def test_a_target_that_is_nearly_a_frame_of_the_robot_is_warned_about(spawn: Spawn):
-    with standing():
+    with published_robot():
         child = started(spawn, "static", "lowr", "flange", *POSE)
         child.line()
         until(lambda: "did you mean" in child.stderr)
@@ -132,7 +132,7 @@ def test_a_target_that_is_nearly_a_frame_of_the_robot_is_warned_about(spawn: Spa
 
 
 def test_a_new_target_above_the_robot_leads_to_the_frame_that_robots_share(spawn: Spawn):
-    with standing():
+    with published_robot():
         child = started(spawn, "static", "map", "world", *POSE)
         child.line()
         until(lambda: "warning" in child.stderr)
@@ -152,7 +152,7 @@ def test_a_new_target_above_the_robot_leads_to_the_frame_that_robots_share(spawn
     ],
 )
 def test_known_new_and_shared_targets_cause_no_warning(spawn: Spawn, edge: tuple[str, ...]):
-    with standing(), connect() as session:
+    with published_robot(), connect() as session:
         publisher = StaticPublisher(session, "rrbot", "here")
         target, source, *new = edge
         transform = Transform(target, source, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -167,7 +167,7 @@ def test_known_new_and_shared_targets_cause_no_warning(spawn: Spawn, edge: tuple
 
 def test_a_chain_of_edges_that_are_published_together_is_known():
     chain = [("lower", "mount"), ("mount", "camera"), ("camera", "lens"), ("mont", "light")]
-    with standing(), connect() as session, StaticPublisher(session, "rrbot", "chain") as publisher:
+    with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "chain") as publisher:
         edges = [Transform(*names, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for names in chain]
         (warning,) = unknown_target_warnings(session, publisher, edges)
     assert (

@@ -3,7 +3,7 @@ from __future__ import annotations
 import os
 
 import pytest
-from helpers.cli_runner import Spawn, failure, standing, started
+from helpers.cli_runner import Spawn, failure, published_robot, started
 
 pytestmark = pytest.mark.processes
 
@@ -12,7 +12,7 @@ POSE = ("--xyz", "1", "0", "0")
 
 @pytest.mark.parametrize("command", [("joints", "rrbot"), ("publish", "rrbot", "--source", "sine")])
 def test_stream_with_a_writer_needs_takeover(spawn: Spawn, command):
-    with standing():
+    with published_robot():
         message = failure(*command)
         assert f"pid {os.getpid()}'" in message
         assert "already writes joint_states of 'rrbot'" in message

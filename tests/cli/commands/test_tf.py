@@ -6,7 +6,7 @@ import re
 import time
 
 import pytest
-from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import ELBOW, SHOULDER, Spawn, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, connect
@@ -21,7 +21,7 @@ PITCH = SHOULDER + ELBOW
 
 
 def test_it_looks_as_tf2_echo_does():
-    with standing():
+    with published_robot():
         lines = zstate("tf", "base", "lower", "--once").stdout.decode().splitlines()
     c, s = math.cos(PITCH), math.sin(PITCH)
     x, y, z = BASE_FROM_LOWER
@@ -46,7 +46,7 @@ def test_it_looks_as_tf2_echo_does():
 
 def test_the_twist_is_that_of_the_published_velocities():
     shoulder_rate, elbow_rate = 0.5, 0.25
-    with standing(velocities=(shoulder_rate, elbow_rate)):
+    with published_robot(velocities=(shoulder_rate, elbow_rate)):
         lines = zstate("tf", "base", "lower", "--once", "--twist").stdout.decode().splitlines()
         facts = json.loads(zstate("tf", "base", "lower", "--once", "--twist", "--json").stdout)
     linear = [0.7 * math.cos(SHOULDER) * shoulder_rate, 0.0, -0.7 * math.sin(SHOULDER) * shoulder_rate]
@@ -58,7 +58,7 @@ def test_the_twist_is_that_of_the_published_velocities():
 
 
 def test_twist_of_a_static_edge_is_zero():
-    with standing():
+    with published_robot():
         lines = zstate("tf", "world", "base", "--once", "--twist").stdout.decode().splitlines()
     assert lines[-2:] == [
         "- Twist: linear [0.000, 0.000, 0.000] m/s",
@@ -81,7 +81,7 @@ def test_stamps_have_nine_digits_and_zeros_no_sign():
 
 
 def test_json_is_one_object_for_a_program():
-    with standing():
+    with published_robot():
         answer = json.loads(zstate("tf", "base", "lower", "--once", "--json").stdout)
     assert (answer["target"], answer["source"]) == ("base", "lower")
     assert answer["translation"] == pytest.approx(BASE_FROM_LOWER, abs=1e-12)
@@ -100,9 +100,9 @@ def test_tf_prints_the_reason_while_it_waits_and_the_end_of_the_wait(spawn: Spaw
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
     assert command.line() == "pose of lower in base"
     until(lambda: "waiting: no robot is announced" in command.stderr)
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         until(lambda: "waiting: robot_description of 'rrbot' has no writer" in command.stderr)
-    with standing():
+    with published_robot():
         assert command.line().startswith("At time ")
     assert "receiving rrbot: 7 frames, 2 joints" in command.stderr
     interrupted(command)
@@ -110,7 +110,7 @@ def test_tf_prints_the_reason_while_it_waits_and_the_end_of_the_wait(spawn: Spaw
 
 def test_tf_reports_when_samples_stop(spawn: Spawn):
     command = started(spawn, "tf", "base", "lower", "--rate", "20")
-    with standing():
+    with published_robot():
         command.line()
         assert command.line().startswith("At time ")
     until(lambda: "no new sample of 'rrbot/base' -> 'rrbot/upper'" in command.stderr)
@@ -120,20 +120,20 @@ def test_tf_reports_when_samples_stop(spawn: Spawn):
 def test_once_gives_up_with_the_reason():
     message = failure("tf", "base", "lower", "--once", "--timeout", "1")
     assert "zstate: gave up after 1 s: no robot is announced" in message
-    with standing():
+    with published_robot():
         message = failure("tf", "base", "lowr", "--once", "--timeout", "1")
     assert "zstate: gave up after 1 s: the frame 'lowr' is unknown; did you mean 'lower'" in message
 
 
 def test_a_robot_that_is_not_there_is_met_with_those_that_are():
-    with standing():
+    with published_robot():
         message = failure("tf", "base", "lower", "--once", "--timeout", "1", "--robot", "rrbt")
     assert "'rrbt'" in message
     assert "did you mean 'rrbot'?" in message
 
 
 def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
-    with standing():
+    with published_robot():
         soon = time.time_ns() + 6_000_000_000  # a busy machine takes its time to start a command
         as_printed = f"{soon // 10**9}.{soon % 10**9:09d}"
         answer = json.loads(
@@ -168,7 +168,7 @@ def test_numbers_that_cannot_be_are_wrong_usage(option: str, value: str):
 
 
 def test_a_bare_name_of_two_robots_lists_both():
-    with standing("r1"), standing("r2"):
+    with published_robot("r1"), published_robot("r2"):
         message = failure("tf", "world", "tool", "--once", "--timeout", "5")
         named = zstate("tf", "r1/world", "r1/tool", "--once")
     assert "'r1/world'" in message

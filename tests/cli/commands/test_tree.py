@@ -4,7 +4,7 @@ import json
 from xml.etree import ElementTree
 
 import pytest
-from helpers.cli_runner import failure, standing, zstate
+from helpers.cli_runner import failure, published_robot, zstate
 
 from zstate import StaticPublisher, Transform, connect
 
@@ -18,7 +18,7 @@ def drawn(*arguments: str) -> list[str]:
 
 
 def test_each_edge_has_its_kind_rate_age_and_writer():
-    with standing():
+    with published_robot():
         heading, root, *lines = drawn()
     assert heading.split() == ["frame", "edge", "rate", "age", "writer"]
     assert root.split() == ["rrbot/world", "root"]
@@ -38,7 +38,7 @@ def test_each_edge_has_its_kind_rate_age_and_writer():
 
 
 def test_guides_show_parents_and_children():
-    with standing():
+    with published_robot():
         lines = drawn()
     assert lines[2].startswith("└── base ")
     assert lines[5].startswith("            ├── camera_link ")
@@ -46,14 +46,14 @@ def test_guides_show_parents_and_children():
 
 
 def test_static_edges_of_others_stand_in_the_tree():
-    with standing(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
+    with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "mount") as statics:
         statics.set(Transform("tool", "gauge", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
         gauge = next(line for line in drawn() if "gauge" in line)
     assert gauge.split()[-2:] == ["static", "mount"]
 
 
 def test_json_has_every_frame():
-    with standing():
+    with published_robot():
         frames = {frame["name"]: frame for frame in json.loads("\n".join(drawn("rrbot", "--json")))}
     assert frames["rrbot/lower"]["parent"] == "rrbot/upper"
     assert frames["rrbot/lower"]["kind"] == "joint"
@@ -62,7 +62,7 @@ def test_json_has_every_frame():
 
 
 def test_dot_and_mermaid_have_an_edge_for_each_frame_but_the_root():
-    with standing():
+    with published_robot():
         dot, mermaid = drawn("--dot"), drawn("--mermaid")
     assert dot[0] == "digraph frames {"
     assert '  "rrbot/world" -> "rrbot/base" [label="static"];' in dot
@@ -73,7 +73,7 @@ def test_dot_and_mermaid_have_an_edge_for_each_frame_but_the_root():
 
 
 def test_the_picture_is_svg_with_every_frame_and_writer():
-    with standing(), connect() as session, StaticPublisher(session, "rrbot", "<mount>") as statics:
+    with published_robot(), connect() as session, StaticPublisher(session, "rrbot", "<mount>") as statics:
         statics.set(Transform("tool", "gauge & dial", (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0)))
         root = ElementTree.fromstring("\n".join(drawn("rrbot", "--svg")))
     assert root.tag == "{http://www.w3.org/2000/svg}svg"
@@ -84,7 +84,7 @@ def test_the_picture_is_svg_with_every_frame_and_writer():
 
 
 def test_a_robot_that_is_not_there_is_an_error_that_lists_the_others():
-    with standing():
+    with published_robot():
         message = failure("tree", "rrbt")
     assert "did you mean 'rrbot'?" in message
     assert "announced: 'rrbot'" in message
@@ -99,7 +99,7 @@ def test_empty_network_is_no_error_and_prints_how_to_start():
 
 
 def test_joint_states_without_model_have_no_tree_and_print_how_to_publish_one():
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         ended = zstate("tree")
     assert ended.returncode == 0
     assert ended.stdout == b""

@@ -10,7 +10,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import RRBOT, failure, interrupted, published_robot, started, zstate
 from helpers.processes import until
 
 from zstate import StatePublisher, connect, load_model
@@ -59,7 +59,7 @@ def test_robot_moved_by_sliders_is_published(spawn):
 
 
 def test_sliders_do_not_move_a_robot_with_another_writer_and_name_it(spawn):
-    with standing():
+    with published_robot():
         child = started(spawn, "view", "rrbot", "--sliders", "--port", "0")
         child.line()
         interrupted(child)
@@ -101,7 +101,7 @@ def test_missing_viser_error_names_the_package_to_install(tmp_path: Path):
 def test_a_snapshot_is_a_picture_of_the_robot(tmp_path: Path):
     imageio = pytest.importorskip("imageio.v3")
     picture = tmp_path / "rrbot.png"
-    with standing():
+    with published_robot():
         command = [sys.executable, "-m", "zstate", "view", "rrbot", "--snapshot", str(picture)]
         command += ["--size", "320", "240"]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=100.0, check=False)
@@ -137,7 +137,7 @@ def test_snapshot_names_visible_robots_hidden_robots_and_missing_meshes(tmp_path
         assert ended.returncode == 0, ended.stderr
         return ended
 
-    with connect() as session, StatePublisher(session, load_model(urdf)) as mine, standing():
+    with connect() as session, StatePublisher(session, load_model(urdf)) as mine, published_robot():
         mine.publish([])
         both = snapshot()
         assert both.stdout == f"wrote {picture}: mine, rrbot, 320 x 240 pixels\n"

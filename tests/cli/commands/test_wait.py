@@ -5,7 +5,16 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import EVERYTHING, RRBOT, Spawn, failure, interrupted, standing, started, zstate
+from helpers.cli_runner import (
+    ALL_STREAMS,
+    RRBOT,
+    Spawn,
+    failure,
+    interrupted,
+    published_robot,
+    started,
+    zstate,
+)
 from helpers.processes import Child, until
 
 from zstate import StatePublisher, connect, load_model
@@ -24,7 +33,7 @@ def await_text(child: Child, text: str) -> None:
 
 
 def test_a_robot_that_is_there_is_not_waited_for():
-    with standing():
+    with published_robot():
         ended = zstate("wait", "robot", "rrbot")
     assert (ended.returncode, ended.stdout.decode()) == (0, "ready: 'rrbot' (7 frames)\n")
     assert ended.stderr == b""
@@ -33,16 +42,16 @@ def test_a_robot_that_is_there_is_not_waited_for():
 def test_a_robot_is_ready_when_it_moves_and_not_before(spawn: Spawn):
     child = started(spawn, "wait", "robot", "rrbot")
     await_text(child, "robot 'rrbot' is not announced")
-    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
+    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]):
         await_text(child, "joint_states of 'rrbot' has no writer")
         assert child.process.poll() is None
-        with standing(streams=("joint_states",)):
+        with published_robot(streams=("joint_states",)):
             assert child.line() == "ready: 'rrbot' (7 frames)"
             assert child.wait() == 0
 
 
 def test_every_robot_that_is_named_has_to_be_there():
-    with standing("left"):
+    with published_robot("left"):
         outcome = waited("robot", "left", "right", "--timeout", "1", code=1)
     assert outcome["ready"] is False
     assert "robot 'right' is not announced" in str(outcome["reason"])
@@ -50,7 +59,7 @@ def test_every_robot_that_is_named_has_to_be_there():
 
 
 def test_robot_that_publishes_transforms_is_ready_without_joint_states():
-    with standing(streams=("tf", "robot_description")):
+    with published_robot(streams=("tf", "robot_description")):
         assert waited("robot", "rrbot", code=0)["ready"] is True
 
 
@@ -62,7 +71,7 @@ def test_a_robot_that_cannot_move_is_ready_with_its_model(tmp_path: Path):
 
 
 def test_a_pose_is_waited_for_with_the_reason():
-    with standing():
+    with published_robot():
         assert waited("frame", "base", "lower", code=0)["ready"] is True
         assert "did you mean 'lower'" in failure("wait", "frame", "base", "lwer", "--timeout", "0.6")
 
@@ -80,7 +89,7 @@ def test_a_robot_behind_a_router_that_comes_late_is_waited_for_as_well(spawn: Sp
     endpoint = f"tcp/127.0.0.1:{free_port}"
     child = started(spawn, "wait", "robot", "rrbot", "--connect", endpoint)
     started(spawn, "router", "--listen", endpoint).line()
-    with standing(router=endpoint):
+    with published_robot(router=endpoint):
         assert child.line() == "ready: 'rrbot' (7 frames)"
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import EVERYTHING, RRBOT, Spawn, failure, standing, started, zstate
-from helpers.processes import a_free_port, again_and_again
+from helpers.cli_runner import ALL_STREAMS, RRBOT, Spawn, failure, published_robot, started, zstate
+from helpers.processes import find_free_port, repeated
 
 from zstate import StatePublisher, StaticPublisher, Transform, connect, load_model
 from zstate.clock import ManualClock, SystemClock
@@ -48,20 +48,20 @@ def warnings(*arguments: str) -> dict[str, str]:
 
 @contextmanager
 def published_with_stamps(
-    stamp: Callable[[], int], streams: tuple[Stream, ...] = EVERYTHING
+    stamp: Callable[[], int], streams: tuple[Stream, ...] = ALL_STREAMS
 ) -> Iterator[None]:
     """Publishes rrbot a hundred times a second, with the stamps that ``stamp`` returns."""
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), streams=streams) as publisher,
-        again_and_again(lambda: publisher.publish([0.0, 0.0], stamp=stamp())),
+        repeated(lambda: publisher.publish([0.0, 0.0], stamp=stamp())),
     ):
         yield
 
 
 def test_every_link_of_a_working_robot_is_ok(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("ZSTATE_KERNEL", "reference")  # selected by the user: no warning
-    with standing():
+    with published_robot():
         report = diagnosed("rrbot", code=0)
         text = zstate("doctor", "rrbot").stdout.decode()
     assert report["sound"]
@@ -73,7 +73,7 @@ def test_every_link_of_a_working_robot_is_ok(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_working_robots_among_several_take_one_line():
-    with standing("left"), standing("right", streams=("tf_static", "robot_description")):
+    with published_robot("left"), published_robot("right", streams=("tf_static", "robot_description")):
         lines = zstate("doctor").stdout.decode().splitlines()
     (left,) = [line for line in lines if "left" in line and "announced" not in line]
     assert left.split()[:2] == ["ok", "left"]
@@ -88,7 +88,7 @@ def test_without_robots_the_next_command_starts_one():
 
 
 def test_missing_robot_is_reported_with_the_announced_ones():
-    with standing():
+    with published_robot():
         found = broken_link("rbot")
     assert found["text"] == "robot 'rbot' is not announced; announced: 'rrbot'"
     assert found["next"] == "zstate doctor rrbot"
@@ -97,21 +97,21 @@ def test_missing_robot_is_reported_with_the_announced_ones():
 def test_robots_that_an_option_hides_are_found(spawn: Spawn, free_port: int):
     endpoint = f"tcp/127.0.0.1:{free_port}"
     started(spawn, "router", "--listen", endpoint).line()
-    with standing():
+    with published_robot():
         found = broken_link("--connect", endpoint)
     assert "'rrbot'" in found["text"]
     assert found["next"] == "zstate doctor rrbot"
 
 
 def test_robots_of_this_host_are_found_when_the_router_is_missing(free_port: int):
-    with standing():
+    with published_robot():
         found = broken_link("--connect", f"tcp/127.0.0.1:{free_port}")
     assert found["name"] == "network"
     assert "without --connect, among the programs of this host: 'rrbot'" in found["text"]
 
 
 def test_a_robot_without_its_driver_lacks_joint_states():
-    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]):
+    with connect() as session, StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]):
         found = broken_link("rrbot")
     assert (found["name"], found["robot"]) == ("joint_states", "rrbot")
     assert found["text"].startswith("'rrbot' has no writer of joint_states, which ")
@@ -120,9 +120,9 @@ def test_a_robot_without_its_driver_lacks_joint_states():
 
 def test_driver_with_another_robot_name_is_found():
     with (
-        standing("rrbot1", streams=("joint_states",)),
+        published_robot("rrbot1", streams=("joint_states",)),
         connect() as session,
-        StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]),
+        StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]),
     ):
         found = broken_link("rrbot")
     assert "'rrbot1', which has joint_states but no model" in found["text"]
@@ -130,7 +130,7 @@ def test_driver_with_another_robot_name_is_found():
 
 
 def test_joint_states_without_a_model_lack_the_model():
-    with standing(streams=("joint_states",)):
+    with published_robot(streams=("joint_states",)):
         found = broken_link("rrbot")
     assert (found["name"], found["next"]) == ("model", "zstate publish rrbot")
 
@@ -139,9 +139,9 @@ def test_joints_of_another_model_are_refused_with_the_reason(tmp_path: Path):
     other = tmp_path / "other.urdf"
     other.write_text(Path(RRBOT).read_text().replace('"elbow"', '"knee"'))
     with (
-        standing(streams=("joint_states",), model=str(other)),
+        published_robot(streams=("joint_states",), model=str(other)),
         connect() as session,
-        StatePublisher(session, load_model(RRBOT), streams=EVERYTHING[1:]),
+        StatePublisher(session, load_model(RRBOT), streams=ALL_STREAMS[1:]),
     ):
         found = broken_link("rrbot")
     assert found["name"] == "joint_states"
@@ -202,7 +202,7 @@ def test_clock_ahead_is_reported_before_its_stamps():
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), clock=ClockAhead()) as publisher,
-        again_and_again(lambda: publisher.publish([0.0, 0.0])),
+        repeated(lambda: publisher.publish([0.0, 0.0])),
     ):
         found = broken_link("rrbot")
     assert found["name"] == "clocks"
@@ -215,7 +215,7 @@ def simulated_time() -> Iterator[None]:
     with (
         connect() as session,
         ClockPublisher(session) as publisher,
-        again_and_again(lambda: publisher.publish(5 * SECOND)),
+        repeated(lambda: publisher.publish(5 * SECOND)),
     ):
         yield
 
@@ -225,7 +225,7 @@ def test_simulated_time_without_a_publisher_is_broken():
     with (
         connect() as session,
         StatePublisher(session, load_model(RRBOT), clock=clock) as publisher,
-        again_and_again(lambda: publisher.publish([0.0, 0.0])),
+        repeated(lambda: publisher.publish([0.0, 0.0])),
     ):
         found = broken_link("rrbot")
     assert found["name"] == "stamps"
@@ -233,7 +233,11 @@ def test_simulated_time_without_a_publisher_is_broken():
 
 
 def test_robots_on_different_clocks_are_a_warning():
-    with simulated_time(), standing("left"), standing("right", clock=ManualClock(5 * SECOND, "sim")):
+    with (
+        simulated_time(),
+        published_robot("left"),
+        published_robot("right", clock=ManualClock(5 * SECOND, "sim")),
+    ):
         done = zstate("doctor")
     lines = done.stdout.decode().splitlines()
     (line,) = [line for line in lines if "different clocks" in line]
@@ -243,9 +247,9 @@ def test_robots_on_different_clocks_are_a_warning():
 
 
 def test_writer_of_a_newer_version_is_reported_as_such():
-    with standing(), connect() as session:
+    with published_robot(), connect() as session:
         newer = session.zenoh.declare_publisher("zstate/rrbot/joint_states", encoding="zstate/JointState;v=2")
-        with again_and_again(lambda: newer.put(b"\x90")):
+        with repeated(lambda: newer.put(b"\x90")):
             found = broken_link("rrbot")
     assert (found["name"], found["next"]) == ("version", "pip install -U zstate")
     assert "version 2" in found["text"]
@@ -253,7 +257,7 @@ def test_writer_of_a_newer_version_is_reported_as_such():
 
 def test_two_writers_of_one_stream_are_a_warning():
     with (
-        standing(),
+        published_robot(),
         connect() as session,
         StatePublisher(session, load_model(RRBOT), streams=("joint_states",), takeover=True),
     ):
@@ -266,7 +270,7 @@ def test_two_writers_of_one_stream_are_a_warning():
 def test_disconnected_frames_are_a_warning(spawn: Spawn):
     child = started(spawn, "static", "rrbot/map", "rrbot/odom", "--xyz", "0", "0", "1")
     child.line()
-    with standing():
+    with published_robot():
         assert "in 2 trees" in warnings("rrbot")["poses"]
 
 
@@ -276,7 +280,7 @@ def test_static_edge_that_closes_a_loop_is_a_warning_with_its_writer(model_first
         session = opened.enter_context(connect())
         wrong = StaticPublisher(session, "rrbot", "mix-up", program="rigger", takeover=True)
         steps = [
-            lambda: opened.enter_context(standing()),
+            lambda: opened.enter_context(published_robot()),
             lambda: wrong.set(Transform("lower", "world", (1, 0, 0), (0, 0, 0, 1))),
         ]
         opened.enter_context(wrong)
@@ -292,8 +296,8 @@ def test_static_edge_that_closes_a_loop_is_a_warning_with_its_writer(model_first
 
 def test_static_edge_on_a_frame_of_another_robot_is_a_warning():
     with (
-        standing("r1"),
-        standing("r2"),
+        published_robot("r1"),
+        published_robot("r2"),
         connect() as session,
         StaticPublisher(session, "r2", "camera", takeover=True) as publisher,
     ):
@@ -317,7 +321,7 @@ def test_unknown_host_name_is_distinguished_from_a_refusing_host():
 
 
 def test_another_program_at_the_rendezvous_address_is_detected(monkeypatch: pytest.MonkeyPatch):
-    with socket.create_server(("127.0.0.1", a_free_port())) as server:
+    with socket.create_server(("127.0.0.1", find_free_port())) as server:
         monkeypatch.setenv("ZSTATE_RENDEZVOUS", "{}:{}".format(*server.getsockname()))
         found = broken_link()
     assert (found["name"], "does not answer: it is another program" in found["text"]) == ("network", True)
@@ -337,7 +341,7 @@ def test_stopped_program_that_blocks_the_rendezvous_is_reported(
     assert reason in zstate("ls").stderr.decode()
     # With a second address, the other programs meet there and are found.
     monkeypatch.setenv("ZSTATE_RENDEZVOUS", f"{rendezvous} 127.0.0.1:{free_port}")
-    with standing("r1"):
+    with published_robot("r1"):
         assert b"r1" in zstate("ls", "--json").stdout
         report = warnings()["network"]
     assert reason in report
@@ -419,7 +423,7 @@ ARM = """<robot name="arm"><link name="base"/><link name="upper"/><link name="ti
 def test_positions_outside_joint_limits_are_a_warning_that_suspects_degrees(
     positions: tuple[float, ...], text: str
 ):
-    with standing("arm", positions, model=ARM):
+    with published_robot("arm", positions, model=ARM):
         report = diagnosed("arm", code=0)
     (found,) = [check for check in report["checks"] if check["state"] == "warning"]
     assert (found["name"], found["text"]) == ("limits", text)
@@ -427,7 +431,7 @@ def test_positions_outside_joint_limits_are_a_warning_that_suspects_degrees(
 
 
 def test_continuous_joint_after_many_turns_is_sound():
-    with standing("arm", (2.0005, 900.0), model=ARM):
+    with published_robot("arm", (2.0005, 900.0), model=ARM):
         assert warnings("arm") == {}
 
 
@@ -445,7 +449,7 @@ def static_edges(*edges: tuple[str, str, str]) -> Iterator[None]:
 
 
 def test_static_target_similar_to_a_frame_is_reported_and_not_joined():
-    with standing(), static_edges(("rrbot", "lowr", "camera")):
+    with published_robot(), static_edges(("rrbot", "lowr", "camera")):
         report = diagnosed("rrbot", code=0)
     (found,) = [check for check in report["checks"] if check["name"] == "poses"]
     assert "'lowr', the parent of 'rrbot/camera', is similar to 'lower'" in found["text"]
@@ -453,14 +457,18 @@ def test_static_target_similar_to_a_frame_is_reported_and_not_joined():
 
 
 def test_static_frame_without_similar_names_can_be_joined():
-    with standing(), static_edges(("rrbot", "island", "palm")):
+    with published_robot(), static_edges(("rrbot", "island", "palm")):
         report = diagnosed("rrbot", code=0)
     (found,) = [check for check in report["checks"] if check["name"] == "poses"]
     assert found["next"].startswith("zstate static rrbot/island rrbot/world")
 
 
 def test_robots_with_a_map_each_are_advised_to_share_one():
-    with standing("a"), standing("b"), static_edges(("a", "map", "world"), ("b", "map", "world")):
+    with (
+        published_robot("a"),
+        published_robot("b"),
+        static_edges(("a", "map", "world"), ("b", "map", "world")),
+    ):
         report = diagnosed(code=0)
     (found,) = [check for check in report["checks"] if check["state"] == "warning"]
     assert (found["name"], found["robot"]) == ("frames", None)
@@ -472,15 +480,15 @@ def test_robots_with_a_map_each_are_advised_to_share_one():
 
 def test_robots_in_one_shared_map_and_of_one_model_are_sound():
     with (
-        standing("a"),
-        standing("b"),
+        published_robot("a"),
+        published_robot("b"),
         static_edges(("a", "fleet/map", "a/world"), ("b", "fleet/map", "b/world")),
     ):
         assert warnings() == {}
 
 
 def test_second_parent_leads_to_existing_commands():
-    with standing(), static_edges(("rrbot", "world", "lower")):
+    with published_robot(), static_edges(("rrbot", "world", "lower")):
         report = diagnosed("rrbot", code=0)
     found = [check for check in report["checks"] if check["name"] == "tf_static"]
     assert {check["state"] for check in found} == {"warning"}

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.cli_runner import RRBOT, standing, zstate
+from helpers.cli_runner import RRBOT, published_robot, zstate
 
 from zstate.cli.doctor.diagnosis import effective_network, with_same_options
 from zstate.cli.session import SessionOptions
@@ -46,7 +46,7 @@ class Found:
 
 @pytest.mark.processes
 def test_nodes_of_one_robot_are_sound_under_any_name(ros_router: str):
-    with standing(wire="ros2", router=ros_router):
+    with published_robot(wire="ros2", router=ros_router):
         for name in ((), ("ros",), ("rrbot",)):
             found = Found(*name)
             assert set(found.states.values()) == {"ok"}, found.texts
@@ -58,9 +58,11 @@ def test_nodes_of_one_robot_are_sound_under_any_name(ros_router: str):
 @pytest.mark.processes
 def test_joints_of_other_models_on_the_topic_are_ok(ros_router: str, gripper: str):
     with ExitStack() as nodes:
-        nodes.enter_context(standing(wire="ros2", router=ros_router))
+        nodes.enter_context(published_robot(wire="ros2", router=ros_router))
         only: tuple[Stream, ...] = ("joint_states",)
-        nodes.enter_context(standing("grip", wire="ros2", router=ros_router, model=gripper, streams=only))
+        nodes.enter_context(
+            published_robot("grip", wire="ros2", router=ros_router, model=gripper, streams=only)
+        )
         found = Found("rrbot")
     assert found.states["joint_states"] == "ok"
     assert found.texts["joint_states"].count(" Hz from ") == 2
@@ -70,8 +72,10 @@ def test_joints_of_other_models_on_the_topic_are_ok(ros_router: str, gripper: st
 @pytest.mark.processes
 def test_joint_published_by_two_nodes_is_a_warning(ros_router: str):
     with ExitStack() as nodes:
-        nodes.enter_context(standing(wire="ros2", router=ros_router))
-        nodes.enter_context(standing("copy", wire="ros2", router=ros_router, streams=("joint_states",)))
+        nodes.enter_context(published_robot(wire="ros2", router=ros_router))
+        nodes.enter_context(
+            published_robot("copy", wire="ros2", router=ros_router, streams=("joint_states",))
+        )
         found = Found()
     assert found.states["joint_states"] == "warning"
     assert "joint 'shoulder' is published by /" in found.texts["joint_states"]
@@ -82,8 +86,8 @@ def test_joint_published_by_two_nodes_is_a_warning(ros_router: str):
 @pytest.mark.processes
 def test_two_robots_in_one_namespace_are_a_warning(ros_router: str, gripper: str):
     with ExitStack() as nodes:
-        nodes.enter_context(standing(wire="ros2", router=ros_router))
-        nodes.enter_context(standing("grip", wire="ros2", router=ros_router, model=gripper))
+        nodes.enter_context(published_robot(wire="ros2", router=ros_router))
+        nodes.enter_context(published_robot("grip", wire="ros2", router=ros_router, model=gripper))
         found = Found()
     assert found.states["writers"] == "warning"
     assert found.texts["writers"].startswith("2 nodes publish the model, ")
@@ -95,8 +99,10 @@ def test_two_robots_in_one_namespace_are_a_warning(ros_router: str, gripper: str
 def test_driver_of_other_joints_is_distinguished_from_a_missing_one(ros_router: str, gripper: str):
     with ExitStack() as nodes:
         only: tuple[Stream, ...] = ("joint_states",)
-        nodes.enter_context(standing(wire="ros2", router=ros_router, streams=WITHOUT_JOINTS))
-        nodes.enter_context(standing("grip", wire="ros2", router=ros_router, model=gripper, streams=only))
+        nodes.enter_context(published_robot(wire="ros2", router=ros_router, streams=WITHOUT_JOINTS))
+        nodes.enter_context(
+            published_robot("grip", wire="ros2", router=ros_router, model=gripper, streams=only)
+        )
         found = Found(code=1)
     assert found.first_broken["name"] == "joint_states"
     text = "no joint on /joint_states ('grip_shoulder', 'grip_elbow') is in the model 'rrbot'"
@@ -105,12 +111,12 @@ def test_driver_of_other_joints_is_distinguished_from_a_missing_one(ros_router: 
 
 @pytest.mark.processes
 def test_missing_driver_and_missing_model_are_reported(ros_router: str):
-    with standing(wire="ros2", router=ros_router, streams=("tf_static", "robot_description")):
+    with published_robot(wire="ros2", router=ros_router, streams=("tf_static", "robot_description")):
         lacking = Found(code=1).first_broken
     assert (lacking["name"], lacking["robot"]) == ("joint_states", "ros")
     assert "/joint_states has no publisher, and /" in lacking["text"]
     assert lacking["next"].startswith(f"zstate joints FILE --wire ros2 --connect {ros_router}  # ")
-    with standing(wire="ros2", router=ros_router, streams=("joint_states",)):
+    with published_robot(wire="ros2", router=ros_router, streams=("joint_states",)):
         lacking = Found(code=1).first_broken
     assert (lacking["name"], lacking["text"]) == ("model", "/robot_description has no publisher")
     assert lacking["next"] == f"zstate publish FILE --wire ros2 --connect {ros_router}"
@@ -149,7 +155,7 @@ def test_degrees_on_the_topic_are_a_warning(ros_router: str, tmp_path: Path):
     limit = '<limit lower="-2" upper="2" effort="1" velocity="1"/>'
     model = tmp_path / "limited.urdf"
     model.write_text(re.sub(r"<limit [^>]*/>", "", text).replace("<axis", f"{limit}<axis"))
-    with standing(positions=(45.0, 0.0), model=str(model), wire="ros2", router=ros_router):
+    with published_robot(positions=(45.0, 0.0), model=str(model), wire="ros2", router=ros_router):
         found = Found()
     assert found.states["limits"] == "warning"
     assert found.texts["limits"].endswith(

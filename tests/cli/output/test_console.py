@@ -8,7 +8,7 @@ from contextlib import ExitStack
 
 import pytest
 from helpers.cli_runner import RRBOT, zstate
-from helpers.processes import again_and_again
+from helpers.processes import repeated
 
 from zstate import StatePublisher, connect, load_model
 from zstate.cli.output.logs import without_controls
@@ -49,7 +49,7 @@ def stranger() -> Iterator[None]:
             mount.set(encode(StaticTransforms(77, (("tool", frame),), pose)))
         status_publisher = StreamPublisher(session, status_key("rrbot", EVIL.identity), ENCODINGS[Status])
         opened.enter_context(status_publisher)
-        opened.enter_context(again_and_again(lambda: status_publisher.put(encode(status))))
+        opened.enter_context(repeated(lambda: status_publisher.put(encode(status))))
         yield
 
 

@@ -13,7 +13,7 @@ import time
 from datetime import datetime, timezone
 
 import pytest
-from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, standing, started
+from helpers.cli_runner import RRBOT, Spawn, failure, interrupted, published_robot, started
 from helpers.processes import DEADLINE_S, until
 
 from zstate import connect
@@ -61,7 +61,7 @@ def test_unknown_format_is_refused():
 def test_every_line_of_a_running_command_is_json(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     until(lambda: "waiting: robot 'rrbot' is not announced" in command.stderr)
-    with standing() as publisher:
+    with published_robot() as publisher:
         command.line()
         output = entries(command.stderr)
     interrupted(command)
@@ -84,7 +84,7 @@ def test_standard_output_of_a_service_is_json_too(spawn: Spawn, free_port: int):
 def test_library_warning_has_its_event_and_reason(spawn: Spawn):
     command = started(spawn, "monitor", "--robots", "--robot", "rrbot", "--log-format", "json")
     key, encoding = "zstate/rrbot/joint_states", ENCODINGS[JointState]
-    with standing(), connect() as session, StreamPublisher(session, key, encoding) as noise:
+    with published_robot(), connect() as session, StreamPublisher(session, key, encoding) as noise:
         command.line()
         until(lambda: noise.has_readers)
         noise.put(b"noise")

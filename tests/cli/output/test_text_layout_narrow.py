@@ -12,7 +12,7 @@ import termios
 from pathlib import Path
 
 import pytest
-from helpers.cli_runner import RRBOT, standing, zstate
+from helpers.cli_runner import RRBOT, published_robot, zstate
 
 pytestmark = pytest.mark.processes
 
@@ -47,7 +47,7 @@ def _read(terminal: int) -> bytes:
 
 
 def test_commands_about_running_robots_fit_the_width():
-    with standing("left"), standing("right"):
+    with published_robot("left"), published_robot("right"):
         for command in (
             ("ls",),
             ("tree",),

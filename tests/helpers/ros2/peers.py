@@ -47,7 +47,7 @@ class Program:
         self._answer("start")
 
     def ask(self, do: str, **arguments: Any) -> Any:
-        self._child.tell(json.dumps({"do": do, **arguments}))
+        self._child.send_line(json.dumps({"do": do, **arguments}))
         return self._answer(do)
 
     def _answer(self, did: str) -> Any:

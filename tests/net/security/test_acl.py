@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import zenoh
-from helpers.processes import a_free_port, until
-from helpers.robots import RRBOT, UPRIGHT, Tap
+from helpers.processes import find_free_port, until
+from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import InvalidInput
@@ -33,7 +33,7 @@ class Site:
     """A router with users, and sessions of its clients."""
 
     def __init__(self, folder: Any, fleet: AclRoles) -> None:
-        self.endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+        self.endpoint = f"tcp/127.0.0.1:{find_free_port()}"
         users = folder / "users.txt"
         users.write_text("".join(f"{name}:secret\n" for name in USERS))
         self.opened = ExitStack()
@@ -95,7 +95,7 @@ WRITES = [
 
 
 def test_each_role_can_write_only_its_own_keys(site: Site):
-    tap = Tap(site.join("desk"), "zstate/**")
+    tap = SampleCollector(site.join("desk"), "zstate/**")
     writers = {user: site.join(user) for user in USERS}
     allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
 
@@ -134,8 +134,11 @@ def publish_and_look(publisher: StatePublisher, listener: TransformListener) -> 
 
 
 def test_robot_receives_only_the_clock_of_others(site: Site):
-    taps = {user: Tap(site.join(user), "zstate/r1/joint_commands") for user in ("r1", "r2", "stranger")}
-    clock = Tap(site.join("r2"), "zstate/clock")
+    taps = {
+        user: SampleCollector(site.join(user), "zstate/r1/joint_commands")
+        for user in ("r1", "r2", "stranger")
+    }
+    clock = SampleCollector(site.join("r2"), "zstate/clock")
     hand, simulator = site.join("hand"), site.join("simulator")
 
     def publish_until_received() -> bool:
@@ -264,7 +267,7 @@ def test_namespace_prefixes_every_key(tmp_path):
 
 
 def test_router_without_users_denies_everything(tmp_path):
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     settings = {
         "mode": "router",
         "listen": {"endpoints": [endpoint]},

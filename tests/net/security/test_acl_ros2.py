@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from helpers.processes import Child, until
-from helpers.robots import RRBOT, UPRIGHT, Tap
+from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import AccessDenied, InvalidInput
@@ -70,7 +70,7 @@ WRITES = [
 
 def test_each_role_can_write_only_its_own_topics(join: Join):
     viewer = join("desk")
-    taps = [Tap(viewer, key) for key in ("7/**", "5/**", "zstate/**")]
+    taps = [SampleCollector(viewer, key) for key in ("7/**", "5/**", "zstate/**")]
     writers = {user: join(user) for user in USERS}
     allowed = {(user.encode(), key) for user, key, is_allowed in WRITES if is_allowed}
 

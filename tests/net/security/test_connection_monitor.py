@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers.access_routers import Fleet
-from helpers.processes import Child, a_free_port, until
+from helpers.access_routers import AccessRouters
+from helpers.processes import Child, find_free_port, until
 
 from zstate.net.security import connection_monitor
 from zstate.net.security.credentials import Credentials
 from zstate.net.session import connect
 
-CASES: dict[str, tuple[Callable[[Fleet], str], Callable[[Fleet], Credentials | None]]] = {
+CASES: dict[str, tuple[Callable[[AccessRouters], str], Callable[[AccessRouters], Credentials | None]]] = {
     "no TLS there": (lambda fleet: fleet.tls("open"), lambda fleet: fleet.identity("r1")),
     "TLS demanded": (lambda fleet: fleet.tcp("mtls"), lambda _: None),
     "wrong CA": (
@@ -50,13 +50,13 @@ def refusals(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
 
 def free_endpoint(credentials: Credentials | None) -> str:
     is_encrypted = credentials is not None and credentials.ca is not None
-    return f"{'tls' if is_encrypted else 'tcp'}/127.0.0.1:{a_free_port()}"
+    return f"{'tls' if is_encrypted else 'tcp'}/127.0.0.1:{find_free_port()}"
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
 @pytest.mark.parametrize("reason", CASES)
 def test_refused_session_that_keeps_trying_logs_the_reason(
-    fleet: Fleet, caplog: pytest.LogCaptureFixture, mode: str, reason: str
+    fleet: AccessRouters, caplog: pytest.LogCaptureFixture, mode: str, reason: str
 ):
     endpoint, credentials = (choose(fleet) for choose in CASES[reason])
     where = free_endpoint(credentials)
@@ -68,7 +68,9 @@ def test_refused_session_that_keeps_trying_logs_the_reason(
     assert text.endswith("; still trying")
 
 
-def test_session_of_a_zenoh_configuration_logs_the_reason(fleet: Fleet, caplog: pytest.LogCaptureFixture):
+def test_session_of_a_zenoh_configuration_logs_the_reason(
+    fleet: AccessRouters, caplog: pytest.LogCaptureFixture
+):
     config = {
         "mode": "router",
         "connect": {"endpoints": [fleet.tcp("users")]},
@@ -79,9 +81,9 @@ def test_session_of_a_zenoh_configuration_logs_the_reason(fleet: Fleet, caplog: 
     assert refusals(caplog)[0][0] == "user demanded"
 
 
-def test_only_refusing_endpoints_are_logged_and_once(fleet: Fleet, caplog: pytest.LogCaptureFixture):
-    first, second = (f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2))
-    unused, refusing = f"tcp/127.0.0.1:{a_free_port()}", fleet.tcp("users")
+def test_only_refusing_endpoints_are_logged_and_once(fleet: AccessRouters, caplog: pytest.LogCaptureFixture):
+    first, second = (f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2))
+    unused, refusing = f"tcp/127.0.0.1:{find_free_port()}", fleet.tcp("users")
     # Each connects to the other, and one link remains.
     settings = {"endpoints": [unused, second, fleet.tcp("open"), refusing], "listen": first}
     with connect(endpoints=first, listen=second), connect(**settings) as session:
@@ -135,7 +137,7 @@ def test_client_logs_a_refusing_router_that_replaced_its_own(
 def test_refusal_is_logged_again_after_a_link(
     routers: Callable[[str, str], Child], caplog: pytest.LogCaptureFixture, free_port: int
 ):
-    endpoint, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint, other = f"tcp/127.0.0.1:{free_port}", f"tcp/127.0.0.1:{find_free_port()}"
     stranger = routers(endpoint, "eve")
     with connect(endpoints=[endpoint, other], listen=free_endpoint(None), credentials=ALICE) as session:
         until(lambda: len(refusals(caplog)) == 1)
@@ -153,7 +155,7 @@ def test_refusal_is_logged_again_after_a_link(
 
 
 def test_a_peer_with_credentials_is_warned_at_a_router_and_a_client_is_not(
-    fleet: Fleet, caplog: pytest.LogCaptureFixture
+    fleet: AccessRouters, caplog: pytest.LogCaptureFixture
 ):
     endpoint, identity = fleet.tls("mtls"), fleet.identity("r1")
     with (

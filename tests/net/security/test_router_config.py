@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import zenoh
-from helpers.processes import a_free_port, until
-from helpers.robots import RRBOT, Tap
+from helpers.processes import find_free_port, until
+from helpers.robots import RRBOT, SampleCollector
 
 from zstate import StatePublisher, connect
 from zstate.errors import ConfigError, InvalidInput
@@ -60,8 +60,8 @@ def test_settings_equal_those_of_a_session_in_router_mode():
 
 
 def test_router_retries_other_routers_and_serves_clients_in_between():
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
-    config = RouterConfig((endpoint,), (f"tcp/127.0.0.1:{a_free_port()}",))
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
+    config = RouterConfig((endpoint,), (f"tcp/127.0.0.1:{find_free_port()}",))
     with connect(config.settings()), connect(mode="client", endpoints=endpoint) as client:
         assert client.zenoh.info.routers_zid()
 
@@ -100,15 +100,15 @@ def test_a_file_without_access_control_is_refused(tmp_path: Path, text: str):
 
 def test_each_robot_is_downsampled_separately_and_latched_values_never():
     """For one rule of both, Zenoh would let through as much of them together as of one."""
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     limits = Downsampling({"joint_states": 20.0}, ("r1", "r2"))
     with (
         connect(RouterConfig((endpoint,), downsampling=limits).settings()),
         connect(mode="client", endpoints=endpoint) as writer,
         connect(mode="client", endpoints=endpoint) as reader,
     ):
-        taps = [Tap(reader, f"zstate/{robot}/joint_states") for robot in ("r1", "r2")]
-        statics = Tap(reader, "zstate/*/tf_static/*")
+        taps = [SampleCollector(reader, f"zstate/{robot}/joint_states") for robot in ("r1", "r2")]
+        statics = SampleCollector(reader, "zstate/*/tf_static/*")
         with (
             StatePublisher(writer, RRBOT, "r1") as one,
             StatePublisher(writer, RRBOT, "r2") as other,
@@ -130,14 +130,14 @@ def test_each_robot_is_downsampled_separately_and_latched_values_never():
 
 
 def test_other_interfaces_are_not_downsampled():
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     limits = Downsampling({"joint_states": 0.01}, ("r1",), ("no-such-interface",))
     with (
         connect(RouterConfig((endpoint,), downsampling=limits).settings()),
         connect(mode="client", endpoints=endpoint) as writer,
         connect(mode="client", endpoints=endpoint) as reader,
     ):
-        tap = Tap(reader, "zstate/r1/joint_states")
+        tap = SampleCollector(reader, "zstate/r1/joint_states")
         with StatePublisher(writer, RRBOT, "r1") as publisher:
             until(lambda: (publisher.publish([0.1, 0.2]), len(tap.arrivals) >= 10)[1])
 

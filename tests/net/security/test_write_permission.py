@@ -4,7 +4,7 @@ import pickle
 from collections.abc import Iterator
 
 import pytest
-from helpers.processes import a_free_port
+from helpers.processes import find_free_port
 from helpers.robots import RRBOT
 
 from zstate import StatePublisher, StaticPublisher, connect, discover
@@ -19,7 +19,7 @@ USERS = ("r1", "r2", "desk", "stranger")
 @pytest.fixture
 def endpoint(tmp_path) -> Iterator[str]:
     """The endpoint of a router with the robots r1 and r2, and the viewer desk."""
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     users = tmp_path / "users.txt"
     users.write_text("".join(f"{name}:secret\n" for name in USERS))
     settings = {
@@ -64,7 +64,7 @@ def test_denial_names_the_identity_and_the_missing_rule(endpoint: str, user: str
 
 
 def test_session_without_credentials_has_no_probe():
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     with (
         connect(mode="router", listen=endpoint),
         connect(mode="client", endpoints=endpoint) as session,
@@ -74,7 +74,7 @@ def test_session_without_credentials_has_no_probe():
 
 
 def test_writer_is_not_refused_after_its_router_closed(tmp_path):
-    endpoint = f"tcp/127.0.0.1:{a_free_port()}"
+    endpoint = f"tcp/127.0.0.1:{find_free_port()}"
     users = tmp_path / "users.txt"
     users.write_text("r1:secret\n")
     settings = {

@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
-from helpers.recording_files import DESCRIPTION, START, S, declared, joint_states, write_run
+from helpers.recording_files import DESCRIPTION, START, S, declare_channels, joint_states, write_run
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
@@ -33,7 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, list[int], lis
     path = tmp_path_factory.mktemp("run") / "run.mcap"
     flushed: list[int] = []
     with RecordingWriter(path) as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         writer.latch(described, "", DESCRIPTION, START, START)
         writer.flush()
         flushed.append(writer.size)

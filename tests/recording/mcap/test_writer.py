@@ -16,7 +16,7 @@ from helpers.recording_files import (
     START,
     STORE,
     S,
-    declared,
+    declare_channels,
     joint_states,
     string_bytes,
     write_run,
@@ -100,7 +100,7 @@ def test_latched_values_repeat_every_ten_seconds_at_the_start_of_a_chunk(tmp_pat
     path = tmp_path / "run.mcap"
     stamps = [START + second * S for second in range(25)]
     with RecordingWriter(path) as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         writer.latch(described, "a", b"A", START, START)
         writer.latch(described, "b", b"B", START, START)
         for second, stamp in enumerate(stamps):
@@ -117,7 +117,7 @@ def test_latched_values_repeat_every_ten_seconds_at_the_start_of_a_chunk(tmp_pat
 def test_new_value_replaces_the_latched_one_and_an_unlatched_one_is_gone(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         for key, value in (("a", b"old"), ("b", b"B"), ("a", b"new")):
             writer.latch(described, key, value, START, START)
         writer.unlatch(described, "b")
@@ -152,7 +152,7 @@ def test_max_bytes_holds_except_for_latched_values_and_the_index(tmp_path: Path)
 
 def test_writer_lists_its_files_and_counts_their_bytes(tmp_path: Path):
     with RecordingWriter(tmp_path / "run.mcap", max_seconds=2.0) as writer:
-        _, joints = declared(writer)
+        _, joints = declare_channels(writer)
         for stamp, payload in joint_states(350):
             writer.write(joints, payload, stamp, stamp)
         writer.flush()
@@ -164,7 +164,7 @@ def test_decreasing_log_times_keep_the_index_correct(tmp_path: Path):
     path = tmp_path / "run.mcap"
     offsets = [0, 5, 3, 40, 20, 35, 1, 60, 50]
     with RecordingWriter(path) as writer:
-        _, joints = declared(writer)
+        _, joints = declare_channels(writer)
         for number, offset in enumerate(offsets):
             writer.write(joints, bytes([offset]), START + offset * MS, START)
             if number % 3 == 2:
@@ -189,7 +189,7 @@ def test_decreasing_log_times_keep_the_index_correct(tmp_path: Path):
 def test_flushed_messages_can_be_read_during_the_recording(tmp_path: Path):
     path, states = tmp_path / "run.mcap", joint_states(30)
     with RecordingWriter(path) as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         writer.latch(described, "", DESCRIPTION, START, START)
         for number, (stamp, payload) in enumerate(states):
             writer.write(joints, payload, stamp, stamp)
@@ -310,7 +310,7 @@ def test_limits_that_would_split_every_message_are_refused(tmp_path: Path, limit
 def test_unwritable_message_leaves_the_file_whole(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as writer:
-        _, joints = declared(writer)
+        _, joints = declare_channels(writer)
         for channel, log_time, publish_time in ((9, 1, 1), (joints, -1, 1), (joints, 1, 1 << 64)):
             with pytest.raises(InvalidInput):
                 writer.write(channel, b"x", log_time, publish_time)
@@ -322,7 +322,7 @@ def test_unwritable_message_leaves_the_file_whole(tmp_path: Path):
 
 def test_closed_writer_writes_nothing(tmp_path: Path):
     writer = RecordingWriter(tmp_path / "run.mcap")
-    _, joints = declared(writer)
+    _, joints = declare_channels(writer)
     writer.close()
     writer.close()
     writer.flush()
@@ -335,7 +335,7 @@ def test_closed_writer_writes_nothing(tmp_path: Path):
 def test_concurrent_writes_and_flushes_lose_nothing(tmp_path: Path):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, max_bytes=70_000) as writer:
-        described, joints = declared(writer)
+        described, joints = declare_channels(writer)
         writer.latch(described, "", DESCRIPTION, START, START)
 
         def write(sender: int) -> None:

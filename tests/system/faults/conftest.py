@@ -1,4 +1,4 @@
-"""What the fault suite has: processes that can be asked, and networks that can be cut."""
+"""Fixtures of the fault suite: processes with queries, and networks that can be cut."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks that are cut, for shorter and for longer than a connection waits before it gives up."""
+"""Network cuts shorter and longer than the timeout of a connection."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import pytest
-from helpers.fault_processes import SLACK, Party, Start, assert_no_growth, client
+from helpers.fault_processes import SLACK, FaultProcess, Start, assert_no_growth, client
 from helpers.fault_queries import MAX_AGE_S
-from helpers.network_namespaces import REASON, Hosts, possible
+from helpers.network_namespaces import REASON, NamespaceHosts, can_create_namespaces
 from helpers.processes import until
 
-pytestmark = [pytest.mark.processes, pytest.mark.netns, pytest.mark.skipif(not possible(), reason=REASON)]
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.netns,
+    pytest.mark.skipif(not can_create_namespaces(), reason=REASON),
+]
 
 RATE_HZ = 100.0
 BOUND_S = 1.0
@@ -23,7 +27,7 @@ CUT_READERS = ("swallowed5", "swallowed15", "unplugged5", "unplugged15")
 class Watched(NamedTuple):
     """Who looks at which robot across a cut, and how that cut is made and mended."""
 
-    party: Party
+    party: FaultProcess
     robot: str
     cut: Callable[[], None]
     heal: Callable[[], None]
@@ -31,13 +35,13 @@ class Watched(NamedTuple):
 
 
 @pytest.fixture
-def hosts() -> Iterator[Hosts]:
-    with Hosts("robot", "writer", *CUT_READERS) as hosts:
+def hosts() -> Iterator[NamespaceHosts]:
+    with NamespaceHosts("robot", "writer", *CUT_READERS) as hosts:
         yield hosts
 
 
-def test_after_cuts_of_5_and_15_s_all_is_back_within_a_second_and_nothing_old_passes_as_new(
-    start: Start, hosts: Hosts
+def test_recovery_from_cuts_of_5_and_15_s_within_a_second_without_old_samples_as_new(
+    start: Start, hosts: NamespaceHosts
 ):
     at_home, away = client("tcp/127.0.0.1:7447"), client(f"tcp/{hosts.address('robot')}:7447")
     home = hosts.namespace("robot")
@@ -53,47 +57,47 @@ def test_after_cuts_of_5_and_15_s_all_is_back_within_a_second_and_nothing_old_pa
         way = swallowing(hosts, name) if name.startswith("swallowed") else unplugging(hosts, name)
         watching[name] = Watched(reader, "r1", *way, 15.0 if name.endswith("15") else 5.0)
     for one in watching.values():
-        assert one.party.ask("after", "r1", 0)
-        assert one.party.ask("after", "r2", 0)
-        one.party.ask("watch", one.robot)
-    before = [one.party.ask("census") for one in watching.values()], router.ask("census")
+        assert one.party.query("after", "r1", 0)
+        assert one.party.query("after", "r2", 0)
+        one.party.query("watch", one.robot)
+    before = [one.party.query("census") for one in watching.values()], router.query("census")
 
     began = time.monotonic()
     for one in watching.values():
         one.cut()
-    writer.ask("mark", 1.0)  # latched values that change while nobody can be told
-    cut_writer.ask("mark", 1.0)
+    writer.query("mark", 1.0)  # latched values that change during the cut
+    cut_writer.query("mark", 1.0)
     healed = {}
     for name, one in sorted(watching.items(), key=lambda named: named[1].seconds):
         until(lambda one=one: time.monotonic() >= began + one.seconds, timeout_s=20.0)
         one.heal()
         healed[name] = time.time_ns()
-        one.party.tell("after", one.robot, healed[name])
-        one.party.tell("mark", one.robot, 1.0)
+        one.party.send("after", one.robot, healed[name])
+        one.party.send("mark", one.robot, 1.0)
 
     for name, one in watching.items():
         check_recovery(name, one, healed[name])
-    stats = witness.ask("stats")
+    stats = witness.query("stats")
     assert stats["refused"] == {}
     for was, one in zip(before[0], watching.values(), strict=True):
-        assert_no_growth(was, one.party.ask("census"))
-    assert_no_growth(before[1], router.ask("census"))
+        assert_no_growth(was, one.party.query("census"))
+    assert_no_growth(before[1], router.query("census"))
 
 
-def swallowing(hosts: Hosts, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
-    return lambda: hosts.swallow(name), lambda: hosts.carry(name)
+def swallowing(hosts: NamespaceHosts, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
+    return lambda: hosts.drop_packets(name), lambda: hosts.pass_packets(name)
 
 
-def unplugging(hosts: Hosts, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
+def unplugging(hosts: NamespaceHosts, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
     return lambda: hosts.unplug(name), lambda: hosts.plug(name)
 
 
 def check_recovery(name: str, one: Watched, healed_at: int) -> None:
-    heard_at, latched_at = one.party.hear(), one.party.hear()
+    heard_at, latched_at = one.party.receive(), one.party.receive()
     assert heard_at, name
     assert latched_at, name
-    one.party.ask("after", one.robot, heard_at)  # so that the watch has seen the end of the gap, too
-    watched, stats = one.party.ask("watched", one.robot), one.party.ask("stats")
+    one.party.query("after", one.robot, heard_at)  # so that the watch has seen the end of the gap, too
+    watched, stats = one.party.query("watched", one.robot), one.party.query("stats")
     heard_s, latched_s = ((at - healed_at) * 1e-9 for at in (heard_at, latched_at))
     print(
         f"{name}: answers again {heard_s:.3f} s after the heal, latched value after {latched_s:.3f} s; "

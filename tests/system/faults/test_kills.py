@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 import pytest
-from helpers.fault_processes import SLACK, Party, Start, assert_no_growth, client, figures
-from helpers.processes import a_free_port
+from helpers.fault_processes import SLACK, FaultProcess, Start, assert_no_growth, client, print_figures
+from helpers.processes import find_free_port
 
 pytestmark = pytest.mark.processes
 
@@ -15,115 +15,115 @@ RATE_HZ = 200.0
 BOUND_S = 1.0
 
 
-def since(party: Party, heard_at: int | None) -> float:
-    """Seconds from when a process was ready until the reader had its answer."""
+def since(party: FaultProcess, heard_at: int | None) -> float:
+    """Seconds from the readiness of a process to the first lookup of the reader."""
     assert heard_at is not None
     return max(0.0, (heard_at - party.ready_at) * 1e-9)
 
 
-def killed(party: Party) -> int:
+def killed(party: FaultProcess) -> int:
     """When that was [ns]."""
     party.kill()
     return time.time_ns()
 
 
-def test_a_publisher_killed_twenty_times_is_heard_again_within_a_second(start: Start, endpoint: str):
-    def publisher(mark: float) -> Party:
+def test_publisher_killed_twenty_times_is_received_again_within_a_second(start: Start, endpoint: str):
+    def publisher(mark: float) -> FaultProcess:
         return start(
             "publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ, mark=mark, wait=False
         )
 
     router = start("router", listen=endpoint)
     reader = start("reader", session=client(endpoint))
-    publishing = publisher(0.0).ready()
-    assert reader.ask("after", "r1", 0)
+    publishing = publisher(0.0).wait_ready()
+    assert reader.query("after", "r1", 0)
     before, answered, latched, silent = [], [], [], []
     for mark in range(1, ROUNDS + 1):
         killed_at = killed(publishing)
         publishing = publisher(mark)
-        publishing.ready()
-        silent.append((reader.ask("after", "r1", killed_at) - killed_at) * 1e-9)
-        answered.append(since(publishing, reader.ask("after", "r1", publishing.ready_at)))
-        latched.append(since(publishing, reader.ask("mark", "r1", mark)))
+        publishing.wait_ready()
+        silent.append((reader.query("after", "r1", killed_at) - killed_at) * 1e-9)
+        answered.append(since(publishing, reader.query("after", "r1", publishing.ready_at)))
+        latched.append(since(publishing, reader.query("mark", "r1", mark)))
         if mark == 2:
-            before = [reader.ask("census"), router.ask("census")]
+            before = [reader.query("census"), router.query("census")]
     for was, party in zip(before, (reader, router), strict=True):
-        assert_no_growth(was, party.ask("census"))
-    figures("publisher killed: silent, with the time to start another", silent)
-    figures("publisher killed: answers again after the new one is ready", answered)
-    figures("publisher killed: new latched value after", latched)
+        assert_no_growth(was, party.query("census"))
+    print_figures("publisher killed: silent, with the time to start another", silent)
+    print_figures("publisher killed: answers again after the new one is ready", answered)
+    print_figures("publisher killed: new latched value after", latched)
     assert max(answered) < BOUND_S * SLACK
     assert max(latched) < BOUND_S * SLACK
-    assert reader.ask("stats")["refused"] == {}
+    assert reader.query("stats")["refused"] == {}
 
 
-def test_a_router_killed_twenty_times_loses_no_latched_value_though_it_changed_meanwhile(
+def test_router_killed_twenty_times_loses_no_latched_value_changed_during_the_outage(
     start: Start, endpoint: str
 ):
     router = start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ)
     reader = start("reader", session=client(endpoint))
-    assert reader.ask("after", "r1", 0)
+    assert reader.query("after", "r1", 0)
     before, answered, latched, silent = [], [], [], []
     for mark in range(1, ROUNDS + 1):
         killed_at = killed(router)
-        publisher.ask("mark", mark)  # nobody carries it now
+        publisher.query("mark", mark)  # no router forwards it now
         router = start("router", listen=endpoint)
-        silent.append((reader.ask("after", "r1", killed_at) - killed_at) * 1e-9)
-        answered.append(since(router, reader.ask("after", "r1", router.ready_at)))
-        latched.append(since(router, reader.ask("mark", "r1", mark)))
+        silent.append((reader.query("after", "r1", killed_at) - killed_at) * 1e-9)
+        answered.append(since(router, reader.query("after", "r1", router.ready_at)))
+        latched.append(since(router, reader.query("mark", "r1", mark)))
         if mark == 2:
-            before = [reader.ask("census"), publisher.ask("census")]
+            before = [reader.query("census"), publisher.query("census")]
     for was, party in zip(before, (reader, publisher), strict=True):
-        assert_no_growth(was, party.ask("census"))
+        assert_no_growth(was, party.query("census"))
     late = start("reader", session=client(endpoint))
-    assert late.ask("after", "r1", late.ready_at) and late.ask("mark", "r1", ROUNDS)
-    figures("router killed: silent, with the time to start another", silent)
-    figures("router killed: answers again after the new one is ready", answered)
-    figures("router killed: latched value changed meanwhile after", latched)
+    assert late.query("after", "r1", late.ready_at) and late.query("mark", "r1", ROUNDS)
+    print_figures("router killed: silent, with the time to start another", silent)
+    print_figures("router killed: answers again after the new one is ready", answered)
+    print_figures("router killed: latched value changed meanwhile after", latched)
     assert max(answered) < BOUND_S * SLACK
     assert max(latched) < BOUND_S * SLACK
 
 
-def test_a_listener_killed_twenty_times_has_everything_within_a_second(start: Start, endpoint: str):
+def test_listener_killed_twenty_times_has_all_data_within_a_second(start: Start, endpoint: str):
     router = start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=RATE_HZ, mark=7.0)
     witness = start("reader", session=client(endpoint))
     before, answered, latched = [], [], []
     for number in range(1, ROUNDS + 1):
         reader = start("reader", session=client(endpoint))
-        answered.append(since(reader, reader.ask("after", "r1", reader.ready_at)))
-        latched.append(since(reader, reader.ask("mark", "r1", 7.0)))
+        answered.append(since(reader, reader.query("after", "r1", reader.ready_at)))
+        latched.append(since(reader, reader.query("mark", "r1", 7.0)))
         reader.kill()
         if number == 2:
-            before = [party.ask("census") for party in (publisher, router, witness)]
+            before = [party.query("census") for party in (publisher, router, witness)]
     for was, party in zip(before, (publisher, router, witness), strict=True):
-        assert_no_growth(was, party.ask("census"))
-    stats = witness.ask("stats")
+        assert_no_growth(was, party.query("census"))
+    stats = witness.query("stats")
     assert (stats["missed"], stats["dropped"], stats["refused"]) == (0, 0, {})
-    figures("listener killed: answers again after", answered)
-    figures("listener killed: latched value after", latched)
+    print_figures("listener killed: answers again after", answered)
+    print_figures("listener killed: latched value after", latched)
     assert max(answered) < BOUND_S * SLACK
     assert max(latched) < BOUND_S * SLACK
 
 
-def test_when_a_router_dies_its_clients_go_on_with_the_next(start: Start):
-    first, second = (f"tcp/127.0.0.1:{a_free_port()}" for _ in range(2))
+def test_clients_of_a_killed_router_continue_with_the_next(start: Start):
+    first, second = (f"tcp/127.0.0.1:{find_free_port()}" for _ in range(2))
     both = client(first, second)
     dying = start("router", listen=first)
     left = start("router", listen=second, connect_to=[first])
     publisher = start("publisher", robot="r1", session=both, rate_hz=RATE_HZ)
     reader = start("reader", session=both)
-    assert reader.ask("after", "r1", 0)
-    assert publisher.ask("routers") == [dying.ask("zid")]
-    reader.ask("watch", "r1")
-    killed_at = reader.ask("newest", "r1")
+    assert reader.query("after", "r1", 0)
+    assert publisher.query("routers") == [dying.query("zid")]
+    reader.query("watch", "r1")
+    killed_at = reader.query("newest", "r1")
     dying.kill()
-    publisher.ask("mark", 5.0)
-    assert reader.ask("after", "r1", killed_at + 200_000_000)
-    assert reader.ask("mark", "r1", 5.0)
-    assert publisher.ask("routers") == [left.ask("zid")]
-    watched = reader.ask("watched", "r1")
+    publisher.query("mark", 5.0)
+    assert reader.query("after", "r1", killed_at + 200_000_000)
+    assert reader.query("mark", "r1", 5.0)
+    assert publisher.query("routers") == [left.query("zid")]
+    watched = reader.query("watched", "r1")
     print(f"router fail-over: a gap of {watched['gap_ns'] * 1e-9:.3f} s")
     assert watched["went_back"] == 0
     assert watched["gap_ns"] * 1e-9 < BOUND_S * SLACK

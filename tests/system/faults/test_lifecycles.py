@@ -1,4 +1,4 @@
-"""Processes that fork, and processes that open and close all day."""
+"""Processes that fork, and processes that open and close many sessions."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ STARTING = """
 
 
 @pytest.mark.parametrize("mode", ["client", "peer"])
-def test_a_forked_child_is_told_to_connect_itself_and_harms_nobody(
+def test_forked_child_gets_an_error_naming_connect_and_affects_no_other_process(
     spawn, start: Start, endpoint: str, mode: str
 ):
     start("router", listen=endpoint)
@@ -139,7 +139,7 @@ def test_a_forked_child_is_told_to_connect_itself_and_harms_nobody(
 
 
 @pytest.mark.parametrize("way", ["client", "peer"])
-def test_two_hundred_starts_and_stops_leave_nothing_behind(spawn, start: Start, endpoint: str, way: str):
+def test_two_hundred_starts_and_stops_leave_no_resources_behind(spawn, start: Start, endpoint: str, way: str):
     count = STARTS if way == "client" else STARTS // 4
     start("router", listen=endpoint)
     child = spawn(STARTING, json.dumps(client(endpoint) if way == "client" else {}), str(count), TESTS)

@@ -1,4 +1,4 @@
-"""Who is slow, frozen or one of many, and what the others notice of it."""
+"""Slow, frozen and many processes, and their effect on others."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ def pass_time(seconds: float) -> None:
     until(lambda: time.monotonic() >= deadline, timeout_s=seconds + 5.0)
 
 
-def test_a_writer_frozen_for_3_s_is_stale_meanwhile_and_goes_on_afterwards(start: Start, endpoint: str):
+def test_writer_frozen_for_3_s_is_stale_and_recovers(start: Start, endpoint: str):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint))
     reader = start("reader", session=client(endpoint))
-    assert reader.ask("after", "r1", 0)
-    reader.ask("watch", "r1")
+    assert reader.query("after", "r1", 0)
+    reader.query("watch", "r1")
     publisher.signal(signal.SIGSTOP)
     pass_time(FROZEN_S)
     publisher.signal(signal.SIGCONT)
     thawed_at = time.time_ns()
-    heard_at = reader.ask("after", "r1", thawed_at)
-    assert reader.ask("after", "r1", heard_at)
-    watched = reader.ask("watched", "r1")
-    publisher.ask("mark", 3.0)
-    assert reader.ask("mark", "r1", 3.0)
+    heard_at = reader.query("after", "r1", thawed_at)
+    assert reader.query("after", "r1", heard_at)
+    watched = reader.query("watched", "r1")
+    publisher.query("mark", 3.0)
+    assert reader.query("mark", "r1", 3.0)
     print(f"writer frozen for 3 s: answers again {(heard_at - thawed_at) * 1e-9:.3f} s after it goes on")
     assert watched["stale"] > 0
     assert (watched["old_as_fresh"], watched["went_back"]) == (0, 0)
@@ -50,60 +50,62 @@ def test_a_writer_frozen_for_3_s_is_stale_meanwhile_and_goes_on_afterwards(start
 
 
 @pytest.mark.parametrize("way", ["through a router", "from peer to peer"])
-def test_a_frozen_reader_holds_neither_the_writer_nor_other_readers_up(start: Start, endpoint: str, way: str):
+def test_frozen_reader_blocks_neither_the_writer_nor_other_readers(start: Start, endpoint: str, way: str):
     session = client(endpoint) if way == "through a router" else {}
     if session:
         start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=session, rate_hz=200.0)
     frozen, other = (start("reader", session=session) for _ in range(2))
     for reader in (frozen, other):
-        assert reader.ask("after", "r1", 0)
-    other.ask("watch", "r1")
+        assert reader.query("after", "r1", 0)
+    other.query("watch", "r1")
     frozen.signal(signal.SIGSTOP)
     pass_time(FROZEN_S)
-    watched, stats = other.ask("watched", "r1"), other.ask("stats")
-    closing_s = publisher.ask("leave")
+    watched, stats = other.query("watched", "r1"), other.query("stats")
+    closing_s = publisher.query("leave")
     print(f"a reader frozen, {way}: the other's longest gap {watched['gap_ns'] * 1e-9:.3f} s, the writer's ")
     print(f"session closes in {closing_s:.3f} s")
     assert (stats["missed"], watched["stale"]) == (0, 0)
     assert closing_s < BOUND_S * SLACK
     frozen.signal(signal.SIGCONT)
-    assert frozen.ask("census")
+    assert frozen.query("census")
 
 
-def test_a_slow_reader_loses_samples_and_the_fast_one_beside_it_none_nor_time(start: Start, endpoint: str):
+def test_slow_reader_loses_samples_and_a_fast_reader_loses_neither_samples_nor_time(
+    start: Start, endpoint: str
+):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=500.0)
     fast = start("reader", session=client(endpoint))
-    assert fast.ask("after", "r1", 0)
-    alone = statistics.median(fast.ask("latencies", "r1", 1000))
+    assert fast.query("after", "r1", 0)
+    alone = statistics.median(fast.query("latencies", "r1", 1000))
     slow = start("reader", session=client(endpoint), robot="r1", busy_ms=10.0)
-    beside = statistics.median(fast.ask("latencies", "r1", 1000))
-    until(lambda: slow.ask("stats")["dropped"] > 0)
-    publisher.ask("pause")
-    slowly, quickly = slow.ask("stats"), fast.ask("stats")
+    beside = statistics.median(fast.query("latencies", "r1", 1000))
+    until(lambda: slow.query("stats")["dropped"] > 0)
+    publisher.query("pause")
+    slowly, quickly = slow.query("stats"), fast.query("stats")
     print(f"a slow reader: the fast one's median latency {alone / 1e3:.0f} us before, {beside / 1e3:.0f} us")
     print(f"beside it; the slow one dropped {slowly['dropped']} samples, the fast one {quickly['dropped']}")
     assert (quickly["dropped"], quickly["missed"], slowly["missed"]) == (0, 0, 0)
     assert beside / alone < 4.5  # 1.5, and as much again for a busy machine
 
 
-def test_twenty_readers_of_one_robot_get_every_sample_and_every_latched_value(start: Start, endpoint: str):
+def test_twenty_readers_of_one_robot_receive_all_samples_and_latched_values(start: Start, endpoint: str):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), mark=20.0)
     readers = [start("reader", session=client(endpoint), wait=False) for _ in range(20)]
     for reader in readers:
-        reader.ready()
+        reader.wait_ready()
     for reader in readers:
-        assert reader.ask("after", "r1", 0)
+        assert reader.query("after", "r1", 0)
     everybody_at = time.time_ns()
     for reader in readers:
-        assert reader.ask("after", "r1", everybody_at + 3_000_000_000)
-        assert reader.ask("mark", "r1", 20.0)
-    last = publisher.ask("pause")
+        assert reader.query("after", "r1", everybody_at + 3_000_000_000)
+        assert reader.query("mark", "r1", 20.0)
+    last = publisher.query("pause")
     for reader in readers:
-        assert reader.ask("after", "r1", last - 1)
-        stats = reader.ask("stats")
+        assert reader.query("after", "r1", last - 1)
+        stats = reader.query("stats")
         assert stats["received"] > 290  # three seconds at 100 Hz, less a rounding
         assert (stats["missed"], stats["dropped"], stats["late"], stats["refused"]) == (0, 0, 0, {})
 
@@ -123,24 +125,24 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(place)], check=True)
 
 
-def test_a_recorder_whose_disk_is_full_says_so_and_nobody_else_notices(
+def test_recorder_with_a_full_disk_reports_it_and_others_are_unaffected(
     start: Start, endpoint: str, small_disk: Path
 ):
     start("router", listen=endpoint)
     publisher = start("publisher", robot="r1", session=client(endpoint), rate_hz=1000.0)
     reader = start("reader", session=client(endpoint))
     recorder = start("recorder", session=client(endpoint), path=str(small_disk / "run.mcap"))
-    assert reader.ask("after", "r1", 0)
-    reader.ask("watch", "r1")
-    until(lambda: recorder.ask("ended"), timeout_s=30.0)
-    reason, written = recorder.ask("ended"), recorder.ask("written")
-    publisher.ask("pause")
-    watched, stats = reader.ask("watched", "r1"), reader.ask("stats")
+    assert reader.query("after", "r1", 0)
+    reader.query("watch", "r1")
+    until(lambda: recorder.query("ended"), timeout_s=30.0)
+    reason, written = recorder.query("ended"), recorder.query("written")
+    publisher.query("pause")
+    watched, stats = reader.query("watched", "r1"), reader.query("stats")
     print(f"a full disk: {reason}; the reader's longest gap {watched['gap_ns'] * 1e-9:.3f} s")
     assert reason.startswith("RecordingError")
     assert "No space left" in reason
     assert (stats["missed"], stats["dropped"], stats["refused"]) == (0, 0, {})
-    assert recorder.ask("census")
+    assert recorder.query("census")
     with RecordingReader(small_disk / "run.mcap") as recording:
         assert not recording.complete
         assert 0 < sum(1 for _ in recording.records()) <= written

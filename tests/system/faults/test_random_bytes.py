@@ -1,4 +1,4 @@
-"""Random bytes on every key there is: nothing crashes, and of what cannot be used nothing goes uncounted.
+"""Random bytes on every key: no crash, and every unusable payload is counted.
 
 ZSTATE_LONG=1 makes a minute of it.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import pytest
 import zenoh
 from helpers.processes import until
-from helpers.robots import RRBOT, await_reader
+from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.net.presence import announce
 from zstate.net.session import Session, connect
@@ -77,14 +77,14 @@ def put(session: Session, key: str, dice: random.Random) -> None:
 
 
 def odd_tokens(dice: random.Random) -> list[str]:
-    """Announcements that nobody makes."""
+    """Malformed announcements."""
     letters = "abz019%~._-=;:|\\ \u00e9"
     parts = ["".join(dice.choices(letters, k=dice.randrange(1, 60))) for _ in range(20)]
     native = [f"zstate/{dice.choice(NAMES)}/@writer/{part}/{part[::-1]}" for part in parts]
     return [*native, *(f"@ros2_lv/0/{part}/0/0/MP/%/%/{part}" for part in parts)]
 
 
-def test_random_bytes_on_every_key_are_counted_one_by_one_and_stop_nobody(monkeypatch: pytest.MonkeyPatch):
+def test_random_bytes_on_every_key_are_each_counted_and_stop_no_listener(monkeypatch: pytest.MonkeyPatch):
     crashes: list[object] = []
     monkeypatch.setattr(threading, "excepthook", crashes.append)
     dice, sent = random.Random(6), Counter[str]()
@@ -96,7 +96,7 @@ def test_random_bytes_on_every_key_are_counted_one_by_one_and_stop_nobody(monkey
             for follow in FOLLOWS
         ]
         for key in {key for target in targets for key in target.keys}:
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         for token in odd_tokens(dice):
             opened.enter_context(announce(writer, token))
         deadline = time.monotonic() + SECONDS
@@ -115,8 +115,8 @@ def test_random_bytes_on_every_key_are_counted_one_by_one_and_stop_nobody(monkey
         print(f"{sent.total()} random payloads on {len(sent)} keys; refused: ")
         print(*(target.listener.stats.refused for target in targets), sep="\n")
         assert crashes == []
-        # And a robot that makes sense is followed as before.
+        # A valid robot is received as before.
         with StatePublisher(writer, RRBOT, "fresh") as fresh:
-            await_reader(writer, "zstate/fresh/joint_states")
+            wait_for_reader(writer, "zstate/fresh/joint_states")
             fresh.publish([0.1, 0.2])
             targets[0].listener.buffer.wait("fresh/world", "fresh/tool", timeout_s=10.0)

@@ -1,4 +1,4 @@
-"""Writers that fight for one robot, and writers whose clock steps."""
+"""Conflicting writers of one robot, and writers with clock steps."""
 
 from __future__ import annotations
 
@@ -12,43 +12,43 @@ pytestmark = pytest.mark.processes
 HOUR = 3600 * 1_000_000_000
 
 
-def test_a_second_writer_in_another_process_ends_and_names_the_first_who_goes_on(start: Start, endpoint: str):
+def test_second_writer_process_ends_naming_the_first_which_continues(start: Start, endpoint: str):
     start("router", listen=endpoint)
     first = start("publisher", robot="r1", session=client(endpoint))
     reader = start("reader", session=client(endpoint))
-    assert reader.ask("after", "r1", 0)
+    assert reader.query("after", "r1", 0)
     second = start("publisher", robot="r1", session=client(endpoint), wait=False)
     assert second.child.wait() != 0
     assert "SecondWriter" in second.child.stderr
     assert f"pid {first.child.process.pid}" in second.child.stderr
-    assert reader.ask("after", "r1", time.time_ns())
-    stats = reader.ask("stats")
+    assert reader.query("after", "r1", time.time_ns())
+    stats = reader.query("stats")
     assert (stats["missed"], stats["refused"]) == (0, {})
 
 
-def test_of_two_writers_that_fight_the_newer_is_followed_and_the_others_samples_are_counted(
+def test_newer_of_two_conflicting_writers_is_used_and_samples_of_the_other_are_counted(
     start: Start, endpoint: str
 ):
     start("router", listen=endpoint)
     start("publisher", robot="r1", session=client(endpoint))
     reader = start("reader", session=client(endpoint))
-    assert reader.ask("after", "r1", 0)
+    assert reader.query("after", "r1", 0)
     second = start("publisher", robot="r1", session=client(endpoint), takeover=True, mark=2.0)
-    assert reader.ask("after", "r1", second.ready_at)
-    reader.ask("watch", "r1")
-    reader.ask("after", "r1", time.time_ns() + 1_000_000_000)
-    watched = reader.ask("watched", "r1")
-    stats = reader.ask("stats")
+    assert reader.query("after", "r1", second.ready_at)
+    reader.query("watch", "r1")
+    reader.query("after", "r1", time.time_ns() + 1_000_000_000)
+    watched = reader.query("watched", "r1")
+    stats = reader.query("stats")
     print(f"two writers fight for a second: {stats}, newest went back {watched['went_back']} times")
     assert (watched["went_back"], watched["old_as_fresh"], watched["stale"]) == (0, 0, 0)
     assert stats["missed"] == 0
     assert stats["refused"]["second writer"] > 50
     second.kill()
-    assert reader.ask("after", "r1", time.time_ns())  # the first is there again
+    assert reader.query("after", "r1", time.time_ns())  # the first is there again
 
 
 @pytest.mark.parametrize("step", [HOUR, -HOUR, 85_000, -85_000], ids=["+1h", "-1h", "+85us", "-85us"])
-def test_a_writer_whose_clock_steps_is_heard_again_within_a_second_as_is_when_it_steps_back(
+def test_writer_with_a_clock_step_is_received_again_within_a_second_also_after_the_step_back(
     start: Start, endpoint: str, step: int
 ):
     start("router", listen=endpoint)
@@ -56,16 +56,16 @@ def test_a_writer_whose_clock_steps_is_heard_again_within_a_second_as_is_when_it
     start("publisher", robot="r2", session=client(endpoint))  # whose clock is right all the time
     reader = start("reader", session=client(endpoint))
     for robot in ("r1", "r2"):
-        assert reader.ask("after", robot, 0)
-    reader.ask("watch", "r2")
+        assert reader.query("after", robot, 0)
+    reader.query("watch", "r2")
     for shift in (step, 0):
-        stepped = publisher.ask("shift", shift)
+        stepped = publisher.query("shift", shift)
         began = time.monotonic()
-        assert reader.ask("near", "r1", stepped)
-        assert reader.ask("after", "r1", stepped + 50_000_000)
+        assert reader.query("near", "r1", stepped)
+        assert reader.query("after", "r1", stepped + 50_000_000)
         print(f"clock of the writer set {shift:+} ns: answers after {time.monotonic() - began:.3f} s")
         assert time.monotonic() - began < 3.0
-    watched, stats = reader.ask("watched", "r2"), reader.ask("stats")
+    watched, stats = reader.query("watched", "r2"), reader.query("stats")
     print(stats)
     assert (watched["went_back"], watched["old_as_fresh"], watched["stale"]) == (0, 0, 0)
     assert stats["missed"] <= 1

@@ -1,5 +1,5 @@
 import pytest
-from helpers.cdr_fuzz import NEW, Fuzz, answer, long_lived
+from helpers.cdr_fuzz import NEW, Fuzz, decode_outcome, long_lived
 from helpers.manual_cdr import cdr, joint_state, tf_message
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +17,7 @@ OLD = long_lived()
 
 def agree(data: bytes) -> None:
     for kind, old in OLD.items():
-        assert answer(NEW[kind](), data) == answer(old, data)
+        assert decode_outcome(NEW[kind](), data) == decode_outcome(old, data)
 
 
 def test_a_run_of_hostile_bytes_finds_nothing_and_reaches_every_outcome():
@@ -47,4 +47,4 @@ def test_bytes_cut_off_or_added_raise_nothing_but_a_message_error(whole: bytes, 
 
 @pytest.mark.parametrize("whole", WHOLE)
 def test_whole_messages_are_read_by_their_own_decoder(whole: bytes):
-    assert "read" in {answer(old, whole)[0] for old in OLD.values()}
+    assert "read" in {decode_outcome(old, whole)[0] for old in OLD.values()}

@@ -16,7 +16,7 @@ from helpers.raw_ros_nodes import (
     key_of,
     moved,
 )
-from helpers.robots import RRBOT, STAMP, assert_pose, await_reader, kinematic_pose
+from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_reader
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -105,7 +105,7 @@ def test_no_payload_stops_a_listener_and_all_are_counted(sessions, monkeypatch, 
         TransformListener(reader, "r1", wire="ros2", follow=follow) as listener,
         StatePublisher(writer, RRBOT, "r1", ("ros2",), streams=["robot_description"]),
     ):
-        await_reader(writer, key_of(topic))
+        wait_for_reader(writer, key_of(topic))
         fuzz = Fuzz(writer, topic)
 
         @settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck), database=None)

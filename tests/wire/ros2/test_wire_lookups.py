@@ -12,13 +12,13 @@ from helpers.processes import until
 from helpers.raw_ros_nodes import (
     JOINT_STATES,
     TF,
-    Ear,
+    KeySubscriber,
     RosNode,
     key_of,
     moved,
     tokens,
 )
-from helpers.robots import RRBOT, STAMP, assert_pose, await_reader, kinematic_pose
+from helpers.robots import RRBOT, STAMP, assert_pose, kinematic_pose, wait_for_reader
 
 from zstate.errors import InvalidInput
 from zstate.model.load import load_model
@@ -56,7 +56,7 @@ def test_lookups_equal_those_of_the_native_wire_bit_for_bit(sessions, model, fol
     listeners = [TransformListener(reader, "r1", wire=wire, follow=follow) for wire in WIRES]
     with StatePublisher(writer, model, "r1", WIRES) as publisher:
         for wire in WIRES:
-            await_reader(writer, data_key(wire, "r1", follow))
+            wait_for_reader(writer, data_key(wire, "r1", follow))
         leaves = [link for link in model.links if link not in {joint.parent for joint in model.joints}]
         links = {
             f"r1/{joint.child}" for joint in model.joints if joint.type == "fixed" or follow == "joint_states"
@@ -103,7 +103,7 @@ def test_joint_states_are_read_back_as_they_were_published(sessions, wire: str):
         SubscribedSource(reader, EVERY, "r1", wire=wire) as source,
         StatePublisher(writer, EVERY, "r1", (wire,), streams=["joint_states"]) as publisher,
     ):
-        await_reader(writer, data_key(wire, "r1", "joint_states"))
+        wait_for_reader(writer, data_key(wire, "r1", "joint_states"))
         publisher.publish(positions, rates, rates + 1.0, stamp=STAMP)
         publisher.publish(positions, stamp=STAMP + 1)
         full, bare = (reading for _, reading in zip(range(2), source, strict=False))
@@ -117,7 +117,7 @@ def test_source_reads_a_ros_driver_and_counts_other_messages(sessions):
     writer, reader = sessions
     names, nan = RRBOT.joint_names, float("nan")
     with SubscribedSource(reader, RRBOT, "r1", wire="ros2") as source:
-        driver = RosNode(writer, "driver").publisher(JOINT_STATES).announce().await_reader()
+        driver = RosNode(writer, "driver").publisher(JOINT_STATES).announce().wait_for_reader()
         driver.joints(STAMP, ("elbow", "lid", "shoulder"), [2.0, 7.0, 1.0], [nan] * 3, [0.2, nan, 0.1])
         driver.joints(0, names, [0.0, 0.0])
         driver.joints(STAMP, names[:1], [0.0])
@@ -154,7 +154,7 @@ def test_both_wires_carry_the_same_numbers_at_the_same_instants(sessions):
     ears = [reader.zenoh.declare_subscriber(key, note(wire)) for wire, key in keys.items()]
     with StatePublisher(writer, RRBOT, "r1", tuple(keys)) as publisher:
         for key in keys.values():
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         for number in range(5):
             publisher.publish([0.1 * number, 0.2], [1.0, 2.0])
         until(lambda: all(len(arrivals) == 5 for arrivals in received.values()))
@@ -174,7 +174,7 @@ def test_behind_a_bridge_robots_are_followed_and_their_writers_named(sessions):
         StaticPublisher(writer, "r1", "mount", wires="ros2dds") as statics,
     ):
         statics.set(Transform("tool", "camera", (0.5, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
-        await_reader(writer, "tf")
+        wait_for_reader(writer, "tf")
         until(lambda: len(discover(reader, wire="ros2dds")) == 1)
         publisher.publish([0.5, 0.25], stamp=STAMP)
         pose = listener.buffer.wait("world", "tool", timeout_s=5.0)
@@ -193,7 +193,7 @@ def test_behind_a_bridge_robots_are_followed_and_their_writers_named(sessions):
 def test_plain_puts_of_a_bridge_need_no_token_and_jumps_of_stamps_are_new_epochs(sessions):
     writer, reader = sessions
     with TransformListener(reader, "r1", wire="ros2dds", follow="tf") as listener:
-        await_reader(writer, "tf")
+        wait_for_reader(writer, "tf")
         for stamp in (STAMP, STAMP + 1, STAMP - 3600 * 1000 * MS, STAMP - 3600 * 1000 * MS + 1):
             writer.zenoh.put("tf", rosbags_tf_message([stamp], [("odom", "base")], [moved(1.0)]))
         until(lambda: listener.stats.received == 3)
@@ -205,17 +205,17 @@ def test_plain_puts_of_a_bridge_need_no_token_and_jumps_of_stamps_are_new_epochs
 def test_stamp_out_of_the_range_of_ros_is_sent_on_neither_wire(sessions, stamp: int):
     writer, reader = sessions
     native, ros = "zstate/r1/joint_states", key_of(JOINT_STATES)
-    ears = Ear(reader, native), Ear(reader, ros), Ear(reader, key_of(TF))
+    ears = KeySubscriber(reader, native), KeySubscriber(reader, ros), KeySubscriber(reader, key_of(TF))
     with StatePublisher(writer, RRBOT, "r1", ("native", "ros2")) as publisher:
         for key in (native, ros, key_of(TF)):
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         publisher.publish([0.0, 0.0], stamp=STAMP)
         with pytest.raises(InvalidInput, match="stamp"):
             publisher.publish([1.0, 1.0], stamp=stamp)
         publisher.publish([2.0, 2.0], stamp=STAMP + 1)
         for ear in ears[1:]:
             assert [seq for seq, _, _ in ear.attachments(2)] == [1, 2]
-        assert [len(ear.heard(2)) for ear in ears] == [2, 2, 2]
+        assert [len(ear.wait_for(2)) for ear in ears] == [2, 2, 2]
 
 
 def test_wire_that_fails_to_open_closes_the_others(sessions):

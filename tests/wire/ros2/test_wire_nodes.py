@@ -16,12 +16,12 @@ from helpers.raw_ros_nodes import (
     TF,
     TF_STATIC,
     TOPICS,
-    Ear,
+    KeySubscriber,
     gid_of,
     key_of,
     tokens,
 )
-from helpers.robots import RRBOT, STAMP, await_reader
+from helpers.robots import RRBOT, STAMP, wait_for_reader
 
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -72,11 +72,11 @@ def decoded_poses(message) -> dict[tuple[str, str], list[float]]:
 
 def test_ros_node_decodes_joint_states_and_transforms(sessions):
     writer, reader = sessions
-    joints, transforms = Ear(reader, key_of(JOINT_STATES)), Ear(reader, key_of(TF))
+    joints, transforms = KeySubscriber(reader, key_of(JOINT_STATES)), KeySubscriber(reader, key_of(TF))
     rates, forces = POSITIONS * 2, POSITIONS * 3
     with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
-        await_reader(writer, key_of(JOINT_STATES))
-        await_reader(writer, key_of(TF))
+        wait_for_reader(writer, key_of(JOINT_STATES))
+        wait_for_reader(writer, key_of(TF))
         publisher.publish(POSITIONS, rates, forces, stamp=STAMP)
         publisher.publish(POSITIONS, stamp=STAMP + 1)
         full, bare = joints.messages(2, JOINT_STATE_MSG)
@@ -98,8 +98,8 @@ def test_ros_node_decodes_joint_states_and_transforms(sessions):
 def test_late_joiner_receives_the_description_and_the_fixed_edges(sessions):
     writer, reader = sessions
     with StatePublisher(writer, RRBOT, wires=("ros2",)):
-        (text,) = Ear(reader, key_of(DESCRIPTION), latched=True).messages(1, STRING_MSG)
-        (statics,) = Ear(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
+        (text,) = KeySubscriber(reader, key_of(DESCRIPTION), latched=True).messages(1, STRING_MSG)
+        (statics,) = KeySubscriber(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
     assert text.data == RRBOT.urdf
     fixed = {(j.parent, j.child): list(j.origin) for j in RRBOT.joints if j.type == "fixed"}
     assert decoded_poses(statics) == fixed
@@ -107,12 +107,14 @@ def test_late_joiner_receives_the_description_and_the_fixed_edges(sessions):
 
 def test_each_message_is_numbered_dated_and_signed_by_an_endpoint_that_is_alive(sessions):
     writer, reader = sessions
-    ears = {topic[0]: Ear(reader, key_of(topic)) for topic in (JOINT_STATES, TF)}
+    ears = {topic[0]: KeySubscriber(reader, key_of(topic)) for topic in (JOINT_STATES, TF)}
     before = time.time_ns()
     with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
-        ears |= {topic[0]: Ear(reader, key_of(topic), latched=True) for topic in (TF_STATIC, DESCRIPTION)}
+        ears |= {
+            topic[0]: KeySubscriber(reader, key_of(topic), latched=True) for topic in (TF_STATIC, DESCRIPTION)
+        }
         for topic in (JOINT_STATES, TF):
-            await_reader(writer, key_of(topic))
+            wait_for_reader(writer, key_of(topic))
         for number in range(3):
             publisher.publish(POSITIONS, stamp=STAMP + number)
         alive = endpoints(reader, 4)
@@ -146,20 +148,20 @@ def test_the_graph_has_one_node_with_four_publishers_as_ros_would_announce_them(
 
 def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
     writer, reader = sessions
-    ears = [Ear(reader, key_of(topic)) for topic in TOPICS]
-    last = Ear(reader, "last")
+    ears = [KeySubscriber(reader, key_of(topic)) for topic in TOPICS]
+    last = KeySubscriber(reader, "last")
     for topic in TOPICS:
-        await_reader(writer, key_of(topic))
+        wait_for_reader(writer, key_of(topic))
     with StatePublisher(writer, RRBOT, wires=("ros2",)) as publisher:
         publisher.publish(POSITIONS, stamp=STAMP)
         for ear in ears:
-            ear.heard(1)
+            ear.wait_for(1)
     with StaticPublisher(writer, "rrbot", "mount", wires="ros2") as statics:
         statics.set(Transform("tool", "camera", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
         statics.withdraw("camera")
-    await_reader(writer, "last")
+    wait_for_reader(writer, "last")
     writer.zenoh.put("last", b"x")
-    last.heard(1)
+    last.wait_for(1)
     kinds = {str(sample.kind) for ear in ears for sample in ear.samples}
     assert kinds == {"SampleKind.PUT"}
     assert [len(message.transforms) for message in ears[2].messages(3, TF_MSG)][1:] == [1, 0]
@@ -167,27 +169,29 @@ def test_nothing_is_ever_deleted_from_the_keys_of_ros(sessions):
 
 def test_humble_has_no_hashes(sessions):
     writer, reader = sessions
-    ear = Ear(reader, key_of(JOINT_STATES, written=HUMBLE))
+    ear = KeySubscriber(reader, key_of(JOINT_STATES, written=HUMBLE))
     with StatePublisher(writer, RRBOT, wires=("ros2:hash=humble",)) as publisher:
-        await_reader(writer, key_of(JOINT_STATES, written=HUMBLE))
+        wait_for_reader(writer, key_of(JOINT_STATES, written=HUMBLE))
         publisher.publish(POSITIONS, stamp=STAMP)
         alive = endpoints(reader, 4)
         assert {chunks[11] for chunks in alive.values()} == {HUMBLE}
         ((_, _, gid),) = ear.attachments(1)
         assert gid == gid_of("/".join(alive["%joint_states"]))
-        (late,) = Ear(reader, key_of(DESCRIPTION, written=HUMBLE), latched=True).messages(1, STRING_MSG)
+        (late,) = KeySubscriber(reader, key_of(DESCRIPTION, written=HUMBLE), latched=True).messages(
+            1, STRING_MSG
+        )
         assert late.data == RRBOT.urdf
 
 
 def test_iron_and_humble_can_be_published_together(sessions):
     writer, reader = sessions
     keys = [key_of(JOINT_STATES), key_of(JOINT_STATES, written=HUMBLE)]
-    ears = [Ear(reader, key) for key in keys]
+    ears = [KeySubscriber(reader, key) for key in keys]
     with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:hash=humble")) as publisher:
         for key in keys:
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         publisher.publish(POSITIONS, stamp=STAMP)
-        iron, humble = (ear.heard(1)[0] for ear in ears)
+        iron, humble = (ear.wait_for(1)[0] for ear in ears)
         nodes = [one.split("/")[3] for one in tokens(reader) if "/NN/" in one]
     assert iron.payload.to_bytes() == humble.payload.to_bytes()
     assert len(set(nodes)) == 2
@@ -196,11 +200,11 @@ def test_iron_and_humble_can_be_published_together(sessions):
 def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.MonkeyPatch):
     writer, reader = sessions
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
-    ear = Ear(reader, key_of(JOINT_STATES, domain=7))
+    ear = KeySubscriber(reader, key_of(JOINT_STATES, domain=7))
     with StatePublisher(writer, RRBOT, wires=("ros2", "ros2:domain=9")) as publisher:
-        await_reader(writer, key_of(JOINT_STATES, domain=7))
+        wait_for_reader(writer, key_of(JOINT_STATES, domain=7))
         publisher.publish(POSITIONS, stamp=STAMP)
-        ear.heard(1)
+        ear.wait_for(1)
         for domain in (7, 9):
             assert len(endpoints(reader, 4, domain)) == 4
         assert tokens(reader, 0) == []
@@ -216,14 +220,19 @@ def test_the_domain_is_the_first_chunk_everywhere(sessions, monkeypatch: pytest.
 )
 def test_namespace_prefixes_topics_and_node(sessions, options, namespace, tf_in):
     writer, reader = sessions
-    ears = {topic[0]: Ear(reader, key_of(topic, namespace), latched=topic == DESCRIPTION) for topic in TOPICS}
-    shared = [Ear(reader, key_of(topic, tf_in), latched=topic == TF_STATIC) for topic in (TF, TF_STATIC)]
+    ears = {
+        topic[0]: KeySubscriber(reader, key_of(topic, namespace), latched=topic == DESCRIPTION)
+        for topic in TOPICS
+    }
+    shared = [
+        KeySubscriber(reader, key_of(topic, tf_in), latched=topic == TF_STATIC) for topic in (TF, TF_STATIC)
+    ]
     with StatePublisher(writer, RRBOT, wires=(f"ros2:{options}",)) as publisher:
         for key in (key_of(JOINT_STATES, namespace), key_of(TF, tf_in)):
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         publisher.publish(POSITIONS, stamp=STAMP)
         for ear in (ears["joint_states"], ears["robot_description"], *shared):
-            ear.heard(1)
+            ear.wait_for(1)
         alive = endpoints(reader, 4)
     around = f"%{namespace.replace('/', '%')}"
     assert {chunks[7] for chunks in alive.values()} == {around}
@@ -235,10 +244,10 @@ def test_namespace_prefixes_topics_and_node(sessions, options, namespace, tf_in)
 
 def test_frame_prefix_applies_to_every_frame_of_the_robot(sessions):
     writer, reader = sessions
-    transforms = Ear(reader, key_of(TF))
+    transforms = KeySubscriber(reader, key_of(TF))
     with StatePublisher(writer, RRBOT, "r1", wires=("ros2:frame_prefix=*/",)) as publisher:
-        (statics,) = Ear(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
-        await_reader(writer, key_of(TF))
+        (statics,) = KeySubscriber(reader, key_of(TF_STATIC), latched=True).messages(1, TF_MSG)
+        wait_for_reader(writer, key_of(TF))
         publisher.publish([0.1, 0.2], stamp=STAMP)
         (moving,) = transforms.messages(1, TF_MSG)
     edges = {(f"r1/{joint.parent}", f"r1/{joint.child}") for joint in RRBOT.joints}
@@ -248,14 +257,14 @@ def test_frame_prefix_applies_to_every_frame_of_the_robot(sessions):
 def test_two_robots_of_one_session_have_two_namespaces(sessions):
     writer, reader = sessions
     wires = ("ros2:namespace=*,frame_prefix=*/",)
-    ears = {robot: Ear(reader, key_of(JOINT_STATES, robot)) for robot in ("r1", "r2")}
-    transforms = Ear(reader, key_of(TF))
+    ears = {robot: KeySubscriber(reader, key_of(JOINT_STATES, robot)) for robot in ("r1", "r2")}
+    transforms = KeySubscriber(reader, key_of(TF))
     with (
         StatePublisher(writer, RRBOT, "r1", wires) as one,
         StatePublisher(writer, RRBOT, "r2", wires) as two,
     ):
         for key in (key_of(JOINT_STATES, "r1"), key_of(JOINT_STATES, "r2"), key_of(TF)):
-            await_reader(writer, key)
+            wait_for_reader(writer, key)
         one.publish([1.0, 1.0], stamp=STAMP)
         two.publish([2.0, 2.0], stamp=STAMP)
         assert ears["r1"].messages(1, JOINT_STATE_MSG)[0].position.tolist() == [1.0, 1.0]

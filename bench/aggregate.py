@@ -1,4 +1,4 @@
-"""Outcome: one subject in one scenario, all rounds together."""
+"""Aggregated figures of one subject in one scenario over all rounds."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from bench.results import Facts, Results
 from bench.scenario import Scenario
 
 
-class Outcome:
-    """Figures over the rounds: medians of them, but sums where samples are counted, and the worst maximum.
+class Aggregate:
+    """Figures over the rounds: medians, but sums of sample counts and the largest maximum.
 
-    Where there are several readers, the rate is that of the slowest and latencies are medians of theirs.
+    With several readers, the rate is that of the slowest and latencies are medians over readers.
     """
 
     def __init__(self, scenario: Scenario, runs: Sequence[Facts]) -> None:
@@ -33,34 +33,34 @@ class Outcome:
 
     @property
     def sent_hz(self) -> float:
-        """Samples that were sent each second, of each robot."""
+        """Samples sent per second and robot."""
         return self._median(lambda run: run["sent_hz"]) / self.scenario.fleet
 
     @property
     def rate_hz(self) -> float:
-        """Samples of each robot that a reader's buffer answered, each second."""
+        """Samples answered by a reader's buffer, per second and robot."""
         slowest = self._median(lambda run: min(reader["rate_hz"] for reader in run["readers"]))
         return slowest / self.scenario.fleet
 
     @property
     def sent(self) -> int:
-        """Samples that were sent, all rounds and readers counted."""
+        """Samples sent, summed over rounds and readers."""
         return sum(run["sent"] * len(run["readers"]) for run in self._runs)
 
     @property
     def lost(self) -> int:
-        """Of these, those that were never answered."""
+        """Sent samples that were never answered."""
         return sum(reader["lost"] for reader in self._readers)
 
     @property
     def late(self) -> int | None:
-        """Of these, those that were answered later than a period after their stamp; None when flat out."""
+        """Samples answered more than a period after their stamp; None if flat out."""
         late = [reader["late"] for reader in self._readers]
         return None if None in late else sum(late)
 
     @cached_property
     def grid_us(self) -> list[float]:
-        """The distribution of latencies [us] at the percentiles of ``recording.GRID``; empty without any."""
+        """Latencies [us] at the percentiles of ``recording.GRID``; empty if there are none."""
         grids = [
             [median(values) for values in zip(*given, strict=True)]
             for run in self._runs
@@ -69,7 +69,7 @@ class Outcome:
         return [median(values) for values in zip(*grids, strict=True)] if grids else []
 
     def latency_us(self, percent: float) -> float | None:
-        """One of these percentiles; of 100 the worst of all."""
+        """One percentile of the latency [us]; for 100 the maximum over all readers."""
         if not self.grid_us:
             return None
         if percent == 100:
@@ -77,7 +77,7 @@ class Outcome:
         return percentile(self.grid_us, percent)
 
     def cpu_percent(self) -> dict[str, float]:
-        """CPU of each role [% of a core]; readers together."""
+        """CPU per role [% of a core]; the sum over readers."""
         roles = self._runs[0]["cpu_percent"]
         return {role: self._median(lambda run, role=role: run["cpu_percent"][role]) for role in roles}
 
@@ -88,58 +88,58 @@ class Outcome:
 
     @property
     def cpu_between(self) -> float:
-        """CPU of those between writer and readers: a router, a master, a daemon [% of a core]."""
+        """CPU of the processes between writer and readers: router, master, daemon [% of a core]."""
         return fsum(used for role, used in self.cpu_percent().items() if role not in ("writer", "reader"))
 
     @property
     def bytes_per_s(self) -> float:
-        """What loopback carried each second, heads of IP and TCP included."""
+        """Loopback bytes per second, IP and TCP headers included."""
         return self._median(lambda run: run["bytes_per_s"])
 
     @property
     def bytes_per_sample(self) -> float:
-        """The same for each sample that was sent."""
+        """Loopback bytes per sent sample."""
         return self._median(lambda run: run["bytes_per_s"] * run["window_s"] / max(1, run["sent"]))
 
     def memory_mb(self) -> dict[str, float]:
-        """The most memory of each role [MB]; readers together."""
+        """Peak memory per role [MB]; the sum over readers."""
         roles = self._runs[0]["peak_memory_mb"]
         return {role: self._median(lambda run, role=role: run["peak_memory_mb"][role]) for role in roles}
 
     @property
     def joins_ms(self) -> list[float]:
-        """After how long [ms] late joiners had the whole tree."""
+        """Times until late joiners had the whole tree [ms], ascending."""
         return sorted(one for run in self._runs for one in run["whole_ms"])
 
     @property
     def connections_ms(self) -> list[float]:
-        """How much of that [ms] opening the session and subscribing took."""
+        """Times late joiners took to open the session and subscribe [ms], ascending."""
         return sorted(one for run in self._runs for one in run["connected_ms"])
 
     def poses(self) -> list[Facts]:
-        """The comparisons of answers with kinematics, one for each round."""
+        """Comparisons of answers with kinematics, one per round."""
         return [run["poses"] for run in self._runs if "poses" in run]
 
     @property
     def others_percent(self) -> float:
-        """CPU of everything else on the machine [% of a core], the worst round."""
+        """CPU of the rest of the machine [% of a core] in the worst round."""
         return max(run["others_cpu_percent"] for run in self._runs)
 
 
-def outcome(results: Results, subject: str, scenario: Scenario) -> Outcome | None:
-    """What there is of one subject in one scenario; None when it was not run, or failed."""
-    runs = results.of(subject, scenario)
-    return Outcome(scenario, runs) if runs else None
+def aggregate(results: Results, subject: str, scenario: Scenario) -> Aggregate | None:
+    """Figures of one subject in one scenario; None if it was not run or failed."""
+    runs = results.completed_runs(subject, scenario)
+    return Aggregate(scenario, runs) if runs else None
 
 
-def outcomes(results: Results, scenario: Scenario) -> dict[str, Outcome]:
-    """All that there are, by subject."""
-    found = ((name, outcome(results, name, scenario)) for name in results.subjects)
+def aggregates(results: Results, scenario: Scenario) -> dict[str, Aggregate]:
+    """Figures of all measured subjects in one scenario, by subject."""
+    found = ((name, aggregate(results, name, scenario)) for name in results.subjects)
     return {name: one for name, one in found if one is not None}
 
 
-def find(results: Results, **wanted: Any) -> list[Scenario]:
-    """The scenarios that were run and have these values."""
+def find_scenarios(results: Results, **values: Any) -> list[Scenario]:
+    """The scenarios of a run with these values."""
     return [
-        one for one in results.scenarios if all(getattr(one, name) == value for name, value in wanted.items())
+        one for one in results.scenarios if all(getattr(one, name) == value for name, value in values.items())
     ]

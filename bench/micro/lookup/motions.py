@@ -1,4 +1,4 @@
-"""What the buffers are filled with: the same motion as joint positions and as a pose of each edge."""
+"""Motions that fill the buffers: the same motion as joint positions and as poses of each edge."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ FIRST = 1_790_000_000_000_000_000
 
 
 @dataclass(frozen=True)
-class World:
-    """A robot that moves for a while, and the pair of frames that is asked for."""
+class RecordedMotion:
+    """A moving robot, and the pair of frames of the lookups."""
 
     name: str
     model: RobotModel
@@ -28,7 +28,7 @@ class World:
 
     @property
     def count(self) -> int:
-        """How many samples there are."""
+        """Number of samples."""
         return self.rate_hz * self.seconds
 
     @property
@@ -42,7 +42,7 @@ class World:
         return FIRST + (self.count - 1) * self.step
 
     def positions(self) -> NDArray[np.float64]:
-        """Each joint on a sine of its own: (count, nq)."""
+        """Joint positions on independent sines: (count, nq)."""
         rng = np.random.default_rng(7)
         width = self.model.position_count
         amplitude, speed, phase = rng.uniform((0.3, 0.5, 0.0), (1.0, 3.0, 6.0), (width, 3)).T
@@ -50,7 +50,7 @@ class World:
         return amplitude * np.sin(speed * seconds + phase)
 
     def write(self, folder: Path) -> Path:
-        """Put the world where workers, with whatever Python they have, can read it."""
+        """Writes the motion to files that workers with any Python can read; returns their common path."""
         edges = [(joint.parent, joint.child) for joint in self.model.joints]
         fixed = np.array([joint.type == "fixed" for joint in self.model.joints])
         positions = self.positions()
@@ -77,7 +77,7 @@ class World:
 
 
 def chain(length: int) -> RobotModel:
-    """So many links, one after the other, each on a revolute joint."""
+    """A chain of ``length`` revolute joints."""
     links = "".join(f'<link name="l{n}"/>' for n in range(length + 1))
     joints = "".join(
         f'<joint name="j{n}" type="revolute"><parent link="l{n}"/><child link="l{n + 1}"/>'
@@ -88,15 +88,15 @@ def chain(length: int) -> RobotModel:
     return load_model(f'<robot name="chain">{links}{joints}</robot>')
 
 
-def worlds() -> dict[str, World]:
-    """All of them, by name."""
+def recorded_motions() -> dict[str, RecordedMotion]:
+    """All motions by name."""
     panda, g1 = load_model("panda"), load_model("g1")
     arm = ("panda_link0", "panda_leftfinger")
-    made = [
-        World("arm", panda, *arm),
-        World("humanoid", g1, "left_ankle_roll_link", "right_rubber_hand"),
-        *(World(f"history {seconds} s", panda, *arm, 1000, seconds) for seconds in (1, 10, 100)),
-        *(World(f"depth {depth}", chain(depth), "l0", f"l{depth}") for depth in (5, 20, 100)),
-        World("40 edges", chain(40), "l0", "l20", 1000),
+    motions = [
+        RecordedMotion("arm", panda, *arm),
+        RecordedMotion("humanoid", g1, "left_ankle_roll_link", "right_rubber_hand"),
+        *(RecordedMotion(f"history {seconds} s", panda, *arm, 1000, seconds) for seconds in (1, 10, 100)),
+        *(RecordedMotion(f"depth {depth}", chain(depth), "l0", f"l{depth}") for depth in (5, 20, 100)),
+        RecordedMotion("40 edges", chain(40), "l0", "l20", 1000),
     ]
-    return {world.name: world for world in made}
+    return {motion.name: motion for motion in motions}

@@ -1,4 +1,4 @@
-"""Who calls a reader's user when a sample has come into the buffer; nothing but the standard library."""
+"""Calls a reader's user after a sample has entered the buffer; standard library only."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from bench.job import Job
 Answer = Callable[[int], None]
 
 
-class Awakening:
-    """Calls ``answer(stamp)`` for each sample in the thread that heard it.
+class WakeupReader:
+    """Calls ``answer(stamp)`` for each sample in the receiving thread.
 
-    A user who is slow would hold up the system's own thread: under that load one of ours takes the newest
-    stamp, again and again, as such a user's loop does.
+    A slow user would block the system's receiving thread: under the load "slow" a separate thread answers
+    the newest stamp in a loop, as such a user's program does.
     """
 
     def __init__(self, job: Job, answer: Answer) -> None:
@@ -22,13 +22,13 @@ class Awakening:
         self._newest: int | None = None
         self._changed = threading.Condition()
         self._is_closed = False
-        self.heard: Answer = answer
+        self.on_sample: Answer = answer
         if job.load == "slow":
-            self.heard = self._leave
+            self.on_sample = self._store
             self._thread = threading.Thread(target=self._answer_newest, daemon=True)
             self._thread.start()
 
-    def _leave(self, stamp: int) -> None:
+    def _store(self, stamp: int) -> None:
         with self._changed:
             self._newest = stamp
             self._changed.notify()
@@ -43,7 +43,7 @@ class Awakening:
             self._answer(stamp)
 
     def close(self) -> None:
-        """Let the loop end."""
+        """Ends the loop."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()

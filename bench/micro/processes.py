@@ -1,4 +1,4 @@
-"""Other processes that a measurement needs: zstate's own commands, and ports for them."""
+"""zstate commands as processes, and free ports for them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-def meet_nobody_else() -> None:
-    """From here on this process, and those it starts, meet on a rendezvous of their own."""
+def use_own_rendezvous() -> None:
+    """Sets a private rendezvous address for this process and its children."""
     os.environ["ZSTATE_RENDEZVOUS"] = f"127.0.0.1:{free_port()}"
 
 
 def free_port() -> int:
-    """A port of loopback that nobody uses."""
+    """An unused loopback port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
 
 
 @contextmanager
-def running(*arguments: str) -> Iterator[None]:
-    """``zstate ARGUMENTS`` runs meanwhile, from its first line of output on."""
+def running_command(*arguments: str) -> Iterator[None]:
+    """Runs ``zstate ARGUMENTS`` inside the block, from its first line of output on."""
     command = [sys.executable, "-m", "zstate", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

@@ -1,6 +1,6 @@
-"""The control: the same processes with the same traffic, of Zenoh and nothing else."""
+"""Control run: the same processes and traffic with Zenoh alone."""
 
-# zenoh's classes have no types to speak of
+# zenoh's classes have few type annotations
 # pyright: basic
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 
 import zenoh
 
-from bench.soak.roles import Report, paced, until_told
+from bench.soak.roles import Report, publish_at_rate, stop_at_end_of_input
 from bench.soak.task import Task
 from zstate import connect, load_model
 from zstate.net.streams import WILDCARD_CAPACITY
 
 
 def publish(task: Task) -> Report:
-    """A share of the robots: payloads as large as samples, and one latched value each."""
+    """Publishes a share of the robots: payloads as large as samples, and one latched value each."""
     model = load_model(task.model)
     payload = bytes(54 + 8 * (model.position_count + model.velocity_count))
     with ExitStack() as opened:
@@ -36,43 +36,43 @@ def publish(task: Task) -> Report:
             )
             robots.append((samples, mark))
 
-        def say(_: int) -> None:
+        def publish_samples(_: int) -> None:
             for samples, _mark in robots:
                 samples.put(payload)
 
-        def tell(number: int) -> None:
+        def publish_mark(number: int) -> None:
             for _samples, mark in robots:
                 mark.put(str(number))
 
-        return paced(task, len(robots), say, tell)
+        return publish_at_rate(task, len(robots), publish_samples, publish_mark)
 
 
 def read(task: Task) -> Report:
-    """The reader of all: counts what comes."""
-    stop = until_told()
+    """Counts the samples of all robots."""
+    stop = stop_at_end_of_input()
     received = 0
     with connect(mode="client", endpoints=task.endpoint) as session:
         handlers = _subscribe(session.zenoh)
 
-        def take() -> None:
+        def count() -> None:
             nonlocal received
             with suppress(zenoh.ZError):  # closed
                 while handlers[0].handler.recv():
                     received += 1
 
-        threading.Thread(target=take, daemon=True).start()
+        threading.Thread(target=count, daemon=True).start()
         print("ready", flush=True)
         stop.wait()
     return {"received": received}
 
 
 def join_fresh(task: Task) -> Report:
-    """A reader that joins now, hears the first sample, and leaves."""
+    """A reader that joins, receives the first sample and leaves."""
     began = time.monotonic()
     with connect(mode="client", endpoints=task.endpoint) as session:
         handlers = _subscribe(session.zenoh)
         handlers[0].handler.recv()
-        time.sleep(1.0)  # as long as a listener of ours is there, more or less
+        time.sleep(1.0)  # about as long as a TransformListener stays
     return {"complete": True, "seconds": round(time.monotonic() - began, 3)}
 
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from bench.micro.lookup.worker import Recorded, serve
+from bench.micro.lookup.worker import MotionFile, serve
 from zstate import LookupFailed, RobotModel, TransformBuffer, load_model
 
 
 class Robot:
     """A filled buffer."""
 
-    def __init__(self, recorded: Recorded, model: RobotModel, positions: Any) -> None:
+    def __init__(self, recorded: MotionFile, model: RobotModel, positions: Any) -> None:
         self.buffer = TransformBuffer(recorded.count * recorded.step * 1e-9)
         self.track = self.buffer.add_robot(model)
         self.names = recorded.target, recorded.source
@@ -33,13 +33,13 @@ class Zstate:
     """The cases of the table."""
 
     @staticmethod
-    def read(recorded: Recorded) -> Any:
+    def read(recorded: MotionFile) -> Any:
         model = load_model(recorded.path.with_suffix(".urdf").read_text())
-        TransformBuffer().add_robot(model)  # what Python loads for that is not the buffer's memory
+        TransformBuffer().add_robot(model)  # modules loaded by this call do not count as memory of the buffer
         return model, list(np.fromfile(recorded.path.with_suffix(".positions")).reshape(recorded.count, -1))
 
     @staticmethod
-    def fill(recorded: Recorded, samples: Any) -> Robot:
+    def fill(recorded: MotionFile, samples: Any) -> Robot:
         return Robot(recorded, *samples)
 
     @staticmethod
@@ -59,13 +59,13 @@ class Zstate:
     def future(robot: Robot, stamps: list[int]) -> Any:
         lookup, (target, source) = robot.buffer.lookup, robot.names
 
-        def ask(stamp: int) -> object:
+        def lookup_error(stamp: int) -> object:
             try:
                 return lookup(target, source, stamp + 10**12)
             except LookupFailed as reason:
                 return reason
 
-        return ask, stamps
+        return lookup_error, stamps
 
     @staticmethod
     def insert(robot: Robot, stamps: list[int]) -> Any:

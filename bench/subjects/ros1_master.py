@@ -1,7 +1,7 @@
-"""A master of ROS 1 and Debian's robot_state_publisher, on ports of their own; the standard library alone.
+"""A ROS 1 master and Debian's robot_state_publisher, on their own ports; standard library only.
 
-``python3 -m bench.subjects.ros1_world describe FILE`` gives the master the robot's description,
-``... publishes`` ends with 0 once robot_state_publisher is there.
+``python3 -m bench.subjects.ros1_master describe FILE`` sets the parameter robot_description,
+``... publishes`` exits with 0 if robot_state_publisher has started.
 """
 
 from __future__ import annotations
@@ -28,21 +28,29 @@ BEST = ("_publish_frequency:=1000", "_ignore_timestamp:=true")
 
 
 def python() -> str | None:
-    """Debian's, if all of it is installed."""
-    there = all(Path(path).exists() for path in (MASTER, STATE_PUBLISHER, LISTENER, MESSAGES))
-    return PYTHON if there else None
+    """Debian's interpreter; None unless all packages are installed."""
+    installed = all(Path(path).exists() for path in (MASTER, STATE_PUBLISHER, LISTENER, MESSAGES))
+    return PYTHON if installed else None
 
 
 def versions(*more: str) -> dict[str, str]:
-    """Of Debian's packages."""
+    """Versions of Debian's packages."""
     form = "-f=${Package} ${Version}\n"
-    asked = ["dpkg-query", "-W", form, "ros-robot-state-publisher", "python3-rospy", "python3-tf2-ros", *more]
-    said = subprocess.run(asked, check=True, capture_output=True, text=True).stdout
-    return dict(line.split(" ", 1) for line in said.splitlines())
+    command = [
+        "dpkg-query",
+        "-W",
+        form,
+        "ros-robot-state-publisher",
+        "python3-rospy",
+        "python3-tf2-ros",
+        *more,
+    ]
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return dict(line.split(" ", 1) for line in output.splitlines())
 
 
 def environment(job: Job) -> Mapping[str, str]:
-    """Where the master is; logs go to the job's folder."""
+    """The master's address; logs go to the job's folder."""
     return {
         "ROS_MASTER_URI": f"http://127.0.0.1:{job.ports[0]}",
         "ROS_IP": "127.0.0.1",
@@ -52,18 +60,18 @@ def environment(job: Job) -> Mapping[str, str]:
 
 
 def services(*parameters: str) -> Callable[[Job], Sequence[Service]]:
-    """The master, which is given the description, and robot_state_publisher with ``parameters``."""
+    """The master with the description, and robot_state_publisher with ``parameters``."""
 
-    def of(job: Job) -> Sequence[Service]:
+    def build(job: Job) -> Sequence[Service]:
         port = job.ports[0]
-        this = (PYTHON, "-m", "bench.subjects.ros1_world")
+        this = (PYTHON, "-m", "bench.subjects.ros1_master")
         master = (PYTHON, MASTER, "--core", "-p", str(port))
         return (
             Service("master", master, port=port, probe=(*this, "describe", job.urdf)),
             Service("state publisher", (STATE_PUBLISHER, *parameters), probe=(*this, "publishes")),
         )
 
-    return of
+    return build
 
 
 def _master() -> Any:
@@ -76,7 +84,7 @@ def _describe(file: str) -> bool:
 
 
 def _publishes() -> bool:
-    """Statics are advertised last but for the subscription to joint states."""
+    """Whether both topics are advertised and joint states subscribed, which comes last."""
     _, _, (publishers, subscribers, _) = _master().getSystemState("/bench")
     published = {topic for topic, nodes in publishers if nodes}
     return {"/tf", "/tf_static"} <= published and any(topic == "/joint_states" for topic, _ in subscribers)

@@ -1,11 +1,11 @@
-"""What watches cost whoever inserts, and how soon they answer: a buffer alone, without a network.
+"""Cost of watches per insert, and time to their first answers: a buffer without a network.
 
-    python -m bench.micro.watching [--robot panda] [--robots 100]
+    python -m bench.micro.watches [--robot panda] [--robots 100]
 
-- **an insert** of a robot's joints: beside watches of others, which sleep, and with some of its own, which
+- **an insert** of a robot's joints: with sleeping watches of other robots, and with watches of its own, which
   answer;
-- **first answers**: robots come one after the other, first the model and then a sample, into a buffer that
-  has a watch for each of them already; from the first of them to the last answer.
+- **first answers**: robots are added one after the other, first the model and then a sample, to a buffer that
+  already has a watch for each of them; from the first robot to the last answer.
 
 Figures are CPU time of the thread: the median of means over 200 inserts, and one run for the first answers.
 """
@@ -34,14 +34,14 @@ def main() -> None:
     options = parser.parse_args()
     model = load_model(options.robot)
     for others, own in ((0, 0), (1, 0), (30, 0), (100, 0), (0, 1), (0, 30)):
-        what = f"an insert beside {others} watches of others and {own} of its own"
-        print(f"{what:<56}{insert_us(model, others, own):10.2f} us", flush=True)
+        what = f"an insert with {others} watches of other robots and {own} of its own"
+        print(f"{what:<60}{insert_us(model, others, own):10.2f} us", flush=True)
     what = f"first answers of {options.robots} robots with a watch each"
-    print(f"{what:<56}{first_answers_ms(model, options.robots):10.1f} ms")
+    print(f"{what:<60}{first_answers_ms(model, options.robots):10.1f} ms")
 
 
 def insert_us(model: RobotModel, others: int, own: int) -> float:
-    """The median insert into the track of one robot, with so many watches of others and of its own."""
+    """Median CPU time [us] of an insert for one robot, with watches of ``others`` and its ``own``."""
     buffer = TransformBuffer()
     names = [f"robot{number}" for number in range(others + 1)]
     tracks = [buffer.add_robot(model, name) for name in names]
@@ -60,18 +60,18 @@ def insert_us(model: RobotModel, others: int, own: int) -> float:
 
 
 def first_answers_ms(model: RobotModel, robots: int) -> float:
-    """From the first robot's model to the answer of the last watch."""
+    """CPU time [ms] from the first robot's model to the answer of the last watch."""
     buffer, answered = TransformBuffer(), set[str]()
     names = [f"robot{number}" for number in range(robots)]
     for name in names:
         buffer.watch(f"{name}/{model.root}", f"{name}/{model.links[-1]}", lambda t: answered.add(t.target))
     rest = np.zeros(model.position_count)
 
-    def come() -> None:
+    def add_robots() -> None:
         for name in names:
             buffer.insert_joints(buffer.add_robot(model, name), 0, rest)
 
-    spent = _cpu_ns(come)
+    spent = _cpu_ns(add_robots)
     assert len(answered) == robots
     return spent * 1e-6
 

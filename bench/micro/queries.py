@@ -1,11 +1,11 @@
-"""What is asked over the network: history on join, one lookup, the time of another clock, metrics.
+"""Network queries: history on join, one lookup, clock offset, metrics.
 
-    python -m bench.micro.questions [--robot panda] [--times 50]
+    python -m bench.micro.queries [--robot panda] [--times 50]
 
 A publisher process at 1 kHz and a router process; this process is a client of the router. Measured in turn:
-from the opening of a listener to an answer 1.9 s in the past; one query on ``zstate/<robot>/lookup``; how
-far the measured offset of the publisher's clock is from the truth, which is 0 since it is the same clock,
-beside the uncertainty that is told; one scrape of the metrics of a listener.
+from opening a listener to an answer 1.9 s in the past; one query on ``zstate/<robot>/lookup``; the error of
+the measured offset of the publisher's clock (the true offset is 0, since it is the same clock) and the
+reported uncertainty; one scrape of a listener's metrics.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from urllib.request import urlopen
 
 import numpy as np
 
-from bench.micro.others import free_port, meet_nobody_else, running
+from bench.micro.processes import free_port, running_command, use_own_rendezvous
 from zstate import TransformListener, connect, load_model
 from zstate.metrics.collectors import ListenerMetrics
 from zstate.metrics.endpoint import MetricsEndpoint
@@ -26,8 +26,8 @@ from zstate.net.clock_offset import measure_offsets
 from zstate.net.session import Session
 
 RATE_HZ = 1000
-REMEMBERED_S = 2.0
-BACK_NS = 1_900_000_000
+CACHE_S = 2.0
+LOOK_BACK_NS = 1_900_000_000
 
 
 def main() -> None:
@@ -36,45 +36,45 @@ def main() -> None:
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--times", type=int, default=50)
     options = parser.parse_args()
-    meet_nobody_else()
+    use_own_rendezvous()
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     publish = ("publish", options.robot, "--source", "sine", "--rate", str(RATE_HZ), "--connect", endpoint)
-    with running("router", "--listen", endpoint), running(*publish):
-        time.sleep(REMEMBERED_S)
+    with running_command("router", "--listen", endpoint), running_command(*publish):
+        time.sleep(CACHE_S)
         with connect(mode="client", endpoints=endpoint) as session:
-            for what, unit, values in measured(session, load_model(options.robot), options.times):
+            for what, unit, values in measure(session, load_model(options.robot), options.times):
                 p50, most = np.median(values), max(values)
                 print(f"{what:<52} p50 {p50:9.1f} {unit}, at most {most:9.1f} {unit}", flush=True)
 
 
-def measured(session: Session, model: RobotModel, times: int) -> Iterator[tuple[str, str, list[float]]]:
-    """The rows: what, its unit, the values."""
+def measure(session: Session, model: RobotModel, times: int) -> Iterator[tuple[str, str, list[float]]]:
+    """The rows: title, unit, values."""
     robot, tip = model.name, model.links[-1]
     yield (
         "listener opened to an answer 1.9 s back",
         "ms",
-        [joining_s(session, model) * 1e3 for _ in range(times)],
+        [join_time_s(session, model) * 1e3 for _ in range(times)],
     )
-    question = f"zstate/{robot}/lookup?target={model.root};source={tip}"
+    selector = f"zstate/{robot}/lookup?target={model.root};source={tip}"
 
-    def ask() -> object:
-        return [reply.ok.payload for reply in session.zenoh.get(question)]
+    def query() -> object:
+        return [reply.ok.payload for reply in session.zenoh.get(selector)]
 
-    yield "lookup by one query", "ms", [spent_s(ask) * 1e3 for _ in range(times)]
+    yield "lookup by one query", "ms", [elapsed_s(query) * 1e3 for _ in range(times)]
     offsets = [measure_offsets(session, robot)[0] for _ in range(times)]
-    yield "clock offset, of which the truth is 0", "us", [abs(one.offset_ns) * 1e-3 for one in offsets]
-    yield "the uncertainty told with it", "us", [one.uncertainty_ns * 1e-3 for one in offsets]
+    yield "error of the clock offset", "us", [abs(one.offset_ns) * 1e-3 for one in offsets]
+    yield "reported uncertainty of the clock offset", "us", [one.uncertainty_ns * 1e-3 for one in offsets]
     with (
         TransformListener(session, robot) as listener,
         MetricsEndpoint([ListenerMetrics(lambda: [listener])]) as endpoint,
     ):
-        spent = [spent_s(lambda: urlopen(endpoint.url).read()) for _ in range(times)]
+        spent = [elapsed_s(lambda: urlopen(endpoint.url).read()) for _ in range(times)]
         yield "scrape of a listener's metrics", "ms", [seconds * 1e3 for seconds in spent]
 
 
-def joining_s(session: Session, model: RobotModel) -> float:
-    """How long a new listener takes to know what was said before it came."""
-    began, stamp = time.monotonic(), time.time_ns() - BACK_NS
+def join_time_s(session: Session, model: RobotModel) -> float:
+    """Time [s] from opening a listener until it has the history of ``LOOK_BACK_NS``."""
+    began, stamp = time.monotonic(), time.time_ns() - LOOK_BACK_NS
     with TransformListener(session, model.name) as listener:
         listener.buffer.wait(model.root, model.links[-1], timeout_s=10.0)
         while not listener.buffer.can_lookup(model.root, model.links[-1], stamp):
@@ -82,8 +82,8 @@ def joining_s(session: Session, model: RobotModel) -> float:
         return time.monotonic() - began
 
 
-def spent_s(action: Callable[[], object]) -> float:
-    """How long it takes."""
+def elapsed_s(action: Callable[[], object]) -> float:
+    """Duration of a call [s]."""
     began = time.monotonic()
     action()
     return time.monotonic() - began

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import tf_tree
 
-from bench.micro.lookup.worker import Recorded, serve
+from bench.micro.lookup.worker import MotionFile, serve
 
 WXYZ_XYZ = [6, 3, 4, 5, 0, 1, 2]
 
@@ -15,7 +15,7 @@ WXYZ_XYZ = [6, 3, 4, 5, 0, 1, 2]
 class Robot:
     """A filled tree."""
 
-    def __init__(self, recorded: Recorded, samples: list[Any]) -> None:
+    def __init__(self, recorded: MotionFile, samples: list[Any]) -> None:
         self.tree = tf_tree.build(_topology(recorded))
         self.names = recorded.target, recorded.source
         self.publishers = [self.tree.publisher(child, parent) for parent, child in recorded.edges]
@@ -32,8 +32,8 @@ class Robot:
         self.stamp += self.step
 
 
-def _topology(recorded: Recorded) -> str:
-    """Its description of a tree: static edges folded into plans, tf2's rule of interpolation."""
+def _topology(recorded: MotionFile) -> str:
+    """The tree in transform-tree's format, with tf2's rule of interpolation."""
     text = '[topology]\ninterp = "lerpslerp"\n'
     for parent, child, pose in recorded.statics:
         numbers = ", ".join(repr(float(pose[k])) for k in WXYZ_XYZ)
@@ -45,15 +45,15 @@ def _topology(recorded: Recorded) -> str:
 
 
 class TransformTree:
-    """The cases of the table; poses are asked for as seven numbers, which is its fastest layout."""
+    """The cases of the table; poses are requested as seven numbers, its fastest layout."""
 
     @staticmethod
-    def read(recorded: Recorded) -> Any:
+    def read(recorded: MotionFile) -> Any:
         poses = np.fromfile(recorded.path.with_suffix(".poses")).reshape(recorded.count, -1, 7)
         return [list(sample) for sample in np.ascontiguousarray(poses[..., WXYZ_XYZ])]
 
     @staticmethod
-    def fill(recorded: Recorded, samples: list[Any]) -> Robot:
+    def fill(recorded: MotionFile, samples: list[Any]) -> Robot:
         return Robot(recorded, samples)
 
     @staticmethod
@@ -75,13 +75,13 @@ class TransformTree:
     def future(robot: Robot, stamps: list[int]) -> Any:
         lookup, (target, source) = robot.tree.lookup, robot.names
 
-        def ask(stamp: int) -> object:
+        def lookup_error(stamp: int) -> object:
             try:
                 return lookup(target, source, stamp + 10**12)
             except tf_tree.TfTreeError as reason:
                 return reason
 
-        return ask, stamps
+        return lookup_error, stamps
 
     @staticmethod
     def insert(robot: Robot, stamps: list[int]) -> Any:

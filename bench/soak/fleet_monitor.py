@@ -1,4 +1,4 @@
-"""Watching: what a reader of all sees of each robot, in memory that does not grow."""
+"""Ages and latched values of all robots of a reader, in constant memory."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from zstate import TransformBuffer, ZStateError, load_model
 
 STALE_MS = 1000.0
 
-Ends = list[tuple[str, str, str]]
-"""Of each robot the root of its model, its last link and its mark, by their names in a buffer."""
+FrameNames = list[tuple[str, str, str]]
+"""Per robot: the root of its model, its last link and its mark, as frame names in a buffer."""
 
 
-def ends_of(task: Task) -> Ends:
-    """Those of all robots."""
+def frame_names(task: Task) -> FrameNames:
+    """The frame names of all robots."""
     model = load_model(task.model)
     return [(f"{name}/{model.root}", f"{name}/{model.links[-1]}", f"{name}/mark") for name in task.names]
 
 
-class Watching:
-    """Looks at every robot when told to: how old it is, and which half minute its static edge names."""
+class FleetMonitor:
+    """Samples the age and the mark of every robot when ``sample`` is called."""
 
-    def __init__(self, buffer: TransformBuffer, ends: Ends) -> None:
+    def __init__(self, buffer: TransformBuffer, ends: FrameNames) -> None:
         self._buffer = buffer
         self._ends = ends
         self._ages = _Ages()
@@ -35,8 +35,8 @@ class Watching:
         self._lost_latched = 0
         self._is_complete = True
 
-    def look(self) -> None:
-        """Look at all of them."""
+    def sample(self) -> None:
+        """Samples all robots once."""
         now = time.time_ns()
         for root, tip, _ in self._ends:
             try:
@@ -44,23 +44,23 @@ class Watching:
             except ZStateError:
                 continue
             self._ages.add(age * 1e-6)
-        self._look_at_latched()
+        self._sample_latched()
 
-    def _look_at_latched(self) -> None:
-        behind = missing(self._buffer, self._ends)
+    def _sample_latched(self) -> None:
+        behind = count_missing_marks(self._buffer, self._ends)
         if epoch() != self._epoch:
-            # The half minute in which the soak begins is not counted: not everybody is there yet.
-            # Nor is the end, when the publishers have gone and taken their edges back.
+            # The half minute of the start is not counted: not all publishers have started.
+            # Nor is the end, after the publishers have left and withdrawn their edges.
             if not self._is_complete and self._latched_after_s and behind < len(self._ends):
                 self._lost_latched += behind
             self._epoch, self._is_complete = epoch(), False
-            behind = missing(self._buffer, self._ends)
+            behind = count_missing_marks(self._buffer, self._ends)
         if not behind and not self._is_complete:
             self._is_complete = True
             self._latched_after_s.append(time.time() - self._epoch * EPOCH_S)
 
     def report(self) -> dict[str, Any]:
-        """What was seen."""
+        """All figures."""
         late = np.array(self._latched_after_s[1:] or [np.nan])  # the first is the time of joining
         return {
             **self._ages.report(),
@@ -93,19 +93,19 @@ class _Ages:
         }
 
 
-def missing(buffer: TransformBuffer, ends: Ends) -> int:
-    """How many robots have not got the static edge of this half minute."""
-    present = float(epoch())
-    return sum(_marked(buffer, root, mark) != present for root, _, mark in ends)
+def count_missing_marks(buffer: TransformBuffer, ends: FrameNames) -> int:
+    """Number of robots without the static edge of this half minute."""
+    current = float(epoch())
+    return sum(_mark_value(buffer, root, mark) != current for root, _, mark in ends)
 
 
-def all_answer(buffer: TransformBuffer, ends: Ends) -> bool:
-    """Whether there is a pose of every robot."""
+def all_available(buffer: TransformBuffer, ends: FrameNames) -> bool:
+    """Whether every robot has a pose."""
     return all(buffer.can_lookup(root, tip) for root, tip, _ in ends)
 
 
-def _marked(buffer: TransformBuffer, root: str, mark: str) -> float | None:
+def _mark_value(buffer: TransformBuffer, root: str, mark: str) -> float | None:
     try:
         return float(buffer.lookup(root, mark).translation[0])
-    except ZStateError:  # not there yet, or withdrawn at the end
+    except ZStateError:  # not received yet, or withdrawn at the end
         return None

@@ -1,7 +1,7 @@
 """tf2 from Debian (``apt-get install python3-tf2-ros``), run by /usr/bin/python3.
 
-``name`` is tf2_ros.Buffer, what programs use; ``plan`` is its bare core, the least that Python can ask.
-Stamps are made into ROS's beforehand and are not counted.
+``name`` is tf2_ros.Buffer, as in most programs; ``plan`` is its core, the cheapest call from Python.
+Stamps are converted to ROS times beforehand and not counted.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from geometry_msgs.msg import TransformStamped
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from worker import Recorded, serve
+from worker import MotionFile, serve
 
 
 def time_of(stamp: int) -> Any:
-    """A stamp as ROS says it."""
+    """A stamp as a ROS time."""
     return rospy.Time(stamp // 10**9, stamp % 10**9)
 
 
@@ -38,7 +38,7 @@ def message(parent: str, child: str, stamp: int, pose: Any) -> Any:
 class Robot:
     """A filled buffer."""
 
-    def __init__(self, recorded: Recorded, poses: Any) -> None:
+    def __init__(self, recorded: MotionFile, poses: Any) -> None:
         self.names = recorded.target, recorded.source
         self.edges, self.poses = recorded.edges, poses
         self.buffer = tf2_ros.Buffer(rospy.Duration(recorded.count * recorded.step * 1e-9), debug=False)
@@ -65,11 +65,11 @@ class Tf2:
     """The cases of the table."""
 
     @staticmethod
-    def read(recorded: Recorded) -> Any:
+    def read(recorded: MotionFile) -> Any:
         return recorded.doubles("poses")
 
     @staticmethod
-    def fill(recorded: Recorded, samples: Any) -> Robot:
+    def fill(recorded: MotionFile, samples: Any) -> Robot:
         return Robot(recorded, samples)
 
     @staticmethod
@@ -86,13 +86,13 @@ class Tf2:
     def future(robot: Robot, stamps: list[int]) -> Any:
         lookup, (target, source) = robot.buffer.lookup_transform, robot.names
 
-        def ask(time: Any) -> object:
+        def lookup_error(time: Any) -> object:
             try:
                 return lookup(target, source, time)
             except tf2_ros.TransformException as reason:
                 return reason
 
-        return ask, [time_of(stamp + 10**12) for stamp in stamps]
+        return lookup_error, [time_of(stamp + 10**12) for stamp in stamps]
 
     @staticmethod
     def insert(robot: Robot, stamps: list[int]) -> Any:

@@ -1,0 +1,53 @@
+"""The files of deploy/ are the output of the commands in its README."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.deployment import DEPLOY
+from helpers.processes import DEADLINE_S
+
+pytestmark = pytest.mark.processes
+
+
+def said(*arguments: str) -> str:
+    command = [sys.executable, "-m", "zstate", *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def commands_in_the_readme() -> list[list[str]]:
+    text = (DEPLOY / "README.md").read_text().replace("\\\n", " ")
+    lines = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).splitlines()
+    return [shlex.split(line) for line in lines if line.startswith("zstate ")]
+
+
+def router_command(contains: str, certs: Path) -> list[str]:
+    """The options of the router command in the README that has ``contains``."""
+    (words,) = [words for words in commands_in_the_readme() if words[1] == "router" and contains in words]
+    options = words[1 : words.index("--print") + 1]
+    return [str(certs) if word in ("certs", "/etc/zstate/certs") else word for word in options]
+
+
+def test_router_configuration_is_generated_by_the_readme_command(certs: Path, tmp_path):
+    acl = tmp_path / "acl.json5"
+    acl.write_text(said("acl", "--robot", "r1", "--viewer", "desk"))
+    options = [str(acl) if word == "acl.json5" else word for word in router_command("--acl", certs)]
+    made = said(*options).replace(str(certs), "/certs")
+    assert made == (DEPLOY / "router.json5").read_text()
+
+
+def test_site_router_configuration_is_generated_by_the_readme_command(certs: Path):
+    made = said(*router_command("--wan", certs)).replace(str(certs), "/etc/zstate/certs")
+    assert made == (DEPLOY / "site-router.json5").read_text()
+
+
+def test_other_commands_of_the_readme_exist():
+    for words in commands_in_the_readme():
+        said(words[1], "--help")
