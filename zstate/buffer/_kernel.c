@@ -2,8 +2,8 @@
  *
  * Each type is specified by its reference in Python, which stays complete:
  * zstate/buffer/history.py (History), path.py and interpolation.py (Path), zstate/transform.py
- * (TransformFields), zstate/model/joint_transforms.py (Edges). Differences to those are bugs, and tests
- * compare both.
+ * (TransformFields), zstate/model/joint_transforms.py (Edges). Differences to those are bugs, and
+ * tests compare both.
  *
  * Threads. All writes and all changes of references need the GIL. The rows of a block that a window
  * covers are never written again, so a batch that holds references to its blocks reads them without

@@ -31,6 +31,9 @@ from zstate.transform import Transform, Twist
 
 S = TypeVar("S")
 
+DEFAULT_HISTORY_S = 10.0
+"""What buffers and listeners keep by default; as in tf2."""
+
 # The number of choices of robots whose snapshot readers are cached.
 _MAX_CACHED_READERS = 16
 
@@ -43,7 +46,7 @@ class TransformBuffer(BufferCore):
     reads the ``clock`` (default: the system's). Any method may be called from any thread.
     """
 
-    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+    def __init__(self, history_s: float = DEFAULT_HISTORY_S, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self._snapshot_readers: dict[frozenset[str], SnapshotReader] = {}
 

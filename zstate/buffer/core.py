@@ -72,7 +72,7 @@ class BufferCore:
     Inserts may come from any thread; a lock serialises them. Lookups take no lock.
     """
 
-    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+    def __init__(self, history_s: float, clock: Clock | None) -> None:
         if not isinstance(history_s, Real) or not 0.0 < history_s < 1e9:
             raise InvalidInput(f"history_s is a positive number of seconds, not {history_s!r}")
         self.history_s = history_s

@@ -168,7 +168,8 @@ class AngleInterpolator(LinearInterpolator):
     """An angle of any number of turns.
 
     It follows the rotation between the samples; but two angles within [-pi, pi] more than half a turn apart
-    are of an encoder that wrapped, and take the short way.
+    are of an encoder that wrapped, and take the short way. ``interpolate_angle`` in ``_kernel/step.h`` is the
+    same rule in C.
     """
 
     def difference(self, now: Bracket) -> Component:

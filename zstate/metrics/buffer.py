@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from zstate._util.bounded_dict import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.buffer.tracks import JointTrack
 from zstate.clock import Clock
 from zstate.errors import LookupFailed, WaitTimeout
@@ -58,7 +58,7 @@ class InstrumentedBuffer(TransformBuffer):
     by a plan or by ``lookup_many`` are not counted.
     """
 
-    def __init__(self, history_s: float = 10.0, clock: Clock | None = None) -> None:
+    def __init__(self, history_s: float = DEFAULT_HISTORY_S, clock: Clock | None = None) -> None:
         super().__init__(history_s, clock)
         self.latency = Histogram(LATENCY_BOUNDS_S)
         self._counting = fork_safe_lock()

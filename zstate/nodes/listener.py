@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from typing import Literal, ParamSpec, TypeVar
 
 from zstate._util.closeable import Closeable
-from zstate.buffer.buffer import TransformBuffer
+from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.clock import SYSTEM, Clock, ClockOffset
 from zstate.errors import InvalidInput, MessageError
 from zstate.ingest.base import StreamIngest
@@ -68,7 +68,7 @@ class TransformListener(Closeable):
         buffer: TransformBuffer | None = None,
         wire: str = "native",
         follow: Follow = "joint_states",
-        history_s: float = 10.0,
+        history_s: float = DEFAULT_HISTORY_S,
         *,
         clock: Clock | None = None,
         history_on_join: bool = True,

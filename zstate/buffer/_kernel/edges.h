@@ -1,4 +1,5 @@
-/* Edges: all edges of a robot from its positions, for EdgeTable in zstate/model/joint_transforms.py. */
+/* Edges: all edges of a robot from its positions, for JointTransforms in
+ * zstate/model/joint_transforms.py. */
 
 typedef struct {
     PyObject_HEAD

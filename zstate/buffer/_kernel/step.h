@@ -41,6 +41,8 @@ interpolate_linear(double a, double b, double ratio)
     return a + ratio * (b - a);
 }
 
+/* Angles within [-pi, pi] more than half a turn apart are of a wrapped encoder, and take the short
+ * way: the same rule as AngleInterpolator in interpolation.py. */
 static inline double
 interpolate_angle(double a, double b, double ratio)
 {
