@@ -84,4 +84,4 @@ def test_doctor_of_a_large_fleet_ends_and_counts_unexamined_robots(fleet: None):
     assert ended.returncode == 1, ended.stderr.decode()  # drivers are announced, and silent
     (line,) = (line for line in ended.stdout.decode().splitlines() if "were not examined" in line)
     assert f"of {ROBOTS + 1} robots were not examined within 2.5 s" in line
-    assert "name one, or give more --timeout" in line
+    assert "name one robot, or raise --timeout" in line

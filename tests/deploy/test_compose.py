@@ -49,7 +49,7 @@ def test_compose_router_refuses_writes_of_other_identities(deployment: Deploymen
 def test_client_without_certificate_is_refused(deployment: Deployment, spawn: Any):
     deployment.start_router(spawn).line()
     ca = Credentials(ca=deployment.certs / "ca.pem")
-    with pytest.raises(AccessDenied, match="demands a certificate"):
+    with pytest.raises(AccessDenied, match="requires a certificate"):
         connect(mode="client", endpoints=f"tls/localhost:{deployment.port}", credentials=ca)
 
 

@@ -101,7 +101,7 @@ def test_ros_looks_up_a_robot_of_zstate_as_zstate_does(bridge: Bridge, tf2_liste
         theirs, _ = tf2_listener().query("lower", "probe", 0, 5.0)
         assert_same_pose(theirs, listener.buffer.lookup("lower", "probe").pose7.tolist(), 1e-12)
         interrupted(carrying)
-        assert carrying.line().endswith(" samples to ROS, 0 from there")
+        assert carrying.line().endswith(" samples to ROS, 0 from ROS")
 
 
 def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
@@ -109,7 +109,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
 ):
     Master().set_parameter(f"{namespace}/robot_description", RRBOT.read_text())
     program(str(STATE_PUBLISHER), "_publish_frequency:=1000", "_ignore_timestamp:=true")
-    talker, listening = peer(), peer("hear")
+    talker, listening = peer(), peer("subscribe")
     carrying = bridge("--from-ros")
     probe = Transform.from_rpy("tool", "probe", (0.1, 0.0, 0.05), (0.2, -0.3, 0.4))
     identity = [0.0] * 6 + [1.0]
@@ -151,7 +151,7 @@ def test_zstate_looks_up_a_robot_of_ros_as_ros_does(
 
 
 def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., RosPeer]):
-    listening, talker = peer("hear"), peer()
+    listening, talker = peer("subscribe"), peer()
     carrying = bridge("--to-ros", "--from-ros")
     in_zstate: Counter[int] = Counter()
 
@@ -198,7 +198,7 @@ def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., R
 
 
 def test_two_bridges_of_one_robot_make_no_loop(bridge: Bridge, peer: Callable[..., RosPeer]):
-    listening = peer("hear")
+    listening = peer("subscribe")
     bridge("--to-ros")
     back = bridge("--from-ros", "--model", str(RRBOT))
     with connect() as session, StatePublisher(session, MODEL, "rrbot", takeover=True) as publisher:
@@ -215,7 +215,7 @@ def test_two_bridges_of_one_robot_make_no_loop(bridge: Bridge, peer: Callable[..
 def test_a_sample_in_ros_has_all_its_numbers_and_nanoseconds(
     bridge: Bridge, peer: Callable[..., RosPeer], namespace: str
 ):
-    listening = peer("hear")
+    listening = peer("subscribe")
     bridge("--to-ros", "--frame-prefix", "left_")
     stamps = iter(range(1_700_000_000_123_456_789, 2**62))
     sent: set[int] = set()
@@ -259,7 +259,7 @@ def test_unusable_messages_are_counted_and_logged_once(bridge: Bridge, peer: Cal
         assert math.isclose(listener.buffer.lookup("world", "tool").rpy[1], 0.3, abs_tol=1e-12)
     interrupted(carrying)
     refused = "zero stamp 2, bad numbers 2, missing joints 2, sizes 2, unknown joints 1"
-    assert carrying.line().endswith(f"from there; refused: {refused}")
+    assert carrying.line().endswith(f"from ROS; refused: {refused}")
     for advice in ("header.stamp", "(nan)", "without 'elbow'", "1 numbers of position", "'wheel'"):
         assert carrying.stderr.count(advice) == 1, carrying.stderr
 

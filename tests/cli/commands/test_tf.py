@@ -145,7 +145,7 @@ def test_an_instant_to_come_is_waited_for_and_one_gone_by_is_refused():
         late = failure("tf", "base", "lower", "--at", str(soon + 3_600 * 10**9), "--timeout", "1")
         seconds = failure("tf", "base", "lower", "--at", str(soon // 10**9))
     assert re.search("before the (oldest|only) sample of 'rrbot/base' -> 'rrbot/upper'", message)
-    assert "leave --at out for the newest pose, or name an instant to come" in message
+    assert "leave --at out for the newest pose, or give a later instant" in message
     assert (
         "the requested stamp, 250.655 s, is simulated time or time since a machine was switched on, but"
         in other

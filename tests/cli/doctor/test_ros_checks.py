@@ -125,7 +125,7 @@ def test_missing_driver_and_missing_model_are_reported(ros_router: str):
 @pytest.mark.processes
 def test_without_nodes_the_domain_is_reported(ros_router: str):
     found = Found(code=1).first_broken
-    assert (found["name"], found["text"]) == ("robots", "nobody publishes the state of a robot in domain 0")
+    assert (found["name"], found["text"]) == ("robots", "no node publishes the state of a robot in domain 0")
 
 
 def test_ros_wire_without_options_joins_the_router_of_the_host(monkeypatch: pytest.MonkeyPatch):

@@ -98,4 +98,4 @@ def test_calibration_is_published_with_renamed_frames(spawn: Spawn, tmp_path: Pa
 def test_static_reports_an_invalid_file(tmp_path: Path):
     several = file_of(tmp_path, f"[{OURS}, {OURS}]", "eyes.json")
     assert "has 2 transforms" in failure("static", "a", "b", "--file", str(several), code=2)
-    assert "--set is for parameters" in failure("static", "--file", str(several), "--set", "a=1", code=2)
+    assert "--set needs a .toml file" in failure("static", "--file", str(several), "--set", "a=1", code=2)

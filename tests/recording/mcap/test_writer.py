@@ -209,7 +209,7 @@ KILLED = """
     from pathlib import Path
     from helpers.recording_files import *
     writer = RecordingWriter(sys.argv[1])
-    described, joints = declared(writer)
+    described, joints = declare_channels(writer)
     writer.latch(described, "", DESCRIPTION, START, START)
     for number, (stamp, payload) in enumerate(joint_states(100)):
         writer.write(joints, payload, stamp, stamp)
@@ -237,7 +237,7 @@ FULL = """
     from zstate.errors import RecordingError
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
     writer = RecordingWriter(sys.argv[1])
-    described, joints = declared(writer)
+    described, joints = declare_channels(writer)
     writer.latch(described, "", DESCRIPTION, START, START)
     written = 0
     try:

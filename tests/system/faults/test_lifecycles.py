@@ -101,7 +101,7 @@ FORKING = """
 STARTING = """
     import json, sys, time
     sys.path.insert(0, sys.argv[3])
-    from helpers.fault_programs import census
+    from helpers.fault_programs import resource_counts
     from zstate import StatePublisher, TransformListener, connect, load_model
 
     model, options, counts = load_model("rrbot"), json.loads(sys.argv[1]), []
@@ -117,10 +117,10 @@ STARTING = """
 
     for _ in range(20):
         once()
-    before, began = census(), time.monotonic()
+    before, began = resource_counts(), time.monotonic()
     for _ in range(int(sys.argv[2]) - 20):
         once()
-    print(json.dumps([before, census(), time.monotonic() - began]))
+    print(json.dumps([before, resource_counts(), time.monotonic() - began]))
 """
 
 

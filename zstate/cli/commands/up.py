@@ -36,7 +36,7 @@ def up_command(file: str, parameters: tuple[str, ...], only_check: bool) -> None
 
     \b
     include = ["network.toml"]        # more such files
-    [parameters]                      # "${rate}" below; "${HOME}" is the environment
+    [parameters]                      # "${rate}" below; "${HOME}": environment
     rate = 100.0
     robots = "${ROBOTS:-left right}"  # left right if ROBOTS is not set
     [router]                          # options of `zstate router`
