@@ -387,7 +387,7 @@ RATCHETS = (
     Ratchet("modules in largest folder", modules_in_largest_folder, 17, 18),
     Ratchet("modules in cycles", modules_in_cycles, 0, 0),
     Ratchet("modules", lambda: len(modules()), 247, 270),
-    Ratchet("lines", lines, 42_220, 36_000),
+    Ratchet("lines", lines, 42_300, 36_000),
     Ratchet("median body", median_body, 5, 6),
 )
 
