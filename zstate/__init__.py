@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from zstate.nodes.listener import TransformListener
     from zstate.nodes.publisher import StatePublisher
     from zstate.nodes.static_publisher import StaticPublisher
+    from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recording import Recording
     from zstate.sources import JointReading, SineSource
     from zstate.transform import Transform, Twist
@@ -77,6 +78,7 @@ __all__ = [
     "Transform",
     "TransformBuffer",
     "TransformListener",
+    "TransformPublisher",
     "Twist",
     "UnknownFrame",
     "Unreachable",
@@ -99,6 +101,7 @@ _HOMES = {
     "Transform": "transform",
     "TransformBuffer": "buffer.buffer",
     "TransformListener": "nodes.listener",
+    "TransformPublisher": "nodes.transform_publisher",
     "Twist": "transform",
     "connect": "net.session",
     "discover": "net.presence",

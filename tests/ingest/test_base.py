@@ -48,9 +48,13 @@ class IngestCase:
         make: type[StreamIngest],
         buffer: TransformBuffer | None = None,
         sharing: IngestCase | None = None,
+        *,
+        is_shared: bool = False,
     ) -> None:
         self.ownership = (
-            sharing.ownership if sharing else FrameOwnership(buffer or TransformBuffer(), Counters())
+            sharing.ownership
+            if sharing
+            else FrameOwnership(buffer or TransformBuffer(), Counters(), is_shared=is_shared)
         )
         self.buffer, self.counters, self.live = (
             self.ownership.buffer,
@@ -138,7 +142,7 @@ def test_delayed_sample_does_not_end_the_epoch(case: IngestCase):
 
 
 def test_writer_with_a_slow_clock_does_not_take_over_edges_of_a_live_writer():
-    ahead = IngestCase(TransformIngest, TransformBuffer(history_s=1e-6))
+    ahead = IngestCase(TransformIngest, TransformBuffer(history_s=1e-6), is_shared=True)
     behind = IngestCase(TransformIngest, sharing=ahead)
     ahead.live |= {("r1", 7): "ahead", ("r1", 8): "behind"}
     for case, session in ((ahead, 7), (behind, 8)):

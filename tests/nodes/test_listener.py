@@ -197,10 +197,11 @@ def test_gaps_in_a_batch_that_filled_the_ring_count_as_dropped(sessions, monkeyp
     def receive(*seqs: int) -> None:
         states = [JointState(STAMP + seq, seq, 9, order_digest(RRBOT.joint_names), b"") for seq in seqs]
         key, encoding = "zstate/r1/joint_states", ENCODINGS[JointState]
-        listener._on_samples([SerializedSample(key, encode(state), encoding) for state in states])
+        samples = [SerializedSample(key, encode(state), encoding) for state in states]
+        listener._on_samples(listener._samples, samples)
 
     with TransformListener(sessions[0], "r1") as listener:
-        monkeypatch.setattr(listener, "_capacity", 3)
+        monkeypatch.setattr(listener._samples, "capacity", 3)
         receive(0)
         receive(2, 5, 6)  # a full ring goes on losing its oldest while it is emptied
         receive(8)

@@ -249,4 +249,7 @@ def _place(announced: Announcement) -> _Place:
 
 
 def _what(announced: Announcement) -> str:
-    return f"static edges as {announced.name!r}" if announced.name else announced.stream
+    if not announced.name:
+        return announced.stream
+    kind = "static edges" if announced.stream == "tf_static" else "transforms"
+    return f"{kind} as {announced.name!r}"

@@ -410,7 +410,10 @@ class FrameOwnership:
         if there is None:
             return _loop(names, by, accepted)
         is_same_edge = there.parent == parent
-        if is_same_edge and (there.is_as_good_as(claim) or self._rank_of(there) == rank):
+        # Of static edges the last value counts; samples of two writers would alternate. ROS allows that.
+        both_move = there.claim is not None and there.pose is None and claim.pose is None
+        may_share = self._rank_of(there) == rank and (self._is_shared or not both_move)
+        if is_same_edge and (there.is_as_good_as(claim) or may_share):
             return None
         if rank == _OTHERS and self._rank_of(there) < _OTHERS:
             text = (

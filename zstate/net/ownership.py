@@ -1,7 +1,8 @@
-"""Exclusive ownership (DDS): one writer for each stream of a robot, one static writer for each child frame.
+"""Exclusive ownership (DDS): one writer for each stream of a robot, one writer of edges for each child frame.
 
-``WriterClaim`` owns streams, and the static edges under one name; ``claim_edges`` owns new static edges while
-they are published. Conflicting writers are found by their liveliness tokens and raise SecondWriter.
+``WriterClaim`` owns streams, and the edges under one name; ``claim_edges`` owns new edges: static ones while
+they are published, because then their value shows them, moving ones as long as their writer is open.
+Conflicting writers are found by their liveliness tokens and raise SecondWriter.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -30,6 +31,7 @@ from zstate.wire.keys import (
     ANY,
     FOREIGN_FRAME,
     MODEL_WRITER,
+    NAMED_STREAMS,
     Stream,
     edge_expression,
     edge_key,
@@ -234,14 +236,16 @@ def seniority(announced: Announcement) -> tuple[int, int]:
 
 
 def _second_writer(first: Announcement) -> SecondWriter:
-    if first.stream == "tf_static":
-        stream = f"static edges of {first.robot!r} under the name {first.name!r}"
+    if first.stream in NAMED_STREAMS:
+        kind = "static edges" if first.stream == "tf_static" else "transforms"
+        stream = f"{kind} of {first.robot!r} under the name {first.name!r}"
     else:
         stream = f"{first.stream} of {first.robot!r}"
-    text = (
-        f"{writer_text(first.writer)} already writes {stream}; stop it first, or publish as well with "
-        "takeover=True (--takeover): readers use the newest writer"
-    )
+    text = f"{writer_text(first.writer)} already writes {stream}; stop it first, or "
+    if first.stream == "transforms":
+        text += "give this writer another name"
+    else:
+        text += "publish as well with takeover=True (--takeover): readers use the newest writer"
     return SecondWriter(text, robot=first.robot, stream=first.stream, first=first.writer)
 
 
@@ -262,9 +266,9 @@ Edge = tuple[str, str]
 def claim_edges(
     session: Session, writer: Announcement, edges: Sequence[Edge], allowed: Container[int] = ()
 ) -> Generator[None]:
-    """Exclusive ownership of the children of ``edges`` while ``writer`` publishes them for the first time.
+    """Exclusive ownership of the children of ``edges``, for ``writer``.
 
-    Raises SecondWriter if a live static writer of any robot places one of them; of two writers that claim one
+    Raises SecondWriter if a live writer of edges of any robot places one of them; of two that claim one
     at the same time the later one gets it. Writers whose sessions are in ``allowed`` do not conflict. Takes
     some round trips.
     """
@@ -299,31 +303,36 @@ def _wait_for_rival_claims(
             return
         first, edge = min(claims, key=lambda claim: seniority(claim[0]))
         if seniority(first) < seniority(writer) or time.monotonic() > deadline:
-            raise _frame_conflict(first, edge, "is placing")
+            raise _frame_conflict(_announced(session, first), edge, "is placing")
         time.sleep(ROUND_S)
 
 
 def check_edges(
     session: Session, writer: Announcement, edges: Sequence[Edge], allowed: Container[int] = ()
 ) -> None:
-    """Raise SecondWriter if a live static writer of any robot places a child of ``edges`` already.
+    """Raise SecondWriter if a static writer of any robot places a child of ``edges`` already.
 
     Frames are full names; ``writer`` publishes ``edges``. Takes one round trip.
     """
     wait_for_discovery(session)
     children = {child for _, child in edges}
     for robot, name, statics in _current_statics(session):
-        if (robot, name) == (writer.robot, writer.name) or statics.session in allowed:
+        is_own = writer.stream == "tf_static" and (robot, name) == (writer.robot, writer.name)
+        if is_own or statics.session in allowed:
             continue
         for parent, child in named_edges(robot, statics.edges):
             if child in children and not _outranks(writer, robot, child):
                 first = Announcement(robot, "tf_static", WriterId(name, "", 0, 0, statics.session), name)
-                for token in confirmed_tokens(session, _WIRE.writers_expression(robot)):
-                    known = _WIRE.parse_token(token, robot)
-                    if known and known.stream == "tf_static" and known.writer.session == statics.session:
-                        first = Announcement(robot, "tf_static", known.writer, name)
-                        break
-                raise _frame_conflict(first, (parent, child), "places")
+                raise _frame_conflict(_announced(session, first), (parent, child), "places")
+
+
+def _announced(session: Session, writer: Announcement) -> Announcement:
+    """The announcement of a writer of edges, of which only robot, name and session are known for certain."""
+    for token in confirmed_tokens(session, _WIRE.writers_expression(writer.robot)):
+        known = _WIRE.parse_token(token, writer.robot)
+        if known and known.name == writer.name and known.writer.session == writer.writer.session:
+            return known
+    return writer
 
 
 def _outranks(writer: Announcement, other_robot: str, child: str) -> bool:
@@ -456,8 +465,11 @@ def named_edges(robot: str, edges: Edges) -> Iterator[Edge]:
 
 def _frame_conflict(first: Announcement, edge: Edge, verb: str) -> SecondWriter:
     parent, child = edge
+    advice = "stop or withdraw that first, or use takeover=True (--takeover)"
+    if first.stream == "transforms":
+        verb, advice = "places", "stop that first"
     text = (
         f"{writer_text(first.writer)} {verb} {child!r} on {parent!r} already, as {first.name!r} of "
-        f"{first.robot!r}; stop or withdraw that first, or use takeover=True (--takeover)"
+        f"{first.robot!r}; {advice}"
     )
-    return SecondWriter(text, robot=first.robot, stream="tf_static", first=first.writer, edge=edge)
+    return SecondWriter(text, robot=first.robot, stream=first.stream, first=first.writer, edge=edge)

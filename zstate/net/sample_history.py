@@ -42,11 +42,12 @@ from zstate.net.queryable import Queryable, Reply
 from zstate.net.session import Session
 from zstate.net.streams import JOIN_WITHIN_S, to_serialized
 from zstate.wire.keys import Stream, stream_key
-from zstate.wire.messages import HistoryPage, JointState
+from zstate.wire.messages import HistoryPage, Sample
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, decode, encode
 from zstate.wire.protocol import SerializedSample
 
 T = TypeVar("T")
+S = TypeVar("S", bound=Sample)
 
 PAGE_BYTES = 32_000
 PAGE_SAMPLES = 256
@@ -117,7 +118,7 @@ class RoundRobinQueue(Generic[T]):
         self._due.clear()
 
 
-class SampleCache:
+class SampleCache(Generic[S]):
     """The samples of the session ``writer``: the last ``span_s`` seconds before the newest, by their stamps.
 
     Holds at most 8 MB, with ``numbers`` numbers in each sample. One thread at a time appends; any reads.
@@ -129,10 +130,10 @@ class SampleCache:
         self.span_s = span_s
         self.writer = writer
         self._span_ns = round(span_s * 1e9)
-        self._states: deque[JointState] = deque(maxlen=MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD))
+        self._states: deque[S] = deque(maxlen=MAX_CACHE_BYTES // (8 * numbers + _OVERHEAD))
         self._newest = 0
 
-    def append(self, state: JointState) -> None:
+    def append(self, state: S) -> None:
         """Cache ``state``, whose ``seq`` is one more than that of the last."""
         states, stamp = self._states, state.stamp
         limit = stamp - self._span_ns
@@ -146,13 +147,13 @@ class SampleCache:
         while states[0].stamp < limit:
             states.popleft()
 
-    def since(self, seq: int) -> list[JointState]:
+    def since(self, seq: int) -> list[S]:
         """The cached samples from ``seq`` on."""
         states = self._states.copy()  # atomic: the writer appends at the same time
         first = seq - states[0].seq if states else 0
         return list(islice(states, max(0, first), None))
 
-    def before(self, seq: int | None, count: int) -> tuple[list[JointState], bool]:
+    def before(self, seq: int | None, count: int) -> tuple[list[S], bool]:
         """The last ``count`` samples before ``seq``, or the newest, and whether there are older ones."""
         states = self._states.copy()
         if not states:
@@ -166,10 +167,15 @@ def serve_history(
     session: Session,
     robot: str,
     stream: Stream,
-    cache: SampleCache,
-    encode_sample: Callable[[JointState], bytes],
+    cache: SampleCache[S],
+    encode_sample: Callable[[S], bytes],
+    *,
+    writer: str = "",
 ) -> Queryable:
-    """Reply on the key of ``stream`` with the samples in ``cache``, in the encoding of the stream."""
+    """Reply on the key of ``stream`` with the samples in ``cache``, in the encoding of the stream.
+
+    ``writer`` is the name in the key of a named stream.
+    """
     encoding = ENCODINGS[STREAM_TYPES[stream]]
 
     def answer(parameters: Mapping[str, str]) -> Reply | None:
@@ -190,7 +196,7 @@ def serve_history(
         page = HistoryPage(encoding, tuple(reversed(samples)), next_before)
         return Reply(encode(page), ENCODINGS[HistoryPage])
 
-    return Queryable(session, stream_key(robot, stream), answer)
+    return Queryable(session, stream_key(robot, stream, writer), answer)
 
 
 @dataclass(eq=False)

@@ -89,9 +89,9 @@ class WireWriter(Closeable):
         if token is not None:
             self._opened.enter_context(announce(session, token))
 
-    def open_stream(self, stream: Stream) -> SampleWriter:
-        """Open and announce ``stream``. Raises AccessDenied if the router drops what it writes."""
-        writer = SampleWriter(self._session, self._encoder(stream))
+    def open_stream(self, stream: Stream, name: str = "") -> SampleWriter:
+        """Open and announce ``stream``; edges under ``name``. Raises AccessDenied if the router drops it."""
+        writer = SampleWriter(self._session, self._encoder(stream, name))
         self._announce(writer)
         return writer
 

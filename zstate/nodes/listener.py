@@ -6,6 +6,8 @@ import os
 import weakref
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, ParamSpec, TypeVar
 
 from zstate._util.closeable import Closeable
@@ -26,7 +28,7 @@ from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened
+from zstate.wire.keys import ANY, MODEL_WRITER, Stream, shortened, stream_key
 from zstate.wire.messages import Message, RobotDescription, Sample, StaticTransforms
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -37,13 +39,28 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+@dataclass(eq=False)
+class _SampleStream:
+    """One of the streams of samples that a listener receives, with the ingests of their writers.
+
+    ``is_shared`` means that each writer publishes its own part of a robot, and has its own ingest.
+    """
+
+    stream: Stream
+    is_shared: bool
+    capacity: int = 0
+    ingests: dict[tuple[str, int], StreamIngest] = field(default_factory=dict[tuple[str, int], StreamIngest])
+    overflowed: set[StreamIngest] = field(default_factory=set[StreamIngest])
+
+
 class TransformListener(Closeable):
     """Fills ``buffer`` with the transforms of one robot, or of all robots with ``robot="*"``.
 
     Frames are named ``robot/frame`` in the buffer; bare names work while they are unique.
     ``follow="joint_states"`` subscribes to joint positions and the model and computes the kinematics here;
-    ``follow="tf"`` subscribes to transforms and needs no model. With ``history_on_join`` the buffer also gets
-    the samples that publishers of the native wire cached in the seconds before (``StatePublisher``'s
+    ``follow="tf"`` subscribes to transforms and needs no model. The edges of other writers of the robot, of a
+    ``StaticPublisher`` or a ``TransformPublisher``, come in either way. With ``history_on_join``
+    the buffer also gets the samples that publishers of the native wire cached in the seconds before (their
     ``cache_s``). A context manager.
 
     The clock domain of each robot is the one in its description, and robots of different domains may share
@@ -88,10 +105,13 @@ class TransformListener(Closeable):
             self._wire.robot_from_key if robot == ANY else lambda _: robot
         )
         self._follow: Follow = follow
-        self._is_shared = follow in self._wire.shared
         self._counters = Counters()
         self._stamp_check = StampCheck(self.buffer, self._counters, is_described=not self._wire.shared)
-        streams: tuple[Stream, ...] = ("robot_description", "tf_static", follow)
+        self._samples = _SampleStream(follow, is_shared=follow in self._wire.shared)
+        self._sample_streams: dict[Stream, _SampleStream] = {follow: self._samples}
+        if not self._wire.shared:
+            self._sample_streams["transforms"] = _SampleStream("transforms", is_shared=True)
+        streams: tuple[Stream, ...] = ("robot_description", "tf_static", *self._sample_streams)
         self._events = EventLog(streams, follow, self._wire.shared, on_event)
         self._ownership = FrameOwnership(
             self.buffer,
@@ -101,9 +121,7 @@ class TransformListener(Closeable):
             on_conflict=self._events.add_second_edge,
         )
         self._names = self._ownership.live
-        self._ingests: dict[tuple[str, int], StreamIngest] = {}
         self._statics: dict[tuple[str, int], StaticTransformIngest] = {}
-        self._overflowed: set[StreamIngest] = set()
         self._history: HistoryReader | None = None
         self._clock_offsets: _WriterClockOffsets | None = None
         self._observers: tuple[Callable[[], object], ...] = ()
@@ -114,9 +132,10 @@ class TransformListener(Closeable):
             opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_description)))
             key = expression(robot, "tf_static")
             opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_statics)))
-            key = expression(robot, follow)
-            self._capacity = capacity_for(key)
-            opening.enter_context(StreamSubscriber(session, key, self._on_samples))
+            for samples in self._sample_streams.values():
+                key = expression(robot, samples.stream)
+                samples.capacity = capacity_for(key)
+                opening.enter_context(StreamSubscriber(session, key, partial(self._on_samples, samples)))
             if history_on_join and self._wire.name == "native":
                 on_history = self._observed(self._on_history)
                 self._history = opening.enter_context(
@@ -153,7 +172,10 @@ class TransformListener(Closeable):
 
     def robots(self) -> tuple[str, ...]:
         """The robots that sent any message so far, sorted by name."""
-        return tuple(sorted({ingest.robot for ingest in list(self._ingests.values()) if ingest.has_data}))
+        ingests = [
+            ingest for samples in self._sample_streams.values() for ingest in list(samples.ingests.values())
+        ]
+        return tuple(sorted({ingest.robot for ingest in ingests if ingest.has_data}))
 
     def events(self) -> tuple[WriterEvent, ...]:
         """The last 1024 events of writers, oldest first.
@@ -192,32 +214,32 @@ class TransformListener(Closeable):
             "or 'forkserver' method"
         )
 
-    def _ingest_for(self, robot: str, session: int) -> StreamIngest:
-        key = (robot, session if self._is_shared else 0)
-        ingest = self._ingests.get(key)
+    def _ingest_for(self, samples: _SampleStream, robot: str, session: int) -> StreamIngest:
+        key = (robot, session if samples.is_shared else 0)
+        ingest = samples.ingests.get(key)
         if ingest is None:
-            make = JointStateIngest if self._follow == "joint_states" else TransformIngest
-            ingest = self._ingests.setdefault(key, make(robot, self._ownership, self._events.add_set_back))
+            make = JointStateIngest if samples.stream == "joint_states" else TransformIngest
+            ingest = samples.ingests.setdefault(key, make(robot, self._ownership, self._events.add_set_back))
             self._ownership.add_robot(robot)
-            if self._is_shared and (robot, session) in self._names:
+            if samples.is_shared and (robot, session) in self._names:
                 ingest.name_writer(session, self._names[robot, session])
         return ingest
 
-    def _on_samples(self, arrivals: list[SerializedSample]) -> None:
-        is_full = len(arrivals) >= self._capacity
+    def _on_samples(self, samples: _SampleStream, arrivals: list[SerializedSample]) -> None:
+        is_full = len(arrivals) >= samples.capacity
         if is_full:
             # A full ring has lost samples of any of the writers, and loses more while it is drained.
-            self._overflowed = set(self._ingests.values())
+            samples.overflowed = set(samples.ingests.values())
         earliest, latest = self._stamp_check.accepted_range()
         failure: Exception | None = None
         for arrival in arrivals:
             try:
                 robot = self._robot_from_key(arrival.key)
-                for sample in self._decode(self._follow, arrival, robot):
+                for sample in self._decode(samples.stream, arrival, robot):
                     if isinstance(sample, Sample):
-                        ingest = self._ingest_for(robot, sample.session)
-                        ingest.insert_sample(sample, overflowed=is_full or ingest in self._overflowed)
-                        self._overflowed.discard(ingest)
+                        ingest = self._ingest_for(samples, robot, sample.session)
+                        ingest.insert_sample(sample, overflowed=is_full or ingest in samples.overflowed)
+                        samples.overflowed.discard(ingest)
                         self._events.on_sample(robot, sample.session)
                         if not earliest <= sample.stamp <= latest:
                             writer = self._names.get((robot, sample.session))
@@ -233,13 +255,16 @@ class TransformListener(Closeable):
 
     def _on_history(self, arrivals: list[SerializedSample], writer: int) -> bool:
         robot = self._robot_from_key(arrivals[0].key)  # the key of the request
-        messages = (message for one in arrivals for message in self._decode(self._follow, one, robot))
+        stream = self._follow if arrivals[0].key == stream_key(robot, self._follow) else "transforms"
+        messages = (message for one in arrivals for message in self._decode(stream, one, robot))
         samples = [message for message in messages if isinstance(message, Sample)]
         if any(sample.session != writer for sample in samples):
             text = f"{robot!r}: samples of another session than {writer}, whose history was requested"
             self._counters.count_refusal("foreign answer", text)
             return False
-        return bool(samples) and self._ingest_for(robot, writer).insert_history(samples)
+        if not samples:
+            return False
+        return self._ingest_for(self._sample_streams[stream], robot, writer).insert_history(samples)
 
     def _on_description(self, arrival: SerializedSample) -> None:
         try:
@@ -251,7 +276,7 @@ class TransformListener(Closeable):
             return
         for description in self._decode("robot_description", arrival, robot):
             if isinstance(description, RobotDescription):
-                self._ingest_for(robot, description.session).describe(description)
+                self._ingest_for(self._samples, robot, description.session).describe(description)
 
     def _on_statics(self, arrival: SerializedSample) -> None:
         try:
@@ -275,7 +300,7 @@ class TransformListener(Closeable):
         return not arrival.payload and not self._wire.shared
 
     def _insert_statics(self, key: str, robot: str, writer: str | None, message: StaticTransforms) -> None:
-        self._ingest_for(robot, message.session).has_data = True
+        self._ingest_for(self._samples, robot, message.session).has_data = True
         if writer is not None:
             ingest = self._static_ingest(key, robot, writer)
             ingest.replace(message)
@@ -323,25 +348,27 @@ class TransformListener(Closeable):
         elif stream == "tf_static":
             self._ownership.remove_writer(robot, session)
         elif stream == "robot_description" and self._follow == "joint_states" and alive:
-            self._ingest_for(robot, session).name_writer(session, name)
-        elif stream == self._follow:
-            self._set_followed_writer(announced, alive=alive)
+            self._ingest_for(self._samples, robot, session).name_writer(session, name)
+        elif stream in self._sample_streams:
+            self._set_followed_writer(self._sample_streams[stream], announced, alive=alive)
 
-    def _set_followed_writer(self, announced: Announcement, *, alive: bool) -> None:
+    def _set_followed_writer(self, samples: _SampleStream, announced: Announcement, *, alive: bool) -> None:
         robot, session = announced.robot, announced.writer.session
+        if samples.stream == "transforms":
+            (self._ownership.add_writer if alive else self._ownership.remove_writer)(robot, session)
         if self._clock_offsets is not None:
             self._clock_offsets.on_writer(announced, alive=alive)
         if alive and self._history is not None:
-            self._history.request(self._wire.expression(robot, self._follow), session)
-        if self._is_shared and (robot, session) not in self._ingests:
-            return  # a ROS node that has not published yet
-        ingest = self._ingest_for(robot, session)
+            self._history.request(stream_key(robot, samples.stream, announced.name), session)
+        if samples.is_shared and (robot, session) not in samples.ingests:
+            return  # it has not published yet
+        ingest = self._ingest_for(samples, robot, session)
         if alive:
             ingest.name_writer(session, str(announced.writer))
             return
         ingest.writer_left(session)
-        if self._is_shared:
-            del self._ingests[robot, session]
+        if samples.is_shared:
+            del samples.ingests[robot, session]
 
 
 class _WriterClockOffsets(Closeable):

@@ -15,7 +15,7 @@ from zstate.net.sample_history import SampleCache
 from zstate.net.session import Session
 from zstate.wire.keys import full_name, lookup_key
 from zstate.wire.lookup_request import LookupRequest, error_to_json, to_json
-from zstate.wire.messages import from_block
+from zstate.wire.messages import JointState, from_block
 
 _JSON = "application/json"
 
@@ -68,7 +68,7 @@ class RecentBuffer:
     Created at the first query, so that a publisher without queries pays nothing.
     """
 
-    def __init__(self, model: RobotModel, robot: str, memory: SampleCache) -> None:
+    def __init__(self, model: RobotModel, robot: str, memory: SampleCache[JointState]) -> None:
         self._model, self._robot = model, robot
         self._memory = memory
         self._state: tuple[TransformBuffer, JointTrack] | None = None

@@ -202,11 +202,13 @@ class StatePublisher(Closeable):
         closed = ", closed" if self._stop.is_set() else ""
         return f"<StatePublisher of {self.robot!r} on {', '.join(self._wires)}: {self._seq} samples{closed}>"
 
-    def _open_cache(self, session: Session, cache_s: float, opening: ExitStack) -> SampleCache | None:
+    def _open_cache(
+        self, session: Session, cache_s: float, opening: ExitStack
+    ) -> SampleCache[JointState] | None:
         if "native" not in self._wires:
             return None
         numbers = self.model.position_count + 2 * self.model.velocity_count
-        cache = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
+        cache: SampleCache[JointState] = SampleCache(cache_s or _NEWEST_ONLY_S, numbers, self._session_id)
         if cache_s:
             encoders = {key: writer.encoder for key, writer in self._writers.items()}
             joints, transforms = encoders.get(("native", "joint_states")), encoders.get(("native", "tf"))

@@ -17,10 +17,20 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import WireWriter, write_all
 from zstate.transform import Transform
-from zstate.wire.identity import Announcement
+from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.keys import MODEL_WRITER, check_robot, check_writer, full_name
 from zstate.wire.messages import StaticTransforms, to_block
 from zstate.wire.registry import as_wire_names, get_wire
+
+
+def edge_writer_name(writer: str | None, identity: WriterId) -> str:
+    """The name under which a writer publishes edges. Raises InvalidInput if it cannot be one."""
+    if writer is None:
+        # A script name may have blanks, which a key cannot.
+        writer = f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"
+    if check_writer(writer) == MODEL_WRITER:
+        raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
+    return writer
 
 
 class StaticPublisher(Closeable):
@@ -50,12 +60,7 @@ class StaticPublisher(Closeable):
     ) -> None:
         identity = local_writer(secrets.randbits(32), program)
         self.robot = check_robot(robot)
-        if writer is None:
-            # A script name may have blanks, which a key cannot.
-            writer = f"{quote(identity.program, safe='')}.{identity.pid}.{identity.session:08x}"
-        self.writer = check_writer(writer)
-        if self.writer == MODEL_WRITER:
-            raise InvalidInput(f"the writer name {MODEL_WRITER!r} belongs to the robot's own model")
+        self.writer = edge_writer_name(writer, identity)
         self._session_id = identity.session
         self._edges: dict[str, Transform] = {}
         # Raises here, where the mistake is made, what every listener would refuse.

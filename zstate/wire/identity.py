@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput, printable
-from zstate.wire.keys import MAX_NAME_LENGTH, Stream, check_writer, shortened
+from zstate.wire.keys import MAX_NAME_LENGTH, NAMED_STREAMS, Stream, check_writer, shortened
 
 _MAX_DIGITS = 20
 _MAX_IDENTITY_LENGTH = 4 * 12 * MAX_NAME_LENGTH
@@ -60,8 +60,8 @@ class WriterId:
 class Announcement:
     """The content of a liveliness token: ``writer`` writes ``stream`` of ``robot``.
 
-    ``name`` is the name under which it writes static edges; empty for other streams, and on wires without
-    such names.
+    ``name`` is the name under which it writes edges, on the ``NAMED_STREAMS``; empty for other streams, and
+    on wires without such names.
     """
 
     robot: str
@@ -78,7 +78,7 @@ class Announcement:
     def parse(cls, robot: str, stream: Stream, identity: str) -> Announcement:
         """The content of a token with this ``identity``. Raises InvalidInput if it is not one."""
         fields = identity.split(",", 6)
-        is_named = len(fields) == 6 and stream == "tf_static"
+        is_named = len(fields) == 6 and stream in NAMED_STREAMS
         name = check_writer(unquote(fields.pop())) if is_named else ""
         found = cls(robot, stream, WriterId.parse(",".join(fields)), name)
         if found.identity != identity:
@@ -88,10 +88,10 @@ class Announcement:
     def conflicts_with(self, other: Announcement) -> bool:
         """Whether the two are different writers of the same stream, of which only one may be active.
 
-        Writers of static edges conflict if their names are equal; without a name they never do.
+        Writers of a named stream conflict if their names are equal; without a name they never do.
         """
         same = (self.robot, self.stream, self.name) == (other.robot, other.stream, other.name)
-        is_exclusive = self.stream != "tf_static" or bool(self.name)
+        is_exclusive = self.stream not in NAMED_STREAMS or bool(self.name)
         return same and is_exclusive and self.writer.session != other.writer.session
 
 

@@ -4,13 +4,15 @@
 ``zstate/<robot>/joint_states``                 JointState, each sample; a query returns a HistoryPage
 ``zstate/<robot>/tf``                           TransformSample, each sample; likewise
 ``zstate/<robot>/tf_static/<writer>``           StaticTransforms, latched
+``zstate/<robot>/transforms/<writer>``          TransformSample of a writer's own edges; a query likewise
 ``zstate/<robot>/robot_description``            RobotDescription, latched
 ``zstate/<robot>/joint_commands``               JointCommand, to a driver
 ``zstate/<robot>/lookup``                       a queryable
 ``zstate/<robot>/status/<id>``                  Status of one writer, once a second while read
 ``zstate/<robot>/@writer/<stream>/<id>``        liveliness token of one writer
 ``zstate/<robot>/@clock/<id>``                  a queryable: the time by that writer's clock
-``zstate/<robot>/@edge/<child>/<parent>/<id>``  liveliness token of a writer about to place a static edge
+``zstate/<robot>/@edge/<child>/<parent>/<id>``  liveliness token of a writer that places a moving edge, or
+                                                is about to place a static one
 ``zstate/@reader/<robot>/<stream>/<id>``        liveliness token of one reader
 ``zstate/clock``                                ClockMessage
 ==============================================  ==========================================
@@ -29,10 +31,15 @@ from urllib.parse import quote, unquote
 
 from zstate.errors import InvalidInput
 
-Stream = Literal["joint_states", "tf", "tf_static", "robot_description", "joint_commands", "clock"]
+Stream = Literal[
+    "joint_states", "tf", "transforms", "tf_static", "robot_description", "joint_commands", "clock"
+]
 
 CLOCK_KEY = "zstate/clock"
 ANY = "*"
+
+NAMED_STREAMS: frozenset[Stream] = frozenset({"tf_static", "transforms"})
+"""The streams with one key for each of the writer names of a robot."""
 
 READERS = "zstate/@reader/*/*/*"
 """The key expression of the tokens of all readers."""
@@ -57,7 +64,7 @@ def check_robot(name: str) -> str:
 
 
 def check_writer(name: str) -> str:
-    """The same for the name under which static edges are written."""
+    """The same for the name under which a writer publishes edges."""
     return _check_chunk("writer", name)
 
 
@@ -94,11 +101,11 @@ def shortened(text: str) -> str:
 
 
 def stream_key(robot: str, stream: Stream, writer: str = "") -> str:
-    """The key on which a writer puts ``stream``; ``tf_static`` has one per ``writer``, ``clock`` only one."""
+    """The key of ``stream``: of the ``NAMED_STREAMS`` one for each ``writer``; ``clock`` has only one."""
     if stream == "clock":
         return CLOCK_KEY
     key = f"zstate/{check_robot(robot)}/{stream}"
-    return f"{key}/{check_writer(writer)}" if stream == "tf_static" else key
+    return f"{key}/{check_writer(writer)}" if stream in NAMED_STREAMS else key
 
 
 def stream_expression(robot: str, stream: Stream) -> str:
@@ -106,7 +113,7 @@ def stream_expression(robot: str, stream: Stream) -> str:
     if stream == "clock":
         return CLOCK_KEY
     key = f"zstate/{_check_robot_or_any(robot)}/{stream}"
-    return f"{key}/*" if stream == "tf_static" else key
+    return f"{key}/*" if stream in NAMED_STREAMS else key
 
 
 def lookup_key(robot: str) -> str:
@@ -174,13 +181,13 @@ def parse_clock_key(key: str) -> tuple[str, str]:
 
 
 def edge_key(robot: str, edge: tuple[str, str], identity: str) -> str:
-    """The token of a writer that is about to place ``edge``: full names of parent and child."""
+    """The token of a writer of ``edge``: full names of parent and child."""
     parent, child = (quote(frame, safe="") for frame in edge)
     return f"zstate/{check_robot(robot)}/@edge/{child}/{parent}/{identity}"
 
 
 def edge_expression(child: str) -> str:
-    """The key expression of the tokens of all writers about to place ``child``, of any robot."""
+    """The key expression of the edge tokens of ``child``, from writers of any robot."""
     return f"zstate/*/@edge/{quote(child, safe='')}/*/*"
 
 

@@ -99,7 +99,7 @@ class JointState(Sample, frozen=True, array_like=True, gc=False):
 
 
 class TransformSample(Sample, frozen=True, array_like=True, gc=False):
-    """Every moving edge of a robot at one instant.
+    """Moving edges at one instant: all those of a robot, or those of one ``TransformPublisher``.
 
     ``poses`` is a block of ``parent_from_child``, seven numbers for each edge. The edges are ``edges``, or
     ``RobotDescription.moving_edges`` if None.
@@ -223,6 +223,7 @@ STATIC_EDGES = 10_000
 MAX_BYTES: Mapping[Stream, int] = {
     "joint_states": SAMPLE_BYTES,
     "tf": SAMPLE_BYTES,
+    "transforms": SAMPLE_BYTES,
     "joint_commands": SAMPLE_BYTES,
     "tf_static": 1_000_000,
     "robot_description": LATCHED_BYTES,

@@ -13,6 +13,7 @@ from zstate.errors import InvalidInput, MessageError
 from zstate.wire.identity import Announcement, WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import (
+    NAMED_STREAMS,
     Stream,
     check_writer,
     parse_writer_key,
@@ -58,6 +59,7 @@ ENCODINGS: dict[type[Message], str] = {
 STREAM_TYPES: dict[Stream, type[Message]] = {
     "joint_states": JointState,
     "tf": TransformSample,
+    "transforms": TransformSample,
     "tf_static": StaticTransforms,
     "robot_description": RobotDescription,
     "joint_commands": JointCommand,
@@ -108,7 +110,7 @@ class NativeStreamEncoder:
     def __init__(self, robot: str, writer: WriterId, stream: Stream, name: str) -> None:
         self.key = stream_key(robot, stream, name)
         self.encoding = ENCODINGS[STREAM_TYPES[stream]]
-        identity = Announcement(robot, stream, writer, name if stream == "tf_static" else "").identity
+        identity = Announcement(robot, stream, writer, name if stream in NAMED_STREAMS else "").identity
         self.token = None if stream == "clock" else writer_key(robot, stream, identity)
 
     def encode(self, message: Message) -> bytes:
@@ -123,6 +125,7 @@ class NativeWire:
 
     name = "native"
     shared: frozenset[Stream] = frozenset()
+    transforms: Stream = "transforms"
 
     def node_token(self, robot: str, writer: WriterId, node: EntityId) -> None:
         return None

@@ -72,6 +72,9 @@ class Wire(Protocol):
     shared: frozenset[Stream]
     """The streams of a robot that several writers publish, each a part."""
 
+    transforms: Stream
+    """The stream that carries the edges of a ``TransformPublisher``."""
+
     def node_token(self, robot: str, writer: WriterId, node: EntityId) -> str | None:
         """The liveliness token of ``writer`` as a node of the ROS graph; None if there is no such graph."""
         ...
@@ -90,7 +93,7 @@ class Wire(Protocol):
         """The encoder of ``stream`` of ``robot`` for ``writer``.
 
         ``node`` identifies the writer, ``number`` this stream within the session; ``name`` is the one under
-        which the writer publishes static edges. Raises InvalidInput for names that cannot be in a key.
+        which the writer publishes edges. Raises InvalidInput for names that cannot be in a key.
         """
         ...
 

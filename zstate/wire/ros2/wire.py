@@ -45,6 +45,7 @@ class Ros2Wire:
 
     name = "ros2"
     shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
+    transforms: Stream = "tf"
     _topic_keys: Callable[[Ros2Options], TopicKeys] = RmwKeys
 
     def __init__(self, options: Ros2Options | None = None) -> None:

@@ -1,0 +1,269 @@
+"""TransformPublisher: moving edges of several writers, beside a robot's joint states."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from helpers.processes import SOON_S, until
+from helpers.robots import RRBOT
+
+from zstate.clock import ManualClock
+from zstate.errors import Closed, InsertRefused, InvalidInput, SecondWriter
+from zstate.net.presence import discover
+from zstate.net.status import watch_status
+from zstate.nodes.listener import TransformListener
+from zstate.nodes.publisher import StatePublisher
+from zstate.nodes.static_publisher import StaticPublisher
+from zstate.nodes.transform_publisher import TransformPublisher
+from zstate.transform import Transform
+from zstate.wire.messages import Status
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+def pose(parent: str, child: str, x: float = 0.0, stamp: int | None = None) -> Transform:
+    return Transform(parent, child, (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), stamp)
+
+
+def test_odometry_moves_the_joints_of_a_robot(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    with (
+        StatePublisher(writer, RRBOT, "r1") as wheels,
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformListener(reader, "r1") as listener,
+    ):
+        for step in range(3):
+            wheels.publish([0.0, 0.0], stamp=stamp + step * 20 * MS)
+            odometry.publish([pose("odom", "world", float(step))], stamp + step * 20 * MS)
+        found = listener.buffer.wait("odom", "base", stamp + 30 * MS, timeout_s=SOON_S)
+        base = listener.buffer.lookup("world", "base", stamp + 30 * MS)
+        assert found.translation - base.translation == pytest.approx([1.5, 0.0, 0.0])
+        assert found.kind == "interpolated"
+
+
+@pytest.mark.parametrize("follow", ["joint_states", "tf"])
+def test_listeners_receive_transforms_whatever_they_follow(sessions, follow):
+    writer, reader = sessions
+    with (
+        TransformPublisher(writer, "r1", "tracker") as tracker,
+        TransformListener(reader, "*", follow=follow) as listener,
+    ):
+        tracker.publish([pose("map", "ball", 2.0)])
+        assert listener.buffer.wait("map", "ball", timeout_s=SOON_S).translation[0] == 2.0
+        assert listener.robots() == ("r1",)
+
+
+def test_late_listener_gets_the_samples_of_the_last_seconds(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    with TransformPublisher(writer, "r1", "tracker") as tracker:
+        for step in range(300):  # more than a page
+            tracker.publish([pose("map", "ball", float(step))], stamp + step * MS)
+        with TransformListener(reader, "r1") as late:
+            until(lambda: late.stats.recalled == 300)
+            poses, valid = late.buffer.lookup_many("map", "ball", stamp + MS * np.arange(300))
+    assert valid.all()
+    assert poses[:, 0].tolist() == [float(step) for step in range(300)]
+
+
+def test_stamp_is_that_of_the_transforms_or_now(sessions):
+    writer, reader = sessions
+    with (
+        TransformPublisher(writer, "r1", "tracker", clock=ManualClock(7 * SECOND)) as tracker,
+        TransformListener(reader, "r1", history_s=1000.0) as listener,
+    ):
+        tracker.publish([pose("map", "ball", 1.0)])
+        tracker.publish([pose("map", "ball", 2.0, 9 * SECOND)])
+        tracker.publish([pose("map", "ball", 3.0, 9 * SECOND)], 8 * SECOND)
+        until(lambda: listener.stats.received == 3)
+        found = [listener.buffer.lookup("map", "ball", second * SECOND) for second in (7, 8, 9)]
+    assert [transform.translation[0] for transform in found] == [1.0, 3.0, 2.0]
+
+
+def test_two_writers_of_one_robot_publish_different_edges(sessions):
+    writer, reader = sessions
+    stamp = time.time_ns()
+    with (
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformPublisher(reader, "r1", "localisation") as localisation,
+        TransformListener(reader, "r1") as listener,
+    ):
+        odometry.publish([pose("odom", "base_link", 1.0)], stamp)
+        localisation.publish([pose("map", "odom", 10.0)], stamp)
+        assert listener.buffer.wait("map", "base_link", timeout_s=SOON_S).translation[0] == 11.0
+        writers = {
+            name for info in discover(reader) for stream, name in info.writers if stream == "transforms"
+        }
+    assert len(writers) == 2
+
+
+def test_second_writer_of_an_edge_is_refused_and_the_first_named(sessions):
+    first_session, second_session = sessions
+    with (
+        TransformPublisher(first_session, "r1", "odometry", program="wheels.py") as first,
+        TransformPublisher(second_session, "r1", "visual") as second,
+        StaticPublisher(second_session, "r1", "mount") as statics,
+    ):
+        first.publish([pose("odom", "base_link")])
+        for publish in (second.publish, lambda edges: statics.set(edges[0])):
+            for parent in ("odom", "map"):
+                with pytest.raises(
+                    SecondWriter, match=r"wheels\.py.* places 'r1/base_link' on 'r1/odom'"
+                ) as raised:
+                    publish([pose(parent, "base_link")])
+                assert raised.value.first is not None
+                assert (raised.value.first.program, raised.value.stream) == ("wheels.py", "transforms")
+        second.publish([pose("odom", "camera")])  # its other edges are not affected
+        assert second.stats.sent == 1
+
+
+def test_edge_is_free_once_its_writer_is_closed(sessions):
+    first_session, second_session = sessions
+    stamp = time.time_ns()
+    with TransformListener(second_session, "r1") as listener:
+        with TransformPublisher(first_session, "r1", "odometry") as first:
+            first.publish([pose("odom", "base_link", 1.0)], stamp)
+            listener.buffer.wait("odom", "base_link", timeout_s=SOON_S)
+        until(lambda: not discover(second_session))
+        with TransformPublisher(second_session, "r1", "visual") as second:
+            second.publish([pose("odom", "base_link", 2.0)], stamp + SECOND)
+            listener.buffer.wait("odom", "base_link", stamp + SECOND, timeout_s=SOON_S)
+        assert listener.stats.refused == {}
+
+
+def test_static_edge_is_not_moved_by_another_writer(sessions):
+    first_session, second_session = sessions
+    with (
+        StaticPublisher(first_session, "r1", "mount") as statics,
+        TransformPublisher(second_session, "r1", "tracker") as tracker,
+    ):
+        statics.set(pose("tool", "camera"))
+        with pytest.raises(SecondWriter, match="'mount' of 'r1'"):
+            tracker.publish([pose("tool", "camera")])
+
+
+def test_two_writers_of_one_name_are_refused(sessions):
+    first_session, second_session = sessions
+    with (
+        TransformPublisher(first_session, "r1", "odometry"),
+        pytest.raises(SecondWriter, match=r"transforms of 'r1' under the name 'odometry'.*another name"),
+    ):
+        TransformPublisher(second_session, "r1", "odometry")
+
+
+def test_of_two_writers_that_start_an_edge_at_once_one_is_refused(sessions):
+    with (
+        TransformPublisher(sessions[0], "r1", "one") as one,
+        TransformPublisher(sessions[1], "r1", "other") as other,
+        ThreadPoolExecutor(2) as threads,
+    ):
+        futures = [threads.submit(writer.publish, [pose("odom", "base_link")]) for writer in (one, other)]
+        errors = [future.exception(timeout=SOON_S) for future in futures]
+    assert sorted(type(error).__name__ for error in errors) == ["NoneType", "SecondWriter"]
+
+
+def test_link_of_an_announced_model_is_refused(sessions):
+    writer, reader = sessions
+    child = RRBOT.joints[0].child
+    with StatePublisher(writer, RRBOT, "r1"), TransformPublisher(reader, "r1", "tracker") as tracker:
+        with pytest.raises(InsertRefused, match="by the model of 'r1'"):
+            tracker.publish([pose("odom", child)])
+        assert (tracker.stats.sent, tracker.stats.refused) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("transforms", "match"),
+    [
+        ([], "at least one; got no transform"),
+        ([("odom", "base"), ("map", "base")], "one transform for each of its children"),
+        ([("odom", "odom")], "itself"),
+        ([("a", "b"), ("b", "a")], "loop"),
+    ],
+)
+def test_bad_sample_is_refused_and_counted(sessions, transforms, match):
+    with TransformPublisher(sessions[0], "r1", "tracker") as tracker:
+        with pytest.raises(InvalidInput, match=match):
+            tracker.publish([pose(*edge) for edge in transforms])
+        assert (tracker.stats.sent, tracker.stats.refused) == (0, 1)
+        tracker.publish([pose("odom", "base")])  # nothing of the refused sample is left
+
+
+def test_transforms_of_several_instants_are_refused(sessions):
+    with (
+        TransformPublisher(sessions[0], "r1", "tracker") as tracker,
+        pytest.raises(InvalidInput, match="have one stamp; got 1, 2"),
+    ):
+        tracker.publish([pose("map", "a", stamp=1), pose("map", "b", stamp=2)])
+
+
+def test_closed_publisher_raises_closed(sessions):
+    tracker = TransformPublisher(sessions[0], "r1", "tracker")
+    tracker.close()
+    tracker.close()
+    with pytest.raises(Closed, match="'tracker'"):
+        tracker.publish([pose("map", "ball")])
+
+
+class Circle:
+    """A source that has nothing new at every fourth instant."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def read(self, stamp: int) -> list[Transform] | None:
+        self.reads += 1
+        return None if self.reads % 4 == 0 else [pose("odom", "base_link", float(self.reads))]
+
+
+def test_run_publishes_a_source_at_an_exact_rate(sessions):
+    writer, reader = sessions
+    with (
+        TransformPublisher(writer, "r1", "odometry") as odometry,
+        TransformListener(reader, "r1") as listener,
+    ):
+        report = odometry.run(Circle(), 200.0, seconds=0.2)
+        until(lambda: listener.stats.received + listener.stats.recalled == odometry.stats.sent)
+        assert report.ticks + report.skipped == 40
+        assert odometry.stats.sent == report.ticks - report.ticks // 4
+        frame = next(frame for frame in listener.buffer.frames() if frame.kind == "pose")
+        assert (frame.name, frame.count) == ("r1/base_link", odometry.stats.sent)
+
+
+def test_status_reports_the_rate(sessions):
+    writer, reader = sessions
+    received: list[tuple[str, Status]] = []
+    with (
+        watch_status(reader, "r1", lambda robot, status: received.append((robot, status))),
+        TransformPublisher(writer, "r1", "odometry", program="wheels.py") as odometry,
+    ):
+        odometry.publish([pose("odom", "base_link")])
+        until(lambda: len(received) > 0)
+    robot, status = received[0]
+    assert (robot, status.program, status.sent, status.level) == ("r1", "wheels.py", 1, "ok")
+
+
+def test_events_name_the_writer_and_its_edges(sessions):
+    writer, reader = sessions
+    with TransformListener(reader, "r1") as listener:
+        with TransformPublisher(writer, "r1", "odometry"):
+            until(lambda: len(listener.events()) == 1)
+        until(lambda: len(listener.events()) == 2)
+        events = [(event.kind, event.stream) for event in listener.events()]
+        assert events == [("joined", "transforms"), ("left", "transforms")]
+        assert "writes transforms as 'odometry'" in listener.events()[0].text
+
+
+def test_samples_are_numbered_without_gaps(sessions):
+    writer, reader = sessions
+    with (
+        TransformPublisher(writer, "r1", "tracker") as tracker,
+        TransformListener(reader, "r1") as listener,
+    ):
+        stamp = time.time_ns()
+        for step in range(50):
+            tracker.publish([pose("map", "ball")], stamp + step)
+        until(lambda: listener.stats.received + listener.stats.recalled >= 50)
+        assert (listener.stats.missed, listener.stats.dropped) == (0, 0)

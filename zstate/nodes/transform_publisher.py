@@ -1,0 +1,237 @@
+"""Publisher of moving transforms: edges that no joint of a model describes (tf2 ``TransformBroadcaster``)."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Protocol
+
+from zstate._util.bounded_dict import BoundedDict
+from zstate._util.closeable import Closeable
+from zstate._util.fork_safe import fork_safe, fork_safe_lock
+from zstate.buffer.buffer import TransformBuffer
+from zstate.clock import SYSTEM, Clock, SystemClock, check_stamp
+from zstate.errors import Closed, InvalidInput, SecondWriter
+from zstate.net.clock_offset import ClockService
+from zstate.net.ownership import Edge, WriterClaim, check_readers, claim_edges
+from zstate.net.presence import local_writer
+from zstate.net.sample_history import SampleCache, serve_history
+from zstate.net.session import Session
+from zstate.net.status import StatusPublisher
+from zstate.net.writer import SampleWriter, WireWriter
+from zstate.nodes.publisher_status import PublisherStats, StatusReporter, StreamStats
+from zstate.nodes.static_publisher import edge_writer_name
+from zstate.rate import Rate, RateReport
+from zstate.transform import Transform
+from zstate.wire.identity import Announcement
+from zstate.wire.keys import Stream, check_robot, full_name
+from zstate.wire.messages import Edges, TransformSample, order_digest, to_block
+from zstate.wire.registry import as_wire_names, get_wire
+
+# Edges of a sample for which the cache has room for 2000 samples.
+_TYPICAL_EDGES = 16
+
+_IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class TransformSource(Protocol):
+    """Interface of programs that compute moving transforms: odometry, trackers, simulators."""
+
+    def read(self, stamp: int) -> Sequence[Transform] | None:
+        """The transforms at ``stamp`` [ns], the present instant; None when there is nothing new."""
+        ...
+
+
+class TransformPublisher(Closeable):
+    """Publishes moving edges under one writer's name: odom -> base_link, a tracked object, a marker.
+
+    A robot may have several such writers, and a ``StatePublisher``; listeners receive the edges of all.
+    Bare frame names are the robot's own; other frames have full names, ``robot/frame``. One sample is one
+    instant of the edges in it. ``writer`` distinguishes this publisher from others; default: the program,
+    its process id and a random number. ``program`` is the script's name by default.
+
+    On the native wire each edge has one writer. SecondWriter, which names the first writer, is raised if
+    another active writer has the same name, and by ``publish`` if another writer of any robot places the
+    same frame. The ROS wires publish on /tf, where every node may write.
+
+    On the native wire the last ``cache_s`` seconds of samples are cached for joining listeners (0 for none),
+    and the status is published once a second while it has a reader. A context manager; safe from any thread.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        robot: str,
+        writer: str | None = None,
+        wires: str | Sequence[str] = ("native",),
+        *,
+        clock: Clock | None = None,
+        program: str = "",
+        cache_s: float = 2.0,
+    ) -> None:
+        identity = local_writer(secrets.randbits(32), program)
+        self.robot = check_robot(robot)
+        self.writer = edge_writer_name(writer, identity)
+        self._session = session
+        self._session_id = identity.session
+        self._clock: Clock = clock or SystemClock()
+        self._wires = as_wire_names(wires)
+        self._announced = Announcement(self.robot, "transforms", identity, self.writer)
+        # The digests of the edges that were published together.
+        self._orders: BoundedDict[Edges, bytes] = BoundedDict()
+        # Raises here, where the mistake is made, what every listener would refuse.
+        self._check = TransformBuffer()
+        self._placed: set[Edge] = set()
+        self._edge_tokens = ExitStack()
+        self._claim: WriterClaim | None = None
+        self._cache: SampleCache[TransformSample] | None = None
+        self._lock = fork_safe_lock()
+        self._stop = fork_safe(threading.Event())
+        self._seq = 0
+        self._refused = 0
+        self._last_refusal = ""
+        self._rate: Rate | None = None
+        self._writers: dict[tuple[str, Stream], SampleWriter] = {}
+        with ExitStack() as opening:
+            if "native" in self._wires:
+                self._claim = opening.enter_context(WriterClaim(session, [self._announced]))
+            if "native" in self._wires and self._clock.domain == SYSTEM:
+                # Before this writer is announced: readers that see its token measure its clock at once.
+                opening.enter_context(ClockService(session, self.robot, identity, self._clock))
+            for name in self._wires:
+                wire = get_wire(name)
+                wire_writer = opening.enter_context(WireWriter(session, wire, self.robot, identity))
+                self._writers[name, wire.transforms] = wire_writer.open_stream(wire.transforms, self.writer)
+            native = self._writers.get(("native", "transforms"))
+            if native is not None:
+                status = StatusReporter(identity, lambda: self.stats).status
+                opening.enter_context(StatusPublisher(session, self.robot, identity.identity, status))
+                if cache_s:
+                    self._cache = SampleCache(cache_s, _TYPICAL_EDGES * 28, self._session_id)
+                    service = serve_history(
+                        session,
+                        self.robot,
+                        "transforms",
+                        self._cache,
+                        native.encoder.encode,
+                        writer=self.writer,
+                    )
+                    opening.enter_context(service)
+            opening.enter_context(self._edge_tokens)
+            self._opened = opening.pop_all()
+
+    def __repr__(self) -> str:
+        closed = ", closed" if self._stop.is_set() else ""
+        return f"<TransformPublisher {self.writer!r} of {self.robot!r}: {self._seq} samples{closed}>"
+
+    @property
+    def stats(self) -> PublisherStats:
+        """Counts of published and refused samples."""
+        streams = {
+            stream: StreamStats(writer.samples, writer.bytes, self._seq - writer.samples)
+            for stream, writer in self._writers.items()
+        }
+        rate = None if self._rate is None else self._rate.report()
+        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate)
+
+    def publish(self, transforms: Sequence[Transform], stamp: int | None = None) -> None:
+        """Publish one sample: each transform places its ``source`` on its ``target``, at ``stamp`` [ns].
+
+        The default stamp is that of the transforms, or now if they have none. The first sample with an edge
+        takes some round trips, in which the edge is compared with those of other writers.
+
+        Raises InvalidInput for no transforms, for two of one child, and for transforms with different stamps;
+        InsertRefused for a self edge, a loop or a second parent among this writer's edges, on the native wire
+        also for an edge that contradicts an announced model, or that places a frame of another robot if that
+        robot, or a third one, places it; SecondWriter; and Closed. If it raises, nothing was sent.
+        """
+        try:
+            stamp = self._stamp(transforms) if stamp is None else check_stamp(stamp)
+            poses = to_block([transform.pose7 for transform in transforms])
+            names = tuple([(transform.target, transform.source) for transform in transforms])
+            with self._lock:
+                if self._stop.is_set():
+                    raise Closed(f"the transform publisher {self.writer!r} is closed")
+                self._check_name()
+                order = self._orders.get(names)
+                if order is None:
+                    order = self._orders[names] = self._place(names)
+                head = (stamp, self._seq, self._session_id)
+                sample = TransformSample(*head, order, poses, names)
+                # Encode for all wires before sending on any: a wire may be unable to represent the stamp.
+                payloads = [(writer, writer.encoder.encode(sample)) for writer in self._writers.values()]
+                self._seq += 1
+                if self._cache is not None:
+                    # Before sending: a reader that misses this sample can then request it as history.
+                    self._cache.append(sample)
+                for writer, payload in payloads:
+                    writer.write(payload)
+        except InvalidInput as error:
+            self._last_refusal = str(error)
+            self._refused += 1
+            raise
+
+    def _stamp(self, transforms: Sequence[Transform]) -> int:
+        """The one stamp of ``transforms``; now if they have none."""
+        stamps = {transform.stamp for transform in transforms}
+        if len(stamps) > 1:
+            given = ", ".join(sorted(map(str, stamps)))
+            raise InvalidInput(f"the transforms of one sample have one stamp; got {given}")
+        (stamp,) = stamps or {None}
+        return self._clock.now() if stamp is None else stamp
+
+    def _check_name(self) -> None:
+        if self._claim is not None:
+            try:
+                self._claim.check()
+            except SecondWriter:
+                self._opened.close()
+                raise
+
+    def _place(self, names: Edges) -> bytes:
+        """Check edges that are published together for the first time, and own them. Returns their digest."""
+        edges = [(full_name(self.robot, parent), full_name(self.robot, child)) for parent, child in names]
+        children = {child for _, child in edges}
+        if not edges or len(children) < len(edges):
+            given = ", ".join(f"{parent!r} -> {child!r}" for parent, child in edges) or "no transform"
+            raise InvalidInput(
+                f"a sample has one transform for each of its children, at least one; got {given}"
+            )
+        with ExitStack() as claims:
+            fresh = [edge for edge in edges if edge not in self._placed]
+            if self._claim is not None and fresh:
+                check_readers(self._session, self._announced, fresh)
+                claims.enter_context(claim_edges(self._session, self._announced, fresh))
+                # An earlier writer that answered above has announced itself by now.
+                self._check_name()
+            self._check.insert_many(edges, 0, [_IDENTITY] * len(edges), writer=self.writer)
+            self._placed.update(fresh)
+            self._edge_tokens.push(claims.pop_all().__exit__)
+        return order_digest(names)
+
+    def run(
+        self, source: TransformSource, rate_hz: float = 50.0, *, seconds: float | None = None
+    ) -> RateReport:
+        """Publish the transforms of ``source`` at exactly ``rate_hz``, for ``seconds`` or until ``close()``.
+
+        Each tick has an absolute deadline; ``Rate`` describes late ticks. If the source has nothing new, the
+        tick publishes nothing. Raises as ``publish``.
+        """
+        self._rate = rate = Rate(rate_hz, self._clock, self._stop, seconds)
+        for now in rate:
+            transforms = source.read(now)
+            if transforms is not None:
+                own = {transform.stamp for transform in transforms}
+                try:
+                    self.publish(transforms, now if own == {None} else None)
+                except Closed:
+                    break
+        return rate.report()
+
+    def close(self) -> None:
+        """Stop publishing; ``run`` returns. A second call does nothing."""
+        self._stop.set()
+        with self._lock:
+            self._opened.close()
