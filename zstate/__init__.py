@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from zstate.nodes.static_publisher import StaticPublisher
     from zstate.nodes.transform_publisher import TransformPublisher
     from zstate.recording.recording import Recording
-    from zstate.sources import JointReading, SineSource
+    from zstate.sources import JointReading, JointStateListener, SineSource
     from zstate.transform import Transform, Twist
 
 __version__ = "0.1.0"
@@ -62,6 +62,7 @@ __all__ = [
     "InsertRefused",
     "InvalidInput",
     "JointReading",
+    "JointStateListener",
     "Kinematics",
     "LookupFailed",
     "ModelError",
@@ -91,6 +92,7 @@ __all__ = [
 
 _HOMES = {
     "JointReading": "sources",
+    "JointStateListener": "sources",
     "Kinematics": "model.kinematics",
     "Recording": "recording.recording",
     "RobotModel": "model.robot",

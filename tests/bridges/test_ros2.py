@@ -22,7 +22,7 @@ from zstate.net.streams import StreamSubscriber
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
-from zstate.sources import SineSource, SubscribedSource
+from zstate.sources import JointStateListener, SineSource
 from zstate.transform import Transform
 from zstate.wire.protocol import SerializedSample
 from zstate.wire.registry import get_wire
@@ -144,7 +144,7 @@ def test_every_number_of_a_joint_state_is_carried(world, here, there):
     world.bridge("r1")
     with (
         StatePublisher(world.join(here), RRBOT, "r1", (here,)) as publisher,
-        SubscribedSource(world.join(there), RRBOT, "r1", wire=there) as source,
+        JointStateListener(world.join(there), "r1", RRBOT, wire=there) as source,
     ):
         publish_until(publisher, lambda: source.read(0))
         publish(publisher)

@@ -13,14 +13,14 @@ from helpers.processes import SOON_S
 
 from zstate import connect, load_model
 from zstate.cli import main, usage_hints
-from zstate.sources import SubscribedSource
+from zstate.sources import JointStateListener
 
 pytestmark = pytest.mark.processes
 
 
 def await_samples() -> None:
     """Until two samples of the RRBot have come in."""
-    with connect() as session, SubscribedSource(session, load_model(RRBOT)) as source:
+    with connect() as session, JointStateListener(session, "rrbot", load_model(RRBOT)) as source:
         readings = iter(source)
         assert next(readings).stamp != next(readings).stamp
 

@@ -10,7 +10,7 @@ from helpers.processes import until
 from zstate import TransformListener, connect, discover, load_model
 from zstate.net.latched import LatchedSubscriber
 from zstate.net.session import Session
-from zstate.sources import SubscribedSource
+from zstate.sources import JointStateListener
 from zstate.wire.protocol import SerializedSample
 
 pytestmark = pytest.mark.processes
@@ -55,7 +55,7 @@ def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_r
     assert streams(client) == EVERYTHING
     with (
         published_robot(router=ros_router, positions=(0.5, -0.25), streams=("joint_states",)),
-        SubscribedSource(client, load_model(RRBOT), wire="ros2") as source,
+        JointStateListener(client, "rrbot", load_model(RRBOT), wire="ros2") as source,
     ):
         heard = next(iter(source))
     assert list(heard.positions) == [0.5, -0.25]

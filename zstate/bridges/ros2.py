@@ -27,7 +27,7 @@ from zstate.net.presence import watch
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
-from zstate.sources.subscribed import DescriptionSubscriber, SubscribedSource
+from zstate.sources.joint_state_listener import DescriptionSubscriber, JointStateListener
 from zstate.transform import Transform
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import ANY, MODEL_WRITER, Stream, check_robot
@@ -173,13 +173,15 @@ class RobotBridge(Closeable):
                 StaticPublisher(target.session, robot, wires=(target.wire,), program=PROGRAM, takeover=True)
             )
             opening.enter_context(StaticBridge(source.session, model, statics, self._counters, source.wire))
-            readings = opening.enter_context(SubscribedSource(source.session, model, robot, wire=source.wire))
+            readings = opening.enter_context(
+                JointStateListener(source.session, robot, model, wire=source.wire)
+            )
             self._carrying = opening.pop_all()
         threading.Thread(
             target=self._publish, args=(readings, publisher), name=f"zstate bridge {robot}", daemon=True
         ).start()
 
-    def _publish(self, readings: SubscribedSource, publisher: StatePublisher) -> None:
+    def _publish(self, readings: JointStateListener, publisher: StatePublisher) -> None:
         with suppress(Closed):
             for reading in readings:
                 try:

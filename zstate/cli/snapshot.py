@@ -33,8 +33,8 @@ from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
 from zstate.rate import Rate
-from zstate.sources import JointReading, SubscribedSource
-from zstate.sources.subscribed import DescriptionSubscriber
+from zstate.sources import JointReading, JointStateListener
+from zstate.sources.joint_state_listener import DescriptionSubscriber
 from zstate.transform import Transform
 from zstate.wire.keys import MODEL_WRITER, check_robot
 from zstate.wire.messages import StaticTransforms, poses_from_block
@@ -254,7 +254,7 @@ class _RobotCapture(Closeable):
         self._wire_name = wire
         self._wire = get_wire(wire)
         self._model: RobotModel | None = None
-        self._source: SubscribedSource | None = None
+        self._source: JointStateListener | None = None
         self._reading: JointReading | None = None
         self._statics: dict[str, StaticTransforms] = {}
         self._opened = ExitStack()
@@ -271,8 +271,12 @@ class _RobotCapture(Closeable):
         if self._source is not None:
             self._source.close()
         self._model = model
-        self._source = SubscribedSource(
-            self._session, model, self.info.name, wire=self._wire_name, on_readings=self._waiter.notify
+        self._source = JointStateListener(
+            self._session,
+            self.info.name,
+            model,
+            wire=self._wire_name,
+            on_reading=lambda _: self._waiter.notify(),
         )
         self._waiter.notify()
 

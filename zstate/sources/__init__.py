@@ -1,7 +1,7 @@
 """Sources of joint states: test signals and other publishers."""
 
 from zstate.sources.joint_source import JointReading, JointSource
+from zstate.sources.joint_state_listener import JointStateListener
 from zstate.sources.sine import SineSource
-from zstate.sources.subscribed import SubscribedSource
 
-__all__ = ["JointReading", "JointSource", "SineSource", "SubscribedSource"]
+__all__ = ["JointReading", "JointSource", "JointStateListener", "SineSource"]

@@ -23,8 +23,8 @@ class JointNumbers(NamedTuple):
     efforts: Floats | None
 
 
-class _Permutation(NamedTuple):
-    """The index in a writer's order of each number in the reader's."""
+class JointColumns(NamedTuple):
+    """The index in a writer's order of each number in the reader's; velocities and efforts share theirs."""
 
     positions: NDArray[np.intp]
     velocities: NDArray[np.intp]
@@ -45,7 +45,9 @@ class JointOrder:
         self.digest = order_digest(tuple(names))
         self._coordinates = tuple(coordinates or names)
         self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
-        self._permutations: dict[tuple[str, ...], _Permutation] = {}
+        count = len(self._coordinates)
+        self._plain = JointColumns(np.arange(count), np.arange(len(self._slots)))
+        self._permutations: dict[tuple[str, ...], JointColumns] = {}
 
     def is_plain(self, state: JointState) -> bool:
         """Whether ``state`` has only positions, in the reader's order: the usual case."""
@@ -57,7 +59,7 @@ class JointOrder:
         velocities = None if state.velocities is None else from_block(state.velocities)
         efforts = None if state.efforts is None else from_block(state.efforts)
         if state.order != self.digest:
-            order = self._permutation(state.names)
+            order = self.columns(state)
             positions = positions[order.positions]
             velocities = None if velocities is None else velocities[order.velocities]
             efforts = None if efforts is None else efforts[order.velocities]
@@ -65,7 +67,11 @@ class JointOrder:
             velocities, efforts = _none_if_nan(velocities), _none_if_nan(efforts)
         return JointNumbers(positions, velocities, efforts)
 
-    def _permutation(self, names: tuple[str, ...] | None) -> _Permutation:
+    def columns(self, state: JointState) -> JointColumns:
+        """The index in ``state`` of each number. Raises MessageError if any is missing."""
+        if state.order == self.digest:
+            return self._plain
+        names = state.names
         if names is None:
             raise MessageError(
                 "a joint state in an order of another model; do both sides use the same URDF?",
@@ -80,7 +86,7 @@ class JointOrder:
                 )
             # One order per writer is usual; a writer that shuffles must not fill the memory.
             positions = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
-            found = _Permutation(positions, positions[self._slots])
+            found = JointColumns(positions, positions[self._slots])
             self._permutations = {names: found}
         return found
 

@@ -30,7 +30,7 @@ from helpers.ros1_processes import (
 
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, load_model
 from zstate.bridges.ros1.node import Master
-from zstate.sources import SubscribedSource
+from zstate.sources import JointStateListener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.skipif(bool(missing_ros_reason()), reason=missing_ros_reason())]
 
@@ -163,7 +163,7 @@ def test_carried_messages_do_not_come_back(bridge: Bridge, peer: Callable[..., R
     with (
         connect() as session,
         StatePublisher(session, MODEL, "rrbot") as publisher,
-        SubscribedSource(session, MODEL, "rrbot") as source,
+        JointStateListener(session, "rrbot", MODEL) as source,
     ):
         counting = threading.Thread(target=count)
         counting.start()

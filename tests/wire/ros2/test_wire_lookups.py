@@ -27,7 +27,7 @@ from zstate.net.presence import discover
 from zstate.nodes.listener import TransformListener
 from zstate.nodes.publisher import StatePublisher
 from zstate.nodes.static_publisher import StaticPublisher
-from zstate.sources import SubscribedSource
+from zstate.sources import JointStateListener
 from zstate.transform import Transform
 from zstate.wire.native import NativeWire
 from zstate.wire.protocol import SerializedSample
@@ -100,7 +100,7 @@ def test_joint_states_are_read_back_as_they_were_published(sessions, wire: str):
     positions = random_positions(EVERY, 1)
     rates = np.arange(float(len(velocity_columns_by_position(EVERY))))
     with (
-        SubscribedSource(reader, EVERY, "r1", wire=wire) as source,
+        JointStateListener(reader, "r1", EVERY, wire=wire) as source,
         StatePublisher(writer, EVERY, "r1", (wire,), streams=["joint_states"]) as publisher,
     ):
         wait_for_reader(writer, data_key(wire, "r1", "joint_states"))
@@ -116,7 +116,7 @@ def test_joint_states_are_read_back_as_they_were_published(sessions, wire: str):
 def test_source_reads_a_ros_driver_and_counts_other_messages(sessions):
     writer, reader = sessions
     names, nan = RRBOT.joint_names, float("nan")
-    with SubscribedSource(reader, RRBOT, "r1", wire="ros2") as source:
+    with JointStateListener(reader, "r1", RRBOT, wire="ros2") as source:
         driver = RosNode(writer, "driver").publisher(JOINT_STATES).announce().wait_for_reader()
         driver.joints(STAMP, ("elbow", "lid", "shoulder"), [2.0, 7.0, 1.0], [nan] * 3, [0.2, nan, 0.1])
         driver.joints(0, names, [0.0, 0.0])

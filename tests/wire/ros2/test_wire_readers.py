@@ -10,7 +10,7 @@ from helpers.raw_ros_nodes import tokens
 
 from zstate.model.load import load_model
 from zstate.nodes.listener import TransformListener
-from zstate.sources import SubscribedSource
+from zstate.sources import JointStateListener
 
 
 @pytest.fixture(autouse=True)
@@ -39,6 +39,9 @@ def test_listener_is_a_node_with_subscriptions_in_the_graph(sessions):
 
 def test_native_listener_declares_no_graph_tokens(sessions):
     writer, reader = sessions
-    with TransformListener(reader, "panda"), SubscribedSource(reader, load_model("rrbot"), "r1", wire="ros2"):
+    with (
+        TransformListener(reader, "panda"),
+        JointStateListener(reader, "r1", load_model("rrbot"), wire="ros2"),
+    ):
         until(lambda: len(tokens(writer)) == 2)
         assert {one.split("/")[5] for one in tokens(writer)} == {"NN", "MS"}

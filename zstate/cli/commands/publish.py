@@ -157,7 +157,7 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
 ) -> None:
     """Publish the joint states of ``wire``: what they imply with ``derived``, everything with ``whole``."""
     from zstate.net.topic_statistics import mean_rate_hz
-    from zstate.sources import SubscribedSource
+    from zstate.sources import JointStateListener
 
     messages, robot = messages_for(wire), derived.robot
     place = messages.place(robot, ("joint_states",))
@@ -173,7 +173,7 @@ def _publish_joint_states(  # noqa: PLR0917 - one use, in the order of the data
         whole.publish(reading.positions, reading.velocities, reading.efforts, reading.stamp)
 
     print_status(f"waiting for {place} ...")
-    with SubscribedSource(session, derived.model, robot, wire=wire) as source:
+    with JointStateListener(session, robot, derived.model, wire=wire) as source:
         if rate_hz is not None:
             run_publisher(derived, _ObservedSource(source, on_reading), rate_hz, seconds)
         else:

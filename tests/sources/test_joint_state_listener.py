@@ -1,15 +1,16 @@
+import asyncio
 import logging
 import threading
 
 import pytest
-from helpers.processes import until
+from helpers.processes import DEADLINE_S, until
 from helpers.robots import RRBOT, wait_for_reader
 
 from zstate.model.load import load_model
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import StatePublisher
-from zstate.sources import SubscribedSource
+from zstate.sources import JointStateListener
 from zstate.wire.messages import JointState, order_digest, to_block
 from zstate.wire.native import ENCODINGS, encode
 
@@ -33,7 +34,7 @@ def joint_state(*blocks: list[float], model=RRBOT) -> bytes:
 
 def test_every_sample_is_read_in_order_with_its_stamp(sessions):
     writer, reader = sessions
-    with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
+    with JointStateListener(reader, "r1", RRBOT) as source, StatePublisher(writer, RRBOT, "r1") as publisher:
         wait_for_reader(writer, KEY)
         for number in range(5):
             publisher.publish([number, -number], [1.0, 2.0], [3.0, 4.0], stamp=number)
@@ -46,7 +47,7 @@ def test_every_sample_is_read_in_order_with_its_stamp(sessions):
 
 def test_read_returns_the_newest_once(sessions):
     writer, reader = sessions
-    with SubscribedSource(reader, RRBOT, "r1") as source, StatePublisher(writer, RRBOT, "r1") as publisher:
+    with JointStateListener(reader, "r1", RRBOT) as source, StatePublisher(writer, RRBOT, "r1") as publisher:
         wait_for_reader(writer, KEY)
         assert source.read(0) is None
         publisher.publish([1.0, 2.0], stamp=1)
@@ -64,12 +65,56 @@ def test_read_returns_the_newest_once(sessions):
         assert source.read(0) is None
 
 
-def test_the_robot_defaults_to_the_models_name(sessions):
+def test_the_model_is_by_default_that_of_the_description(sessions):
     writer, reader = sessions
-    with SubscribedSource(reader, RRBOT) as source, StatePublisher(writer, RRBOT) as publisher:
-        wait_for_reader(writer, "zstate/rrbot/joint_states")
-        publisher.publish([1.0, 2.0], stamp=1)
-        assert next(iter(source)).stamp == 1
+    with JointStateListener(reader, "r1") as joints:
+        assert joints.model is None
+        put(writer, joint_state([1.0, 2.0]))  # arrives before the description
+        with StatePublisher(writer, RRBOT, "r1") as publisher:
+            until(lambda: joints.model is not None)
+            publisher.publish([3.0, 4.0], stamp=8)
+            readings = [reading for _, reading in zip(range(2), joints, strict=False)]
+    assert [reading.stamp for reading in readings] == [7, 8]
+    assert joints.model.joint_names == RRBOT.joint_names
+
+
+def test_callback_gets_every_sample(sessions):
+    writer, reader = sessions
+    stamps: list[int | None] = []
+    with (
+        JointStateListener(reader, "r1", RRBOT, on_reading=lambda reading: stamps.append(reading.stamp)),
+        StatePublisher(writer, RRBOT, "r1") as publisher,
+    ):
+        wait_for_reader(writer, KEY)
+        for number in range(5):
+            publisher.publish([0.0, 0.0], stamp=number)
+        until(lambda: stamps == [0, 1, 2, 3, 4])
+
+
+def test_tasks_read_samples_and_end_with_the_listener(sessions):
+    writer, reader = sessions
+    joints = JointStateListener(reader, "r1", RRBOT)
+
+    async def read() -> list[int | None]:
+        async def collect() -> None:
+            async for reading in joints:
+                stamps.append(reading.stamp)
+                arrived.set()
+
+        stamps: list[int | None] = []
+        arrived = asyncio.Event()
+        task = asyncio.create_task(collect())
+        with StatePublisher(writer, RRBOT, "r1") as publisher:
+            await asyncio.to_thread(wait_for_reader, writer, KEY)
+            for number in range(3):
+                arrived.clear()
+                publisher.publish([0.0, 0.0], stamp=number)
+                await asyncio.wait_for(arrived.wait(), DEADLINE_S)
+        await asyncio.to_thread(joints.close)
+        await asyncio.wait_for(task, DEADLINE_S)
+        return stamps
+
+    assert asyncio.run(read()) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +137,7 @@ def test_unusable_samples_are_counted_and_logged_once_and_the_next_is_read(
     sessions, caplog, payload: bytes, encoding: str, reason: str
 ):
     writer, reader = sessions
-    with caplog.at_level(logging.WARNING), SubscribedSource(reader, RRBOT, "r1") as source:
+    with caplog.at_level(logging.WARNING), JointStateListener(reader, "r1", RRBOT) as source:
         put(writer, payload, encoding)
         put(writer, payload, encoding)
         until(lambda: source.refused == {reason: 2})
@@ -104,13 +149,13 @@ def test_unusable_samples_are_counted_and_logged_once_and_the_next_is_read(
 
 def test_a_floating_joint_without_a_unit_quaternion_is_refused_before_republishing(sessions):
     writer, reader = sessions
-    with SubscribedSource(reader, FLOATING, "r1") as source:
+    with JointStateListener(reader, "r1", FLOATING) as source:
         put(writer, joint_state([0, 0, 0, 0, 0, 0, 0.5], model=FLOATING))
         until(lambda: source.refused == {"bad numbers": 1})
 
 
 def test_close_ends_an_iteration_that_waits(sessions):
-    source = SubscribedSource(sessions[1], RRBOT, "r1")
+    source = JointStateListener(sessions[1], "r1", RRBOT)
     readings: list[object] = []
     thread = threading.Thread(target=lambda: readings.extend(source))
     thread.start()
@@ -124,10 +169,10 @@ def test_close_ends_an_iteration_that_waits(sessions):
 def test_a_publisher_runs_on_what_another_publishes(sessions):
     writer, reader = sessions
     with (
-        SubscribedSource(reader, RRBOT, "r1") as source,
+        JointStateListener(reader, "r1", RRBOT) as source,
         StatePublisher(writer, RRBOT, "r1", streams=["joint_states"]) as driver,
         StatePublisher(reader, RRBOT, "r2") as echo,
-        SubscribedSource(writer, RRBOT, "r2") as echoed,
+        JointStateListener(writer, "r2", RRBOT) as echoed,
     ):
         wait_for_reader(writer, KEY)
         wait_for_reader(reader, "zstate/r2/joint_states")

@@ -10,7 +10,7 @@ from zstate.model.load import load_model
 from zstate.net.latched import LatchedPublisher
 from zstate.net.session import Session
 from zstate.nodes.publisher import StatePublisher
-from zstate.sources.subscribed import DescriptionSubscriber
+from zstate.sources.joint_state_listener import DescriptionSubscriber
 from zstate.wire.messages import RobotDescription
 from zstate.wire.native import ENCODINGS, encode
 
