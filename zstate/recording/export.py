@@ -82,10 +82,12 @@ class ParquetFile(Closeable):
 
     def write(self, columns: Columns) -> None:
         """Append the rows of ``columns``, which are the same for each call."""
-        table = self._arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
-        if self._writer is None:
-            self._writer = self._parquet.ParquetWriter(self._path, table.schema, compression="zstd")
-        self._writer.write_table(table)
+        table: Any = self._arrow.table(
+            {name: np.ascontiguousarray(column) for name, column in columns.items()}
+        )
+        writer = self._writer or self._parquet.ParquetWriter(self._path, table.schema, compression="zstd")
+        self._writer = writer
+        writer.write_table(table)
 
     def close(self) -> None:
         """Complete and close the file. A second call does nothing."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zstate.errors import MessageError
 from zstate.model.joint_trajectory import JointTrajectory
@@ -68,23 +69,28 @@ class JointStateReader:
             for _ in states:
                 self._refuse(error.reason, f"{self._robot!r}: {error}")
             return
-        positions, velocities, efforts = (
-            None if blocks[0] is None else from_block(b"".join(blocks)).reshape(len(states), -1)
-            for blocks in (
-                [state.positions for state in states],
-                [state.velocities for state in states],
-                [state.efforts for state in states],
-            )
-        )
+        velocities = _rows([state.velocities for state in states], columns.velocities)
+        efforts = _rows([state.efforts for state in states], columns.velocities)
         yield JointTrajectory(
             self.joint_names,
             self.coordinates,
             self.velocity_coordinates,
             np.array([state.stamp for state in states], dtype=np.int64),
-            positions[:, columns.positions],
-            None if velocities is None else velocities[:, columns.velocities],
-            None if efforts is None else efforts[:, columns.velocities],
+            _stacked([state.positions for state in states], columns.positions),
+            velocities,
+            efforts,
         )
+
+
+def _rows(blocks: Sequence[bytes | None], columns: NDArray[np.intp]) -> NDArray[np.float64] | None:
+    """One row for each block; None if they are None, or if no number is known."""
+    known = [block for block in blocks if block is not None]
+    rows = _stacked(known, columns) if known else None
+    return None if rows is None or np.isnan(rows).all() else rows
+
+
+def _stacked(blocks: Sequence[bytes], columns: NDArray[np.intp]) -> NDArray[np.float64]:
+    return from_block(b"".join(blocks)).reshape(len(blocks), -1)[:, columns]
 
 
 def _has_same_columns(one: JointState, other: JointState) -> bool:
