@@ -1,4 +1,4 @@
-"""Protocol of the programs in this folder: JSON lines, requests on standard input, replies on standard output.
+"""Protocol of this folder's programs: JSON lines, requests on standard input, replies on standard output.
 
 A request is ``{"do": NAME, ...}``; its reply is ``{"did": NAME, "answer": ...}`` or
 ``{"failed": NAME, "why": ...}``.
