@@ -33,7 +33,7 @@ def needs_matplotlib() -> None:
 
 
 def texts(file: Path) -> str:
-    """What stands in a picture, which Matplotlib has as comments beside the outlines of the letters."""
+    """The texts of a picture, which Matplotlib writes as comments next to the outlines of the letters."""
     ElementTree.parse(file)
     return file.read_text()
 

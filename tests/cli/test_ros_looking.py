@@ -150,7 +150,7 @@ def test_invalid_wire_is_wrong_usage_with_the_reason():
     assert "'native'" in failure("ls", "--wire", "ros3", code=2)
 
 
-# What "tcp/127.0.0.1:7447" is to others: that port belongs to whoever runs these tests.
+# Another default router: port 7447 of the test machine may be in use.
 ELSEWHERE = """
 import sys
 import zstate.net.config as config

@@ -16,13 +16,13 @@ def test_a_long_cell_goes_on_below_itself():
 
 
 def test_where_the_last_column_is_too_narrow_a_line_goes_on_with_an_indent():
-    line = "  frame  " + "x" * 30 + "  and what is to be said of it"
-    assert wrap(line, 45).splitlines() == [f"  frame  {'x' * 30}  and", "    what is to be said of it"]
+    line = "  frame  " + "x" * 30 + "  and a remark about this frame"
+    assert wrap(line, 45).splitlines() == [f"  frame  {'x' * 30}  and", "    a remark about this frame"]
 
 
 def test_prose_is_folded_between_words_which_stay_whole():
-    said = wrap("zstate: nothing answers at 'tcp/a-host-with-a-long-name:7447' (refused)", 30)
-    assert said.splitlines() == [
+    wrapped = wrap("zstate: nothing answers at 'tcp/a-host-with-a-long-name:7447' (refused)", 30)
+    assert wrapped.splitlines() == [
         "zstate: nothing answers at",
         "  'tcp/a-host-with-a-long-name:7447'",
         "  (refused)",

@@ -248,8 +248,8 @@ def test_zenoh_prints_nothing_on_the_terminal(spawn, free_port: int):
         import sys
         from zstate.errors import NetworkError
         from zstate.net.session import connect
-        nobody = {"mode": "client", "endpoints": sys.argv[1], "timeout_s": 0.3}
-        for arguments in (nobody, {"listen": "tcp/192.0.2.1:1"}):
+        unreachable = {"mode": "client", "endpoints": sys.argv[1], "timeout_s": 0.3}
+        for arguments in (unreachable, {"listen": "tcp/192.0.2.1:1"}):
             try:
                 connect(**arguments)
             except NetworkError:

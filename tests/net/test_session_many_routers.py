@@ -107,7 +107,7 @@ def test_streams_resume_when_the_fleet_router_returns(spawn: Spawn):
     with client(site) as robot, StatePublisher(robot, RRBOT, "r1") as publisher:
         dying.kill()
         # The robot's own programs are not affected.
-        with client(site) as beside, TransformListener(beside, "r1") as listener:
+        with client(site) as local, TransformListener(local, "r1") as listener:
             until(lambda: publish_and_check(publisher, listener))
         router(spawn, fleet)
         with client(fleet) as hall, TransformListener(hall, "r1") as listener:

@@ -49,7 +49,7 @@ def test_open_streams_are_announced_and_received_until_close(sessions, wire: str
         late.wait_for(1)
         until(lambda: len(discover(reader, wire=wire)) == 1)
         (robot,) = discover(reader, wire=wire)
-        assert {said for said, _ in robot.writers} == {"joint_states", "robot_description"}
+        assert {stream for stream, _ in robot.writers} == {"joint_states", "robot_description"}
     until(lambda: discover(reader, timeout_s=0.1, wire=wire) == ())
     until(lambda: tokens(reader) == [])
 

@@ -97,7 +97,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_topics_are_selected_by_name(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(5))
     assert payloads(tmp_path / "run.mcap", topics=["/robot_description"]) == [DESCRIPTION]
-    assert payloads(tmp_path / "run.mcap", topics=["/nobody"]) == []
+    assert payloads(tmp_path / "run.mcap", topics=["/unknown"]) == []
     assert payloads(tmp_path / "run.mcap", topics=[]) == []
 
 
@@ -236,7 +236,7 @@ def test_every_variant_that_mcap_writes_is_read(tmp_path: Path, options: dict[st
     mixed = random.Random(3).sample(states, len(states))
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=5000, **options)
-        writer.start("ros2", "somebody")
+        writer.start("ros2", "another library")
         schema = writer.register_schema("sensor_msgs/msg/JointState", "ros2msg", b"")
         channel = writer.register_channel("/joint_states", "cdr", schema)
         writer.add_attachment(0, 0, "note", "text/plain", b"hello")

@@ -59,26 +59,28 @@ def wild(path: Path, seed: int) -> None:
         tale.describe("arm")
         offset = 0
         for n in range(600):
-            heard = START + n * 10 * MS
+            log_time = START + n * 10 * MS
             if n == 150:
                 offset = -3600 * S
             session = 1 + (n > 300)
-            stamp = heard + offset - dice.choice([0, 0, 0, 35 * MS, 70 * MS])
+            stamp = log_time + offset - dice.choice([0, 0, 0, 35 * MS, 70 * MS])
             tale.joints(
                 "arm",
                 stamp,
                 swing_positions(dice.random()),
                 swing_velocities(n),
                 session=session,
-                log_time=heard,
+                log_time=log_time,
             )
             if n % 3 == 0:
                 world = pose(dice.random(), dice.random(), yaw=dice.random())
-                tale.edges("arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, log_time=heard)
+                tale.edges(
+                    "arm", stamp, {("odom", "world"): world, ("map", "odom"): pose(n)}, log_time=log_time
+                )
             if n % 50 == 7:
-                tale.edges("arm", stamp, {("map", "odom"): pose(-n)}, log_time=heard, session=5)
+                tale.edges("arm", stamp, {("map", "odom"): pose(-n)}, log_time=log_time, session=5)
             if n in {20, 400}:
-                tale.statics("arm", heard, {("tool", "tip"): pose(z=n)})
+                tale.statics("arm", log_time, {("tool", "tip"): pose(z=n)})
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -94,9 +96,9 @@ def test_lookup_many_equals_that_of_a_full_buffer(tmp_path: Path, seed: int, mon
         for target, source in [("map", "tip"), ("world", "tool"), ("odom", "map"), ("tool", "tip")]:
             poses, valid = buffer.lookup_many(target, source, stamps)
             assert valid.sum() > 5
-            told, is_told = recording.lookup_many(target, source, stamps)
-            assert np.array_equal(is_told, valid)
-            assert np.array_equal(told, poses, equal_nan=True)
+            streamed_poses, streamed_valid = recording.lookup_many(target, source, stamps)
+            assert np.array_equal(streamed_valid, valid)
+            assert np.array_equal(streamed_poses, poses, equal_nan=True)
 
 
 def test_lookup_many_of_no_stamps_is_empty(tmp_path: Path):

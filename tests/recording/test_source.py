@@ -92,8 +92,8 @@ def test_restarted_writer_continues_at_its_log_times(tmp_path: Path):
         tale.joints("arm", 4 * S, [3, 0], session=2, log_time=START + 3 * S)
     with RecordedSource(tmp_path / "r.mcap", None, RRBOT) as source:
         stamps = [source.read(NOW + n * S) for n in range(4)]
-    told = [None if reading is None else (reading.stamp, reading.positions[0]) for reading in stamps]
-    assert told == [(NOW, 1.0), None, (NOW + 2 * S, 2.0), (NOW + 3 * S, 3.0)]
+    found = [None if reading is None else (reading.stamp, reading.positions[0]) for reading in stamps]
+    assert found == [(NOW, 1.0), None, (NOW + 2 * S, 2.0), (NOW + 3 * S, 3.0)]
 
 
 def test_late_sample_does_not_move_the_robot_back(tmp_path: Path):
@@ -115,5 +115,5 @@ def test_publisher_runs_with_a_recorded_source(tmp_path: Path):
     ):
         report = publisher.run(source, 1000.0, seconds=source.duration_s + 0.001)
         assert source.ended
-        # From the description to the last state, 90 ms later, which took 200 us to be heard.
+        # From the description to the last state, 90 ms later, which arrived 200 us after its stamp.
         assert report.ticks == 91

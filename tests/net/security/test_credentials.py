@@ -135,7 +135,7 @@ def test_unreadable_file_is_named(fleet: Path, tmp_path: Path):
     ("lines", "text"),
     [
         ("alice\n", "line 1: write user:password"),
-        ("alice:wonder\n# nobody\n", "line 2: write user:password; comments"),
+        ("alice:wonder\n# viewer\n", "line 2: write user:password; comments"),
         ("alice:\n", "line 1: write user:password"),
         (":wonder\n", "line 1: write user:password"),
         ("alice:a\n\nbob:b\nalice:c\n", "line 4: the user 'alice' is already in line 1"),

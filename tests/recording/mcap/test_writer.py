@@ -39,7 +39,7 @@ def in_file_order(path: Path) -> list[tuple[str, bytes]]:
         try:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
                 messages.append((channel.topic, message.data))
-        except Exception:  # what mcap says at the end of a cut file
+        except Exception:  # the error of mcap at the end of a cut file
             pass
     return messages
 
