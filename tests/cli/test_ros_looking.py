@@ -55,8 +55,8 @@ def test_tf_between_two_trees_names_the_command_that_joins_them(ros_router: str)
 
 
 def test_tree_shows_frames_by_their_ros_names_with_the_nodes_that_write_them(ros_router: str):
-    spoken = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
-    with published_robot("r1", wire=spoken, router=ros_router):
+    wire = "ros2:namespace=r1,frame_prefix=r1/,node=driver"
+    with published_robot("r1", wire=wire, router=ros_router):
         lines = zstate("tree").stdout.decode().splitlines()
     assert lines[1].split() == ["r1/world", "root"]
     (upper,) = (line for line in lines if "r1/upper" in line)

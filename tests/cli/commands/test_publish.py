@@ -133,10 +133,10 @@ def test_unknown_wire_error_lists_known_wires():
 
 
 def test_a_recording_is_published_as_if_it_were_now(spawn: Spawn, tmp_path: Path):
-    with RecordingBuilder(tmp_path / "run.mcap", "arm") as tale:
-        tale.describe("arm")
+    with RecordingBuilder(tmp_path / "run.mcap", "arm") as builder:
+        builder.describe("arm")
         for n in range(100):
-            tale.joints("arm", START + n * 10 * MS, swing_positions(n))
+            builder.joints("arm", START + n * 10 * MS, swing_positions(n))
     with connect() as session, TransformListener(session, "rrbot") as listener:
         before = time.time_ns()
         child = started(spawn, "publish", RRBOT, "--source", str(tmp_path / "run.mcap"), "--rate", "200")
