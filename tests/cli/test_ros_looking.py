@@ -79,7 +79,7 @@ def test_tree_names_a_node_that_sends_nothing(ros_router: str):
     assert b"tool" in ended.stdout
 
 
-def test_tree_of_nobody_is_a_failure(ros_router: str):
+def test_tree_without_robots_is_a_failure(ros_router: str):
     assert "no node publishes /tf in domain 5" in failure("tree", "--wire", "ros2:domain=5")
 
 
@@ -89,7 +89,7 @@ def test_echo_needs_no_robot_and_no_description(ros_router: str):
     assert document["positions"] == {"shoulder": SHOULDER, "elbow": ELBOW}
 
 
-def test_what_a_driver_does_not_measure_is_null_in_json(spawn: Spawn, ros_router: str):
+def test_unmeasured_values_are_null_in_json(spawn: Spawn, ros_router: str):
     command = started(spawn, "echo", "--json")
     unmeasured = JointState(
         5, 0, 1, order_digest(("a",)), to_block([0.5]), None, to_block([math.nan]), ("a",)

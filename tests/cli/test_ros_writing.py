@@ -61,7 +61,7 @@ def test_native_joint_states_are_published_completely_on_ros(spawn: Spawn, ros_r
     assert list(reading.positions) == [0.5, -0.25]
 
 
-def test_a_sine_goes_out_on_all_wires(spawn: Spawn, ros_router: str, client: Session):
+def test_a_sine_is_published_on_all_wires(spawn: Spawn, ros_router: str, client: Session):
     wires = ("--wire", "native", "--wire", "ros2:namespace=r1")
     started(spawn, "publish", RRBOT, "--source", "sine", *wires).line()
     assert streams(client, "native") == EVERYTHING

@@ -114,7 +114,7 @@ def test_the_terminal_blocks_match_real_output(folder: Path, without_xacro: None
             )
 
 
-def test_the_robot_runs_and_can_be_looked_at(cell: Child, driver):
+def test_the_robot_runs_and_can_be_inspected(cell: Child, driver):
     driver()
     assert zstate("wait", "robot", "arm").stdout == b"ready: 'arm' (3 frames)\n"
     (robot,) = json.loads(zstate("ls", "--json").stdout)
@@ -153,7 +153,7 @@ def test_1_without_a_publisher_the_robot_is_missing(folder: Path):
     assert "its publisher is not running" in found["text"]
 
 
-def test_2_a_path_with_a_space_works_and_is_named_where_the_quotes_are_forgotten(folder: Path, spawn: Spawn):
+def test_2_a_path_with_a_space_works_and_missing_quotes_are_reported(folder: Path, spawn: Spawn):
     place = folder / "my robot"
     place.mkdir()
     for name in ("arm.urdf", "cell.toml"):
@@ -193,7 +193,9 @@ def test_3_bad_urdf_is_refused_by_every_reader(folder: Path, driver, right: str,
         ("0", "1970 and after"),
     ],
 )
-def test_4_stamps_of_the_future_and_of_1970_are_used_and_named(cell: Child, driver, stamp: str, cause: str):
+def test_4_stamps_of_the_future_and_of_1970_are_used_and_reported(
+    cell: Child, driver, stamp: str, cause: str
+):
     stamped(stamp)
     process = driver()
     assert zstate("wait", "robot", "arm").returncode == 0
@@ -214,7 +216,7 @@ def test_5_unexpanded_xacro_is_recognised(folder: Path, without_xacro: None):
     assert message in failure("up", "cell.toml")
 
 
-def test_5_a_xacro_expression_that_was_left_over_is_recognised(folder: Path):
+def test_5_a_leftover_xacro_expression_is_recognised(folder: Path):
     lines = XACRO.splitlines(keepends=True)
     Path("arm.urdf").write_text('<robot name="arm">\n' + "".join(lines[2:]))
     message = failure("publish", "arm.urdf")
