@@ -3,7 +3,7 @@ from __future__ import annotations
 from zstate._util.bounded_dict import MAX_ENTRIES, BoundedDict
 
 
-def test_the_entry_that_was_assigned_first_is_dropped_first():
+def test_oldest_entry_is_dropped_first():
     known: BoundedDict[int, str] = BoundedDict()
     for number in range(MAX_ENTRIES):
         known[number] = "old"

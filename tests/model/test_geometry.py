@@ -63,7 +63,7 @@ def test_a_colour_inside_the_link_is_read():
     assert only(robot(visual(more=inside))).color == (0.1, 0.2, 0.3, 0.4)
 
 
-def test_a_material_that_is_only_named_means_the_one_in_the_robot():
+def test_named_material_refers_to_the_definition_in_the_robot():
     top = '<material name="red"><color rgba="1 0 0 1"/></material>'
     assert only(robot(visual(more='<material name="red"/>'), top)).color == (1, 0, 0, 1)
 
@@ -75,7 +75,7 @@ def test_a_material_defined_in_one_link_may_be_named_by_an_earlier_one():
     assert [shape.color for shape in parse_shapes(model)] == [(1, 0, 0, 1)] * 2
 
 
-def test_the_robots_material_wins_over_the_links_as_in_rviz():
+def test_material_of_the_robot_precedes_that_of_the_link_as_in_rviz():
     top = '<material name="red"><color rgba="1 0 0 1"/></material>'
     inside = '<material name="red"><color rgba="0.9 0 0 1"/></material>'
     assert only(robot(visual(more=inside), top)).color == (1, 0, 0, 1)

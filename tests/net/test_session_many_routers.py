@@ -39,7 +39,7 @@ def publish_and_check(publisher: StatePublisher, listener: TransformListener, af
     return listener.buffer.latest("base", "lower") > after
 
 
-def test_clients_use_the_next_router_when_theirs_is_killed(spawn: Spawn):
+def test_clients_use_the_next_router_when_one_is_killed(spawn: Spawn):
     first, second = endpoint(), endpoint()
     dying = router(spawn, first)
     router(spawn, second, "--connect", first)

@@ -99,7 +99,7 @@ def test_late_subscriber_receives_only_the_status_of_the_last_second(sessions):
         assert len(received.statuses) == 1
 
 
-def test_publisher_that_stands_still_is_stale(sessions):
+def test_silent_publisher_is_stale(sessions):
     received = Statuses(sessions[1], "r1")
     with StatePublisher(sessions[0], RRBOT, "r1") as publisher:
         publisher.publish([0.0, 0.0])

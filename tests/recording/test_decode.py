@@ -150,7 +150,7 @@ def test_messages_of_a_foreign_topic_are_counted(tmp_path: Path):
     ]
 
 
-def test_other_topics_of_a_bag_are_listed_and_left_out(tmp_path: Path):
+def test_other_topics_of_a_bag_are_listed_and_skipped(tmp_path: Path):
     with Bag(tmp_path / "bag") as bag:
         bag.joints(START, {"shoulder": 0.0}, "/joint_commands")
         bag.write("/chatter", START, STORE.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String")
@@ -168,7 +168,7 @@ def test_selected_robot_includes_the_root_namespace_of_a_bag(tmp_path: Path):
     assert {(s.writer.robot, s.writer.stream) for s in decoded} == {("dog", "joint_states"), ("ros", "tf")}
 
 
-def test_undecodable_messages_are_reported_and_left_out(tmp_path: Path):
+def test_undecodable_messages_are_reported_and_skipped(tmp_path: Path):
     with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
         builder.describe("arm")
         builder.joints("arm", START, swing_positions(0))

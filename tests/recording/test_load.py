@@ -288,7 +288,7 @@ def test_unknown_robot_error_lists_the_recorded_ones(tmp_path: Path):
         recorded_buffer(tmp_path / "r.mcap", "leg")
 
 
-def test_file_that_is_no_recording_is_refused(tmp_path: Path):
+def test_file_that_is_not_a_recording_is_refused(tmp_path: Path):
     (tmp_path / "x.mcap").write_text("hello")
     with pytest.raises(RecordingError, match="not a recording"):
         recorded_buffer(tmp_path / "x.mcap")

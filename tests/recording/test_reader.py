@@ -134,7 +134,7 @@ def test_split_files_are_read_as_one_and_separately(tmp_path: Path):
     assert alone == [DESCRIPTION, *(payload for _, payload in states[200:400])]
 
 
-def test_files_of_an_older_recording_of_that_name_are_left_out(tmp_path: Path):
+def test_files_of_an_older_recording_with_that_name_are_ignored(tmp_path: Path):
     write_run(tmp_path / "run.mcap", joint_states(500), max_seconds=2.0)
     write_run(tmp_path / "run.mcap", joint_states(300), max_seconds=2.0, overwrite=True)
     assert (tmp_path / "run_2.mcap").exists()

@@ -221,7 +221,7 @@ def test_the_wire_does_not_check_for_infinite_numbers():
 
 
 @given(st.binary(max_size=200), st.sampled_from(list(ENCODINGS)))
-def test_arbitrary_bytes_raise_nothing_but_a_message_error(payload: bytes, kind: type[Message]):
+def test_arbitrary_bytes_raise_only_message_error(payload: bytes, kind: type[Message]):
     try:
         decode(payload, ENCODINGS[kind], kind)
     except MessageError as error:
@@ -229,7 +229,7 @@ def test_arbitrary_bytes_raise_nothing_but_a_message_error(payload: bytes, kind:
 
 
 @given(st.sampled_from(MESSAGES), st.integers(0, 10_000), st.integers(0, 255))
-def test_one_changed_byte_raises_nothing_but_a_message_error(message: Message, at: int, value: int):
+def test_one_changed_byte_raises_only_message_error(message: Message, at: int, value: int):
     payload = bytearray(encode(message))
     payload[at % len(payload)] = value
     try:

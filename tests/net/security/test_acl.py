@@ -273,19 +273,19 @@ def test_zenoh_parses_the_text_to_the_same_rules():
     assert (parsed["enabled"], parsed["default_permission"]) == (True, "deny")
 
 
-def test_rules_without_a_role_are_left_out():
+def test_rules_without_a_role_are_omitted():
     rules = [rule["id"] for rule in access_control(AclRoles(viewers=("desk", "desk")))["rules"]]
     assert rules == ["viewers read", "viewers are given", "readers are known"]
 
 
 @pytest.mark.parametrize("name", ["", "*", "a/b", "two words", "@r1", "r1:x", "x" * 65, "röbi"])
-def test_a_name_that_cannot_be_one_is_refused(name: str):
+def test_invalid_identity_name_is_refused(name: str):
     with pytest.raises(InvalidInput, match="cannot be the name of an identity"):
         AclRoles((name,))
 
 
 @pytest.mark.parametrize("namespace", ["/hall", "hall/", "a//b", "h*", "@x"])
-def test_namespace_that_is_no_key_prefix_is_refused(namespace: str):
+def test_invalid_namespace_is_refused(namespace: str):
     with pytest.raises(InvalidInput, match="is not made of chunks"):
         AclRoles(("r1",), namespace=namespace)
 

@@ -81,7 +81,7 @@ def test_rendezvous_of_one_host_needs_no_credentials():
         assert "endpoints=" in refusal(Credentials(user="a", password="b"), mode=mode, endpoints=())
 
 
-def test_files_that_are_missing_are_named(fleet: Path):
+def test_missing_files_are_named(fleet: Path):
     for part in ("ca", "certificate", "key"):
         files = {"ca": fleet / "ca.pem", "certificate": fleet / "r1.pem", "key": fleet / "r1.key"}
         text = refusal(Credentials(**{**files, part: fleet / "nothing"}))

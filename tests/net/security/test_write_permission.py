@@ -22,7 +22,7 @@ def endpoint(tmp_path) -> Iterator[str]:
         yield endpoint
 
 
-def test_a_robot_may_write_itself(endpoint: str):
+def test_robot_may_write_its_own_keys(endpoint: str):
     with (
         join(endpoint, "r1") as session,
         StatePublisher(session, RRBOT, "r1"),

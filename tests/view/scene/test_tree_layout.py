@@ -84,7 +84,7 @@ def test_trees_keep_their_places_while_robots_move_and_samples_are_missing(scene
     assert scene.layout_version == version
 
 
-def test_trees_stand_on_the_floor_of_the_fixed_frame(scene):
+def test_every_tree_is_drawn_on_the_floor_of_the_fixed_frame(scene):
     """A walker with its root at the hip next to an arm with its root at the floor."""
     two = tree({"arm/base": None, "arm/tip": "arm/base", "walker/hip": None, "walker/foot": "walker/hip"})
     shown = snapshot(two, {"arm/tip": at(z=1.0), "walker/foot": at(z=-0.9)})

@@ -129,7 +129,7 @@ def test_a_publisher_is_that_of_the_robot_whose_topic_it_writes(options, namespa
         "zstate/r1/@writer/tf/x",
     ],
 )
-def test_tokens_of_anything_else_announce_nothing(token: str):
+def test_other_tokens_announce_nothing(token: str):
     assert wire().parse_token(token, "r1") is None
     assert wire().parse_token(token, "*") is None
 
