@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from zstate import se3
 from zstate.buffer.frame_tree import Edge, TreeSnapshot
 from zstate.buffer.history import HistoryView
-from zstate.buffer.interpolation import PoseInterpolator, bracket_of_edges
+from zstate.buffer.interpolation import rows_around
 from zstate.buffer.tracks import JointTrack, PoseTrack, Track
 from zstate.errors import InPast, InvalidInput, UnknownFrame, format_duration
 
@@ -32,7 +32,6 @@ JointReader: TypeAlias = Callable[[JointTrack, int], tuple[NDArray[np.float64], 
 """``joint_positions`` of a buffer."""
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-_EDGE_POSE = PoseInterpolator(0)
 
 
 class TimeSpan(NamedTuple):
@@ -270,26 +269,16 @@ def _edge_poses(joint_positions: JointReader, track: Track, view: HistoryView, s
             return last.reshape(-1, 7)
         return track.kinematics.edge_poses(last[: track.model.position_count])
     if isinstance(track, PoseTrack):
-        now = bracket_of_edges(view, stamp)
-        assert now is not None  # the view covers the stamp
-        return np.stack(se3.normalize(_EDGE_POSE.value(now), se3.ARRAYS), axis=-1)
+        around = rows_around(view, stamp)
+        assert around is not None  # the view covers the stamp
+        before, after, ratio, _ = around
+        first, second = (se3.unstack(view.rows[row].reshape(-1, 7)) for row in (before, after))
+        return np.stack(se3.normalize(se3.interpolate(first, second, ratio, se3.ARRAYS), se3.ARRAYS), axis=-1)
     try:
         positions, _ = joint_positions(track, stamp)
     except (InPast, InvalidInput):  # since then the history has moved on, or the robot was removed
         positions = view.rows[view.first, : track.model.position_count]
     return track.kinematics.edge_poses(positions)
-
-
-def joint_history(track: JointTrack, until: int, duration_s: float, points: int) -> JointHistory:
-    """The samples of ``duration_s`` up to ``until`` [ns]; of more than ``points`` every n-th."""
-    view = track.history.view
-    stamps, rows = view.kept_stamps(), view.kept_rows()
-    first, end = np.searchsorted(stamps, (until - round(duration_s * 1e9), until + 1)).tolist()
-    step = max(1, -(-(end - first) // points))
-    # Counted from the first sample kept, so that consecutive plots choose the same samples.
-    start = first + (-first) % step
-    chosen = slice(start, end, step)
-    return JointHistory(stamps[chosen], rows[chosen, : track.model.position_count])
 
 
 def to_dual(poses: Poses) -> Duals:

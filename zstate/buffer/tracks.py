@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate.buffer.history import History, HistoryView
 from zstate.clock import ClockOffset
-from zstate.errors import LookupFailed
 from zstate.model.joint_transforms import JointTransform, JointTransforms
 from zstate.model.kinematics import Kinematics
 from zstate.model.robot import RobotModel
@@ -161,23 +160,6 @@ class PoseTrack:
 
 
 Track: TypeAlias = JointTrack | PoseTrack
-
-
-F = TypeVar("F", bound=LookupFailed)
-
-
-def with_track_info(failure: F, track: Track) -> F:
-    """The same failure, with what is known of the track and of its writer's clock."""
-    failure.track = track.name
-    owner = track.owner
-    if owner is None:
-        return failure
-    failure.is_recorded = owner.is_recording
-    measured = None if track.writer is None else owner.clock_offsets.get(track.writer)
-    offset = None if measured is None else measured()
-    if offset is not None:
-        failure.clock_offset_ns, failure.clock_uncertainty_ns = offset
-    return failure
 
 
 class Coverage(NamedTuple):
