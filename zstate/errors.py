@@ -36,9 +36,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from zstate._util.format import difference_text, format_duration, format_time
+
+E = TypeVar("E", bound="ZStateError")
 
 # A smaller clock offset does not explain a failed lookup.
 _LEAST_OFFSET_NS = 1_000_000
@@ -72,7 +74,7 @@ class ZStateError(Exception):
         return _restored, (type(self), self.args, self.facts())
 
 
-def _restored(kind: type[ZStateError], texts: tuple[Any, ...], facts: dict[str, Any]) -> ZStateError:
+def _restored(kind: type[E], texts: tuple[Any, ...], facts: dict[str, Any]) -> E:
     # Bypasses the constructor: pickle does not pass its keyword-only arguments.
     error = kind.__new__(kind)
     error.args = texts
@@ -583,9 +585,7 @@ def as_timeout(reason: LookupFailed, waited_s: float) -> WaitTimeout:
 
 
 def _restored_timeout(reason: type[LookupFailed], facts: dict[str, Any]) -> WaitTimeout:
-    error = _timeout_class(reason).__new__(_timeout_class(reason))
-    error.__dict__.update(facts)
-    return error
+    return _restored(_timeout_class(reason), (), facts)
 
 
 @cache

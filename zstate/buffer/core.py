@@ -107,18 +107,14 @@ class BufferCore:
                 raise InvalidInput(f"the prefix of a robot begins its frames' names; {problem}")
             prefix = prefix.removesuffix("/")
         if interpolation not in get_args(Interpolation):
-            raise InvalidInput(
-                f"interpolation is one of {', '.join(get_args(Interpolation))}; got {interpolation!r}"
-            )
+            kinds = ", ".join(get_args(Interpolation))
+            raise InvalidInput(f"interpolation is one of {kinds}; got {interpolation!r}")
         track = JointTrack(model, prefix, self._span_ns, interpolation)
         track.owner = self._owner
         with self._lock, self._tree.transaction():
             if prefix and self._tree.robots.get(prefix) is not None:
-                raise InsertRefused(
-                    f"there is a robot {prefix!r} in this buffer; remove_robot first",
-                    reason="second writer",
-                    edge=(prefix, model.root),
-                )
+                text = f"there is a robot {prefix!r} in this buffer; remove_robot first"
+                raise InsertRefused(text, reason="second writer", edge=(prefix, model.root))
             self._tree.add_frame(track.frame(model.root))
             for index, form in enumerate(track.forms):
                 parent, child = track.edge(form)
@@ -190,7 +186,9 @@ class BufferCore:
         with self._lock:
             if track.owner is not self._owner:
                 self._check_owned(track)
-            inserted = track.try_insert(stamp, positions, velocities)
+            inserted = None
+            if track.has_plain_joints:
+                inserted = track.history.try_insert(stamp, positions, velocities, track.position_count)
         if inserted:
             # Nearly every sample ends here, without the call in between.
             self._waiters.notify(track)
@@ -240,11 +238,8 @@ class BufferCore:
         """
         edge = (transform.target, transform.source)
         if transform.stamp is None:
-            raise InsertRefused(
-                f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves",
-                reason="no stamp",
-                edge=edge,
-            )
+            text = f"{edge[0]!r} -> {edge[1]!r} has no stamp; use insert_static for an edge that never moves"
+            raise InsertRefused(text, reason="no stamp", edge=edge)
         return self._insert_poses((edge,), transform.stamp, transform.pose7[None], writer)
 
     def insert_many(
@@ -313,11 +308,8 @@ class BufferCore:
                 raise InvalidInput(f"there is no frame {child!r} to withdraw{hint}")
             edge = self._tree.frames[name]
             if edge is not None and edge.robot is not None:
-                raise InsertRefused(
-                    f"{name!r} is placed by {edge.writer}; remove_robot removes the whole robot",
-                    reason="second writer",
-                    edge=edge.names,
-                )
+                text = f"{name!r} is placed by {edge.writer}; remove_robot removes the whole robot"
+                raise InsertRefused(text, reason="second writer", edge=edge.names)
             if edge is not None:
                 self._pose_tracks.split_edge(edge.names)
             self._tree.detach(name)
@@ -374,8 +366,7 @@ class BufferCore:
                 f"the buffer was given a clock of {given!r} time, and now one of {clock.domain!r} time; "
                 "give both the same, or a buffer without a clock"
             )
-        self.clock = clock
-        self.domain.given = clock.domain
+        self.clock, self.domain.given = clock, clock.domain
 
     def domain_between(self, target: str, source: str) -> str | None:
         """The clock domain of transforms between two frames, None if not known. Raises as ``plan``."""

@@ -249,32 +249,27 @@ class FrameTree:
         """Raises InsertRefused for bad names, a self edge, a second parent and a loop."""
         self.check_names(parent, child)
         if parent == child:
-            raise InsertRefused(
-                f"{parent!r} -> {child!r}: a frame cannot be placed on itself",
-                reason="self edge",
-                edge=(parent, child),
-            )
+            text = f"{parent!r} -> {child!r}: a frame cannot be placed on itself"
+            raise InsertRefused(text, reason="self edge", edge=(parent, child))
         existing = self.frames.get(child)
         if existing is not None and existing.parent != parent:
-            raise InsertRefused(
+            text = (
                 f"{child!r} has the parent {existing.parent!r}{_by(existing.writer)} and cannot get a second "
-                f"one, {parent!r}{_by(writer)}; withdraw({child!r}) first if it really moved",
-                reason="second parent",
-                edge=(parent, child),
+                f"one, {parent!r}{_by(writer)}; withdraw({child!r}) first if it really moved"
             )
+            raise InsertRefused(text, reason="second parent", edge=(parent, child))
         if existing is not None or child not in self.frames:
             return
         chain = [child]
         for edge in self.edges_above(parent):
             chain.insert(1, edge.child)
             if edge.parent == child:
-                raise InsertRefused(
+                text = (
                     f"{parent!r} -> {child!r}{_by(writer)} would close the loop "
                     f"{' -> '.join(map(repr, chain))} -> {child!r}; "
-                    f"{edge.parent!r} -> {edge.child!r} is written{_by(edge.writer) or ' by hand'}",
-                    reason="loop",
-                    edge=(parent, child),
+                    f"{edge.parent!r} -> {edge.child!r} is written{_by(edge.writer) or ' by hand'}"
                 )
+                raise InsertRefused(text, reason="loop", edge=(parent, child))
 
     @staticmethod
     def check_names(parent: str, child: str) -> None:
@@ -332,11 +327,8 @@ class FrameTree:
             return name
         candidates = [full for full in self.names.with_bare(name) if full.split("/", 1)[0] in self.robots]
         if len(candidates) > 1:
-            raise InsertRefused(
-                f"the frame name {name!r} is not unique: {', '.join(candidates)}; name it in full",
-                reason="frame name",
-                edge=(name, name),
-            )
+            text = f"the frame name {name!r} is not unique: {', '.join(candidates)}; name it in full"
+            raise InsertRefused(text, reason="frame name", edge=(name, name))
         return candidates[0] if candidates else name
 
     def resolve(self, name: str, target: str, source: str) -> str:

@@ -52,9 +52,9 @@ class JointTrack:
         self.model_writer: str | None = None
         self.owner: TrackOwner | None = None
         self.history = History(model.position_count, span_ns)
-        # Quaternions of floating joints have to be checked and normalised.
-        self._has_plain_joints = all(form.kind != "floating" for form in self.forms)
-        self._position_count = model.position_count
+        self.position_count = model.position_count
+        self.has_plain_joints = not self._table.has_floats
+        """Whether there are no floating joints, whose quaternions have to be checked and normalised."""
 
     def __repr__(self) -> str:
         return f"<track of {self.name!r}, {self.history.view.size} samples>"
@@ -102,12 +102,6 @@ class JointTrack:
         if isinstance(positions, bytes) and len(positions) % 8 == 0:
             positions = np.frombuffer(positions, "<f8")
         return self._table.normalised(self.model.check_positions(positions))
-
-    def try_insert(self, stamp: object, positions: object, velocities: object) -> bool | None:
-        """``insert`` of unchecked input; None if ``check_positions`` and ``insert`` have to be used."""
-        if not self._has_plain_joints:
-            return None
-        return self.history.try_insert(stamp, positions, velocities, self._position_count)
 
     def insert(
         self, stamp: int, positions: NDArray[np.float64], velocities: NDArray[np.float64] | None

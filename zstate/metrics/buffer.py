@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -80,22 +81,11 @@ class InstrumentedBuffer(TransformBuffer):
         with self._counting:
             return dict(self._failures)
 
-    def lookup(
-        self,
-        target: str,
-        source: str,
-        at: int | None = None,
-        *,
-        timeout_s: float = 0.0,
-        max_age_s: float | None = None,
-        predict_s: float = 0.0,
-    ) -> Transform:
+    def lookup(self, target: str, source: str, at: int | None = None, **options: Any) -> Transform:
         with self._counting:
             self._lookups += 1
         try:
-            return super().lookup(
-                target, source, at, timeout_s=timeout_s, max_age_s=max_age_s, predict_s=predict_s
-            )
+            return super().lookup(target, source, at, **options)
         except LookupFailed as error:
             kind = error.reason if isinstance(error, WaitTimeout) else type(error)
             with self._counting:
