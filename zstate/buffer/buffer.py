@@ -282,10 +282,7 @@ class TransformBuffer(BufferCore):
         return transform
 
     def _lookup_or_expect(self, query: Query, waiter: Waiter) -> Transform | LookupFailed:
-        """The transform; or the reason against it, with the wake condition of ``waiter`` set.
-
-        Raises a reason that no later insert can end.
-        """
+        """The transform, or the reason that ``waiter`` expects to end. Raises one that no insert can end."""
         version = self._tree.version
         try:
             return self._lookup(query)

@@ -342,10 +342,7 @@ class FrameTree:
         raise UnknownFrame(target, source, name=name, near_misses=near, frame_count=len(self.names))
 
     def path(self, target: str, source: str) -> TreePath:
-        """The edges between two frames.
-
-        Raises UnknownFrame, AmbiguousFrame, Disconnected or ClockMismatch.
-        """
+        """The edges between both. Raises UnknownFrame, AmbiguousFrame, Disconnected or ClockMismatch."""
         target_frame = self.resolve(target, target, source)
         source_frame = self.resolve(source, target, source)
         parts = self._split_at_common_ancestor(target_frame, source_frame)

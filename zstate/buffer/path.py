@@ -104,10 +104,7 @@ class TransformPath:
         """Raises the reason why there is no transform now, if it is found at once."""
 
     def transform(self, stamp: int | None, predict_ns: int = 0) -> Transform:
-        """The transform at ``stamp``, or at the latest instant.
-
-        Raises NoData, InPast, InFuture, Stale or NotFinite.
-        """
+        """The transform at ``stamp``, or the latest. Raises NoData, InPast, InFuture, Stale or NotFinite."""
         transform = self.at(stamp)
         if transform is not None:
             return transform
