@@ -298,7 +298,7 @@ class TransformBuffer(BufferCore):
         except LookupFailed as reason:
             return self._expect_change(query, reason, waiter, version)
         newer = None if transform.stamp is None else transform.stamp + 1
-        waiter.expect(WakeCondition(dependencies, dict.fromkeys(path.tracks, newer)), version)
+        waiter.expect(WakeCondition(dependencies, {use.track: newer for use in path.uses}), version)
         return transform
 
     def _expect_change(
@@ -365,11 +365,11 @@ class TransformBuffer(BufferCore):
         """
         self._check_owned(track)
         path = joints_path(track, self._read_views)
-        readout = path.read(None if at is None else check_stamp(at))
-        positions = np.hstack([np.empty(0), *readout.values[0]])
+        values, stamp, *_ = path.read(None if at is None else check_stamp(at))
+        positions = np.hstack([np.empty(0), *values[0]])
         if not np.isfinite(positions).all():
-            raise path.not_finite(readout.values, readout.stamp)
-        return positions, readout.stamp
+            raise path.not_finite(values, stamp)
+        return positions, stamp
 
     def link_poses(self, track: JointTrack, at: int | None = None) -> tuple[NDArray[np.float64], int]:
         """Every link of one robot at a stamp, and that stamp: (L, 7), rows as ``track.model.links``.

@@ -17,7 +17,7 @@ from zstate.buffer.frame_tree import Edge, FrameInfo, FrameTree, PathDependencie
 from zstate.buffer.history import HistoryView, insert_together, keep_only_around
 from zstate.buffer.path import TrackUse, TransformPath, compile_path
 from zstate.buffer.pose_tracks import EdgeNames, Poses, PoseTrackTable, TooOld, check_poses, second_writer
-from zstate.buffer.tracks import ClockOffsets, Interpolation, JointTrack, PoseTrack, Track, TrackOwner
+from zstate.buffer.tracks import Interpolation, JointTrack, PoseTrack, Track, TrackOwner
 from zstate.buffer.waiting import WaiterRegistry
 from zstate.checks import check_names, name_problem
 from zstate.clock import Clock, SystemClock, check_stamp
@@ -56,6 +56,8 @@ class BufferCore:
         self.ignored = 0
         """The number of samples that were older than the history reaches."""
         self._owner = TrackOwner()
+        self.clock_offsets = self._owner.clock_offsets
+        """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
         self._span_ns = round(history_s * 1e9)
         self._lock = fork_safe(threading.RLock())
         self._writes = 0
@@ -64,11 +66,6 @@ class BufferCore:
         self._pose_tracks = PoseTrackTable(self._tree, self._span_ns, self._owner)
         self._paths: dict[tuple[str, str], CachedPath] = {}
         self._stop_reason = ""
-
-    @property
-    def clock_offsets(self) -> ClockOffsets:
-        """By writer: a function that returns how far its clock is ahead of this host's, None if not known."""
-        return self._owner.clock_offsets
 
     @property
     def is_recording(self) -> bool:

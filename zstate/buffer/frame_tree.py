@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from operator import itemgetter
 from typing import Literal, NamedTuple
 
 from zstate import se3
@@ -170,14 +171,6 @@ def _bare(name: str) -> str:
     return "" if bare.startswith("/") else bare
 
 
-class _RemovedEdge(NamedTuple):
-    """An edge that was removed, its writer, and when, by a monotonic clock [s]."""
-
-    edge: tuple[str, str]
-    writer: str | None
-    at_s: float
-
-
 class FrameTree:
     """Frames by name, one parent each. Changes need the buffer's lock.
 
@@ -191,7 +184,8 @@ class FrameTree:
         self.frames: dict[str, Edge | None] = {}
         self.robots: dict[str, JointTrack | None] = {}
         self.names = FrameNameIndex()
-        self._removed: dict[str, _RemovedEdge] = {}
+        # By child: when its edge was removed, by a monotonic clock [s], the edge's names and its writer.
+        self._removed: dict[str, tuple[float, tuple[str, str], str | None]] = {}
         # The edges of frames before a transaction changed them; None outside of one.
         self._before: dict[str, Edge | None] | None = None
 
@@ -229,7 +223,7 @@ class FrameTree:
         """Remove the edge that places ``child``; the frame stays."""
         edge = self.frames.get(child)
         if edge is not None:
-            self._removed[child] = _RemovedEdge(edge.names, edge.writer, time.monotonic())
+            self._removed[child] = (time.monotonic(), edge.names, edge.writer)
         self._place(child, None)
 
     def invalidate(self, track: JointTrack) -> None:
@@ -351,9 +345,8 @@ class FrameTree:
             failure = Disconnected(target, source, roots=roots)
             removed = [self._removed[root] for root in roots if root in self._removed]
             if removed:
-                last = max(removed, key=lambda one: one.at_s)
-                failure.edge, failure.writer = last.edge, last.writer
-                failure.gone_s = time.monotonic() - last.at_s
+                at_s, failure.edge, failure.writer = max(removed, key=itemgetter(0))
+                failure.gone_s = time.monotonic() - at_s
             raise failure
         edges = [edge for part in parts for edge in part]
         dependencies = self._depend_on({target: target_frame, source: source_frame}, edges)

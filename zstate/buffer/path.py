@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -64,38 +65,20 @@ class TrackUse(NamedTuple):
     edge: tuple[str, str]
 
 
-class JointReadout(NamedTuple):
-    """The values of all interpolators of a path at an instant, and how they were made."""
-
-    values: list[list[se3.Component]]
-    stamp: int
-    kind: Kind
-    predicted_ns: int
-
-
+@dataclass(eq=False, repr=False)
 class TransformPath:
-    """From ``source`` to ``target`` by their common ancestor.
+    """A path, from the common ancestor of two frames down to each; ``uses`` are the tracks that it reads.
 
     ``domain`` is the clock domain of its moving edges, empty if none is known.
     """
 
-    def __init__(
-        self,
-        names: tuple[str, str],
-        steps_to_target: Sequence[Step],
-        steps_to_source: Sequence[Step],
-        uses: Sequence[TrackUse],
-        read_views: ViewReader,
-        *,
-        domain: str = "",
-    ) -> None:
-        self.target, self.source = names
-        self.steps_to_target = steps_to_target
-        self.steps_to_source = steps_to_source
-        self.uses = tuple(uses)
-        self.tracks = tuple(use.track for use in uses)
-        self.domain = domain
-        self._read_views = read_views
+    target: str
+    source: str
+    steps_to_target: Sequence[Step]
+    steps_to_source: Sequence[Step]
+    uses: Sequence[TrackUse]
+    read_views: ViewReader
+    domain: str = ""
 
     def at(self, stamp: object = None, /) -> Transform | None:
         """The transform, if it is found at once; None if ``transform`` has to be used."""
@@ -120,11 +103,14 @@ class TransformPath:
         """The newest instant that every moving edge has reached [ns]. Raises NoData or Stale."""
         if not self.uses:
             raise NoData(self.target, self.source)
-        return self._latest(self._read_views(self.uses))
+        return self._latest(self.read_views(self.uses))
 
-    def read(self, stamp: int | None, predict_ns: int = 0) -> JointReadout:
-        """The values of each track at ``stamp``, or at the latest instant. Raises as ``transform``."""
-        views = self._read_views(self.uses)
+    def read(self, stamp: int | None, predict_ns: int = 0) -> tuple[Values, int, Kind, int]:
+        """The values of each track at ``stamp``, or at the latest instant. Raises as ``transform``.
+
+        Also the stamp [ns], how the values were made, and how far they are predicted [ns].
+        """
+        views = self.read_views(self.uses)
         at = self._latest(views) if stamp is None else stamp
         kind: Kind = "exact"
         predicted_ns = 0
@@ -140,11 +126,11 @@ class TransformPath:
                     raise self.failure_at(at, views, predict_ns)
                 kind, predicted_ns = "predicted", max(predicted_ns, at - view.newest)
                 values.append(predicted)
-        return JointReadout(values, at, kind, predicted_ns)
+        return values, at, kind, predicted_ns
 
     def motion(self, stamp: int | None) -> tuple[Motion, int | None]:
         """Pose and velocity of the source in the target. Raises as ``transform``; NoData without rates."""
-        views = self._read_views(self.uses)
+        views = self.read_views(self.uses)
         at = stamp if stamp is not None or not self.uses else self._latest(views)
         values: list[list[se3.Component]] = []
         rates: list[list[se3.Component]] = []
@@ -167,7 +153,7 @@ class TransformPath:
 
     def poses(self, stamps: Stamps) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The pose at each stamp: (T, 7), NaN where it is not known, and (T,) where it is."""
-        views = self._read_views(self.uses)
+        views = self.read_views(self.uses)
         valid = np.ones(len(stamps), dtype=np.bool_)
         for view in views:
             valid &= (stamps >= view.oldest) & (stamps <= view.newest) if view.size else False
@@ -330,7 +316,7 @@ def compile_path(
     uses = tuple(by_track.values())
     is_cubic = any(getattr(one, "cubic", False) for use in uses for one in use.interpolators)
     kind = CompiledPath if compiled and kernel == "c" and not is_cubic else TransformPath
-    return kind((target, source), steps_to_target, steps_to_source, uses, read_views, domain=edges.domain)
+    return kind(target, source, steps_to_target, steps_to_source, uses, read_views, edges.domain)
 
 
 def joints_path(track: JointTrack, read_views: ViewReader) -> TransformPath:
@@ -339,7 +325,7 @@ def joints_path(track: JointTrack, read_views: ViewReader) -> TransformPath:
     interpolators = [one for index, _ in joints for one in _joint_interpolators(track, index)]
     root = track.frame(track.model.root)
     edge = track.edge(track.forms[joints[0][0]]) if joints else (root, root)
-    return TransformPath((root, root), (), (), [TrackUse(track, interpolators, edge)], read_views)
+    return TransformPath(root, root, (), (), [TrackUse(track, interpolators, edge)], read_views)
 
 
 def _steps(edges: Sequence[Edge], uses: dict[Track, TrackUse]) -> list[Step]:

@@ -39,10 +39,7 @@ class PoseTrackTable:
         self._version = -1
 
     def track_rows(self, names: tuple[EdgeNames, ...], stamp: int, writer: str | None) -> TrackRows:
-        """The tracks for a sample of these edges.
-
-        Raises InsertRefused for an edge that is not possible, TooOld for a stamp before a history.
-        """
+        """The tracks for a sample of these edges. Raises InsertRefused, or TooOld for too old a stamp."""
         if self._version != self._tree.version:
             self._cache.clear()
         try:

@@ -158,14 +158,6 @@ class FramePoses:
         return up, duals
 
 
-class _TrackPart(NamedTuple):
-    """A track of a snapshot: row ``rows[k]`` of the table is edge ``edges[k]`` of the track."""
-
-    track: Track
-    rows: Rows
-    edges: Rows
-
-
 class SnapshotReader:
     """Reads all frames of a tree; of ``robots`` only, with the frames above theirs, if there are any."""
 
@@ -188,14 +180,13 @@ class SnapshotReader:
         for row, edge in enumerate(edges):
             if edge is not None and edge.track is not None:
                 places.setdefault(edge.track, []).append((row, edge.index))
-        self._parts = tuple(
-            _TrackPart(track, *np.array(pairs, dtype=np.intp).T) for track, pairs in places.items()
-        )
-        self._writers = [part.track.writer for part in self._parts]
+        # Of each track: row ``rows[k]`` of the table is edge ``edges[k]`` of the track.
+        self._parts = {track: np.array(pairs, dtype=np.intp).T for track, pairs in places.items()}
+        self._writers = [track.writer for track in self._parts]
 
     def is_current(self, version: int) -> bool:
         """Whether tree and writers are unchanged. A writer may become known after its first samples."""
-        return version == self._version and self._writers == [part.track.writer for part in self._parts]
+        return version == self._version and self._writers == [track.writer for track in self._parts]
 
     def read(self, joint_positions: JointReader, stamp: int | None, hold_ns: int) -> FramePoses:
         """As ``TransformBuffer.snapshot``."""
@@ -203,7 +194,7 @@ class SnapshotReader:
         known = np.ones(len(poses), dtype=np.bool_)
         reasons: dict[int, str] = {}
         newest: list[int] = []
-        for track, rows, edges in self._parts:
+        for track, (rows, edges) in self._parts.items():
             view = track.history.view
             reason = _reason_against(track, view, stamp, hold_ns)
             if reason is None:

@@ -170,10 +170,7 @@ class FrameOwnership:
                 self._insert(claim)
 
     def place_model(self, robot: str, model: RobotModel, before: JointTrack | None) -> JointTrack:
-        """Add a robot's model to the buffer, replacing the track ``before``.
-
-        Conflicting edges of any writer are withdrawn. Raises InsertRefused.
-        """
+        """Replace the track ``before`` by a model; conflicting edges are withdrawn. Raises InsertRefused."""
         with self._lock:
             if before is not None:
                 self.buffer.remove_robot(before)
@@ -212,10 +209,7 @@ class FrameOwnership:
     def set_statics(
         self, source: EdgeSource, edges: Mapping[EdgeNames, Transform], *, adds: bool = False
     ) -> None:
-        """Replace the static edges of ``source``.
-
-        With ``adds``, as in ROS, only earlier edges of the same children are replaced.
-        """
+        """Replace the static edges of ``source``; with ``adds``, as in ROS, only of the same children."""
         with self._lock:
             edges = {self._named(names): pose for names, pose in edges.items()}
             children = {child for _, child in edges}

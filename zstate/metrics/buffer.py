@@ -63,17 +63,13 @@ class InstrumentedBuffer(TransformBuffer):
         super().__init__(history_s, clock)
         self.latency = Histogram(LATENCY_BOUNDS_S)
         self._counting = fork_safe_lock()
-        self._lookups = 0
+        self.lookups = 0
+        """Number of calls of ``lookup``."""
         self._failures: Counter[str] = Counter()
 
     def latency_of(self, robot: str) -> Histogram:
         """The latency of one robot; here that of all robots."""
         return self.latency
-
-    @property
-    def lookups(self) -> int:
-        """Number of calls of ``lookup``."""
-        return self._lookups
 
     @property
     def failures(self) -> dict[str, int]:
@@ -83,7 +79,7 @@ class InstrumentedBuffer(TransformBuffer):
 
     def lookup(self, target: str, source: str, at: int | None = None, **options: Any) -> Transform:
         with self._counting:
-            self._lookups += 1
+            self.lookups += 1
         try:
             return super().lookup(target, source, at, **options)
         except LookupFailed as error:
@@ -134,10 +130,7 @@ class RobotMeasure:
 
 
 class MeteredBuffer(InstrumentedBuffer):
-    """An InstrumentedBuffer that also measures, for each robot, when each sample can be looked up.
-
-    ``has_samples`` is set at the first one.
-    """
+    """An InstrumentedBuffer that also measures each robot; ``has_samples`` is set at the first sample."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         super().__init__(clock=clock)
