@@ -183,8 +183,7 @@ class PoseInterpolator:
     velocity: int = -1
 
     def _pose(self, row: Any) -> Pose:
-        c = self.column
-        return (row[c], row[c + 1], row[c + 2], row[c + 3], row[c + 4], row[c + 5], row[c + 6])
+        return tuple(row[self.column : self.column + 7])  # type: ignore[return-value]
 
     def value(self, now: Bracket) -> Pose:
         """The pose at the instant."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -19,16 +20,14 @@ Interpolation = Literal["linear", "hermite"]
 ClockOffsets: TypeAlias = dict[str, Callable[[], ClockOffset | None]]
 
 
+@dataclass(eq=False, slots=True)
 class TrackOwner:
     """Facts about a buffer that its tracks and their errors need."""
 
-    __slots__ = ("clock_offsets", "is_recording")
-
-    def __init__(self) -> None:
-        self.clock_offsets: ClockOffsets = {}
-        """By writer: how far its clock is ahead of the clock of this host."""
-        self.is_recording = False
-        """Whether the samples come from a file: no sample is added later."""
+    clock_offsets: ClockOffsets = field(default_factory=dict[str, Callable[[], ClockOffset | None]])
+    """By writer: how far its clock is ahead of the clock of this host."""
+    is_recording: bool = False
+    """Whether the samples come from a file: no sample is added later."""
 
 
 class JointTrack:
