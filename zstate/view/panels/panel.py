@@ -1,4 +1,4 @@
-"""Panel interface, the context of an update, and widgets with two-way binding."""
+"""Panel interface, the context of an update, and widgets that the user and the program change."""
 
 from __future__ import annotations
 
@@ -73,30 +73,24 @@ class BoundWidget(Generic[T]):
             self._handle.value = self._last = value
 
 
-class FrameDropdown:
+class FrameDropdown(BoundWidget[str]):
     """Dropdown of frame names that come and go; ``placeholder`` is its text without a selection."""
 
     def __init__(self, gui: viser.GuiApi, label: str, placeholder: str, hint: str | None = None) -> None:
         self._placeholder = placeholder
         self._list: viser.GuiDropdownHandle[str] = gui.add_dropdown(label, (placeholder,), hint=hint)
-        self._bound = BoundWidget[str](self._list)
+        super().__init__(self._list)
 
     @property
     def frame(self) -> str | None:
         """The selected name."""
-        value = self._bound.value
-        return None if value == self._placeholder else value
+        return None if self.value == self._placeholder else self.value
 
     def poll_change(self) -> str | None:
-        """The name that the user has selected since the last call; None if unchanged."""
-        value = self._bound.poll_change()
+        value = super().poll_change()
         return None if value == self._placeholder else value
-
-    def show(self, name: str) -> None:
-        """Select ``name``, which is one of the options."""
-        self._bound.show(name)
 
     def set_options(self, names: Sequence[str], selected: str | None) -> None:
         """Offer ``names``, and select one of them or none."""
         self._list.options = tuple(names) if selected is not None else (self._placeholder, *names)
-        self._bound.show(self._placeholder if selected is None else selected)
+        self.show(self._placeholder if selected is None else selected)

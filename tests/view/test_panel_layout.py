@@ -9,8 +9,8 @@ from zstate.buffer.buffer import TransformBuffer
 from zstate.clock import ManualClock
 from zstate.transform import Transform
 from zstate.view.data_source import ViewSource
-from zstate.view.panels.layout import PanelLayout
 from zstate.view.scene.scene import Scene
+from zstate.view.view import PanelLayout
 
 
 @pytest.fixture

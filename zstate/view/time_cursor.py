@@ -1,23 +1,14 @@
-"""Tab Time: the time cursor (live, paused or playing), and the slider that moves it."""
+"""TimeCursor: the instant on display, live, paused or playing."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from datetime import datetime
-
-import viser
 
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.snapshot import TimeSpan
-from zstate.clock import SYSTEM
 from zstate.errors import InvalidInput
-from zstate.view.panels import html
-from zstate.view.panels.panel import BoundWidget, PanelContext
-
-_SPEEDS: tuple[str, ...] = ("0.1x", "0.25x", "0.5x", "1x", "2x", "5x", "10x")
-_STEP_S = 0.01
 
 
 class TimeCursor:
@@ -118,56 +109,3 @@ class TimeCursor:
         if self._at is not None:
             # Samples older than the buffer's history are gone.
             self._at = min(max(self._at, span.oldest), span.newest)
-
-
-class TimePanel:
-    """Pause, seek and play at a selectable speed.
-
-    The slider counts seconds: of a recording from its beginning, live backwards from the newest sample.
-    """
-
-    def __init__(self, gui: viser.GuiApi, cursor: TimeCursor) -> None:
-        self._cursor = cursor
-        self._state = gui.add_html("")
-        actions = {"Live": cursor.go_live} if cursor.can_be_live else {}
-        actions |= {"Pause": cursor.pause, "Play": cursor.play}
-        buttons: viser.GuiButtonGroupHandle = gui.add_button_group("Time", tuple(actions))
-        buttons.on_click(lambda event: actions[event.target.value]())
-        self._slider = gui.add_slider("Seconds", min=0.0, max=_STEP_S, step=_STEP_S, initial_value=0.0)
-        self._seconds = BoundWidget[float](self._slider)
-        speeds: viser.GuiDropdownHandle[str] = gui.add_dropdown("Speed", _SPEEDS, initial_value="1x")
-        self._speed = BoundWidget[str](speeds)
-        self._span: TimeSpan | None = None
-
-    def update(self, context: PanelContext) -> None:
-        cursor = self._cursor
-        speed, seconds = self._speed.poll_change(), self._seconds.poll_change()
-        if speed is not None:
-            cursor.speed = float(speed.removesuffix("x"))
-        if seconds is not None and self._span is not None:
-            cursor.seek(self._origin(self._span) + round(seconds * 1e9))
-            return
-        span = context.buffer.span()
-        if span is None:
-            return
-        if cursor.is_live and self._span is not None and self._seconds.value == 0.0:
-            # The range of an unused slider is sent about once a second, not with every update.
-            span = self._span if span.newest - self._span.newest < 1_000_000_000 else span
-        length_s = max(_STEP_S, round((span.newest - span.oldest) / 1e9, 2))
-        self._slider.min, self._slider.max = (-length_s, 0.0) if cursor.can_be_live else (0.0, length_s)
-        self._span = span
-        stamp = context.snapshot.stamp
-        at = span.newest if cursor.is_live or stamp is None else stamp
-        self._seconds.show(round((at - self._origin(span)) / 1e9, 2))
-        text = f"{'Playing' if cursor.is_playing else 'Paused'} at {_stamp_text(at, context.domain)}"
-        self._state.content = html.paragraph("Live" if cursor.is_live else text)
-
-    def _origin(self, span: TimeSpan) -> int:
-        return span.newest if self._cursor.can_be_live else span.oldest
-
-
-def _stamp_text(stamp: int, domain: str | None) -> str:
-    if domain not in (None, SYSTEM):
-        return f"{stamp / 1e9:.2f} s of {domain!r} time"
-    then = datetime.fromtimestamp(stamp // 1_000_000_000).astimezone()
-    return f"{then:%Y-%m-%d %H:%M:%S}.{stamp // 10_000_000 % 100:02d}"

@@ -1,23 +1,40 @@
-"""Tab Joints: sliders that move a robot, and plots of joint positions over time."""
+"""Tabs Joints and Time: sliders that move a robot, plots of its joints, and the time cursor."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from datetime import datetime
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 from viser import uplot
 
+from zstate.buffer.snapshot import TimeSpan
+from zstate.clock import SYSTEM
 from zstate.model.robot import coordinate_names
 from zstate.view.data_source import ViewSource
 from zstate.view.panels import html
 from zstate.view.panels.html import format_number
 from zstate.view.panels.panel import BoundWidget, PanelContext
 from zstate.view.sliders import SliderPublisher, SliderSpec
+from zstate.view.time_cursor import TimeCursor
 
 _UNITS: tuple[str, ...] = ("rad", "deg")
+_NO_ROBOT: tuple[str, ...] = ("(none)",)
+_ALL = "all joints"
+_PLOT_S = 10.0
+_PLOT_HEIGHT = 180
+_PLOT_EVERY = 3
+"""A plot is redrawn with every third update: it costs more than any other panel."""
+
+_COLORS = ("#1971c2", "#e8590c", "#2f9e44", "#c2255c", "#6741d9", "#0c8599", "#f08c00", "#495057")
+_LEGEND = uplot.Legend(show=True, live=False)
+_SCALES = {"x": uplot.Scale(time=False, range=(-_PLOT_S, 0.0))}
+
+_SPEEDS: tuple[str, ...] = ("0.1x", "0.25x", "0.5x", "1x", "2x", "5x", "10x")
+_STEP_S = 0.01
 
 
 class SlidersPanel:
@@ -31,13 +48,13 @@ class SlidersPanel:
         self._publisher = publisher
         self._state = gui.add_html("")
         self._retry = gui.add_button("Try again", visible=False)
-        self._retry.on_click(self._reopen)
-        actions: dict[str, Callable[[], None]] = {
-            "Home": publisher.home,
-            "Zero": publisher.zero,
-            "Random": publisher.random,
-            "Sine": self._toggle_sine,
-        }
+        self._retry.on_click(lambda _: publisher.open())
+
+        def toggle_sine() -> None:
+            publisher.sine_enabled = not publisher.sine_enabled
+
+        actions: dict[str, Callable[[], None]] = {"Home": publisher.home, "Zero": publisher.zero}
+        actions |= {"Random": publisher.random, "Sine": toggle_sine}
         buttons: viser.GuiButtonGroupHandle = gui.add_button_group("All joints", tuple(actions))
         buttons.on_click(lambda event: actions[event.target.value]())
         units: viser.GuiDropdownHandle[str] = gui.add_dropdown("Angles in", _UNITS)
@@ -56,7 +73,7 @@ class SlidersPanel:
             publisher.rate_hz = rate_hz
         if self._unit.poll_change() is not None:
             for slider in self._sliders:
-                slider.remove()
+                slider.handle.remove()
             self._sliders = self._new_sliders()
         robot, conflict, achieved_hz = publisher.robot, publisher.conflict, publisher.achieved_hz
         for slider, value in zip(self._sliders, publisher.values.tolist(), strict=True):
@@ -77,18 +94,10 @@ class SlidersPanel:
         self._mimics.content = html.pairs(rows) if rows else ""
 
     def _new_sliders(self) -> list[_JointSlider]:
-        publisher = self._publisher
+        publisher, unit = self._publisher, self._unit.value
         with self._folder:
             specs = zip(publisher.mapping.specs, publisher.values.tolist(), strict=True)
-            return [
-                _JointSlider(self._gui, publisher, spec, value, self._unit.value) for spec, value in specs
-            ]
-
-    def _reopen(self, _: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-        self._publisher.open()
-
-    def _toggle_sine(self) -> None:
-        self._publisher.sine_enabled = not self._publisher.sine_enabled
+            return [_JointSlider(self._gui, publisher, spec, value, unit) for spec, value in specs]
 
 
 class _JointSlider:
@@ -106,9 +115,15 @@ class _JointSlider:
         hint = f"{spec.name}: {lower:g} to {upper:g} {unit}"
         value = min(max(self._displayed(value), lower), upper)
         label = f"{spec.name} [m]" if unit == "m" else spec.name
-        self._slider = gui.add_slider(label, lower, max(upper, lower + step), step, value, hint=hint)
-        self._bound = BoundWidget[float](self._slider)
-        self._slider.on_update(self._set)
+        self.handle = gui.add_slider(label, lower, max(upper, lower + step), step, value, hint=hint)
+        self._bound = BoundWidget[float](self.handle)
+        self.handle.on_update(self._set)
+
+    def show(self, value: float, *, disabled: bool) -> None:
+        """Display ``value``, unless the user has just moved this slider."""
+        self.handle.disabled = disabled
+        if self._bound.poll_change() is None:
+            self._bound.show(min(max(self._displayed(value), self.handle.min), self.handle.max))
 
     def _displayed(self, value: float) -> float:
         return round(value * self._scale, self._precision)
@@ -120,27 +135,6 @@ class _JointSlider:
             # A limit is rounded for display, maybe to a value beyond it.
             limited = float(np.clip(value / self._scale, self._spec.lower, self._spec.upper))
             self._publisher.set(self._spec.name, limited)
-
-    def show(self, value: float, *, disabled: bool) -> None:
-        """Display ``value``, unless the user has just moved this slider."""
-        self._slider.disabled = disabled
-        if self._bound.poll_change() is None:
-            self._bound.show(min(max(self._displayed(value), self._slider.min), self._slider.max))
-
-    def remove(self) -> None:
-        self._slider.remove()
-
-
-_NO_ROBOT: tuple[str, ...] = ("(none)",)
-_ALL = "all joints"
-_SECONDS = 10.0
-_HEIGHT = 180
-_EVERY = 3
-"""A plot is redrawn with every third update: it costs more than any other panel."""
-
-_COLORS = ("#1971c2", "#e8590c", "#2f9e44", "#c2255c", "#6741d9", "#0c8599", "#f08c00", "#495057")
-_LEGEND = uplot.Legend(show=True, live=False)
-_SCALES = {"x": uplot.Scale(time=False, range=(-_SECONDS, 0.0))}
 
 
 class PlotsPanel:
@@ -172,32 +166,78 @@ class PlotsPanel:
         track = context.snapshot.tree.robots.get(robot)
         names = () if track is None else coordinate_names(track.model)
         columns = [k for k, name in enumerate(names) if joint in (_ALL, name)]
+        drawn = () if stamp is None else tuple(names[k] for k in columns)
         self._updates += 1
-        if track is None or not columns or stamp is None:
-            self._clear()
-            return
-        drawn = tuple(names[k] for k in columns)
-        if drawn != self._drawn or self._updates % _EVERY == 0:
-            history = context.buffer.joint_history(track, stamp, _SECONDS)
-            data = ((history.stamps - stamp) / 1e9, *history.positions[:, columns].T)
-            self._draw(drawn, data)
-
-    def _clear(self) -> None:
-        if self._plot is not None:
+        if drawn != self._drawn and self._plot is not None:
             self._plot.remove()
             self._plot = None
-        self._drawn = ()
+        is_due = self._plot is None or self._updates % _PLOT_EVERY == 0
+        if track is not None and stamp is not None and drawn and is_due:
+            history = context.buffer.joint_history(track, stamp, _PLOT_S)
+            self._draw(drawn, ((history.stamps - stamp) / 1e9, *history.positions[:, columns].T))
+        self._drawn = drawn
 
     def _draw(self, names: tuple[str, ...], data: tuple[NDArray[np.float64], ...]) -> None:
-        if names == self._drawn and self._plot is not None:
+        if self._plot is not None:
             self._plot.data = data
             return
-        self._clear()
         lines = [
             uplot.Series(label=name, stroke=_COLORS[number % len(_COLORS)], width=1.5)
             for number, name in enumerate(names)
         ]
         series = (uplot.Series(label="s"), *lines)
         with self._folder:
-            self._plot = self._gui.add_uplot(data, series, scales=_SCALES, legend=_LEGEND, height=_HEIGHT)
-        self._drawn = names
+            self._plot = self._gui.add_uplot(
+                data, series, scales=_SCALES, legend=_LEGEND, height=_PLOT_HEIGHT
+            )
+
+
+class TimePanel:
+    """Pause, seek and play at a selectable speed.
+
+    The slider counts seconds: of a recording from its beginning, live backwards from the newest sample.
+    """
+
+    def __init__(self, gui: viser.GuiApi, cursor: TimeCursor) -> None:
+        self._cursor = cursor
+        self._state = gui.add_html("")
+        actions = {"Live": cursor.go_live} if cursor.can_be_live else {}
+        actions |= {"Pause": cursor.pause, "Play": cursor.play}
+        buttons: viser.GuiButtonGroupHandle = gui.add_button_group("Time", tuple(actions))
+        buttons.on_click(lambda event: actions[event.target.value]())
+        self._slider = gui.add_slider("Seconds", min=0.0, max=_STEP_S, step=_STEP_S, initial_value=0.0)
+        self._seconds = BoundWidget[float](self._slider)
+        speeds: viser.GuiDropdownHandle[str] = gui.add_dropdown("Speed", _SPEEDS, initial_value="1x")
+        self._speed = BoundWidget[str](speeds)
+        self._span: TimeSpan | None = None
+
+    def update(self, context: PanelContext) -> None:
+        cursor = self._cursor
+        speed, seconds = self._speed.poll_change(), self._seconds.poll_change()
+        if speed is not None:
+            cursor.speed = float(speed.removesuffix("x"))
+        if seconds is not None and self._span is not None:
+            cursor.seek(self._origin(self._span) + round(seconds * 1e9))
+            return
+        span = context.buffer.span()
+        if span is None:
+            return
+        if cursor.is_live and self._span is not None and self._seconds.value == 0.0:
+            # The range of an unused slider is sent about once a second, not with every update.
+            span = self._span if span.newest - self._span.newest < 1_000_000_000 else span
+        length_s = max(_STEP_S, round((span.newest - span.oldest) / 1e9, 2))
+        self._slider.min, self._slider.max = (-length_s, 0.0) if cursor.can_be_live else (0.0, length_s)
+        self._span = span
+        stamp = context.snapshot.stamp
+        at = span.newest if cursor.is_live or stamp is None else stamp
+        self._seconds.show(round((at - self._origin(span)) / 1e9, 2))
+        if context.domain in (None, SYSTEM):
+            then = datetime.fromtimestamp(at // 1_000_000_000).astimezone()
+            text = f"{then:%Y-%m-%d %H:%M:%S}.{at // 10_000_000 % 100:02d}"
+        else:
+            text = f"{at / 1e9:.2f} s of {context.domain!r} time"
+        text = f"{'Playing' if cursor.is_playing else 'Paused'} at {text}"
+        self._state.content = html.paragraph("Live" if cursor.is_live else text)
+
+    def _origin(self, span: TimeSpan) -> int:
+        return span.newest if self._cursor.can_be_live else span.oldest
