@@ -148,7 +148,7 @@ def _groups(features: list[NDArray[Any]]) -> tuple[NDArray[np.intp], NDArray[np.
     return first, kinds
 
 
-def primitive(shape: Box | Cylinder | Sphere, *, textured: bool = False) -> Mesh:
+def primitive(shape: Box | Cylinder | Sphere, textured: bool) -> Mesh:
     """The mesh of a shape, with texture coordinates if ``textured``.
 
     The image covers each side of a box; it goes once around a cylinder or a sphere, from the lower end

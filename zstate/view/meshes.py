@@ -1,10 +1,14 @@
-"""Meshes of shapes as binary glTF, from files or primitives. The one module that uses trimesh and Pillow."""
+"""Meshes of shapes as binary glTF, from files or primitives, loaded on a background thread.
+
+The one module that uses trimesh and Pillow.
+"""
 
 from __future__ import annotations
 
 import io
+import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,10 +47,7 @@ _COPIED_BYTES = 512 * 1024 * 1024
 
 @dataclass(frozen=True, eq=False)
 class Copy:
-    """A mesh in one colour, as binary glTF, with its bounds [m].
-
-    It is kept while an asset uses it.
-    """
+    """A mesh in one colour, as binary glTF, with its bounds [m]; kept while an asset uses it."""
 
     glb: bytes
     low: Corner
@@ -103,16 +104,16 @@ class Meshes:
         ``base`` is the folder of a URDF file that the user named, see MeshPaths.
         """
         geometry = shape.geometry
-        if not isinstance(geometry, MeshFile):
-            source = (geometry, shape.texture is not None)
-            name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
-            if self._pack(source).triangle_count:
-                return self._colored(source, shape, over, base, name)
-            return MissingFile(name, "nothing can be drawn: its size is zero, or not finite")
-        uri, scale = geometry.uri, geometry.scale
-        return self._read(
-            uri, base, lambda path: replace(self._colored(path, shape, over, base, uri), scale=scale)
-        )
+        if isinstance(geometry, MeshFile):
+            uri, scale = geometry.uri, geometry.scale
+            return self._read(
+                uri, base, lambda path: replace(self._colored(path, shape, over, base, uri), scale=scale)
+            )
+        source = (geometry, shape.texture is not None)
+        name = f"<{type(geometry).__name__.lower()}> of link {shape.link!r}"
+        if self._pack(source).triangle_count:
+            return self._colored(source, shape, over, base, name)
+        return MissingFile(name, "nothing can be drawn: its size is zero, or not finite")
 
     def missing_texture(self, shape: Shape, base: Path | None = None) -> MissingFile | None:
         """Why the texture of the shape cannot be loaded; None if it can, or if there is none."""
@@ -122,14 +123,13 @@ class Meshes:
     def _colored(
         self, source: _Source, shape: Shape, over: Color | None, base: Path | None, name: str
     ) -> MeshAsset:
+        image = self._texture(shape, base) if over is None else None
         if over is not None:
             override = MaterialOverride(over=over)
+        elif isinstance(image, bytes):
+            override = MaterialOverride(Material(shape.color or (1.0, 1.0, 1.0, 1.0), image))
         else:
-            image = self._texture(shape, base)
-            if isinstance(image, bytes):
-                override = MaterialOverride(Material(shape.color or (1.0, 1.0, 1.0, 1.0), image))
-            else:
-                override = MaterialOverride(Material(shape.color or GREY))
+            override = MaterialOverride(Material(shape.color or GREY))
         done = self._copies.get((source, override))
         if done is not None:
             return MeshAsset(done)
@@ -151,10 +151,7 @@ class Meshes:
     def _pack(self, source: _Source) -> Glb:
         done = self._packed.pop(source, None)
         if done is None:
-            meshes = (
-                read_mesh(source) if isinstance(source, Path) else [primitive(source[0], textured=source[1])]
-            )
-            done = Glb(meshes)
+            done = Glb(read_mesh(source) if isinstance(source, Path) else [primitive(*source)])
             self.kept_byte_count += done.byte_count
         self._packed[source] = done
         while self.kept_byte_count > self._kept_bytes and len(self._packed) > 1:
@@ -176,6 +173,67 @@ class Meshes:
             return read(path)
         except (OSError, UnreadableFile) as error:
             return MissingFile(uri, str(error), (str(path.parent),))
+
+
+@dataclass(eq=False)
+class MeshRequest:
+    """A shape to load; ``over`` and ``base`` as for ``Meshes.load``. Requests compare by identity.
+
+    When it ``is_loaded``, ``asset`` is None if it cannot be drawn, and ``missing`` are the files that it
+    lacks: its own, its texture or a copy in its colour.
+    """
+
+    shape: Shape
+    over: Color | None
+    base: Path | None
+    asset: MeshAsset | None = None
+    missing: tuple[MissingFile, ...] = ()
+    is_loaded: bool = False
+
+
+class MeshLoader:
+    """Loads meshes on a background thread that exits when its queue is empty: files do not delay pictures."""
+
+    def __init__(self, meshes: Meshes) -> None:
+        self._meshes = meshes
+        self._lock = threading.Lock()
+        self._queue: list[MeshRequest] = []
+        self._running = False
+
+    def request(self, requests: Sequence[MeshRequest]) -> None:
+        """Queue requests."""
+        with self._lock:
+            self._queue += requests
+            if self._queue and not self._running:
+                self._running = True
+                threading.Thread(target=self._run, name="zstate-meshes", daemon=True).start()
+
+    def cancel(self, requests: Iterable[MeshRequest]) -> None:
+        """Drop requests that are still queued."""
+        cancelled = set(requests)
+        with self._lock:
+            self._queue = [request for request in self._queue if request not in cancelled]
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._queue:
+                    self._running = False
+                    return
+                request = self._queue.pop(0)
+            texture = None
+            try:
+                asset = self._meshes.load(request.shape, request.over, request.base)
+                if request.over is None:
+                    texture = self._meshes.missing_texture(request.shape, request.base)
+            except Exception as error:  # one unforeseen file must not stop the others
+                asset = MissingFile(str(request.shape.geometry), f"{type(error).__name__}: {error}")
+            if isinstance(asset, MeshAsset):
+                request.asset, lacks = asset, (texture, asset.defect)
+            else:
+                lacks = (asset, texture)
+            request.missing = tuple(one for one in lacks if one is not None)
+            request.is_loaded = True
 
 
 class UnreadableFile(ValueError):

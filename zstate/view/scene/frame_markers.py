@@ -1,4 +1,4 @@
-"""Markers of frames: axes, lines to parents, labels with names or with the age of stale robots, trails."""
+"""Markers of frames: axes, lines to parents, labels and trails."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate.buffer.snapshot import FramePoses, FrameTable, Mask, Poses, Rows
+from zstate.buffer.snapshot import FramePoses, Mask, Poses, Rows
 from zstate.view.scene.frame_nodes import FrameNodes, set_instances, wxyzs
 
 _AXIS_LENGTH_M = 0.1
@@ -102,19 +102,17 @@ class NodeLabels:
     ) -> None:
         """Show ``texts``, by frame, and no others."""
         for frame, (path, label) in list(self._labels.items()):
-            if nodes.paths.get(frame) != path:
-                del self._labels[frame]  # it was removed with its node
-            elif frame not in texts:
+            is_on_node = nodes.paths.get(frame) == path  # else it was removed with its node
+            if is_on_node and frame not in texts:
                 label.remove()
+            if not is_on_node or frame not in texts:
                 del self._labels[frame]
         for frame, text in texts.items():
             path = nodes.paths.get(frame)
-            if path is None:
-                continue
             if frame in self._labels:
                 label = self._labels[frame][1]
                 label.text, label.font_size_mode = text, size
-            else:
+            elif path is not None:
                 label = self._scene.add_label(
                     f"{path}/{self._name}", text, font_size_mode=size, **self._options
                 )
@@ -166,48 +164,21 @@ def _texts(snapshot: FramePoses, shown: Mask, joined: Mask) -> dict[str, str]:
     return {names[row]: "\n".join(texts) for row, texts in lines.items()}
 
 
-class StaleLabels:
-    """The text of each stale robot, on a label at its first frame."""
-
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._labels = NodeLabels(scene, "stale", anchor="top-center")
-        self._texts: dict[str, str] = {}
-        self._tree: FrameTable | None = None
-        self._first_frames: dict[str, str] = {}
-
-    def set(self, robot: str, text: str | None) -> None:
-        """Set the text of a stale robot; None if it is not stale."""
-        if text is None:
-            self._texts.pop(robot, None)
-        else:
-            self._texts[robot] = text
-
-    def is_stale(self, robot: str) -> bool:
-        """Whether the robot has a text."""
-        return robot in self._texts
-
-    def frames(self, tree: FrameTable) -> frozenset[str]:
-        """The frames that carry labels: the first of each stale robot, since parents come first."""
-        if tree is not self._tree:
-            self._tree, self._first_frames = tree, {}
-            for name in tree.names:
-                self._first_frames.setdefault(name.partition("/")[0], name)
-        return frozenset(self._first_frames[robot] for robot in self._texts if robot in self._first_frames)
-
-    def show(self, nodes: FrameNodes) -> None:
-        """Draw the labels."""
-        first = self._first_frames
-        texts = {first[robot]: f"{robot}: {text}" for robot, text in self._texts.items() if robot in first}
-        self._labels.show(texts, nodes)
-
-
 class _Trail:
     """The last positions of one frame, as a fixed number of segments that start at one point."""
 
-    def __init__(self, handle: viser.LineSegmentsHandle, position: NDArray[np.float64], stamp: int) -> None:
-        self.handle = handle
+    def __init__(self, scene: viser.SceneApi, number: int, position: NDArray[np.float64], stamp: int) -> None:
         self._points = np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32)
         self._stamp = stamp
+        fade = np.linspace(0.0, 1.0, 2 * _TRAIL_SEGMENTS)[:, None] ** 0.5
+        colors = (1.0 - fade) * _BACKGROUND + fade * np.array(_TRAIL_COLORS[number % len(_TRAIL_COLORS)])
+        self.handle = scene.add_line_segments(
+            f"/trails/{number}",
+            self._points,
+            colors.reshape(_TRAIL_SEGMENTS, 2, 3).astype(np.uint8),
+            thickness=_TRAIL_WIDTH_PX,
+            thickness_units="screen",
+        )
 
     def continues_at(self, stamp: int) -> bool:
         """Whether a position at that stamp continues the trail: time has not jumped."""
@@ -216,14 +187,13 @@ class _Trail:
     def add(self, position: NDArray[np.float64], stamp: int) -> None:
         """Append a position, unless it is too soon or too near."""
         last = self._points[-1, 1]
-        near = float(np.linalg.norm(position - last)) < _MIN_STEP_M
-        if near or stamp - self._stamp < _TRAIL_PERIOD_NS:
-            self._stamp = stamp if near else self._stamp
-            return
-        self._points = np.roll(self._points, -1, axis=0)
-        self._points[-1] = (last, position)
-        self._stamp = stamp
-        self.handle.points = self._points
+        if float(np.linalg.norm(position - last)) < _MIN_STEP_M:
+            self._stamp = stamp
+        elif stamp - self._stamp >= _TRAIL_PERIOD_NS:
+            self._points = np.roll(self._points, -1, axis=0)
+            self._points[-1] = (last, position)
+            self._stamp = stamp
+            self.handle.points = self._points
 
 
 class Trails:
@@ -232,7 +202,7 @@ class Trails:
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
         self._trails: dict[str, _Trail | None] = {}
-        self._colors: dict[str, int] = {}
+        self._numbers: dict[str, int] = {}
         self._fixed = ""
 
     def set_trail(self, frame: str, on: bool) -> None:
@@ -249,28 +219,15 @@ class Trails:
             self._fixed = fixed
             for frame in self._trails:
                 self._clear(frame)
-        for frame in self._trails:
+        for frame, trail in self._trails.items():
             row = snapshot.tree.index.get(frame)
             if row is None or snapshot.stamp is None or not np.isfinite(placed[row, 0]):
                 continue
-            trail, position = self._trails[frame], placed[row, :3]
             if trail is not None and trail.continues_at(snapshot.stamp):
-                trail.add(position, snapshot.stamp)
+                trail.add(placed[row, :3], snapshot.stamp)
             else:
-                line = self._add_line(frame, position)
-                self._trails[frame] = _Trail(line, position, snapshot.stamp)
-
-    def _add_line(self, frame: str, position: NDArray[np.float64]) -> viser.LineSegmentsHandle:
-        number = self._colors.setdefault(frame, len(self._colors))
-        fade = np.linspace(0.0, 1.0, 2 * _TRAIL_SEGMENTS)[:, None] ** 0.5
-        colors = (1.0 - fade) * _BACKGROUND + fade * np.array(_TRAIL_COLORS[number % len(_TRAIL_COLORS)])
-        return self._scene.add_line_segments(
-            f"/trails/{number}",
-            np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32),
-            colors.reshape(_TRAIL_SEGMENTS, 2, 3).astype(np.uint8),
-            thickness=_TRAIL_WIDTH_PX,
-            thickness_units="screen",
-        )
+                number = self._numbers.setdefault(frame, len(self._numbers))
+                self._trails[frame] = _Trail(self._scene, number, placed[row, :3], snapshot.stamp)
 
     def _clear(self, frame: str) -> None:
         trail = self._trails[frame]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import viser
@@ -15,16 +14,11 @@ from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
 from zstate.model.findings import Finding
 from zstate.model.geometry import Shape, read_shapes
 from zstate.model.robot import RobotModel
-from zstate.view.mesh_loader import MeshLoader
-from zstate.view.mesh_paths import MissingFile
-from zstate.view.meshes import Meshes
-from zstate.view.scene.frame_markers import Axes, FrameLabels, ParentLines, StaleLabels, Trails
+from zstate.view.meshes import Meshes, MeshLoader
+from zstate.view.scene.frame_markers import Axes, FrameLabels, NodeLabels, ParentLines, Trails
 from zstate.view.scene.frame_nodes import FrameNodes, in_frame
 from zstate.view.scene.robot_meshes import InstancedMeshes, RenderStyle, RobotMeshes
 from zstate.view.scene.tree_layout import TreeLayout
-
-# Identical robots have the same shapes, and the same folder of the URDF file if the user named one.
-_Kind: TypeAlias = tuple[tuple[Shape, ...], Path | None]
 
 _MIN_INSTANCES = 4  # identical robots that are drawn by instances
 
@@ -37,28 +31,35 @@ class Scene:
     ``busy`` until all are drawn. To be used by one thread.
     """
 
-    def __init__(self, server: viser.ViserServer, meshes: Meshes | None = None) -> None:
+    def __init__(self, server: viser.ViserServer) -> None:
         self.visuals = True
         self.collisions = False
         self.axes = True
         self.names = False
         self.parent_lines = False
-        self._scene = server.scene
-        self._loader = MeshLoader(meshes or Meshes())
-        self._robots = _Robots(server.scene, self._loader)
-        self._faults: dict[str, tuple[tuple[str, str], ...]] = {}
-        self._nodes = FrameNodes(server.scene)
-        self._axes = Axes(server.scene)
-        self._names = FrameLabels(server.scene)
-        self._lines = ParentLines(server.scene)
-        self._trails = Trails(server.scene)
-        self._stale_labels = StaleLabels(server.scene)
-        self._layout = TreeLayout(server.scene)
+        scene = self._scene = server.scene
+        self._loader = MeshLoader(Meshes())
+        self._single: dict[str, RobotMeshes] = {}
+        # Identical robots have the same shapes, and the same folder of the URDF file if the user named one.
+        self._instanced: dict[tuple[tuple[Shape, ...], Path | None], InstancedMeshes] = {}
+        self._instanced_count = 0
+        self._faults: dict[str, list[tuple[str, str]]] = {}
+        self._stale: dict[str, str] = {}
+        self._tree: FrameTable | None = None
+        self._first_frames: dict[str, str] = {}
+        self._nodes = FrameNodes(scene)
+        self._axes = Axes(scene)
+        self._names = FrameLabels(scene)
+        self._lines = ParentLines(scene)
+        self._trails = Trails(scene)
+        self._layout = TreeLayout()
+        self._stale_labels = NodeLabels(scene, "stale", anchor="top-center")
+        self._tree_labels = NodeLabels(scene, "tree", anchor="bottom-center")
 
     @property
     def busy(self) -> bool:
         """Whether meshes are still being loaded."""
-        return self._loader.busy
+        return any(meshes.busy for meshes in self._meshes())
 
     @property
     def layout_version(self) -> int:
@@ -73,21 +74,46 @@ class Scene:
         ``shapes`` default to those of its model. ``base`` is the folder of its URDF file, if the user named
         one: then every file in it can be loaded, otherwise only those in packages.
         """
-        faults: tuple[Finding, ...] = ()
+        faults: Sequence[Finding] = ()
         if shapes is None:
             shapes, faults = read_shapes(model)
-        self._faults[name] = tuple((f"{name}, line {one.line}", one.message) for one in faults)
-        self._robots.set(name, tuple(shapes), self._nodes, base)
+        self._remove_meshes(name)
+        self._faults[name] = [(f"{name}, line {one.line}", one.message) for one in faults]
+        kind = tuple(shapes), base
+        alike = [robot for robot, meshes in self._single.items() if meshes.kind == kind]
+        if kind not in self._instanced and len(alike) + 1 < _MIN_INSTANCES:
+            self._single[name] = RobotMeshes(self._scene, self._loader, name, *kind)
+            return
+        for robot in alike:
+            self._single.pop(robot).remove(self._nodes)
+        if kind not in self._instanced:
+            self._instanced_count += 1
+            path = f"/instanced/{self._instanced_count}"
+            self._instanced[kind] = InstancedMeshes(self._scene, self._loader, path, *kind)
+        self._instanced[kind].robots |= dict.fromkeys([*alike, name])
 
     def remove_robot(self, name: str) -> None:
         """Remove a robot, if it exists."""
-        self._robots.remove(name, self._nodes)
+        self._remove_meshes(name)
         self._faults.pop(name, None)
-        self._stale_labels.set(name, None)
+        self._stale.pop(name, None)
+
+    def _remove_meshes(self, name: str) -> None:
+        single = self._single.pop(name, None)
+        if single is not None:
+            single.remove(self._nodes)
+        for kind, group in list(self._instanced.items()):
+            group.robots.pop(name, None)
+            if not group.robots:
+                group.remove()
+                del self._instanced[kind]
 
     def set_stale(self, robot: str, text: str | None) -> None:
         """Draw a stale robot in translucent grey, with ``text`` at its root; with None, as usual."""
-        self._stale_labels.set(robot, text)
+        if text is None:
+            self._stale.pop(robot, None)
+        else:
+            self._stale[robot] = text
 
     def set_trail(self, frame: str, on: bool) -> None:
         """Start or remove the trail of a frame."""
@@ -95,8 +121,8 @@ class Scene:
 
     def missing_meshes(self, robot: str) -> tuple[tuple[str, str], ...]:
         """Files of a robot that cannot be drawn: the name in the URDF, and the reason."""
-        missing = tuple((one.uri, one.why) for one in self._robots.missing(robot))
-        return self._faults.get(robot, ()) + missing
+        missing = chain.from_iterable(meshes.missing for meshes in self._meshes() if robot in meshes.robots)
+        return (*self._faults.get(robot, ()), *((one.uri, one.why) for one in missing))
 
     def show(self, snapshot: FramePoses, fixed: str) -> Poses:
         """Draw everything at one instant, relative to the frame ``fixed``.
@@ -104,98 +130,44 @@ class Scene:
         Returns the pose of each frame, as ``snapshot.poses_in(fixed)``; trees that are not connected to the
         fixed frame have the poses at which they are drawn. Raises UnknownFrame.
         """
+        tree = snapshot.tree
+        if tree is not self._tree:
+            self._tree = tree
+            # Parents come first.
+            self._first_frames = {name.partition("/")[0]: name for name in reversed(tree.names)}
+        first = self._first_frames
+        stale = {first[robot]: f"{robot}: {text}" for robot, text in self._stale.items() if robot in first}
         placed = self._layout.placed(snapshot, fixed)
-        frames = self._robots.frames | self._stale_labels.frames(snapshot.tree) | self._layout.frames
-        self._nodes.show(snapshot, placed, frozenset(snapshot.tree.names) if self.names else frames)
+        on_links = (meshes.frames for meshes in self._single.values())
+        carriers = tree.names if self.names else chain(stale, self._layout.labels, *on_links)
+        self._nodes.show(snapshot, placed, frozenset(carriers))
         shown = self._nodes.shown
-        self._robots.show(self._nodes, snapshot.tree, placed, self._styles)
+        for name, meshes in self._single.items():
+            meshes.show(self._nodes, self._styles(name))
+        for group in self._instanced.values():
+            group.show(tree, placed, {name: self._styles(name) for name in group.robots})
         self._axes.show(self.axes, placed, shown)
-        self._lines.show(self.parent_lines, placed, shown, snapshot.tree.parents)
+        self._lines.show(self.parent_lines, placed, shown, tree.parents)
         self._names.show(self.names, snapshot, self._nodes)
         self._trails.show(snapshot, fixed, placed)
-        self._stale_labels.show(self._nodes)
-        self._layout.show(self._nodes)
+        self._stale_labels.show(stale, self._nodes)
+        self._tree_labels.show(self._layout.labels, self._nodes)
         return placed
 
     def corners(self, tree: FrameTable, placed: Poses) -> NDArray[np.float64]:
         """The corners of the bounding boxes of all loaded visuals with a known pose: (N, 3) [m]."""
         boxes = [np.empty((0, 3))]
-        for frame, corners in self._robots.corners():
+        for frame, corners in chain.from_iterable(meshes.corners() for meshes in self._meshes()):
             row = tree.index.get(frame)
             if row is not None and np.isfinite(placed[row, 0]):
                 boxes.append(in_frame(placed[row].tolist(), corners))
         return np.concatenate(boxes)
 
+    def _meshes(self) -> chain[RobotMeshes | InstancedMeshes]:
+        return chain(self._single.values(), self._instanced.values())
+
     def _styles(self, robot: str) -> set[RenderStyle]:
         styles: set[RenderStyle] = {"collision"} if self.collisions else set()
         if self.visuals:
-            styles.add("stale" if self._stale_labels.is_stale(robot) else "visual")
+            styles.add("stale" if robot in self._stale else "visual")
         return styles
-
-
-class _Robots:
-    """The meshes of all robots. ``frames`` are those whose nodes carry some."""
-
-    def __init__(self, scene: viser.SceneApi, loader: MeshLoader) -> None:
-        self._scene = scene
-        self._loader = loader
-        self._single: dict[str, RobotMeshes] = {}
-        self._instanced: dict[_Kind, InstancedMeshes] = {}
-        self._instanced_count = 0
-        self.frames: frozenset[str] = frozenset()
-
-    def set(self, name: str, shapes: tuple[Shape, ...], nodes: FrameNodes, base: Path | None = None) -> None:
-        """Add or replace a robot; ``base`` as for RobotMeshes."""
-        self.remove(name, nodes)
-        kind = shapes, base
-        alike = [robot for robot, meshes in self._single.items() if (meshes.shapes, meshes.base) == kind]
-        if kind in self._instanced or len(alike) + 1 >= _MIN_INSTANCES:
-            for robot in alike:
-                self._single.pop(robot).remove(nodes)
-            if kind not in self._instanced:
-                self._instanced_count += 1
-                path = f"/instanced/{self._instanced_count}"
-                self._instanced[kind] = InstancedMeshes(self._scene, self._loader, shapes, path, base)
-            self._instanced[kind].robots |= dict.fromkeys([*alike, name])
-        else:
-            self._single[name] = RobotMeshes(self._scene, self._loader, name, shapes, base)
-        self._find_frames()
-
-    def remove(self, name: str, nodes: FrameNodes) -> None:
-        """Remove a robot, if it exists."""
-        meshes = self._single.pop(name, None)
-        if meshes is not None:
-            meshes.remove(nodes)
-        for kind, group in list(self._instanced.items()):
-            group.robots.pop(name, None)
-            if not group.robots:
-                group.remove()
-                del self._instanced[kind]
-        self._find_frames()
-
-    def missing(self, name: str) -> Sequence[MissingFile]:
-        """Files of a robot that cannot be drawn."""
-        if name in self._single:
-            return self._single[name].meshes.missing
-        groups = [group for group in self._instanced.values() if name in group.robots]
-        return groups[0].meshes.missing if groups else ()
-
-    def show(
-        self, nodes: FrameNodes, tree: FrameTable, placed: Poses, styles: Callable[[str], set[RenderStyle]]
-    ) -> None:
-        """Draw each robot in its styles, with the meshes loaded since."""
-        for loaded in self._loader.fetch():
-            any(one.meshes.receive(loaded) for one in chain(self._single.values(), self._instanced.values()))
-        for name, meshes in self._single.items():
-            meshes.show(nodes, styles(name))
-        for group in self._instanced.values():
-            group.show(tree, placed, {name: styles(name) for name in group.robots})
-
-    def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
-        """The frame of each loaded visual, with the corners of its bounding box in it (8, 3) [m]."""
-        return chain.from_iterable(
-            one.corners() for one in (*self._single.values(), *self._instanced.values())
-        )
-
-    def _find_frames(self) -> None:
-        self.frames = frozenset(chain.from_iterable(meshes.frames for meshes in self._single.values()))

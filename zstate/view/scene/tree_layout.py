@@ -13,12 +13,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import viser
 from numpy.typing import NDArray
 
-from zstate.buffer.snapshot import FramePoses, FrameTable, Poses, Rows
-from zstate.view.scene.frame_markers import NodeLabels
-from zstate.view.scene.frame_nodes import FrameNodes
+from zstate.buffer.snapshot import FramePoses, FrameTable, Poses
 
 _GAP_M = 0.3
 _MARGIN_M = 0.12  # of meshes around their frames
@@ -37,82 +34,61 @@ class _Box(NamedTuple):
 
 
 class TreeLayout:
-    """Places trees next to that of the fixed frame, and labels all if there are several.
+    """Places trees next to that of the fixed frame; ``labels`` are texts by root if there are several.
 
     A tree keeps its place while robots move. The layout is computed again, and ``version`` grows, when a tree
     appears or disappears, or more of its frames have a pose.
     """
 
-    def __init__(self, scene: viser.SceneApi) -> None:
-        self._node_labels = NodeLabels(scene, "tree", anchor="bottom-center")
-        self._tree: FrameTable | None = None
-        self._laid_out_for: tuple[int, int] | None = None
-        self._boxes: dict[str, tuple[tuple[str, ...], int, _Box]] = {}
-        self._offsets: dict[int, Offset] = {}
-        self._named_offsets: dict[str, Offset] = {}
-        self._texts: dict[str, str] = {}
+    def __init__(self) -> None:
+        self._laid_out_for: tuple[FrameTable, int, int] | None = None
+        # By root: the frames of the tree, the number of them with a pose, and their box.
+        self._boxes: dict[str, tuple[list[str], int, _Box]] = {}
+        self._offsets: dict[str, Offset] = {}
+        self.labels: dict[str, str] = {}
         self.version = 0
-
-    @property
-    def frames(self) -> frozenset[str]:
-        """The frames that carry labels."""
-        return frozenset(self._texts)
 
     def placed(self, snapshot: FramePoses, fixed: str) -> Poses:
         """As ``snapshot.poses_in(fixed)``, with poses for every tree. Raises UnknownFrame."""
         tree = snapshot.tree
         root = int(tree.roots[tree.row(fixed)])
-        laid_out_for = root, int(np.count_nonzero(snapshot.known))
-        if tree is not self._tree or laid_out_for != self._laid_out_for:
-            self._tree, self._laid_out_for = tree, laid_out_for
+        laid_out_for = tree, root, int(np.count_nonzero(snapshot.known))
+        if laid_out_for != self._laid_out_for:
+            self._laid_out_for = laid_out_for
             self._lay_out(snapshot, root)
         if not self._offsets:
             return snapshot.poses_in(fixed)
-        return snapshot.poses_side_by_side(fixed, self._offsets)
-
-    def show(self, nodes: FrameNodes) -> None:
-        """Draw the labels."""
-        self._node_labels.show(self._texts, nodes)
+        offsets = {tree.index[name]: offset for name, offset in self._offsets.items()}
+        return snapshot.poses_side_by_side(fixed, offsets)
 
     def _lay_out(self, snapshot: FramePoses, first: int) -> None:
         names = snapshot.tree.names
-        members = _members(snapshot.tree)
+        members: dict[int, list[int]] = {}
+        for row, root in enumerate(snapshot.tree.roots.tolist()):
+            members.setdefault(root, []).append(row)
         others = sorted((row for row in members if row != first), key=lambda row: _natural(names[row]))
         ordered = [first, *others]
-        boxes = [self._box(snapshot, row, members[row]) for row in ordered]
-        self._boxes = {name: self._boxes[name] for name in (names[row] for row in ordered)}
-        offsets = _in_rows(boxes)
-        self._offsets = {row: offset for row, offset in zip(ordered, offsets, strict=True) if row != first}
-        named = {names[row]: offset for row, offset in self._offsets.items()}
-        self.version += named != self._named_offsets
-        self._named_offsets = named
-        self._texts = {}
+        self._boxes = {names[row]: self._box(snapshot, row, members[row]) for row in ordered}
+        offsets = _in_rows([box for _, _, box in self._boxes.values()])
+        named = {names[row]: offset for row, offset in zip(others, offsets[1:], strict=True)}
+        self.version += named != self._offsets
+        self._offsets = named
+        self.labels = {}
         for row in ordered if others else ():
-            robots = {names[k].partition("/")[0] for k in map(int, members[row]) if "/" in names[k]}
+            robots = {names[k].partition("/")[0] for k in members[row] if "/" in names[k]}
             title = robots.pop() if len(robots) == 1 else names[row]
-            self._texts[names[row]] = title if row == first else f"{title} (position unknown)"
+            self.labels[names[row]] = title if row == first else f"{title} (position unknown)"
 
-    def _box(self, snapshot: FramePoses, root: int, rows: Rows) -> _Box:
+    def _box(self, snapshot: FramePoses, root: int, rows: list[int]) -> tuple[list[str], int, _Box]:
         """The largest box of the tree so far: it does not shrink while samples are missing."""
-        tree = snapshot.tree
-        names = tuple(tree.names[row] for row in map(int, rows))
+        names = [snapshot.tree.names[row] for row in rows]
         tops, poses = snapshot.tops
-        known = rows[tops[rows] == root]
+        known = [row for row in rows if tops[row] == root]
         before = self._boxes.get(names[0])
         if before is not None and before[0] == names and before[1] >= len(known):
-            return before[2]
-        box = _bounding_box([tree.names[row] for row in map(int, known)], poses[known, :3])
-        self._boxes[names[0]] = names, len(known), box
-        return box
-
-
-def _members(tree: FrameTable) -> dict[int, Rows]:
-    """The rows of each tree by the row of its root, which is the first."""
-    order = np.argsort(tree.roots, kind="stable")
-    starts = np.flatnonzero(np.diff(tree.roots[order], prepend=-1))
-    ends = [*starts[1:].tolist(), len(order)]
-    groups = [order[start:end] for start, end in zip(starts.tolist(), ends, strict=True)]
-    return {int(tree.roots[group[0]]): group for group in groups}
+            return before
+        box = _bounding_box([snapshot.tree.names[row] for row in known], poses[known, :3])
+        return names, len(known), box
 
 
 def _bounding_box(names: Sequence[str], points: NDArray[np.float64]) -> _Box:
