@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -118,23 +119,14 @@ class ViewSource(Closeable):
             self._version += 1
 
 
+@dataclass
 class FixedFrame:
     """The fixed frame, as in rviz: the ``requested`` one if it exists, else the root of the largest tree."""
 
-    def __init__(self, requested: str = "") -> None:
-        self.requested = requested
-        self._tree: FrameTable | None = None
-        self._default = ""
+    requested: str = ""
 
     def resolve(self, tree: FrameTable) -> str:
-        """Its name; empty if there is no frame."""
-        if tree is not self._tree:
-            self._tree, self._default = tree, default_fixed_frame(tree)
-        return self.requested if self.requested in tree.index else self._default
-
-
-def default_fixed_frame(tree: FrameTable) -> str:
-    """The root of the most frames, the first of equal ones; empty if there is no frame."""
-    if not tree.names:
-        return ""
-    return tree.names[int(np.bincount(tree.roots).argmax())]
+        """Its name; of equally large trees, the first root. Empty if there is no frame."""
+        if self.requested in tree.index:
+            return self.requested
+        return tree.names[int(np.bincount(tree.roots).argmax())] if tree.names else ""

@@ -157,22 +157,24 @@ def _joined(meshes: Iterable[Mesh]) -> list[Mesh]:
     every = [mesh for group in by_material.values() for mesh in group]
     has_uv = any(one.uv is not None for one in every)
     has_colors = any(one.colors is not None for one in every)
-    return [_join(group, has_uv, has_colors) for group in by_material.values()]
-
-
-def _join(group: list[Mesh], has_uv: bool, has_colors: bool) -> Mesh:
-    starts = np.cumsum([0, *(len(one.points) for one in group[:-1])])
-    rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
-    uv = [np.zeros((len(one.points), 2), np.float32) if one.uv is None else one.uv for one in group]
-    white = np.full(4, 255, dtype=np.uint8)
-    colors = [np.tile(white, (len(one.points), 1)) if one.colors is None else one.colors for one in group]
-    return Mesh(
-        np.concatenate([one.points for one in group]),
-        np.concatenate(rows).astype(np.uint32),
-        group[0].material,
-        np.concatenate(uv) if has_uv else None,
-        np.concatenate(colors) if has_colors else None,
-    )
+    joined: list[Mesh] = []
+    for material, group in by_material.items():
+        counts = [len(one.points) for one in group]
+        starts = np.cumsum([0, *counts[:-1]])
+        rows = [one.triangles + np.uint32(start) for one, start in zip(group, starts, strict=True)]
+        uv = [np.zeros((len(one.points), 2), np.float32) if one.uv is None else one.uv for one in group]
+        white = [np.full((count, 4), 255, dtype=np.uint8) for count in counts]
+        colors = [hue if one.colors is None else one.colors for one, hue in zip(group, white, strict=True)]
+        joined.append(
+            Mesh(
+                np.concatenate([one.points for one in group]),
+                np.concatenate(rows).astype(np.uint32),
+                material,
+                np.concatenate(uv) if has_uv else None,
+                np.concatenate(colors) if has_colors else None,
+            )
+        )
+    return joined
 
 
 def _material(material: Material, images: list[bytes]) -> dict[str, Any]:

@@ -282,35 +282,33 @@ def _loaded(path: Path, data: Path | io.BytesIO) -> tuple[Mesh, ...]:
     scene: Any = _load(data, file_type=kind, resolver=resolver, process=kind == "stl")
     meshes: list[Mesh] = []
     for node in scene.graph.nodes_geometry:
-        matrix, name = scene.graph[node]
+        transform, name = scene.graph[node]
         mesh = scene.geometry[name]
         if len(getattr(mesh, "faces", ())):
             scale = 1.0 if mesh.units is None else unit_conversion(mesh.units, "meters")
-            metres = np.asarray(matrix, dtype=np.float64) * [[scale], [scale], [scale], [1.0]]
-            meshes.append(_mesh(mesh, metres))
+            matrix = np.asarray(transform, dtype=np.float64)[:3] * scale
+            points = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:, :3].T + matrix[:, 3]
+            # From the cache: the property would compute normals if the file has none.
+            own: Any = mesh._cache.cache.get("vertex_normals")
+            normals = (
+                None if own is None else np.asarray(own, dtype=np.float64) @ np.linalg.inv(matrix[:, :3])
+            )
+            material, uv, colors = _visual(mesh.visual)
+            faces = np.asarray(mesh.faces)
+            meshes.append(smooth_normals(points, faces, material, normals=normals, uv=uv, colors=colors))
     return tuple(meshes)
-
-
-def _mesh(mesh: Any, matrix: NDArray[np.float64]) -> Mesh:
-    points = np.asarray(mesh.vertices, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    # From the cache: the property would compute normals if the file has none.
-    own: Any = mesh._cache.cache.get("vertex_normals")
-    normals = None if own is None else np.asarray(own, dtype=np.float64) @ np.linalg.inv(matrix[:3, :3])
-    material, uv, colors = _visual(mesh.visual)
-    return smooth_normals(points, np.asarray(mesh.faces), material, normals=normals, uv=uv, colors=colors)
 
 
 def _visual(visual: Any) -> tuple[Material | None, NDArray[np.float64] | None, NDArray[np.uint8] | None]:
     """Material, texture coordinates and point colours."""
     if visual.kind in {"vertex", "face"}:
         return Material((1.0, 1.0, 1.0, 1.0)), None, np.asarray(visual.vertex_colors, dtype=np.uint8)
-    material = getattr(visual, "material", None)
-    if material is None:
+    if getattr(visual, "material", None) is None:
         return None, None, None
-    own = _material(material)
+    material = _material(visual.material)
     # Without a material of its own, the URDF may have a texture for it.
-    is_covered = visual.uv is not None and (own is None or own.image is not None)
-    return own, np.asarray(visual.uv, dtype=np.float64) if is_covered else None, None
+    is_covered = visual.uv is not None and (material is None or material.image is not None)
+    return material, np.asarray(visual.uv, dtype=np.float64) if is_covered else None, None
 
 
 def _material(material: Any) -> Material | None:
@@ -320,17 +318,16 @@ def _material(material: Any) -> Material | None:
         return None  # trimesh adds a material to an OBJ file with texture coordinates and no material
     else:
         factor, image = material.diffuse, material.image
-    given = (1.0,) * 4 if factor is None else (np.asarray(factor, dtype=np.float64) / 255.0).tolist()
-    red, green, blue, opacity = given
+    own = (1.0,) * 4 if factor is None else (np.asarray(factor, dtype=np.float64) / 255.0).tolist()
+    red, green, blue, opacity = own
     color = (red, green, blue, opacity if opacity > _INVISIBLE else 1.0)
     return Material(color, None if image is None else _encoded(image))
 
 
 def _encoded(image: Any) -> bytes:
     image.thumbnail((_WIDEST_IMAGE, _WIDEST_IMAGE))
-    has_opacity = image.mode in {"RGBA", "LA", "PA"} or "transparency" in image.info
     buffer = io.BytesIO()
-    if has_opacity:
+    if image.mode in {"RGBA", "LA", "PA"} or "transparency" in image.info:
         image.convert("RGBA").save(buffer, "PNG", compress_level=3)
     else:
         image.convert("RGB").save(buffer, "JPEG", quality=88)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import imageio.v3
 import numpy as np
+import viser
 from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
@@ -47,7 +48,8 @@ _FLAGS = (
 _EXIT_TIMEOUT_S = 3.0
 _OPEN_TIMEOUT_S = 30.0
 _DRAW_TIMEOUT_S = 30.0
-# A browser unpacks meshes one after the other: a picture is complete when it hardly changes any more.
+# A browser unpacks meshes one after the other and reports none of them: a picture is complete when it hardly
+# changes any more.
 _UNPACK_PERIOD_S = 0.5
 _MAX_CHANGED = 0.004  # share of pixels
 _MAX_ATTEMPTS = 6
@@ -97,7 +99,7 @@ class HeadlessBrowser(Closeable):
 
 
 def save_screenshot(
-    page: ViewServer, path: Path, *, width: int = 1280, height: int = 800, hold: Callable[[float], bool]
+    page: ViewServer, path: Path, *, width: int, height: int, hold: Callable[[float], bool]
 ) -> None:
     """Write what ``page`` shows, without its panels, to ``path``.
 
@@ -114,17 +116,14 @@ def save_screenshot(
         client = next(iter(page.server.get_clients().values()))
         if not hold(_DRAW_TIMEOUT_S):
             raise ScreenshotFailed(f"no robot had a pose to be drawn within {_DRAW_TIMEOUT_S:g} s")
-
-        def draw() -> Pixels:
-            try:
-                pixels: Pixels = client.get_render(
-                    height, width, transport_format="png", timeout=_DRAW_TIMEOUT_S
-                )
-            except (RuntimeError, TimeoutError) as error:
-                raise ScreenshotFailed(f"the browser draws nothing: {error}") from None
-            return _on_white(pixels)
-
-        pixels = _until_stable(draw)
+        pixels = _render(client, width, height)
+        for _ in range(_MAX_ATTEMPTS):
+            time.sleep(_UNPACK_PERIOD_S)
+            before, pixels = pixels, _render(client, width, height)
+            if before.shape == pixels.shape:
+                difference = np.abs(before.astype(np.int16) - pixels.astype(np.int16)).max(axis=2)
+                if float((difference > 16).mean()) < _MAX_CHANGED:
+                    break
     try:
         out = BytesIO()
         imageio.v3.imwrite(out, pixels, extension=".png")  # pyright: ignore[reportUnknownMemberType]
@@ -133,22 +132,13 @@ def save_screenshot(
         raise InvalidInput(f"the picture cannot be written: {error}") from None
 
 
-def _on_white(pixels: Pixels) -> Pixels:
-    """(H, W, 4) with opacity, on a white background (H, W, 3)."""
+def _render(client: viser.ClientHandle, width: int, height: int) -> Pixels:
+    """The picture of a browser on a white background (H, W, 3)."""
+    try:
+        pixels: Pixels = client.get_render(height, width, transport_format="png", timeout=_DRAW_TIMEOUT_S)
+    except (RuntimeError, TimeoutError) as error:
+        raise ScreenshotFailed(f"the browser draws nothing: {error}") from None
     if pixels.shape[2] == 3:
         return pixels
     opacity = pixels[:, :, 3:].astype(np.float64) / 255.0
     return np.round(pixels[:, :, :3] * opacity + 255.0 * (1.0 - opacity)).astype(np.uint8)
-
-
-def _until_stable(draw: Callable[[], Pixels]) -> Pixels:
-    """The first picture that hardly differs from the one before, or the last attempt."""
-    last = draw()
-    for _ in range(_MAX_ATTEMPTS):
-        time.sleep(_UNPACK_PERIOD_S)
-        before, last = last, draw()
-        if before.shape == last.shape:
-            difference = np.abs(before.astype(np.int16) - last.astype(np.int16)).max(axis=2)
-            if float((difference > 16).mean()) < _MAX_CHANGED:
-                break
-    return last

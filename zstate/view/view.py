@@ -22,7 +22,7 @@ from zstate.rate import Rate
 from zstate.view.camera import FIELD_OF_VIEW, Camera, CameraPose, Visibility, fit_camera, robot_visibility
 from zstate.view.data_source import FixedFrame, ViewSource
 from zstate.view.panels import html
-from zstate.view.panels.control_panels import PlotsPanel, SlidersPanel, TimePanel
+from zstate.view.panels.control_panels import PlotsPanel, SlidersPanel, TimeCursor, TimePanel
 from zstate.view.panels.display_panels import (
     DisplayPanel,
     FramesPanel,
@@ -34,7 +34,6 @@ from zstate.view.panels.panel import Panel, PanelContext
 from zstate.view.scene.scene import Scene
 from zstate.view.server import ViewServer
 from zstate.view.sliders import SliderPublisher
-from zstate.view.time_cursor import TimeCursor
 
 _LOG = logging.getLogger("zstate")
 
@@ -71,7 +70,7 @@ class View(Closeable):
         self._rate_hz = rate_hz
         self._folders = folders or {}
         self.scene = Scene(page.server)
-        self._layout = PanelLayout(page.server, source, self.scene, sliders, fixed_frame)
+        self.layout = PanelLayout(page.server, source, self.scene, sliders, fixed_frame)
         self._camera = camera
         self._aspect = aspect
         self._version = -1
@@ -123,7 +122,7 @@ class View(Closeable):
             self.draw()
         except Exception as error:  # the next picture may succeed, and the other robots are still moving
             fault = f"{type(error).__name__}: {error}"
-            self._layout.show_fault(fault)
+            self.layout.show_fault(fault)
             frame = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{Path(frame.filename).name}, line {frame.lineno}"
             if where not in self._logged:
@@ -131,7 +130,7 @@ class View(Closeable):
                 text = "the view failed to draw a picture (%s, in %s); it continues and tries again"
                 _LOG.warning(text, fault, where)
         else:
-            self._layout.show_fault("")
+            self.layout.show_fault("")
 
     def draw(self) -> FramePoses:
         """Draw the newest snapshot, or the one at the stamp selected on the page."""
@@ -141,10 +140,10 @@ class View(Closeable):
             if self._version != version:
                 self._update_robots()
                 self._version = version
-            snapshot = self._source.snapshot(self._layout.stamp)
+            snapshot = self._source.snapshot(self.layout.stamp)
             if self._hold_requested:
                 self._held, self._fitted_to = snapshot, None
-        fixed = self._layout.fixed_frame(snapshot)
+        fixed = self.layout.fixed.resolve(snapshot.tree)
         with self._page.server.atomic():
             try:
                 if fixed:
@@ -157,7 +156,7 @@ class View(Closeable):
             finally:
                 # Panels mark robots that have become stale since: wrong in a picture of an earlier instant.
                 if self._held is None and time.monotonic() >= self._panels_due_s:
-                    self._layout.update(snapshot)
+                    self.layout.update(snapshot)
                     self._panels_due_s = time.monotonic() + _PANELS_PERIOD_S
         return snapshot
 
@@ -211,22 +210,17 @@ class View(Closeable):
             return tuple(Visibility(robot, False, "no robot has a pose yet") for robot in robots)
         return tuple(robot_visibility(self._held, self._held_poses, self._camera_pose, self._aspect, robots))
 
-    @property
-    def fault(self) -> str:
-        """Why the last picture could not be drawn; empty if it was drawn."""
-        return self._layout.fault
-
     def close(self) -> None:
         """Close the panels. A second call does nothing."""
-        self._layout.close()
+        self.layout.close()
 
 
 class PanelLayout(Closeable):
     """Adds the panels to the page of ``server``; ``sliders`` belong to the robots that are moved from it.
 
-    ``fixed_frame`` is selected at first. The drawing thread reads ``stamp`` and ``fixed_frame`` for each
-    picture, and calls ``update`` with the snapshot on display a few times a second. ``fault`` is why the last
-    picture could not be drawn; empty if it was drawn.
+    ``fixed_frame`` is selected at first. The drawing thread reads ``stamp`` and ``fixed`` for each picture,
+    and calls ``update`` with the snapshot on display a few times a second. ``fault`` is why the last picture
+    could not be drawn; empty if it was drawn.
     """
 
     def __init__(
@@ -239,7 +233,7 @@ class PanelLayout(Closeable):
     ) -> None:
         gui = server.gui
         self._source = source
-        self._fixed = FixedFrame(fixed_frame)
+        self.fixed = FixedFrame(fixed_frame)
         self._resources = ExitStack()
         self.cursor = TimeCursor(live=source.session is not None)
         self.fault = ""
@@ -248,7 +242,7 @@ class PanelLayout(Closeable):
         # The display panel is first: a fixed frame selected there applies to the other panels.
         with tabs.add_tab("View"):
             self._panels: list[Panel] = [
-                DisplayPanel(gui, scene, self._fixed),
+                DisplayPanel(gui, scene, self.fixed),
                 RobotsPanel(gui, source, scene),
             ]
         with tabs.add_tab("Frames"):
@@ -273,17 +267,14 @@ class PanelLayout(Closeable):
         """The stamp to show [ns]; None for the newest samples."""
         return self.cursor.stamp(self._source.buffer.span())
 
-    def fixed_frame(self, snapshot: FramePoses) -> str:
-        """The fixed frame; empty if there is no frame."""
-        return self._fixed.resolve(snapshot.tree)
-
     def update(self, snapshot: FramePoses) -> None:
         """Apply the user's input, and show what has changed."""
         buffer, is_live = self._source.buffer, self.cursor.is_live
         domain = buffer.domain.name
         now = buffer.clock.now() if is_live and domain in (None, buffer.clock.domain) else None
         for panel in self._panels:
-            panel.update(PanelContext(snapshot, self.fixed_frame(snapshot), buffer, is_live, now, domain))
+            fixed = self.fixed.resolve(snapshot.tree)
+            panel.update(PanelContext(snapshot, fixed, buffer, is_live, now, domain))
 
     def show_fault(self, fault: str) -> None:
         """Show why the last picture could not be drawn; nothing if it was drawn."""
