@@ -49,14 +49,9 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
         self._views: list[dict[str, Any]] = []
         self._binary = bytearray()
-        self._corner_count = 0
+        self.triangle_count = 0
         for mesh in _joined(meshes):
             self._add(mesh)
-
-    @property
-    def triangle_count(self) -> int:
-        """Number of triangles."""
-        return self._corner_count // 3
 
     @property
     def bounds(self) -> tuple[Corner, Corner]:
@@ -121,7 +116,7 @@ class Glb:
             colors = mesh.colors / 255.0
             colors[:, :3] = _linear(colors[:, :3])
             attributes["COLOR_0"] = self._array(colors.astype(np.float32), _VERTICES)
-        self._corner_count += mesh.triangles.size
+        self.triangle_count += len(mesh.triangles)
         # The largest index of a type means primitive restart.
         narrow = np.uint16 if len(mesh.points) < 0xFFFF else np.uint32
         rows = self._array(mesh.triangles.reshape(-1, 1).astype(narrow), _INDICES)

@@ -79,22 +79,17 @@ class HeadlessBrowser(Closeable):
         if os.geteuid() == 0:
             command.append("--no-sandbox")  # root has none
         silent = subprocess.DEVNULL
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [*command, url], stdin=silent, stdout=silent, stderr=silent, start_new_session=True
         )
 
-    @property
-    def has_exited(self) -> bool:
-        """Whether the browser has exited by itself, which it never should."""
-        return self._process.poll() is not None
-
     def close(self) -> None:
         """Stop the browser and remove its profile. A second call does nothing."""
-        self._process.terminate()
+        self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_EXIT_TIMEOUT_S)
-        self._process.kill()
-        self._process.wait()
+            self.process.wait(_EXIT_TIMEOUT_S)
+        self.process.kill()
+        self.process.wait()
         self._profile.cleanup()
 
 
@@ -109,7 +104,7 @@ def save_screenshot(
     with HeadlessBrowser(page.url, width, height) as browser:
         deadline = time.monotonic() + _OPEN_TIMEOUT_S
         while not wait_interruptible(page.connected, 0.2):
-            if browser.has_exited or time.monotonic() > deadline:
+            if browser.process.poll() is not None or time.monotonic() > deadline:
                 raise ScreenshotFailed(
                     "the browser did not open the page; does it start by itself, without a screen?"
                 )

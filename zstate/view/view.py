@@ -173,7 +173,7 @@ class View(Closeable):
 
     def _fit_camera(self, snapshot: FramePoses, fixed: str, poses: Poses) -> None:
         """Fit camera and floor to all robots if robots, fixed frame, poses or meshes have been added."""
-        subject = fixed, tuple(self._drawn), self.scene.layout_version
+        subject = fixed, tuple(self._drawn), self.scene.layout.version
         unknown = int(np.count_nonzero(~snapshot.known))
         has_more = unknown < self._fitted_unknown or (self._fitted_busy and not self.scene.busy)
         if not self._drawn or (subject == self._fitted_to and not has_more):

@@ -43,7 +43,6 @@ class DisplayPanel:
     def __init__(self, gui: viser.GuiApi, scene: Scene, fixed: FixedFrame) -> None:
         self._scene = scene
         self._fixed = fixed
-        self._tree: FrameTable | None = None
         hint = "Everything is seen from this frame. Click and type to search."
         self._frames = FrameDropdown(gui, "Fixed frame", "(no frame yet)", hint)
         self._unknown = gui.add_html("")
@@ -57,11 +56,7 @@ class DisplayPanel:
         if selected is not None:
             self._fixed.requested = selected
         requested, fixed = self._fixed.requested, self._fixed.resolve(tree)
-        if tree is not self._tree:
-            self._tree = tree
-            self._frames.set_options(tree.names, fixed or None)
-        elif fixed:
-            self._frames.show(fixed)
+        self._frames.set_options(tree.names, fixed or None)
         text = f"{requested!r} is not a known frame; everything is seen from {fixed!r}"
         is_unknown = requested not in ("", fixed)
         self._unknown.content = html.paragraph(text, color=html.WARNING) if is_unknown else ""
@@ -185,7 +180,11 @@ class FramesPanel:
                 selected = found[0] if found else None
             self._tree, self._query = tree, query
             self._selected.set_options(found, selected)
-            text = _found_text(found, len(tree.names), query)
+            text = f"none of {len(tree.names)} frames matches {query!r}"
+            if found:
+                more = len(found) - 1 - _MAX_FRAMES
+                listed = ", ".join(found[1 : 1 + _MAX_FRAMES]) + (f" and {more} more" if more > 0 else "")
+                text = f"{len(found)} of {len(tree.names)} frames" + (f"; also {listed}" if listed else "")
             self._found.content = html.paragraph(text, muted=True) if query else ""
         checked, is_other = self._trail.poll_change(), self._selected.poll_change() is not None
         frame = self._selected.frame
@@ -222,14 +221,6 @@ def search_frames(names: Sequence[str], query: str) -> tuple[str, ...]:
     return tuple(sorted(found, key=rank))
 
 
-def _found_text(found: Sequence[str], total: int, query: str) -> str:
-    if not found:
-        return f"none of {total} frames matches {query!r}"
-    more = len(found) - 1 - _MAX_FRAMES
-    listed = ", ".join(found[1 : 1 + _MAX_FRAMES]) + (f" and {more} more" if more > 0 else "")
-    return f"{len(found)} of {total} frames" + (f"; also {listed}" if listed else "")
-
-
 def _frame_rows(frame: str, context: PanelContext) -> Rows:
     """Pose, parent and writer of a frame."""
     info = next(iter(context.buffer.frames((frame,))), None)
@@ -241,7 +232,9 @@ def _frame_rows(frame: str, context: PanelContext) -> Rows:
     rows += [("parent", info.parent), ("kind", info.kind), ("writer", info.writer or "unknown")]
     if info.kind != "static":
         rate = "-" if info.rate_hz is None else f"{info.rate_hz:.1f} Hz"
-        rows += [("age", context.age_text(info.newest_in(context.domain or SYSTEM))), ("rate", rate)]
+        newest = info.newest_in(context.domain or SYSTEM)
+        age = "-" if newest is None or context.now is None else format_duration(context.now - newest)
+        rows += [("age", age), ("rate", rate)]
     return rows
 
 

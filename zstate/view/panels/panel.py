@@ -9,7 +9,6 @@ import viser
 
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.snapshot import FramePoses
-from zstate.errors import format_duration
 
 T = TypeVar("T")
 
@@ -32,10 +31,6 @@ class PanelContext(NamedTuple):
     def at(self) -> int | None:
         """The stamp for lookups in the buffer: None if live."""
         return None if self.is_live else self.snapshot.stamp
-
-    def age_text(self, stamp: int | None) -> str:
-        """The age of a stamp; "-" if it is not known."""
-        return "-" if stamp is None or self.now is None else format_duration(self.now - stamp)
 
 
 class Panel(Protocol):
@@ -92,5 +87,7 @@ class FrameDropdown(BoundWidget[str]):
 
     def set_options(self, names: Sequence[str], selected: str | None) -> None:
         """Offer ``names``, and select one of them or none."""
-        self._list.options = tuple(names) if selected is not None else (self._placeholder, *names)
+        options = tuple(names) if selected is not None else (self._placeholder, *names)
+        if options != self._list.options:
+            self._list.options = options
         self.show(self._placeholder if selected is None else selected)

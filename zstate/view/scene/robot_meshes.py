@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import viser
@@ -32,23 +32,31 @@ _NOWHERE = (0.0, 0.0, 0.0)
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 
+class RobotKind(NamedTuple):
+    """What identical robots share: their shapes, and the folder of the URDF file if the user named one."""
+
+    shapes: tuple[Shape, ...]
+    base: Path | None
+
+
 class StyledMeshes:
     """The shapes of ``robots`` as ``meshes`` by style; those of a style are loaded when it is first shown.
 
-    ``base`` is the folder of the URDF file, if the user named one. ``version`` grows when meshes have been
-    loaded, ``missing`` are the files that cannot be drawn.
+    ``version`` grows when meshes have been loaded, ``missing`` are the files that cannot be drawn.
     """
 
-    def __init__(self, loader: MeshLoader, shapes: tuple[Shape, ...], base: Path | None) -> None:
-        self.kind = shapes, base
+    def __init__(self, scene: viser.SceneApi, loader: MeshLoader, kind: RobotKind) -> None:
+        self.kind = kind
         self.robots: dict[str, None] = {}
         self.meshes: dict[RenderStyle, list[MeshRequest]] = {}
         for style, color in STYLE_COLORS.items():
             role = "collision" if style == "collision" else "visual"
-            self.meshes[style] = [MeshRequest(shape, color, base) for shape in shapes if shape.role == role]
+            shapes = [shape for shape in kind.shapes if shape.role == role]
+            self.meshes[style] = [MeshRequest(shape, color, kind.base) for shape in shapes]
         self.requested: set[RenderStyle] = set()
         self.missing: list[MissingFile] = []
         self.version = 0
+        self._scene = scene
         self._loader = loader
         self._pending: list[MeshRequest] = []
 
@@ -88,18 +96,10 @@ class RobotMeshes(StyledMeshes):
     A mesh is removed with its node, so all meshes are checked when nodes change.
     """
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        loader: MeshLoader,
-        robot: str,
-        shapes: tuple[Shape, ...],
-        base: Path | None,
-    ) -> None:
-        super().__init__(loader, shapes, base)
+    def __init__(self, scene: viser.SceneApi, loader: MeshLoader, kind: RobotKind, robot: str) -> None:
+        super().__init__(scene, loader, kind)
         self.robots[robot] = None
-        self.frames = {f"{robot}/{shape.link}" for shape in shapes}
-        self._scene = scene
+        self.frames = {f"{robot}/{shape.link}" for shape in kind.shapes}
         self._robot = robot
         # With the paths of the frame nodes that they are on.
         self._handles: dict[MeshRequest, tuple[str, viser.GlbHandle]] = {}
@@ -150,8 +150,8 @@ class _Batch:
     """The instances of one mesh; the poses and the visibility that were sent last."""
 
     handle: viser.BatchedGlbHandle
-    sent: NDArray[np.float32] | None = None
-    shown: Mask | None = None
+    sent: NDArray[np.float32]
+    shown: Mask
 
 
 class InstancedMeshes(StyledMeshes):
@@ -162,18 +162,10 @@ class InstancedMeshes(StyledMeshes):
     message at all.
     """
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        loader: MeshLoader,
-        path: str,
-        shapes: tuple[Shape, ...],
-        base: Path | None,
-    ) -> None:
-        super().__init__(loader, shapes, base)
-        self._scene = scene
+    def __init__(self, scene: viser.SceneApi, loader: MeshLoader, kind: RobotKind, path: str) -> None:
+        super().__init__(scene, loader, kind)
         self._path = path
-        # The rows of the links in ``_tree``, (robots, meshes), for the robots in ``_order``.
+        # The rows of the links in ``_tree``, (robots, meshes), for the robots in ``_order``; -1 if missing.
         self._rows: dict[RenderStyle, Rows] = {}
         self._origins = {
             style: np.array([mesh.shape.origin for mesh in meshes]).reshape(-1, 7)
@@ -188,8 +180,11 @@ class InstancedMeshes(StyledMeshes):
         """Draw each robot in its styles, at the poses of its links in the fixed frame."""
         robots = tuple(self.robots)
         if tree is not self._tree or robots != self._order:
-            self._find_rows(tree)
             self._tree, self._order = tree, robots
+            for style, meshes in self.meshes.items():
+                links = [f"{robot}/{mesh.shape.link}" for robot in robots for mesh in meshes]
+                rows = np.array([tree.index.get(link, -1) for link in links], dtype=np.intp)
+                self._rows[style] = rows.reshape(len(robots), len(meshes))
             if len(robots) > self._capacity:
                 self._remove_nodes()
                 self._capacity = 1 << (len(robots) - 1).bit_length()
@@ -203,13 +198,6 @@ class InstancedMeshes(StyledMeshes):
         """Remove all meshes."""
         self._remove_nodes()
         self.cancel()
-
-    def _find_rows(self, tree: FrameTable) -> None:
-        """Find the rows of the links; -1 for a missing link."""
-        for style, meshes in self.meshes.items():
-            links = [f"{robot}/{mesh.shape.link}" for robot in self.robots for mesh in meshes]
-            rows = np.array([tree.index.get(link, -1) for link in links], dtype=np.intp)
-            self._rows[style] = rows.reshape(len(self.robots), len(meshes))
 
     def _remove_nodes(self) -> None:
         for batch in self._batches.values():
@@ -244,8 +232,8 @@ class InstancedMeshes(StyledMeshes):
                 scale=(x, y, z),
                 lod="off",
             )
-            batch = self._batches[mesh] = _Batch(handle)
-        if batch.shown is None or not np.array_equal(visible, batch.shown):
+            batch = self._batches[mesh] = _Batch(handle, np.empty(0, np.float32), np.empty(0, np.bool_))
+        if not np.array_equal(visible, batch.shown):
             batch.shown = visible.copy()
             scales = (visible[:, None] * np.abs(asset.scale)).astype(np.float32)
             batch.handle.batched_scales = self._padded(scales, _NOWHERE)
@@ -254,8 +242,7 @@ class InstancedMeshes(StyledMeshes):
         turns = signs * np.prod(signs)
         mirrored = np.concatenate([poses[:, :3] * signs, poses[:, 3:6] * turns, poses[:, 6:]], axis=1)
         mirrored = mirrored.astype(np.float32)
-        sent = batch.sent
-        if sent is None or sent.shape != mirrored.shape or np.abs(mirrored - sent).max() > _INVISIBLE:
+        if batch.sent.shape != mirrored.shape or np.abs(mirrored - batch.sent).max() > _INVISIBLE:
             batch.sent = mirrored
             rotations = self._padded(wxyzs(mirrored), _UNTURNED)
             set_instances(batch.handle, self._padded(mirrored[:, :3], _NOWHERE), rotations)
