@@ -94,13 +94,9 @@ def robot_visibility(
     half = ahead * math.tan(0.5 * FIELD_OF_VIEW)
     with np.errstate(invalid="ignore"):  # frames without a pose, which are not seen
         seen = (ahead > 0.0) & (np.abs(up) <= half) & (np.abs(right) <= half * aspect)
-    rows: dict[str, list[int]] = {}
-    for row, name in enumerate(tree.names):
-        if "/" in name:
-            rows.setdefault(name.partition("/")[0], []).append(row)
     for robot in robots:
-        links = rows.get(robot)
-        if links is None:
+        links = [row for row, name in enumerate(tree.names) if name.startswith(f"{robot}/")]
+        if not links:
             yield Visibility(robot, False, "its description has not been received")
             continue
         is_visible = bool(seen[links].any())

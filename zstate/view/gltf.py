@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -28,17 +27,6 @@ _VERTICES, _INDICES = 34962, 34963
 _PNG = b"\x89PNG"
 _ROUGHNESS = 0.65
 
-_PLAIN = Material(GREY)
-Corner = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class MaterialOverride:
-    """The material of meshes without one (``missing``), or one colour for all (``over``)."""
-
-    missing: Material = _PLAIN
-    over: Color | None = None
-
 
 class Glb:
     """Meshes packed once, for files in several colours; meshes with the same material are joined."""
@@ -54,12 +42,10 @@ class Glb:
             self._add(mesh)
 
     @property
-    def bounds(self) -> tuple[Corner, Corner]:
-        """The lowest and the highest coordinates of its points [m]; needs at least one point."""
+    def bounds(self) -> NDArray[np.float64]:
+        """The lowest and the highest coordinates of its points: (2, 3) [m]; needs at least one point."""
         boxes = [one for one in self._accessors if "min" in one]
-        low = np.min([one["min"] for one in boxes], axis=0).tolist()
-        high = np.max([one["max"] for one in boxes], axis=0).tolist()
-        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+        return np.array([np.min([one["min"] for one in boxes], 0), np.max([one["max"] for one in boxes], 0)])
 
     @property
     def byte_count(self) -> int:
@@ -67,14 +53,14 @@ class Glb:
         images = {material.image for material, _ in self._materials if material and material.image}
         return len(self._binary) + sum(map(len, images))
 
-    def to_bytes(self, override: MaterialOverride) -> bytes:
-        """The glTF file."""
+    def to_bytes(self, missing: Material, over: Color | None) -> bytes:
+        """The glTF file; meshes without a material have ``missing``, or all have the colour ``over``."""
         materials: list[Material] = []
         for own, has_uv in self._materials:
-            material = override.missing if own is None else own
-            if override.over is not None:
-                material = Material(override.over)
-            materials.append(material if has_uv and override.over is None else Material(material.color))
+            material = missing if own is None else own
+            if over is not None or not has_uv:
+                material = Material(over or material.color)
+            materials.append(material)
         images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
         binary, views = bytearray(self._binary), list(self._views)
         for image in images:

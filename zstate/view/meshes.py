@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +24,7 @@ from trimesh.resolvers import FilePathResolver
 from trimesh.units import unit_conversion
 
 from zstate.model.geometry import Box, Color, Cylinder, MeshFile, Shape, Sphere
-from zstate.view.gltf import GREY, Corner, Glb, MaterialOverride
+from zstate.view.gltf import GREY, Glb
 from zstate.view.mesh_geometry import Material, Mesh, primitive, smooth_normals
 from zstate.view.mesh_paths import MeshPaths, MissingFile
 
@@ -50,8 +50,7 @@ class Copy:
     """A mesh in one colour, as binary glTF, with its bounds [m]; kept while an asset uses it."""
 
     glb: bytes
-    low: Corner
-    high: Corner
+    bounds: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class MeshAsset:
 
     def corners(self) -> NDArray[np.float64]:
         """The corners of its bounding box, scaled: (8, 3) [m]."""
-        ends = np.array([self.copy.low, self.copy.high]) * self.scale
+        ends = self.copy.bounds * self.scale
         return np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
 
     @property
@@ -90,7 +89,9 @@ class Meshes:
         self._packed: OrderedDict[_Source, Glb] = OrderedDict()
         self.kept_byte_count = 0
         """Size of the geometry in memory [bytes]."""
-        self._copies: WeakValueDictionary[tuple[_Source, MaterialOverride], Copy] = WeakValueDictionary()
+        self._copies: WeakValueDictionary[tuple[_Source, Material, Color | None], Copy] = (
+            WeakValueDictionary()
+        )
         self._firsts: WeakValueDictionary[_Source, Copy] = WeakValueDictionary()
         self._copied_bytes = 0
         # Sizes of copies that are no longer used; appended by any thread.
@@ -124,13 +125,11 @@ class Meshes:
         self, source: _Source, shape: Shape, over: Color | None, base: Path | None, name: str
     ) -> MeshAsset:
         image = self._texture(shape, base) if over is None else None
-        if over is not None:
-            override = MaterialOverride(over=over)
-        elif isinstance(image, bytes):
-            override = MaterialOverride(Material(shape.color or (1.0, 1.0, 1.0, 1.0), image))
+        if isinstance(image, bytes):
+            missing = Material(shape.color or (1.0, 1.0, 1.0, 1.0), image)
         else:
-            override = MaterialOverride(Material(shape.color or GREY))
-        done = self._copies.get((source, override))
+            missing = Material(GREY if shape.color is None or over is not None else shape.color)
+        done = self._copies.get((source, missing, over))
         if done is not None:
             return MeshAsset(done)
         packed = self._pack(source)
@@ -141,7 +140,7 @@ class Meshes:
             limit = f"{self._max_copied_bytes / 1e6:.0f} MB"
             reason = f"drawn in another colour: the meshes on the page have reached the limit of {limit}"
             return MeshAsset(another, defect=MissingFile(name, reason))
-        done = self._copies[source, override] = Copy(packed.to_bytes(override), *packed.bounds)
+        done = self._copies[source, missing, over] = Copy(packed.to_bytes(missing, over), packed.bounds)
         if another is None:
             self._firsts[source] = done
         self._copied_bytes += len(done.glb)
@@ -208,11 +207,10 @@ class MeshLoader:
                 self._running = True
                 threading.Thread(target=self._run, name="zstate-meshes", daemon=True).start()
 
-    def cancel(self, requests: Iterable[MeshRequest]) -> None:
+    def cancel(self, requests: Sequence[MeshRequest]) -> None:
         """Drop requests that are still queued."""
-        cancelled = set(requests)
         with self._lock:
-            self._queue = [request for request in self._queue if request not in cancelled]
+            self._queue = [request for request in self._queue if request not in requests]
 
     def _run(self) -> None:
         while True:

@@ -7,8 +7,8 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 
@@ -17,7 +17,6 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from zstate._util.closeable import Closeable
 from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, LibraryMissing, ZStateError
 from zstate.view.server import ViewServer
@@ -61,36 +60,33 @@ class ScreenshotFailed(ZStateError):
     """The browser did not open or draw the page."""
 
 
-class HeadlessBrowser(Closeable):
-    """Shows ``url`` in a window of ``width`` by ``height`` pixels that is on no screen.
+@contextmanager
+def _headless_browser(url: str, width: int, height: int) -> Generator[subprocess.Popen[bytes]]:
+    """A browser that shows ``url`` in a window of ``width`` by ``height`` pixels that is on no screen.
 
     Raises LibraryMissing if no Chromium-based browser is installed.
     """
-
-    def __init__(self, url: str, width: int, height: int) -> None:
-        program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
-        if program is None:
-            raise LibraryMissing(
-                "a picture needs a Chromium-based browser, and none is installed: apt-get install chromium"
-            )
-        self._profile = tempfile.TemporaryDirectory(prefix="zstate-view-", ignore_cleanup_errors=True)
-        window = (f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}")
-        command = [program, *_FLAGS, *window]
+    program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
+    if program is None:
+        raise LibraryMissing(
+            "a picture needs a Chromium-based browser, and none is installed: apt-get install chromium"
+        )
+    with tempfile.TemporaryDirectory(prefix="zstate-view-", ignore_cleanup_errors=True) as profile:
+        command = [program, *_FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}"]
         if os.geteuid() == 0:
             command.append("--no-sandbox")  # root has none
         silent = subprocess.DEVNULL
-        self.process = subprocess.Popen(
+        process = subprocess.Popen(
             [*command, url], stdin=silent, stdout=silent, stderr=silent, start_new_session=True
         )
-
-    def close(self) -> None:
-        """Stop the browser and remove its profile. A second call does nothing."""
-        self.process.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            self.process.wait(_EXIT_TIMEOUT_S)
-        self.process.kill()
-        self.process.wait()
-        self._profile.cleanup()
+        try:
+            yield process
+        finally:
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_EXIT_TIMEOUT_S)
+            process.kill()
+            process.wait()
 
 
 def save_screenshot(
@@ -101,10 +97,10 @@ def save_screenshot(
     The view must be running in another thread; ``hold`` is its method. Raises LibraryMissing if no browser is
     installed, ScreenshotFailed if it does not draw in time, InvalidInput if the file cannot be written.
     """
-    with HeadlessBrowser(page.url, width, height) as browser:
+    with _headless_browser(page.url, width, height) as browser:
         deadline = time.monotonic() + _OPEN_TIMEOUT_S
         while not wait_interruptible(page.connected, 0.2):
-            if browser.process.poll() is not None or time.monotonic() > deadline:
+            if browser.poll() is not None or time.monotonic() > deadline:
                 raise ScreenshotFailed(
                     "the browser did not open the page; does it start by itself, without a screen?"
                 )

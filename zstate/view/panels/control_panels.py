@@ -148,11 +148,9 @@ class PlotsPanel:
     def __init__(self, gui: viser.GuiApi, source: ViewSource) -> None:
         self._gui = gui
         self._source = source
-        self._robots: tuple[str, ...] = ()
         self._robot: viser.GuiDropdownHandle[str] = gui.add_dropdown("Robot", _NO_ROBOT)
         hint = "The last ten seconds, in rad or m."
         self._joint: viser.GuiDropdownHandle[str] = gui.add_dropdown("Joint", _NO_ROBOT, hint=hint)
-        self._listed_robot = ""
         self._folder = gui.add_folder(None)
         self._plot: viser.GuiUplotHandle | None = None
         self._drawn: tuple[str, ...] = ()
@@ -160,13 +158,14 @@ class PlotsPanel:
 
     def update(self, context: PanelContext) -> None:
         models = self._source.models
-        if tuple(models) != self._robots:
-            self._robots = tuple(models)
-            self._robot.options = self._robots or _NO_ROBOT
+        robots = tuple(models) or _NO_ROBOT
+        if robots != self._robot.options:
+            self._robot.options = robots
         robot = self._robot.value
-        if robot != self._listed_robot and robot in models:
-            self._listed_robot = robot
-            self._joint.options = (*_NO_ROBOT, _ALL, *coordinate_names(models[robot]))
+        if robot in models:
+            joints = (*_NO_ROBOT, _ALL, *coordinate_names(models[robot]))
+            if joints != self._joint.options:
+                self._joint.options = joints
         joint, stamp = self._joint.value, context.snapshot.stamp
         track = context.snapshot.tree.robots.get(robot)
         names = () if track is None else coordinate_names(track.model)
@@ -281,11 +280,9 @@ class TimeCursor:
         now_s = self._now_s()
         elapsed_s, self._since_s = now_s - self._since_s, now_s
         span = self._span
-        if span is None:
+        if span is None or self.is_live:
             return
         if self._at is None:
-            if self.can_be_live:
-                return
             self._at = span.oldest
         elif self._playing:
             self._at += round(elapsed_s * self._speed * 1e9)

@@ -23,13 +23,7 @@ from zstate.view.panels.html import Rows, format_number, pose_rows
 from zstate.view.panels.panel import BoundWidget, FrameDropdown, PanelContext
 from zstate.view.scene.scene import Scene
 
-_DISPLAYS = {
-    "visuals": "Visuals",
-    "collisions": "Collisions",
-    "axes": "Axes",
-    "names": "Names",
-    "parent_lines": "Parent lines",
-}
+_DISPLAYS = ("visuals", "collisions", "axes", "names", "parent_lines")
 _MAX_LINES = 12
 _MAX_FRAMES = 10
 _NO_POSE = "no pose"
@@ -47,7 +41,8 @@ class DisplayPanel:
         self._frames = FrameDropdown(gui, "Fixed frame", "(no frame yet)", hint)
         self._unknown = gui.add_html("")
         self._boxes = {
-            name: gui.add_checkbox(label, getattr(scene, name)) for name, label in _DISPLAYS.items()
+            name: gui.add_checkbox(name.replace("_", " ").capitalize(), getattr(scene, name))
+            for name in _DISPLAYS
         }
 
     def update(self, context: PanelContext) -> None:
@@ -125,11 +120,10 @@ def disconnected_html(tree: FrameTable, fixed: str) -> str:
         return ""
     lines = [f"{name}{f', and {below} below it' * bool(below)}" for name, below in others]
     command = f"zstate static {tree.names[root]} {others[0][0]} --xyz 1 0 0"
-    text = (
-        f"They are drawn next to it: their position is not known. Connect them, for instance with: {command}"
-    )
+    text = "They are drawn next to it: their position is not known. Connect them, for instance with:"
     end = "not connected to the fixed frame"
-    return _listing(f"frame is {end}", f"frames are {end}", lines) + html.paragraph(text, muted=True)
+    listing = _listing(f"frame is {end}", f"frames are {end}", lines)
+    return listing + html.paragraph(f"{text} {command}", muted=True)
 
 
 def unplaced_html(snapshot: FramePoses) -> str:

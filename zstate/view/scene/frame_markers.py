@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -48,21 +49,22 @@ class Axes:
 
     def show(self, on: bool, placed: Poses, shown: Mask) -> None:
         """Draw axes at each shown pose (N, 7), if ``on``."""
-        if not on or not shown.any():
-            if self._handle is not None:
-                self._handle.visible = False
-            return
-        poses = placed[shown].astype(np.float32)
-        if self._handle is None or len(self._drawn) != len(poses):
+        is_visible = on and bool(shown.any())
+        if self._handle is not None:
+            self._handle.visible = is_visible
+        if is_visible:
+            poses = placed[shown].astype(np.float32)
+            if self._handle is None or len(self._drawn) != len(poses):
+                self._handle = self._scene.add_batched_axes(
+                    "/axes",
+                    wxyzs(poses),
+                    poses[:, :3],
+                    axes_length=_AXIS_LENGTH_M,
+                    axes_radius=_AXIS_RADIUS_M,
+                )
+            elif not np.array_equal(poses, self._drawn):
+                set_instances(self._handle, poses[:, :3], wxyzs(poses))
             self._drawn = poses
-            self._handle = self._scene.add_batched_axes(
-                "/axes", wxyzs(poses), poses[:, :3], axes_length=_AXIS_LENGTH_M, axes_radius=_AXIS_RADIUS_M
-            )
-            return
-        self._handle.visible = True
-        if not np.array_equal(poses, self._drawn):
-            self._drawn = poses
-            set_instances(self._handle, poses[:, :3], wxyzs(poses))
 
 
 class ParentLines:
@@ -75,17 +77,15 @@ class ParentLines:
     def show(self, on: bool, placed: Poses, shown: Mask, parents: Rows) -> None:
         """Draw a line to each shown pose (N, 7) from a shown parent, if ``on``."""
         rows = np.flatnonzero(shown & (parents >= 0) & shown[parents]) if on else parents[:0]
-        if not len(rows):
-            if self._handle is not None:
-                self._handle.visible = False
-            return
         points = np.stack([placed[parents[rows], :3], placed[rows, :3]], axis=1).astype(np.float32)
-        if self._handle is None:
+        if self._handle is None and len(rows):
             self._handle = self._scene.add_line_segments(
                 "/lines", points, _LINE_COLOR, thickness=_LINE_WIDTH_PX, thickness_units="screen"
             )
-        self._handle.visible = True
-        self._handle.points = points
+        if self._handle is not None:
+            self._handle.visible = bool(len(rows))
+            if len(rows):
+                self._handle.points = points
 
 
 class NodeLabels:
@@ -164,36 +164,13 @@ def _texts(snapshot: FramePoses, shown: Mask, joined: Mask) -> dict[str, str]:
     return {names[row]: "\n".join(texts) for row, texts in lines.items()}
 
 
+@dataclass
 class _Trail:
     """The last positions of one frame, as a fixed number of segments that start at one point."""
 
-    def __init__(self, scene: viser.SceneApi, number: int, position: NDArray[np.float64], stamp: int) -> None:
-        self._points = np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32)
-        self._stamp = stamp
-        fade = np.linspace(0.0, 1.0, 2 * _TRAIL_SEGMENTS)[:, None] ** 0.5
-        colors = (1.0 - fade) * _BACKGROUND + fade * np.array(_TRAIL_COLORS[number % len(_TRAIL_COLORS)])
-        self.handle = scene.add_line_segments(
-            f"/trails/{number}",
-            self._points,
-            colors.reshape(_TRAIL_SEGMENTS, 2, 3).astype(np.uint8),
-            thickness=_TRAIL_WIDTH_PX,
-            thickness_units="screen",
-        )
-
-    def continues_at(self, stamp: int) -> bool:
-        """Whether a position at that stamp continues the trail: time has not jumped."""
-        return 0 <= stamp - self._stamp < _MAX_GAP_NS
-
-    def add(self, position: NDArray[np.float64], stamp: int) -> None:
-        """Append a position, unless it is too soon or too near."""
-        last = self._points[-1, 1]
-        if float(np.linalg.norm(position - last)) < _MIN_STEP_M:
-            self._stamp = stamp
-        elif stamp - self._stamp >= _TRAIL_PERIOD_NS:
-            self._points = np.roll(self._points, -1, axis=0)
-            self._points[-1] = (last, position)
-            self._stamp = stamp
-            self.handle.points = self._points
+    handle: viser.LineSegmentsHandle
+    points: NDArray[np.float32]
+    stamp: int
 
 
 class Trails:
@@ -214,20 +191,41 @@ class Trails:
             del self._trails[frame]
 
     def show(self, snapshot: FramePoses, fixed: str, placed: Poses) -> None:
-        """Append the current positions."""
+        """Append the current positions, unless they are too soon or too near."""
         if fixed != self._fixed:
             self._fixed = fixed
             for frame in self._trails:
                 self._clear(frame)
         for frame, trail in self._trails.items():
-            row = snapshot.tree.index.get(frame)
-            if row is None or snapshot.stamp is None or not np.isfinite(placed[row, 0]):
+            row, stamp = snapshot.tree.index.get(frame), snapshot.stamp
+            if row is None or stamp is None or not np.isfinite(placed[row, 0]):
                 continue
-            if trail is not None and trail.continues_at(snapshot.stamp):
-                trail.add(placed[row, :3], snapshot.stamp)
-            else:
-                number = self._numbers.setdefault(frame, len(self._numbers))
-                self._trails[frame] = _Trail(self._scene, number, placed[row, :3], snapshot.stamp)
+            position = placed[row, :3]
+            if trail is None or not 0 <= stamp - trail.stamp < _MAX_GAP_NS:
+                self._trails[frame] = self._new_trail(frame, position, stamp)
+                continue
+            last = trail.points[-1, 1]
+            if float(np.linalg.norm(position - last)) < _MIN_STEP_M:
+                trail.stamp = stamp
+            elif stamp - trail.stamp >= _TRAIL_PERIOD_NS:
+                points = np.roll(trail.points, -1, axis=0)
+                points[-1] = (last, position)
+                trail.points, trail.stamp = points, stamp
+                trail.handle.points = points
+
+    def _new_trail(self, frame: str, position: NDArray[np.float64], stamp: int) -> _Trail:
+        number = self._numbers.setdefault(frame, len(self._numbers))
+        points = np.broadcast_to(position, (_TRAIL_SEGMENTS, 2, 3)).astype(np.float32)
+        fade = np.linspace(0.0, 1.0, 2 * _TRAIL_SEGMENTS)[:, None] ** 0.5
+        colors = (1.0 - fade) * _BACKGROUND + fade * np.array(_TRAIL_COLORS[number % len(_TRAIL_COLORS)])
+        handle = self._scene.add_line_segments(
+            f"/trails/{number}",
+            points,
+            colors.reshape(_TRAIL_SEGMENTS, 2, 3).astype(np.uint8),
+            thickness=_TRAIL_WIDTH_PX,
+            thickness_units="screen",
+        )
+        return _Trail(handle, points, stamp)
 
     def _clear(self, frame: str) -> None:
         trail = self._trails[frame]

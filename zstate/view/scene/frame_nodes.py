@@ -54,7 +54,12 @@ class FrameNodes:
             self._rebuild(snapshot.tree)
         shown = np.isfinite(placed[:, 0])
         if not np.array_equal(shown, self.shown):
-            self._set_visible(snapshot.tree, shown)
+            self.shown = shown
+            self.version += 1
+            # A node without a pose is visible if a descendant has one.
+            visible = _with_ancestors(shown, snapshot.tree)[self._rows].tolist()
+            for handle, is_visible in zip(self._node_handles, visible, strict=True):
+                handle.visible = is_visible
         # Poses in the node of the parent, which is at the fixed frame if its own pose is unknown.
         parents = snapshot.tree.parents
         on_shown = (parents >= 0) & shown[parents]
@@ -67,7 +72,13 @@ class FrameNodes:
         return self.tree is not None and frame in self.paths and bool(self.shown[self.tree.row(frame)])
 
     def _rebuild(self, tree: FrameTable) -> None:
-        paths = self._new_paths(tree)
+        """Short names, because every message contains one; the number of a frame never changes."""
+        carriers = np.array([name in self._carriers for name in tree.names], dtype=np.bool_)
+        paths: dict[str, str] = {}
+        for row in np.flatnonzero(_with_ancestors(carriers, tree)).tolist():
+            name, parent = tree.names[row], int(tree.parents[row])
+            above = _TOP if parent < 0 else paths[tree.names[parent]]
+            paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
         removed = self._handles.keys() - set(paths.values())
         for path in removed:
             handle = self._handles.pop(path)
@@ -81,24 +92,6 @@ class FrameNodes:
         self._poses = np.full((len(paths), 7), np.nan)
         self.shown = np.zeros(0, dtype=np.bool_)
         self.tree, self.paths = tree, paths
-        self.version += 1
-
-    def _new_paths(self, tree: FrameTable) -> dict[str, str]:
-        """Short names, because every message contains one; the number of a frame never changes."""
-        carriers = np.array([name in self._carriers for name in tree.names], dtype=np.bool_)
-        paths: dict[str, str] = {}
-        for row in np.flatnonzero(_with_ancestors(carriers, tree)).tolist():
-            name, parent = tree.names[row], int(tree.parents[row])
-            above = _TOP if parent < 0 else paths[tree.names[parent]]
-            paths[name] = f"{above}/{self._ids.setdefault(name, len(self._ids))}"
-        return paths
-
-    def _set_visible(self, tree: FrameTable, shown: Mask) -> None:
-        """Hide nodes without a pose, unless a descendant has one."""
-        visible = _with_ancestors(shown, tree)[self._rows].tolist()
-        for handle, is_visible in zip(self._node_handles, visible, strict=True):
-            handle.visible = is_visible
-        self.shown = shown
         self.version += 1
 
     def _move(self, poses: Poses) -> None:

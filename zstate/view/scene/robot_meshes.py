@@ -42,7 +42,8 @@ class RobotKind(NamedTuple):
 class StyledMeshes:
     """The shapes of ``robots`` as ``meshes`` by style; those of a style are loaded when it is first shown.
 
-    ``version`` grows when meshes have been loaded, ``missing`` are the files that cannot be drawn.
+    ``pending`` meshes are still being loaded, ``version`` grows with each that is loaded, and ``missing`` are
+    the files that cannot be drawn.
     """
 
     def __init__(self, scene: viser.SceneApi, loader: MeshLoader, kind: RobotKind) -> None:
@@ -58,29 +59,20 @@ class StyledMeshes:
         self.version = 0
         self._scene = scene
         self._loader = loader
-        self._pending: list[MeshRequest] = []
-
-    @property
-    def busy(self) -> bool:
-        """Whether a mesh is still being loaded."""
-        return bool(self._pending)
+        self.pending: list[MeshRequest] = []
 
     def load(self, styles: Collection[RenderStyle]) -> None:
         """Request the meshes of the styles, once, and count the meshes that have been loaded."""
         for style, meshes in self.meshes.items():
             if style in styles and style not in self.requested:
                 self.requested.add(style)
-                self._pending += meshes
+                self.pending += meshes
                 self._loader.request(meshes)
-        loaded = [mesh for mesh in self._pending if mesh.is_loaded]
+        loaded = [mesh for mesh in self.pending if mesh.is_loaded]
         for mesh in loaded:
-            self._pending.remove(mesh)
+            self.pending.remove(mesh)
             self.version += 1
             self.missing += [one for one in mesh.missing if one not in self.missing]
-
-    def cancel(self) -> None:
-        """Drop all requests."""
-        self._loader.cancel(self._pending)
 
     def corners(self) -> Iterator[tuple[str, NDArray[np.float64]]]:
         """The frame of each loaded visual, with the corners of its bounding box in it (8, 3) [m]."""
@@ -142,7 +134,7 @@ class RobotMeshes(StyledMeshes):
         for mesh, (path, handle) in self._handles.items():
             if nodes.paths.get(f"{self._robot}/{mesh.shape.link}") == path:
                 handle.remove()
-        self.cancel()
+        self._loader.cancel(self.pending)
 
 
 @dataclass(eq=False)
@@ -197,7 +189,7 @@ class InstancedMeshes(StyledMeshes):
     def remove(self) -> None:
         """Remove all meshes."""
         self._remove_nodes()
-        self.cancel()
+        self._loader.cancel(self.pending)
 
     def _remove_nodes(self) -> None:
         for batch in self._batches.values():

@@ -66,7 +66,7 @@ class Scene:
     @property
     def busy(self) -> bool:
         """Whether meshes are still being loaded."""
-        return any(meshes.busy for meshes in self._meshes())
+        return any(meshes.pending for meshes in self._meshes())
 
     def set_robot(
         self, name: str, model: RobotModel, shapes: Sequence[Shape] | None = None, base: Path | None = None
