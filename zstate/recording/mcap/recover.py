@@ -99,7 +99,7 @@ def _copy(file: BoundedFile, scan: Scan, output: McapOutput) -> Counter[str]:
                 payload = data[start + MESSAGE.size : stop]
                 writer.add_message(copied[number], log_time, payload, publish_time, sequence)
                 counts[index.channels[number].topic] += 1
-        output.flush()
+        output.write_chunk()
     for attachment in scan.attachments:
         created, logged = attachment.create_time, attachment.log_time
         writer.add_attachment(created, logged, attachment.name, attachment.media_type, attachment.data)
