@@ -61,9 +61,9 @@ class Record(NamedTuple):
 class ReadFilter(NamedTuple):
     """Selects records of these topics (None: all) with log times in [begin, end)."""
 
-    topics: frozenset[str] | None = None
-    begin: int = -(1 << 63)
-    end: int = 1 << 64
+    topics: frozenset[str] | None
+    begin: int
+    end: int
 
     def accepts(self, channel: Channel) -> bool:
         """Whether records of ``channel`` are read at all: only CDR is."""
