@@ -11,6 +11,7 @@ from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.clock import SIMULATED, ManualClock
 from zstate.errors import InvalidInput, MessageError, ModelError
+from zstate.ingest.joint_states import joint_order
 from zstate.ingest.transforms import ModelEdgeFilter
 from zstate.model.robot import RobotModel
 from zstate.model.urdf import parse_urdf
@@ -19,7 +20,7 @@ from zstate.net.presence import local_writer
 from zstate.net.session import Session
 from zstate.net.writer import LatchedWriter, SampleWriter, WireWriter, write_all
 from zstate.nodes.publisher import StatePublisher
-from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, joint_order, static_key
+from zstate.recording.decode import DecodedMessage, LatchedState, RecordedWriter, static_key
 from zstate.wire.identity import Announcement
 from zstate.wire.keys import MODEL_WRITER, Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample

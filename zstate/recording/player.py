@@ -19,10 +19,10 @@ from zstate.recording.decode import (
     LATCHED,
     DecodedRecording,
     LatchedState,
+    check_has_robot,
     first_descriptions,
     recorded_model,
 )
-from zstate.recording.load import check_has_robot
 from zstate.recording.playback_publishers import PlaybackPublishers
 from zstate.recording.player_clock import Lateness, PlayerClock
 from zstate.recording.reader import RecordingReader
