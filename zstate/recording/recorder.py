@@ -26,6 +26,7 @@ from zstate.net.presence import announce_reader, watch
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.rate import Rate
+from zstate.recording.decode import LATCHED
 from zstate.recording.encode import RecordingEncoder
 from zstate.recording.mcap.writer import RecordingWriter
 from zstate.wire.identity import Announcement
@@ -53,7 +54,6 @@ _DISCOVERY_NS = 300_000_000
 _DRAIN_S = 0.5
 _JOIN_WITHIN_S = 0.9
 
-_LATCHED: tuple[Stream, ...] = ("robot_description", "tf_static")
 _SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
 
@@ -83,21 +83,17 @@ class MessageQueue(Closeable):
         self._opened = ExitStack()
 
     def subscribe(self, stream: Stream, expression: str, robot: str | None) -> None:
-        """Subscribe to samples."""
+        """Subscribe to a stream; an empty payload of a latched one is a withdrawn value."""
         capacity = capacity_for(expression)
 
         def put(arrivals: list[SerializedSample]) -> None:
             self._put(Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity))
 
-        self._opened.enter_context(StreamSubscriber(self._session, expression, put))
-
-    def subscribe_latched(self, stream: Stream, expression: str, robot: str | None) -> None:
-        """Subscribe to latched values; an empty payload is a withdrawn one."""
-
-        def put(arrival: SerializedSample) -> None:
-            self._put(Batch(stream, robot, [arrival], time.time_ns(), overflowed=False))
-
-        self._opened.enter_context(LatchedSubscriber(self._session, expression, put))
+        if stream in LATCHED:
+            subscriber = LatchedSubscriber(self._session, expression, lambda arrival: put([arrival]))
+        else:
+            subscriber = StreamSubscriber(self._session, expression, put)
+        self._opened.enter_context(subscriber)
 
     def pop_all(self) -> list[Batch]:
         """Remove and return all batches, in the order of reception."""
@@ -189,7 +185,7 @@ class Recorder(Closeable):
             opening.enter_context(watch(session, robot, self._on_writer, wire))
             self._subscribe()
             for robot in self._selected or (ANY,):
-                for announcement in announce_reader(session, self._wire, robot, (*_LATCHED, *_SAMPLES)):
+                for announcement in announce_reader(session, self._wire, robot, (*LATCHED, *_SAMPLES)):
                     opening.enter_context(announcement)
             self._writer = RecordingWriter(
                 path, max_bytes=max_bytes, max_seconds=max_seconds, overwrite=overwrite
@@ -203,13 +199,13 @@ class Recorder(Closeable):
 
     def _subscribe(self) -> None:
         """Subscribe to every stream; if two robots share an expression, keys distinguish them."""
-        for stream in (*_LATCHED, *_SAMPLES):
+        for stream in (*LATCHED, *_SAMPLES):
             robots: dict[str, set[str]] = {}
             for robot in self._selected or (ANY,):
                 robots.setdefault(self._wire.expression(robot, stream), set()).add(robot)
-            subscribe = self._queue.subscribe_latched if stream in _LATCHED else self._queue.subscribe
             for expression, named in robots.items():
-                subscribe(stream, expression, named.pop() if self._selected and len(named) == 1 else None)
+                robot = named.pop() if self._selected and len(named) == 1 else None
+                self._queue.subscribe(stream, expression, robot)
         clock = self._wire.expression(self._selected[0] if self._selected else ANY, "clock")
         self._queue.subscribe("clock", clock, SHARED)
 
@@ -316,7 +312,7 @@ class Recorder(Closeable):
             robot = self._robot(batch, arrival)
             if robot is None:
                 continue
-            if batch.stream in _LATCHED and self._large.accepts(robot, len(arrival.payload)):
+            if batch.stream in LATCHED and self._large.accepts(robot, len(arrival.payload)):
                 self._large.put(robot, batch, arrival)
             else:
                 self._write_arrival(robot, batch, arrival)
@@ -325,7 +321,7 @@ class Recorder(Closeable):
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
         assert encoder is not None
         static_writer = self._wire.static_writer_name(arrival.key) if stream == "tf_static" else None
-        if not arrival.payload and stream in _LATCHED:
+        if not arrival.payload and stream in LATCHED:
             if static_writer is not None:
                 encoder.withdraw(robot, static_writer, stamp)
             return
