@@ -65,11 +65,12 @@ class RecordingEncoder:
     Samples are written from one thread, latched messages from the same or from one other thread: large ones
     take long to encode, and do not block samples.
 
-    ``alone`` is the robot in the root of ROS's names (see ``RosNamespaces``). ``refuse(reason, text)`` is
-    called for each message that cannot be written: CDR cannot represent it ("no stamp", "stamp outside 1901
-    to 2038", "not sayable"), its model is unusable ("unusable model"), or its robot has opened too many
-    channels ("too many writers", see ``OpenChannels``). ``programs`` maps sessions to program names, as far
-    as known when the first message of a session is written.
+    The robot ``alone`` and what belongs to no robot are in the root of ROS's names, with unchanged frame
+    names, where every ROS tool finds them; any other robot has a namespace and a frame prefix of its own.
+    ``refuse(reason, text)`` is called for each message that cannot be written: CDR cannot represent it ("no
+    stamp", "stamp outside 1901 to 2038", "not sayable"), its model is unusable ("unusable model"), or its
+    robot has opened too many channels ("too many writers", see ``OpenChannels``). ``programs`` maps sessions
+    to program names, as far as known when the first message of a session is written.
     """
 
     def __init__(
@@ -82,7 +83,8 @@ class RecordingEncoder:
     ) -> None:
         self._writer = writer
         self._refuse = refuse
-        self._namespaces = RosNamespaces(alone)
+        self._root = {SHARED, alone}
+        self._namespaces: dict[str, str] = {}
         self._programs = programs
         self._lock = fork_safe_lock()
         self._channels: defaultdict[str, OpenChannels] = defaultdict(OpenChannels)
@@ -209,7 +211,7 @@ class RecordingEncoder:
             return channel
         if not opened.allow(log_time):
             raise _TooManyWriters("its writers start too often, each with channels of its own")
-        options = self._namespaces.options(robot)
+        options = self._options(robot)
         metadata = {"zstate.session": str(session)}
         if stream != "clock":
             metadata |= {ROBOT: robot, "zstate.frame_prefix": options.frame_prefix}
@@ -223,6 +225,18 @@ class RecordingEncoder:
         for unused in opened.add(key, channel, self._latched.get(robot, {}).values()):
             self._writer.release(unused.number)
         return channel
+
+    def _options(self, robot: str) -> Ros2Options:
+        """The namespace and the frame prefix of a robot. Raises InvalidInput for an invalid name."""
+        if robot in self._root:
+            return Ros2Options()
+        if robot not in self._namespaces:
+            # "arm-1" and "arm.1" are valid robots for zstate, but not valid names in ROS.
+            name = re.sub(r"\W|^(?=\d)", "_", robot, flags=re.ASCII)
+            while name in self._namespaces.values():
+                name += "_"
+            self._namespaces[robot] = name
+        return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
 
 
 class ChannelEncoder:
@@ -339,30 +353,6 @@ class PendingSamples:
     def pop(self, robot: str) -> Iterable[tuple[Sample | ClockMessage, int]]:
         """Remove the samples of ``robot``, and return them with their log times."""
         return self._robots.pop(robot, ())
-
-
-class RosNamespaces:
-    """The ROS namespace and the frame prefix of each robot in one recording.
-
-    ``alone`` and what belongs to no robot are in the root, with unchanged frame names, where every ROS tool
-    finds them. Any other robot has a namespace and a frame prefix of its own.
-    """
-
-    def __init__(self, alone: str | None = None) -> None:
-        self._root = {SHARED, alone}
-        self._namespaces: dict[str, str] = {}
-
-    def options(self, robot: str) -> Ros2Options:
-        """Raises InvalidInput for an invalid robot name."""
-        if robot in self._root:
-            return Ros2Options()
-        if robot not in self._namespaces:
-            # "arm-1" and "arm.1" are valid robots for zstate, but not valid names in ROS.
-            name = re.sub(r"\W|^(?=\d)", "_", robot, flags=re.ASCII)
-            while name in self._namespaces.values():
-                name += "_"
-            self._namespaces[robot] = name
-        return Ros2Options(namespace=self._namespaces[robot], frame_prefix=f"{robot}/")
 
 
 class StaticAccumulator:

@@ -301,12 +301,9 @@ class _Ros1Encoder:
         self._table = JointTransforms(model)
         forms = self._table.forms
         self._rows = [row for row, form in enumerate(forms) if form.kind != "fixed"]
+        self.has_moving_edges = bool(self._rows)
         edges = [(names.prefix + forms[row].parent, names.prefix + forms[row].child) for row in self._rows]
         self._transforms = TransformsWriter(ros, edges)
-
-    @property
-    def has_moving_edges(self) -> bool:
-        return bool(self._rows)
 
     def transforms(self, stamp: int, positions: NDArray[np.float64]) -> Any:
         return self._transforms.message(stamp, self._table.poses(positions).take(self._rows, axis=0))
