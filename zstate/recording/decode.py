@@ -129,11 +129,6 @@ class DecodedRecording:
             or (writer.foreign and writer.robot == SHARED and writer.stream in ("tf", "tf_static"))
         }
 
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """The first and the last log time [ns] of the whole recording; None when it is empty."""
-        return self._reader.span
-
     def messages(
         self,
         robots: Collection[str] | None = None,

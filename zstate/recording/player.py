@@ -112,7 +112,7 @@ class Player(Closeable):
         self._position = self._begin
 
     def _bounds(self, path: str | Path, start_s: float, duration_s: float | None) -> tuple[int, int]:
-        span = self._recording.span
+        span = self._reader.span
         if span is None or not self.robots:
             raise InvalidInput(f"there is nothing in {str(path)!r} to replay")
         length_s = (span[1] - span[0]) / 1e9

@@ -87,7 +87,16 @@ class MessageQueue(Closeable):
         capacity = capacity_for(expression)
 
         def put(arrivals: list[SerializedSample]) -> None:
-            self._put(Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity))
+            batch = Batch(stream, robot, arrivals, time.time_ns(), len(arrivals) >= capacity)
+            with self._has_room:
+                # A slow reader must not fill the memory: the subscription's ring drops samples, and counts
+                # them.
+                while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= QUEUE_BYTES):
+                    self._has_room.wait()
+                if self._is_open:
+                    self._batches.append(batch)
+                    self._waiting += len(arrivals)
+                    self._bytes += sum(len(arrival.payload) for arrival in arrivals)
 
         if stream in LATCHED:
             subscriber = LatchedSubscriber(self._session, expression, lambda arrival: put([arrival]))
@@ -109,16 +118,6 @@ class MessageQueue(Closeable):
             self._is_open = False
             self._has_room.notify_all()
         self._opened.close()
-
-    def _put(self, batch: Batch) -> None:
-        with self._has_room:
-            # A slow reader must not fill the memory: the subscription's ring drops samples, and counts them.
-            while self._is_open and (self._waiting >= QUEUE_LENGTH or self._bytes >= QUEUE_BYTES):
-                self._has_room.wait()
-            if self._is_open:
-                self._batches.append(batch)
-                self._waiting += len(batch.arrivals)
-                self._bytes += sum(len(arrival.payload) for arrival in batch.arrivals)
 
 
 @dataclass(frozen=True, slots=True)
