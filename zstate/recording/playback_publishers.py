@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from typing import NamedTuple
 
@@ -27,6 +27,8 @@ from zstate.wire.joint_order import JointOrder
 from zstate.wire.keys import MODEL_WRITER, Stream
 from zstate.wire.messages import JointState, Message, RobotDescription, StaticTransforms, TransformSample
 from zstate.wire.registry import get_wire
+
+_SAMPLES: tuple[Stream, ...] = ("joint_states", "tf")
 
 
 class PlaybackPublishers(Closeable):
@@ -62,7 +64,10 @@ class PlaybackPublishers(Closeable):
             opening.callback(lambda: [robot.publisher.close() for robot in self._robots.values()])
             for robot, model in models.items():
                 self._open(robot, model, _is_computed(robot, writers))
-            for robot, streams in self._other_streams(writers).items():
+            recorded = {(writer.robot, writer.stream) for writer in writers}
+            for robot in {robot for robot, _ in recorded if robot}:
+                own = self._robots[robot].streams if robot in self._robots else ()
+                streams = [one for one in _SAMPLES if (robot, one) in recorded and one not in own]
                 self._others[robot] = PassthroughPublisher(
                     session, wires, robot, streams, sessions=self._sessions, takeover=takeover
                 )
@@ -90,17 +95,6 @@ class PlaybackPublishers(Closeable):
         )
         self._robots[robot] = _RobotPublisher(publisher, joint_order(model), streams)
         self._sessions.add(publisher.description().session)
-
-    def _other_streams(self, writers: Iterable[RecordedWriter]) -> dict[str, list[Stream]]:
-        streams: dict[str, list[Stream]] = {}
-        for writer in writers:
-            if writer.robot:
-                found = streams.setdefault(writer.robot, [])
-                robot = self._robots.get(writer.robot)
-                own: Collection[Stream] = () if robot is None else robot.streams
-                if writer.stream in ("joint_states", "tf") and writer.stream not in (*own, *found):
-                    found.append(writer.stream)
-        return streams
 
     def publish(self, decoded: DecodedMessage) -> bool:
         """Publish it; False for a repetition and for what cannot be published."""
@@ -266,8 +260,8 @@ def _is_computed(robot: str, writers: Collection[RecordedWriter]) -> bool:
 
     That is the case without recorded transforms, or if the writer of the joint states wrote them too.
     """
-    sessions: dict[Stream, set[int]] = {"tf": set(), "joint_states": set()}
-    for writer in writers:
-        if writer.robot == robot and writer.stream in sessions:
-            sessions[writer.stream].add(writer.session)
-    return sessions["tf"] <= sessions["joint_states"]
+
+    def sessions(stream: Stream) -> set[int]:
+        return {writer.session for writer in writers if (writer.robot, writer.stream) == (robot, stream)}
+
+    return sessions("tf") <= sessions("joint_states")

@@ -60,7 +60,7 @@ class McapFile:
             try:
                 self._index = index = Summary(file).index()
             except CorruptData:
-                self._index = index = Scan(file).index()
+                self._index = index = Scan(file).index
         self.profile, self.library = index.header.profile, index.header.library
         self._channels: dict[int, Channel] = {}
         for number, channel in index.channels.items():

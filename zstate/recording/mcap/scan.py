@@ -44,11 +44,14 @@ _OVERLAP = 8
 
 
 class Scan:
-    """Contents of a file. Raises CorruptData if not even its header can be read."""
+    """Contents of a file: its rebuilt ``index``, ``metadata`` and ``attachments``.
+
+    Raises CorruptData if not even its header can be read.
+    """
 
     def __init__(self, file: BoundedFile) -> None:
         self._file = file
-        self._header, at = read_header(file)
+        header, at = read_header(file)
         self._end = file.size
         self._summary: Summary | None = None
         with suppress(CorruptData):
@@ -66,27 +69,24 @@ class Scan:
         while at < self._end and not self._has_data_end:
             at = self._step(at)
         self._add_bare_range(at)
+        schemas, channels = self._schemas, self._channels
         if self._summary is not None:  # its copy describes the channels whose chunk is lost
-            self._schemas = {**self._summary.contents.schemas, **self._schemas}
-            self._channels = {**self._summary.contents.channels, **self._channels}
+            schemas = {**self._summary.contents.schemas, **schemas}
+            channels = {**self._summary.contents.channels, **channels}
         for number, count in self._counts.items():
-            if number not in self._channels:
+            if number not in channels:
                 reason = f"{count} messages of channel {number}, whose description is lost"
                 self._losses.append(DataLoss(self._ranges[0].offset, 0, reason))
-
-    def index(self) -> Index:
-        """The rebuilt index."""
-        counts = {number: count for number, count in self._counts.items() if number in self._channels}
-        complete = self._has_data_end and not self._losses
-        if complete:
-            try:
-                read_footer(self._file)
-            except CorruptData:
-                complete = False
+        counts = {number: count for number, count in self._counts.items() if number in channels}
         ranges = tuple(one for one in self._ranges if one.channels)
         span = (min(one.first for one in ranges), max(one.last for one in ranges)) if ranges else None
+        complete = False
+        if self._has_data_end and not self._losses:
+            with suppress(CorruptData):
+                read_footer(file)
+                complete = True
         losses = tuple(self._losses)
-        return Index(self._header, self._schemas, self._channels, counts, span, ranges, complete, losses)
+        self.index = Index(header, schemas, channels, counts, span, ranges, complete, losses)
 
     def _step(self, at: int) -> int:
         """Read the record at ``at``; the offset to continue at."""
