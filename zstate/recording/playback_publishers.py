@@ -67,7 +67,9 @@ class PlaybackPublishers(Closeable):
             recorded = {(writer.robot, writer.stream) for writer in writers}
             for robot in {robot for robot, _ in recorded if robot}:
                 own = self._robots[robot].streams if robot in self._robots else ()
-                streams = [one for one in _SAMPLES if (robot, one) in recorded and one not in own]
+                streams: list[Stream] = [
+                    one for one in _SAMPLES if (robot, one) in recorded and one not in own
+                ]
                 self._others[robot] = PassthroughPublisher(
                     session, wires, robot, streams, sessions=self._sessions, takeover=takeover
                 )

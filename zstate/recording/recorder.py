@@ -279,7 +279,18 @@ class Recorder(Closeable):
         if self._encoder is None:
             return
         for batch in self._pending:
-            self._write(batch)
+            self._gaps.start_batch(overflowed=batch.overflowed)
+            for arrival in batch.arrivals:
+                if time.monotonic() > self._ends_at:
+                    self._counters.count("dropped")
+                    continue
+                robot = self._robot(batch, arrival)
+                if robot is None:
+                    continue
+                if batch.stream in LATCHED and self._large.accepts(robot, len(arrival.payload)):
+                    self._large.put(robot, batch, arrival)
+                else:
+                    self._write_arrival(robot, batch, arrival)
         self._pending = []
 
     def _new_encoder(self) -> RecordingEncoder | None:
@@ -301,20 +312,6 @@ class Recorder(Closeable):
         return RecordingEncoder(
             self._writer, self._counters.count_refusal, alone=alone, programs=self._programs
         )
-
-    def _write(self, batch: Batch) -> None:
-        self._gaps.start_batch(overflowed=batch.overflowed)
-        for arrival in batch.arrivals:
-            if time.monotonic() > self._ends_at:
-                self._counters.count("dropped")
-                continue
-            robot = self._robot(batch, arrival)
-            if robot is None:
-                continue
-            if batch.stream in LATCHED and self._large.accepts(robot, len(arrival.payload)):
-                self._large.put(robot, batch, arrival)
-            else:
-                self._write_arrival(robot, batch, arrival)
 
     def _write_arrival(self, robot: str, batch: Batch, arrival: SerializedSample) -> None:
         encoder, stream, stamp = self._encoder, batch.stream, batch.stamp
