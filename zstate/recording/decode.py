@@ -56,10 +56,9 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot."""
         name = channel.topic.rpartition("/")[2]
-        for stream in STREAMS:
-            if name == stream and channel.type_name == ros_type(stream).name:
-                break
-        else:
+        known = (one for one in STREAMS if name == one and channel.type_name == ros_type(one).name)
+        stream = next(known, None)
+        if stream is None:
             return None
         facts = channel.metadata
         foreign = _SESSION not in facts
@@ -238,8 +237,8 @@ def first_descriptions(
     recording: DecodedRecording, robots: Collection[str] | None = None
 ) -> dict[str, DecodedMessage]:
     """The first description of each robot."""
-    described = [writer.robot for writer in recording.writers if writer.stream == "robot_description"]
-    missing = {robot for robot in described if robots is None or robot in robots}
+    described = {writer.robot for writer in recording.writers if writer.stream == "robot_description"}
+    missing = described if robots is None else described.intersection(robots)
     found: dict[str, DecodedMessage] = {}
     for decoded in recording.messages(missing, ("robot_description",)):
         found.setdefault(decoded.writer.robot, decoded)

@@ -10,7 +10,6 @@ from typing import Any
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
 from zstate.bridges.ros1.messages import (
-    Edge,
     JointStateReader,
     Ros1FrameNames,
     get_stamp,
@@ -67,7 +66,7 @@ class Ros1ToNative(Closeable):
         self._edges: dict[str, tuple[str, tuple[float, ...]]] = {}
         self._joint_names: list[str] = []
         self._tf_checked_at: dict[str, float] = {}
-        self._not_carried: set[Edge] = set()
+        self._not_carried: set[tuple[str, str]] = set()
         if at_once:
             self._publisher()
         node.subscribe("joint_states", node.ros.JointState, self._on_joints)

@@ -17,11 +17,8 @@ from zstate.errors import InsertRefused, MessageError, SecondWriter
 from zstate.model.joint_transforms import JointTransforms
 from zstate.model.robot import RobotModel, coordinate_names, velocity_columns_by_position
 from zstate.sources.joint_source import JointStateValidator
-from zstate.wire.joint_order import JointNumbers
+from zstate.wire.joint_order import Floats, JointNumbers
 from zstate.wire.keys import wire_name
-
-Floats = NDArray[np.float64]
-Edge = tuple[str, str]
 
 _SECOND = 1_000_000_000
 # A ROS 1 time is two unsigned numbers of 32 bits.
@@ -87,7 +84,7 @@ class JointStateWriter:
 class TransformsWriter:
     """Encodes the poses of ``edges`` (parent and child, by their ROS names) in one TFMessage."""
 
-    def __init__(self, ros: RospyModules, edges: Sequence[Edge]) -> None:
+    def __init__(self, ros: RospyModules, edges: Sequence[tuple[str, str]]) -> None:
         self._message = ros.TFMessage()
         for parent, child in edges:
             transform = ros.TransformStamped(child_frame_id=child)
@@ -121,7 +118,7 @@ class RobotWriter:
         edges = [(names.prefix + forms[row].parent, names.prefix + forms[row].child) for row in self._rows]
         self._transforms = TransformsWriter(ros, edges)
 
-    def transforms(self, stamp: int, positions: NDArray[np.float64]) -> Any:
+    def transforms(self, stamp: int, positions: Floats) -> Any:
         return self._transforms.message(stamp, self._table.poses(positions).take(self._rows, axis=0))
 
 

@@ -7,16 +7,16 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.refusals import Refusals
-from zstate.bridges.ros1.messages import Edge, RobotWriter, Ros1FrameNames, TransformsWriter, refusal_reason
+from zstate.bridges.ros1.messages import RobotWriter, Ros1FrameNames, TransformsWriter, refusal_reason
 from zstate.bridges.ros1.node import Node
 from zstate.errors import InvalidInput, MessageError, ModelError, Unreachable
 from zstate.model.urdf import parse_urdf
 from zstate.net.session import Session
 from zstate.net.subscription import Received, subscribe
+from zstate.wire.joint_order import Floats
 from zstate.wire.keys import MODEL_WRITER
 from zstate.wire.messages import JointState, RobotDescription, StaticTransforms, poses_from_block
 from zstate.wire.native import NativeWire
@@ -51,7 +51,7 @@ class NativeToRos1(Closeable):
         self._with_description = with_description
         self._refusals = refusals
         self._wire = NativeWire()
-        self._statics: dict[str, dict[Edge, NDArray[np.float64]]] = {}
+        self._statics: dict[str, dict[tuple[str, str], Floats]] = {}
         self._joints = node.publisher("joint_states", node.ros.JointState)
         self._moving = node.publisher("/tf", node.ros.TFMessage)
         self._fixed = node.publisher("/tf_static", node.ros.TFMessage, latch=True)
@@ -114,7 +114,7 @@ class NativeToRos1(Closeable):
         """Replace the static edges of one writer (None: withdrawn; ROS nodes keep withdrawn edges)."""
         if statics is not None and self._is_own(statics.session, writer):
             return
-        edges: dict[Edge, NDArray[np.float64]] = {}
+        edges: dict[tuple[str, str], Floats] = {}
         if statics is not None:
             poses = poses_from_block(statics.poses)
             if not np.isfinite(poses).all():
