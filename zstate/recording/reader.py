@@ -139,9 +139,10 @@ class SqliteFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.size = self._steps = 0
+        self.size = self._steps = self._max_steps = 0
         with self._errors():
             self.size = path.stat().st_size
+            self._max_steps = _STEPS + _STEPS_PER_BYTE * self.size
             uri = f"file:{quote(str(path.resolve()))}?mode=ro"
             journals = [path.with_name(path.name + ending) for ending in ("-wal", "-journal")]
             if not any(journal.exists() for journal in journals):
@@ -171,26 +172,17 @@ class SqliteFile:
     def _errors(self) -> Generator[None, None, None]:
         try:
             yield
-        except sqlite3.OperationalError as error:
-            if "interrupted" in str(error) and self._steps <= self._max_steps:
-                raise KeyboardInterrupt from None  # SQLite drops exceptions that signals raise in the handler
-            raise self._unreadable(error) from error
         except (sqlite3.Error, OSError, ValueError, TypeError, OverflowError) as error:
-            raise self._unreadable(error) from error
-
-    def _unreadable(self, error: Exception) -> RecordingError:
-        reason = str(error)
-        if self._steps > self._max_steps:
-            reason = f"a query took more than {self._max_steps} steps, too many for {self.size} bytes"
-        text = (
-            f"{str(self.path)!r} cannot be read as a rosbag2 database: {reason}; if it is damaged, "
-            "`sqlite3 FILE .recover` may save a part of it"
-        )
-        return RecordingError(text, path=str(self.path))
-
-    @property
-    def _max_steps(self) -> int:
-        return _STEPS + _STEPS_PER_BYTE * self.size
+            reason = str(error)
+            if self._steps > self._max_steps:
+                reason = f"a query took more than {self._max_steps} steps, too many for {self.size} bytes"
+            elif isinstance(error, sqlite3.OperationalError) and "interrupted" in reason:
+                raise KeyboardInterrupt from None  # SQLite drops exceptions that signals raise in the handler
+            text = (
+                f"{str(self.path)!r} cannot be read as a rosbag2 database: {reason}; if it is damaged, "
+                "`sqlite3 FILE .recover` may save a part of it"
+            )
+            raise RecordingError(text, path=str(self.path)) from error
 
     def _is_over_limit(self) -> bool:
         self._steps += _STEPS_BETWEEN
