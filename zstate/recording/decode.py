@@ -56,9 +56,10 @@ class RecordedWriter:
     def from_channel(cls, channel: Channel) -> RecordedWriter | None:
         """The writer of ``channel``; None if it is no stream of a robot."""
         name = channel.topic.rpartition("/")[2]
-        known = (one for one in STREAMS if name == one and channel.type_name == ros_type(one).name)
-        stream = next(known, None)
-        if stream is None:
+        for stream in STREAMS:
+            if name == stream and channel.type_name == ros_type(stream).name:
+                break
+        else:
             return None
         facts = channel.metadata
         foreign = _SESSION not in facts
