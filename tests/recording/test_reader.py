@@ -436,7 +436,7 @@ def test_query_that_takes_too_long_for_the_file_size_is_ended(
         database.commit()
     with RecordingReader(path) as reader:
         assert reader.span == (0, 19_999)
-    monkeypatch.setattr("zstate.recording.sqlite_file._STEPS", 0)
-    monkeypatch.setattr("zstate.recording.sqlite_file._STEPS_PER_BYTE", 0)
+    monkeypatch.setattr("zstate.recording.reader._STEPS", 0)
+    monkeypatch.setattr("zstate.recording.reader._STEPS_PER_BYTE", 0)
     with pytest.raises(RecordingError, match="took more than 0 steps"):
         RecordingReader(path)

@@ -85,7 +85,7 @@ def wild(path: Path, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_lookup_many_equals_that_of_a_full_buffer(tmp_path: Path, seed: int, monkeypatch):
-    monkeypatch.setattr("zstate.recording.load._BATCH", 37)
+    monkeypatch.setattr("zstate.recording.recording._BATCH", 37)
     wild(tmp_path / "r.mcap", seed)
     dice = np.random.default_rng(seed)
     begin = START - 3600 * S

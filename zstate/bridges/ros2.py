@@ -232,8 +232,7 @@ class Bridge(Closeable):
             BridgeSide(native, "native", "native to ROS"),
             BridgeSide(ros, ros_wire, "ROS to native"),
         )
-        ignore: Callable[[str, Way | None], object] = lambda _robot, _way: None  # noqa: E731
-        self._on_change = on_change or ignore
+        self._on_change: Callable[[str, Way | None], object] = on_change or (lambda _robot, _way: None)
         self._writers: defaultdict[str, tuple[set[Announcement], ...]] = defaultdict(lambda: (set(), set()))
         self._carriers: dict[str, RobotBridge] = {}
         self._conflicts: set[str] = set()

@@ -25,8 +25,7 @@ from zstate.cli.stream_reader import StreamReader
 from zstate.cli.waiting import PoseWaiter
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.nodes.listener import TransformListener
-from zstate.recording.decode import DecodedRecording, first_descriptions
-from zstate.recording.load import check_has_robot
+from zstate.recording.decode import DecodedRecording, check_has_robot, first_descriptions
 from zstate.recording.reader import RecordingReader
 from zstate.recording.recording import Recording
 from zstate.wire.messages import JointState, RobotDescription

@@ -22,8 +22,7 @@ from zstate.net.session import Session
 from zstate.nodes.publisher import STREAMS, StatePublisher
 from zstate.rate import check_rate
 from zstate.se3 import quaternion_from_rpy, rpy_from_quaternion
-from zstate.sources.joint_source import JointReading
-from zstate.sources.sine import SineSource
+from zstate.sources.joint_source import JointReading, SineSource
 
 Unit = Literal["rad", "m"]
 Values = NDArray[np.float64]

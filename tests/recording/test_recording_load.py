@@ -34,14 +34,16 @@ from zstate.wire.messages import RobotDescription
 IDENTITY = pose()
 
 
-def description(model=RRBOT, session: int = 1) -> RobotDescription:
-    return RobotDescription(session, model.urdf, model.digest, model.joint_names, ())
+def live_buffer() -> tuple[TransformBuffer, JointStateIngest]:
+    """The buffer of a listener that knows the model of "arm", and its ingest."""
+    live = TransformBuffer()
+    ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
+    ingest.describe(RobotDescription(1, RRBOT.urdf, RRBOT.digest, RRBOT.joint_names, ()))
+    return live, ingest
 
 
 def test_lookups_are_bit_identical_to_a_live_buffer(tmp_path: Path):
-    live = TransformBuffer()
-    ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
-    ingest.describe(description())
+    live, ingest = live_buffer()
     with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
         builder.describe("arm")
         for n in range(1500):
@@ -107,9 +109,7 @@ def test_new_writer_with_an_earlier_clock_starts_a_new_history(tmp_path: Path):
 
 
 def test_second_sample_of_a_clock_set_back_starts_a_new_history_as_live(tmp_path: Path):
-    live = TransformBuffer()
-    ingest = JointStateIngest("arm", FrameOwnership(live, Counters()))
-    ingest.describe(description())
+    live, ingest = live_buffer()
     with RecordingBuilder(tmp_path / "r.mcap", "arm") as builder:
         builder.describe("arm")
         for number, stamp in enumerate([100 * S, 101 * S, 5 * S, 6 * S, 7 * S]):
