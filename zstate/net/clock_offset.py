@@ -5,9 +5,6 @@ at some time during the round trip; with the middle of it the error is at most h
 shortest of several is used (as in NTP). Writers on simulated time do not reply: they share one clock.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import threading

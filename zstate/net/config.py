@@ -1,8 +1,5 @@
 """Session settings: modes, checked endpoints, ``ZSTATE_*`` variables, and the zenoh.Config they make."""
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import ipaddress

@@ -1,8 +1,5 @@
 """Latched values (ROS 1; transient local in DDS): late joiners receive the current value of each key."""
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false, reportUnknownLambdaType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 from collections.abc import Callable

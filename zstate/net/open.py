@@ -3,9 +3,6 @@
 Also sets Zenoh's thread-pool sizes: enough that closing dead links does not block reconnecting peers.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import json

@@ -4,9 +4,6 @@
 they are published. Conflicting writers are found by their liveliness tokens and raise SecondWriter.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import time

@@ -3,9 +3,6 @@
 Discovery queries the tokens; ``WriterWatch`` follows their changes. ``connections`` counts links.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import math

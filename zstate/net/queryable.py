@@ -7,9 +7,6 @@ while Zenoh holds its own: next to a computing thread, 8000 replies then take mo
 into a channel that is never full, and the limit is applied where they are read.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import logging

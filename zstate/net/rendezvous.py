@@ -11,9 +11,6 @@ second, sessions meet at the next address in the same way and keep checking the 
 register there, and so meet the process that was stopped.
 """
 
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import os

@@ -15,9 +15,6 @@ announced writer may never reply: in the order of arrival a thousand silent writ
 those of another robot by minutes. So robots take turns.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import heapq

@@ -1,8 +1,5 @@
 """Session: the connection to the network, opened by ``connect``."""
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import itertools

@@ -3,9 +3,6 @@
 A ``Receiver`` is one daemon thread that drains a Zenoh channel in batches.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import sys

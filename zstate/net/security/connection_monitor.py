@@ -3,9 +3,6 @@
 A probe session is a second session with the same credentials, which checks that the router forwards a sample.
 """
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import json

@@ -1,8 +1,5 @@
 """Detects writes that the router's access control drops. Zenoh gives no error for them."""
 
-# pyright: reportUnknownMemberType=false
-# zenoh's stubs leave the return types of some methods out
-
 from __future__ import annotations
 
 import time
