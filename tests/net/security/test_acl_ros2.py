@@ -14,8 +14,9 @@ from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import AccessDenied, InvalidInput
 from zstate.net.presence import current_tokens
-from zstate.net.security.acl import AclRoles, access_control, access_text
+from zstate.net.security.acl import AclRoles, access_control
 from zstate.net.security.credentials import Credentials
+from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 
 WIRE = "ros2:domain=7,namespace=*"
