@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from functools import cached_property
 from itertools import pairwise
 from statistics import median, pstdev
@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from zstate._util.bounded_dict import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.clock import Clock, SystemClock
-from zstate.errors import InvalidInput, MessageError
 from zstate.ingest.deadline import Deadline
 from zstate.net.streams import StreamSubscriber
+from zstate.net.subscription import decode_samples
 from zstate.wire.keys import ANY, Stream
 from zstate.wire.messages import Sample
 
@@ -214,15 +214,12 @@ class TopicStatistics(Closeable):
     def subscribe(self, stream: Stream, robot: str = ANY) -> None:
         """Count ``stream`` of ``robot``, or of all robots, from now on."""
 
-        def on_samples(received: list[SerializedSample]) -> None:
+        def on_samples(samples: list[SerializedSample]) -> None:
             at, now = time.monotonic_ns(), self._clock.now()
             with self._arrived:
-                for serialized in received:
-                    with suppress(InvalidInput, MessageError):
-                        name = self._wire.robot_from_key(serialized.key) if robot == ANY else robot
-                        for sample in self._wire.decode(stream, serialized, name):
-                            if isinstance(sample, Sample):
-                                self.add(name, stream, sample, at, now)
+                for name, _, message in decode_samples(self._wire, robot, stream, samples):
+                    if isinstance(message, Sample):
+                        self.add(name, stream, message, at, now)
                 self._arrived.notify_all()
 
         key = self._wire.expression(robot, stream)
@@ -259,5 +256,4 @@ class TopicStatistics(Closeable):
             self._arrived.wait_for(lambda: all(map(is_measurable, sources)), timeout_s)
 
     def close(self) -> None:
-        """Unsubscribe. A second call does nothing."""
         self._subscriptions.close()
