@@ -7,6 +7,7 @@ shortest of several is used (as in NTP). Writers on simulated time do not reply:
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Collection
@@ -33,7 +34,10 @@ REFRESH_S = 30.0
 _UNANSWERED_REFRESH_S = 5.0
 
 _TIMEOUTS_S = (0.1, 0.2, 0.5)
-"""Of three attempts, the later two after those of other robots; then none until the offset is read again."""
+"""Of three attempts, the later two after those of other robots; then none until the offset is read again.
+
+Longer if the writer did not reply before.
+"""
 
 _DISCOVERY_S = 0.05
 
@@ -167,7 +171,6 @@ class ClockOffsetMonitor(Closeable):
                     self._is_open = False
 
     def close(self) -> None:
-        """Stop measuring. A second call does nothing."""
         with self._lock:
             self._is_open = False
             self._requests.clear()
@@ -179,39 +182,33 @@ class ClockOffsetMonitor(Closeable):
                 if offset is None:
                     self._is_running = False
                     return
+            timeout_s = _TIMEOUTS_S[min(offset.unanswered, len(_TIMEOUTS_S) - 1)]
             try:
-                if offset.update(_measure(self._session, offset.key, 8, self._clock, offset.timeout_s)):
-                    self.request(offset)
+                measured = _measure(self._session, offset.key, 8, self._clock, timeout_s)
             except (Closed, zenoh.ZError):
                 self.close()  # with the session
+                continue
+            for one in measured:
+                offset.known = ClockOffset(one.offset_ns, one.uncertainty_ns)
+            offset.unanswered = 0 if measured else offset.unanswered + 1
+            if 0 < offset.unanswered < len(_TIMEOUTS_S):
+                self.request(offset)
 
 
+@dataclass(eq=False)
 class _WriterOffset:
-    """The offset of one writer's clock, if it is known."""
+    """The offset of one writer's clock, if it is ``known``."""
 
-    def __init__(self, monitor: ClockOffsetMonitor, robot: str, key: str) -> None:
-        self.robot = robot
-        self.key = key
-        self.offset: ClockOffset | None = None
-        self._unanswered = 0
-        self._monitor = monitor
-        self._requested_s = -REFRESH_S
-
-    @property
-    def timeout_s(self) -> float:
-        """The time for the next reply: longer if the writer did not reply before."""
-        return _TIMEOUTS_S[min(self._unanswered, len(_TIMEOUTS_S) - 1)]
-
-    def update(self, measured: Collection[MeasuredOffset]) -> bool:
-        """Store a measurement. Returns whether to try again, without a reply."""
-        self._unanswered = 0 if measured else self._unanswered + 1
-        for one in measured:
-            self.offset = ClockOffset(one.offset_ns, one.uncertainty_ns)
-        return 0 < self._unanswered < len(_TIMEOUTS_S)
+    monitor: ClockOffsetMonitor
+    robot: str
+    key: str
+    known: ClockOffset | None = None
+    unanswered: int = 0
+    requested_s: float = -math.inf
 
     def __call__(self) -> ClockOffset | None:
         now_s = time.monotonic()
-        if now_s - self._requested_s >= (_UNANSWERED_REFRESH_S if self.offset is None else REFRESH_S):
-            self._requested_s = now_s
-            self._monitor.request(self)
-        return self.offset
+        if now_s - self.requested_s >= (_UNANSWERED_REFRESH_S if self.known is None else REFRESH_S):
+            self.requested_s = now_s
+            self.monitor.request(self)
+        return self.known

@@ -192,7 +192,6 @@ class GraphMonitor(Closeable):
                     del self._statuses[key]
 
     def close(self) -> None:
-        """Stop the thread. A second call does nothing."""
         self._stop.set()
         self._status.close()
         self._thread.join(_JOIN_TIMEOUT_S)

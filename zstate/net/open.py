@@ -1,4 +1,4 @@
-"""Opening a Zenoh session: retried until a router or peer accepts it, or all of them refuse.
+"""Opening a Zenoh session: retried until a router or peer accepts it, or all of them deny it.
 
 Also sets Zenoh's thread-pool sizes: enough that closing dead links does not block reconnecting peers.
 """
@@ -11,6 +11,7 @@ import os
 import re
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import zenoh
@@ -65,17 +66,17 @@ def open_with_retry(
     """A session with ``config``; if it gets no link, retried for ``timeout_s`` [s].
 
     Raises PortBusy, Unreachable, NetworkError; and AccessDenied, before the timeout, if all of ``endpoints``
-    refuse.
+    deny it.
     """
     deadline, next_check = time.monotonic() + timeout_s, 0.0
     while (session := _attempt(config)) is None:
         if time.monotonic() >= min(deadline, next_check):
-            from zstate.net.security.connection_check import check_endpoints  # noqa: PLC0415  # loads ssl
+            from zstate.net.security.connection_check import check_connections  # noqa: PLC0415  # loads ssl
 
-            results = check_endpoints(endpoints, credentials)
+            results = check_connections(endpoints, credentials)
             next_check = time.monotonic() + CHECK_PERIOD_S
-            if results.are_refusals or time.monotonic() >= deadline:
-                # A router that answers the check may have started after our attempt, and refuse nothing.
+            if results.is_denied or time.monotonic() >= deadline:
+                # A router that answers the check may have started after our attempt, and deny nothing.
                 session = _attempt(config) if isinstance(results.error, AccessDenied) else None
                 if session is None:
                     raise results.error
@@ -120,3 +121,23 @@ def connect_timeout(config: zenoh.Config) -> float:
         return 0.0
     config.insert_json5("connect/timeout_ms", "0")
     return math.inf if timeout_ms < 0 else timeout_ms / 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeSession:
+    """Configuration of a second client with the same ``identity``, which checks what a router forwards."""
+
+    config: zenoh.Config
+    identity: str
+
+    @classmethod
+    def for_config(cls, config: zenoh.Config, credentials: Credentials | None) -> ProbeSession | None:
+        """For the session that ``config`` opened; None unless it is a client with an identity."""
+        if credentials is None or not credentials.identity or json.loads(config.get_json("mode")) != "client":
+            return None
+        config.insert_json5("connect/timeout_ms", "0")  # each endpoint once
+        return cls(config, credentials.identity)
+
+    def open(self) -> zenoh.Session:
+        """Open it. Raises zenoh.ZError if no router answers."""
+        return open_zenoh(self.config)

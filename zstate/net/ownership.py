@@ -100,7 +100,7 @@ class WriterClaim(Closeable):
             wait_for_discovery(self._session)
             self._wait_for_expiry(raises_early=False)
         except BaseException:
-            self._release()
+            self.close()
             raise
 
     def confirm(self) -> None:
@@ -142,15 +142,12 @@ class WriterClaim(Closeable):
 
     def close(self) -> None:
         """Release the ownership. A second call does nothing."""
-        self._release()
+        with _CLAIMS_LOCK:
+            _CLAIMS[self._session].discard(self)
         if self._tokens is not None:
             self._session.release(self._tokens)
         while self._received:
             self._session.release(self._received.popitem()[1])
-
-    def _release(self) -> None:
-        with _CLAIMS_LOCK:
-            _CLAIMS[self._session].discard(self)
 
     def _wait_for_expiry(self, *, raises_early: bool) -> None:
         """Wait until there is no rival, for ``TOKEN_EXPIRY_S``. ``raises_early``: not if one is older."""

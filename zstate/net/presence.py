@@ -84,7 +84,6 @@ class LivelinessToken(Closeable):
         self._token = token
 
     def close(self) -> None:
-        """Undeclare the token. A second call does nothing."""
         self._session.release(self._token)
 
 
@@ -207,7 +206,6 @@ class RouterLossDetector(Closeable):
             time.sleep(_POLL_S)
 
     def close(self) -> None:
-        """Undeclare the listener. A second call does nothing."""
         self._session.release(self._events)
 
 

@@ -211,13 +211,11 @@ class _Address:
 
     @property
     def is_registered(self) -> bool:
-        """Whether the session sees a rendezvous peer there."""
         registration = self._registration
         return registration is not None and registration.is_registered
 
     @property
     def is_silent(self) -> bool:
-        """Whether no rendezvous peer answered there."""
         registration = self._registration
         return registration is not None and registration.is_silent
 
@@ -242,7 +240,7 @@ class _Address:
 
     def join(self, session: zenoh.Session, endpoint: str) -> RendezvousRegistration:
         """The registration of ``session`` there."""
-        registration = self._registration
+        registration = self._registration  # ``leave`` may clear it at the same time
         if registration is None:
             registration = RendezvousRegistration(session, endpoint, self.endpoint, self._key)
             self._registration = registration

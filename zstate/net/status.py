@@ -44,7 +44,6 @@ class StatusPublisher(Closeable):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop publishing. A second call does nothing."""
         self._stop.set()
         self._publisher.close()
         if threading.current_thread() is not self._thread:

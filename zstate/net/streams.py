@@ -166,7 +166,6 @@ class StreamPublisher(Closeable):
             raise Closed(f"the publisher of {self._key!r} is closed") from None
 
     def close(self) -> None:
-        """Undeclare the publisher. A second call does nothing."""
         if self._changes is not None:
             self._session.release(self._changes)
         self._session.release(self._publisher)

@@ -21,7 +21,7 @@ from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_a
 from zstate.net.security.connection_check import (
     accepts_tcp,
     check_all_tcp,
-    check_endpoints,
+    check_connections,
     check_rendezvous,
     check_tcp,
 )
@@ -83,8 +83,8 @@ def network_check(session: Session, network: SessionOptions) -> Check:
         if reason is not None:
             text = f"nothing answers at {endpoint!r} ({reason.text}); a peer keeps trying"
             return broken("network", text, reason.next)
-        replies = check_endpoints([endpoint], network.credentials)
-        if replies.are_refusals and not parts:
+        replies = check_connections([endpoint], network.credentials)
+        if replies.is_denied and not parts:
             return broken("network", str(replies.error), f"zstate config{connect_options(network)}")
     return ok("network", f"{network.joins_as}, linked to {joined}")
 
@@ -123,7 +123,7 @@ def _rendezvous_number(session: Session, count: int) -> int | None:
 
 def access_check(session: Session, network: SessionOptions, robot: str) -> Check | None:
     """Whether an identity named ``robot`` may write as that robot; None for other identities."""
-    from zstate.net.security.write_permission import check_may_write
+    from zstate.net.writer import check_may_write
 
     credentials = network.credentials
     if session.probe is None or credentials is None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +23,7 @@ from typing import Any
 
 from zstate.errors import ConfigError, InvalidInput
 from zstate.net.config import user_config
+from zstate.net.security.credentials import check_identity
 from zstate.wire.keys import CLOCK_KEY, VERBATIM_CHUNKS, check_robot
 from zstate.wire.registry import ros_options
 from zstate.wire.ros2.options import Ros2Options
@@ -37,7 +37,6 @@ _WRITER, _, _EDGE, _READER = VERBATIM_CHUNKS
 _READING = ("NN", "MS", "SC")  # tokens of nodes, of their subscribers and of their service clients
 _NODE_TOPICS = ("rosout", "parameter_events")  # outside of all namespaces; each ROS node writes them
 _SECTIONS = ("rules", "subjects", "policies")
-_IDENTITY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +63,7 @@ class AclRoles:
 
     def __post_init__(self) -> None:
         for name in self.identities:
-            if not _IDENTITY.fullmatch(name):
-                raise InvalidInput(
-                    f"{name!r} cannot be the name of an identity; use up to 64 of A-Z a-z 0-9 . _ -, "
-                    "beginning with a letter or digit"
-                )
+            check_identity(name)
         check_namespace(self.namespace)
         if not self.identities:
             raise InvalidInput("no role has a name; access control without names would deny everything")
