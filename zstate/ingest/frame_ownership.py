@@ -25,7 +25,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import count
 from typing import NamedTuple
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.frame_tree import Edge

@@ -17,7 +17,7 @@ from itertools import pairwise
 from statistics import median, pstdev
 from typing import TYPE_CHECKING, NamedTuple
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.clock import Clock, SystemClock
 from zstate.ingest.deadline import Deadline
