@@ -90,7 +90,7 @@ def measure_offsets(
 def _measure(
     session: Session, expression: str, rounds: int, clock: Clock, timeout_s: float
 ) -> Collection[MeasuredOffset]:
-    best: dict[str, MeasuredOffset] = {}
+    best: dict[tuple[str, WriterId], MeasuredOffset] = {}
     deadline = time.monotonic() + timeout_s
     while rounds:
         has_reply = False
@@ -103,16 +103,11 @@ def _measure(
             consolidation=zenoh.ConsolidationMode.NONE,
         )
         for reply in replies:
-            round_trip_ns = time.monotonic_ns() - sent_ns
-            decoded = _decode_reply(reply)
-            if decoded is not None:
+            measured = _offset_in(reply, now, time.monotonic_ns() - sent_ns)
+            if measured is not None:
                 has_reply = True
-                robot, writer, stamp = decoded
-                half = round_trip_ns // 2
-                measured = MeasuredOffset(robot, writer, stamp - (now + half), half, round_trip_ns)
-                key = clock_key(robot, writer.identity)
-                if key not in best or round_trip_ns < best[key].round_trip_ns:
-                    best[key] = measured
+                key = measured.robot, measured.writer
+                best[key] = min(best.get(key, measured), measured, key=lambda one: one.round_trip_ns)
         if has_reply:
             rounds -= 1
         elif best or time.monotonic() > deadline:
@@ -122,8 +117,8 @@ def _measure(
     return best.values()
 
 
-def _decode_reply(reply: zenoh.Reply) -> tuple[str, WriterId, int] | None:
-    """Robot, writer and the time of its clock; None for other replies."""
+def _offset_in(reply: zenoh.Reply, sent: int, round_trip_ns: int) -> MeasuredOffset | None:
+    """The offset by the ``reply`` to a query sent at ``sent`` [ns] by the local clock; None for others."""
     if reply.ok is None:
         return None
     try:
@@ -132,7 +127,10 @@ def _decode_reply(reply: zenoh.Reply) -> tuple[str, WriterId, int] | None:
         message = decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding), ClockMessage)
     except (InvalidInput, MessageError):
         return None
-    return (robot, writer, message.stamp) if message.session == writer.session else None
+    if message.session != writer.session:
+        return None
+    half = round_trip_ns // 2
+    return MeasuredOffset(robot, writer, message.stamp - (sent + half), half, round_trip_ns)
 
 
 class ClockOffsetMonitor(Closeable):

@@ -11,6 +11,7 @@ import weakref
 from collections.abc import Container, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from itertools import islice
 from typing import NamedTuple, TypeAlias
 
 import zenoh
@@ -186,11 +187,7 @@ class WriterClaim(Closeable):
                 ring,
                 history=zenoh.ext.HistoryConfig(max_samples=1),
             )
-        handler = self._received[stream].handler
-        for _ in range(CAPACITY):
-            sample = handler.try_recv()
-            if sample is None:
-                break
+        for sample in islice(iter(self._received[stream].handler.try_recv, None), CAPACITY):
             with suppress(MessageError):  # withdrawn, or not of zstate
                 for message in _WIRE.decode(rival.stream, to_serialized(sample), rival.robot):
                     if isinstance(message, Sample | StaticTransforms | RobotDescription):

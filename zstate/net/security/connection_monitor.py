@@ -100,9 +100,7 @@ class ConnectionMonitor(Closeable):
         ring: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(64)
         scout = zenoh.scout(ring, what="peer|router", config=self._config)
         self._stop.wait(_SCOUT_S)
-        hellos: dict[str, list[str]] = {}
-        while (hello := scout.try_recv()) is not None:
-            hellos[str(hello.zid)] = hello.locators
+        hellos = {str(hello.zid): hello.locators for hello in iter(scout.try_recv, None)}
         scout.stop()
         hellos.pop(str(self._session.zid()), None)
         return [locator for locators in hellos.values() for locator in locators]
