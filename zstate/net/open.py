@@ -110,12 +110,12 @@ def connect_timeout(config: zenoh.Config) -> float:
     ``config`` describes no client, or does not retry.
     """
 
-    def client_value(value: Any) -> Any:
-        """The client's part of a setting that may have a value for each mode."""
+    def client_value(name: str) -> Any:
+        """A setting, or the client's part of it if it has a value for each mode."""
+        value: Any = json.loads(config.get_json(f"connect/{name}"))
         return cast("dict[str, Any]", value).get("client") if isinstance(value, dict) else value
 
-    settings: dict[str, Any] = json.loads(config.get_json("connect"))
-    timeout_ms, is_needed = (client_value(settings[name]) for name in ("timeout_ms", "exit_on_failure"))
+    timeout_ms, is_needed = client_value("timeout_ms"), client_value("exit_on_failure")
     is_client = json.loads(config.get_json("mode")) == "client"
     if not (is_client and endpoints_in(config) and timeout_ms) or is_needed is False:
         return 0.0

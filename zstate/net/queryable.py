@@ -38,7 +38,6 @@ MAX_PAUSE_S = 0.2
 _LOG = logging.getLogger("zstate")
 
 _Channel: TypeAlias = "zenoh.handlers.FifoChannel[zenoh.Reply]"
-_Queries: TypeAlias = "zenoh.handlers.RingChannel[zenoh.Query]"
 
 
 def query(
@@ -111,7 +110,7 @@ class Queryable(Receiver[zenoh.Query]):
         self.answered = 0
         self._key = key
         self._answer = answer
-        ring: _Queries = zenoh.handlers.RingChannel(capacity)
+        ring: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(capacity)
         super().__init__(session, session.zenoh.declare_queryable(key, ring), capacity)
 
     def _on_batch(self, batch: list[zenoh.Query]) -> None:

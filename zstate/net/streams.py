@@ -108,9 +108,6 @@ class Receiver(Closeable, Generic[T]):
                     threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._thread)))
 
 
-_Statuses: TypeAlias = "zenoh.handlers.Handler[zenoh.MatchingStatus]"
-
-
 def capacity_for(keyexpr: str) -> int:
     """The number of samples of ``keyexpr`` that wait for their reader; beyond it the oldest are lost."""
     return WILDCARD_CAPACITY if "*" in keyexpr else CAPACITY
@@ -143,7 +140,7 @@ class StreamPublisher(Closeable):
             express=False,
         )
         self._has_readers = False
-        self._changes: zenoh.MatchingListener[_Statuses] | None = None
+        self._changes: zenoh.MatchingListener[zenoh.handlers.Handler[zenoh.MatchingStatus]] | None = None
 
     @property
     def has_readers(self) -> bool:

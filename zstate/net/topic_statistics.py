@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from itertools import pairwise
@@ -178,19 +178,12 @@ class WriterKey(NamedTuple):
     session: int
 
 
-Sources = Callable[[str, Stream, Sample], Iterator[Hashable]]
-"""The keys under which a sample of a robot's stream is counted."""
-
-
-def by_writer(robot: str, stream: Stream, sample: Sample) -> Iterator[WriterKey]:
-    """Each writer of a stream is a source."""
-    yield WriterKey(robot, stream, sample.session)
-
-
 class TopicStatistics(Closeable):
     """Statistics of subscribed streams by source; messages that cannot be decoded are skipped.
 
-    ``clock`` is that of the stamps. ``on_sample`` is called with each sample, in the subscriber's thread.
+    ``sources(robot, stream, sample)`` are the keys under which a sample is counted, by default the
+    ``WriterKey`` of its writer. ``clock`` is that of the stamps. ``on_sample`` is called with each sample, in
+    the subscriber's thread.
     """
 
     def __init__(
@@ -198,13 +191,14 @@ class TopicStatistics(Closeable):
         session: Session,
         wire: Wire,
         *,
-        sources: Sources = by_writer,
+        sources: Callable[[str, Stream, Sample], Iterable[Hashable]] | None = None,
         clock: Clock | None = None,
         window: int = WINDOW,
         on_sample: Callable[[Stream, Sample], None] | None = None,
     ) -> None:
         self.gaps = SequenceGaps()
-        self._session, self._wire, self._sources = session, wire, sources
+        self._session, self._wire = session, wire
+        self._sources = sources or (lambda name, stream, one: (WriterKey(name, stream, one.session),))
         self._clock = clock or SystemClock()
         self._on_sample, self._window = on_sample, window
         self._statistics: BoundedDict[Hashable, IntervalStatistics] = BoundedDict()
