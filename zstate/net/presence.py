@@ -38,7 +38,7 @@ ROUND_S = 0.1
 
 _RECENT_S = 0.1
 _ROUTER_EVENT_S = 0.02
-_POLL_S = 0.002
+_POLL_S = 0.002  # Zenoh's channels have no receive with a timeout
 
 
 def local_writer(session: int, program: str = "") -> WriterId:

@@ -42,7 +42,7 @@ _REGISTRATION_POLL_S = 0.01
 PROBE_PERIOD_S = 0.2
 JOIN_WITHIN_S = 0.3
 _DISCOVERY_TIMEOUT_S = 3.0
-_DISCOVERY_POLL_S = 0.002
+_DISCOVERY_POLL_S = 0.002  # nothing reports a port that becomes free
 
 
 def rendezvous_key(number: int) -> str:

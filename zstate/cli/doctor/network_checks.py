@@ -19,7 +19,6 @@ from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.presence import announce, connections, discover
 from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
 from zstate.net.security.connection_check import (
-    accepts_tcp,
     check_all_tcp,
     check_connections,
     check_rendezvous,
@@ -144,7 +143,7 @@ def find_elsewhere(network: SessionOptions) -> Iterator[tuple[str, tuple[str, ..
     """Other options with which robots are announced, and their names."""
     router = SessionOptions("client", (ROUTER_ENDPOINT,))
     others = [("", SessionOptions())] if network.is_explicit else []
-    if ROUTER_ENDPOINT not in network.connect and accepts_tcp(ROUTER_ENDPOINT):
+    if ROUTER_ENDPOINT not in network.connect and check_tcp(ROUTER_ENDPOINT) is None:
         others.append((f" --connect {ROUTER_ENDPOINT}", router))
     for options, other in others:
         try:

@@ -38,7 +38,17 @@ def issue_identities(
     Raises InvalidInput before any file is written, ConfigError for an unusable authority and files that
     cannot be written. Importing this module raises LibraryMissing without ``cryptography``.
     """
-    _check(names, hosts, days)
+    for name in names:
+        check_identity(name, reserved=AUTHORITY)
+        if names.count(name) > 1:
+            raise InvalidInput(f"the identity {name!r} is named twice")
+    for host in hosts:
+        if not _is_address(host) and not _HOST_NAME.fullmatch(host):
+            raise InvalidInput(
+                f"{host!r} is neither a host name nor an IP address; give it without protocol and port"
+            )
+    if days < 1:
+        raise InvalidInput(f"days is {days}; a certificate is valid for one day at least")
     issued = {name: CertificateFiles.for_name(folder, name) for name in names}
     for name, files in issued.items():
         if files.existing:
@@ -55,20 +65,6 @@ def issue_identities(
         is_server = servers is None or name in servers
         authority.issue(name, files, (*THIS_HOST, *hosts) if is_server else (), (first, last))
     return issued
-
-
-def _check(names: Sequence[str], hosts: Sequence[str], days: int) -> None:
-    for name in names:
-        check_identity(name, reserved=AUTHORITY)
-        if names.count(name) > 1:
-            raise InvalidInput(f"the identity {name!r} is named twice")
-    for host in hosts:
-        if not _is_address(host) and not _HOST_NAME.fullmatch(host):
-            raise InvalidInput(
-                f"{host!r} is neither a host name nor an IP address; give it without protocol and port"
-            )
-    if days < 1:
-        raise InvalidInput(f"days is {days}; a certificate is valid for one day at least")
 
 
 def _is_address(host: str) -> bool:

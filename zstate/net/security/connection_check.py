@@ -276,11 +276,6 @@ def check_tcp(endpoint: str) -> Unreachability | None:
     return Unreachability(text, f"ping -c 3 {host}")
 
 
-def accepts_tcp(endpoint: str) -> bool:
-    """Whether any program accepts TCP connections at ``endpoint``."""
-    return _tcp_address(endpoint) is not None and check_tcp(endpoint) is None
-
-
 def check_all_tcp(endpoints: Sequence[str]) -> Unreachability:
     """Why no session was opened at any of ``endpoints``, and the command for the first one with a reason."""
     reasons: list[str] = []
