@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from zstate.errors import Closed, InvalidInput
 from zstate.net.presence import discover
 from zstate.net.session import Session, connect
-from zstate.net.status import StatusPublisher, watch_status
+from zstate.net.status import StatusPublisher, StatusSubscriber
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import StatePublisher
 from zstate.sources import JointReading, SineSource
@@ -34,7 +34,7 @@ class Statuses:
     def __init__(self, session: Session, robot: str = "*") -> None:
         self.statuses: list[tuple[str, Status]] = []
         self.times: list[float] = []
-        self.watch = watch_status(session, robot, self._on_status)
+        self.watch = StatusSubscriber(session, robot, self._on_status)
 
     def _on_status(self, robot: str, status: Status) -> None:
         self.times.append(time.monotonic())

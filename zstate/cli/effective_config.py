@@ -16,7 +16,7 @@ from typing import Any, cast
 import click
 from click.core import ParameterSource
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.options import PASSWORD_VARIABLE, build_credentials
 from zstate.cli.output.logs import FORMAT_VARIABLE, FORMATS
 from zstate.cli.output.wire_text import is_ros

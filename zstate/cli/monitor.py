@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate.cli.output.console import (
     count_text,

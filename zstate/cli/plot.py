@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.output.console import fail, print_status
 from zstate.cli.output.joint_state_text import DescribedJointStates, Document, JointStateFormatter, flatten
 from zstate.cli.output.wire_text import default_stream

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe
 from zstate.buffer.buffer import TransformBuffer
 from zstate.buffer.tracks import JointTrack

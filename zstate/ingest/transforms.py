@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate.clock import SET_BACK_NS
 from zstate.errors import InsertRefused, InvalidInput
 from zstate.ingest.base import ClockSetBack, StreamIngest

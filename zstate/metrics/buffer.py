@@ -13,7 +13,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.buffer.buffer import DEFAULT_HISTORY_S, TransformBuffer
 from zstate.buffer.tracks import JointTrack

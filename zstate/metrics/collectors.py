@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Protocol
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate.buffer.buffer import TransformBuffer
 from zstate.ingest.counters import ListenerStats
 from zstate.metrics.buffer import Histogram, InstrumentedBuffer

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.model.findings import Finding, Findings, quoted
 from zstate.model.robot import RobotModel
 from zstate.model.xml import Element, NumberError, read_document, read_number, read_numbers

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.errors import InvalidInput, LibraryMissing
 from zstate.model.joint_transforms import Floats, JointTransform, JointTransforms
 from zstate.model.robot import RobotModel

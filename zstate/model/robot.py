@@ -33,7 +33,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.checks import real_numbers
 from zstate.errors import FindingLike, InvalidInput
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.model.findings import Findings, quoted, shortened
 from zstate.model.robot import POSITION_COUNTS, VELOCITY_COUNTS, Joint, RobotModel
 from zstate.model.urdf_joint import JointReader

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Final
 
-from zstate._util.suggestions import suggestion_text
+from zstate._util.format import suggestion_text
 from zstate.model.findings import Findings, quoted, shortened
 from zstate.model.robot import POSITION_COUNTS, Joint, JointType, Limits, Mimic
 from zstate.model.xml import Element, NumberError, read_number, read_numbers

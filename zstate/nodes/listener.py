@@ -21,7 +21,7 @@ from zstate.ingest.stamp_checks import StampCheck
 from zstate.ingest.transforms import StaticTransformIngest, TransformIngest
 from zstate.net.clock_offset import ClockOffsetMonitor
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import announce_reader, watch
+from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.sample_history import HistoryReader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
@@ -126,7 +126,7 @@ class TransformListener(Closeable):
                 self._clock_offsets = opening.enter_context(_WriterClockOffsets(session, self.buffer))
             # History is requested from each writer found: after subscribing, so that no sample falls between.
             on_writer, on_cut_off = self._observed(self._on_writer), self._observed(self._on_cut_off)
-            opening.enter_context(watch(session, robot, on_writer, wire, on_cut_off))
+            opening.enter_context(WriterWatch(session, robot, on_writer, wire, on_cut_off))
             for announcement in announce_reader(session, self._wire, robot, streams):
                 opening.enter_context(announcement)
             self._opened = opening.pop_all()

@@ -43,7 +43,7 @@ class LookupService(Closeable):
     @property
     def overflows(self) -> int:
         """How often the queue of queries was full, so that some may have been lost."""
-        return self._service.overflows
+        return self._service.full_batches
 
     def _answer(self, parameters: Mapping[str, str]) -> Reply:
         try:

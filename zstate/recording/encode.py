@@ -7,7 +7,7 @@ from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
-from zstate._util.bounded_queue import BoundedQueue
+from zstate._util.bounded import BoundedQueue
 from zstate._util.fork_safe import fork_safe_lock
 from zstate.errors import InvalidInput, ModelError
 from zstate.model.robot import coordinate_names, velocity_columns_by_position

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from zstate._util.bounded_dict import BoundedDict
+from zstate._util.bounded import BoundedDict
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe, fork_safe_lock
 from zstate.clock import SystemClock, wait_interruptible
@@ -22,7 +22,7 @@ from zstate.errors import Closed, InvalidInput, MessageError, RecordingError
 from zstate.ingest.counters import Counters, GapCounter
 from zstate.net.at_exit import forked_text
 from zstate.net.latched import LatchedSubscriber
-from zstate.net.presence import announce_reader, watch
+from zstate.net.presence import WriterWatch, announce_reader
 from zstate.net.session import Session
 from zstate.net.streams import StreamSubscriber, capacity_for
 from zstate.rate import Rate
@@ -181,7 +181,7 @@ class Recorder(Closeable):
         with ExitStack() as opening:
             self._queue = opening.enter_context(MessageQueue(session))
             robot = self._selected[0] if len(self._selected) == 1 else ANY
-            opening.enter_context(watch(session, robot, self._on_writer, wire))
+            opening.enter_context(WriterWatch(session, robot, self._on_writer, wire))
             self._subscribe()
             for robot in self._selected or (ANY,):
                 for announcement in announce_reader(session, self._wire, robot, (*LATCHED, *_SAMPLES)):

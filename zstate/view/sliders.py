@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate._util.fork_safe import fork_safe_lock
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.clock import Clock
 from zstate.errors import InvalidInput, SecondWriter
 from zstate.model.robot import Joint, RobotModel

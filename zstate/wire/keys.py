@@ -37,6 +37,9 @@ ANY = "*"
 READERS = "zstate/@reader/*/*/*"
 """The key expression of the tokens of all readers."""
 
+VERBATIM_CHUNKS = ("@writer", "@clock", "@edge", "@reader")
+"""The chunks of tokens and clocks: ``*`` and ``**`` do not match them (Zenoh: verbatim chunks)."""
+
 MODEL_WRITER = "robot_description"
 """The writer of the edges that a robot's own model fixes."""
 

@@ -23,7 +23,8 @@ from helpers.robots import RRBOT, UPRIGHT, SampleCollector
 from zstate import StatePublisher, StaticPublisher, Transform, TransformListener, connect, discover
 from zstate.errors import InvalidInput
 from zstate.net.presence import announce, discover_readers
-from zstate.net.security.acl import AclRoles, access_control, access_text
+from zstate.net.security.acl import AclRoles, access_control
+from zstate.net.security.router_config import access_text
 from zstate.net.session import Session
 from zstate.net.streams import StreamPublisher
 from zstate.nodes.publisher import STREAMS

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.options import form_options, session_options, wire_option
 from zstate.cli.output.console import fail, print_json, print_result, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros, messages_for

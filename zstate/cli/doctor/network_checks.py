@@ -19,9 +19,8 @@ from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.presence import announce, connections, discover
 from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
 from zstate.net.security.connection_check import (
-    accepts_tcp,
     check_all_tcp,
-    check_endpoints,
+    check_connections,
     check_rendezvous,
     check_tcp,
 )
@@ -83,8 +82,8 @@ def network_check(session: Session, network: SessionOptions) -> Check:
         if reason is not None:
             text = f"nothing answers at {endpoint!r} ({reason.text}); a peer keeps trying"
             return broken("network", text, reason.next)
-        replies = check_endpoints([endpoint], network.credentials)
-        if replies.are_refusals and not parts:
+        replies = check_connections([endpoint], network.credentials)
+        if replies.is_denied and not parts:
             return broken("network", str(replies.error), f"zstate config{connect_options(network)}")
     return ok("network", f"{network.joins_as}, linked to {joined}")
 
@@ -123,7 +122,7 @@ def _rendezvous_number(session: Session, count: int) -> int | None:
 
 def access_check(session: Session, network: SessionOptions, robot: str) -> Check | None:
     """Whether an identity named ``robot`` may write as that robot; None for other identities."""
-    from zstate.net.security.write_permission import check_may_write
+    from zstate.net.writer import check_may_write
 
     credentials = network.credentials
     if session.probe is None or credentials is None:
@@ -144,7 +143,7 @@ def find_elsewhere(network: SessionOptions) -> Iterator[tuple[str, tuple[str, ..
     """Other options with which robots are announced, and their names."""
     router = SessionOptions("client", (ROUTER_ENDPOINT,))
     others = [("", SessionOptions())] if network.is_explicit else []
-    if ROUTER_ENDPOINT not in network.connect and accepts_tcp(ROUTER_ENDPOINT):
+    if ROUTER_ENDPOINT not in network.connect and check_tcp(ROUTER_ENDPOINT) is None:
         others.append((f" --connect {ROUTER_ENDPOINT}", router))
     for options, other in others:
         try:

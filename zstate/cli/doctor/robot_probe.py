@@ -20,7 +20,7 @@ from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
 from zstate.net.queryable import query
 from zstate.net.session import Session
-from zstate.net.status import watch_status
+from zstate.net.status import StatusSubscriber
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.identity import WriterId
@@ -165,7 +165,7 @@ class RobotProbe(Closeable):
             samples = StreamSamples(session, info.name, self.followed, self._wire, on_change)
             self.samples = opening.enter_context(samples)
             if is_native:
-                opening.enter_context(watch_status(session, info.name, self._on_status))
+                opening.enter_context(StatusSubscriber(session, info.name, self._on_status))
             else:
                 for stream in _ROS_STREAMS:
                     nodes = StreamSamples(session, info.name, stream, self._wire)

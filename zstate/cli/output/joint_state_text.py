@@ -12,7 +12,7 @@ from threading import Event
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from zstate._util.closeable import Closeable
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.output.console import print_status
 from zstate.clock import wait_interruptible
 from zstate.errors import InvalidInput, MessageError, ModelError

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.up.schema import (
     NetworkSection,
     ProgramSection,

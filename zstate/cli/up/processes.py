@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from zstate._util.endpoint import format_host
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.options import load_robot, parse_xacro_args
 from zstate.cli.up.cell import Cell
 from zstate.cli.up.schema import (

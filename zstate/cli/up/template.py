@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-from zstate._util.suggestions import did_you_mean
+from zstate._util.format import did_you_mean
 from zstate.cli.up.toml_file import TomlFile
 from zstate.errors import ConfigError, InvalidInput
 

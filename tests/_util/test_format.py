@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from zstate._util.suggestions import did_you_mean, suggestion_text
+from zstate._util.format import did_you_mean, suggestion_text
 
 
 def test_similar_names_are_suggested_and_others_are_not():
