@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import json_option, xacro_arguments
+from zstate.cli import options
 from zstate.cli.output.console import count_text, output_width, print_json, print_wrapped
 from zstate.cli.output.text_layout import Guides, Table, chain_lines, first_fitting, in_columns, tree_lines
 from zstate.errors import FindingLike, ModelError
@@ -25,12 +25,12 @@ _JOINT_HEADINGS = ("joint", "type", "parent", "child", "position", "range", "vel
 
 @click.command("check")
 @click.argument("file")
-@xacro_arguments
+@options.xacro_arguments
 @click.option("--fix-hints", is_flag=True, help="Print a correction below each finding.")
 @click.option(
     "--joints", "joint_table", is_flag=True, help="Print the joints as a table instead of the tree."
 )
-@json_option("One JSON object.")
+@options.json_option("One JSON object.")
 def check_command(
     file: str, xacro_args: dict[str, str], fix_hints: bool, joint_table: bool, as_json: bool
 ) -> None:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import load_robot, rate_option, seconds_option, xacro_arguments
+from zstate.cli import options
+from zstate.cli.options import load_robot
 from zstate.cli.output.console import (
     count_text,
     duration_or_dash,
@@ -53,10 +54,10 @@ _WIDTH_WITH_ANGLES = 72
 
 @click.command("demo")
 @click.argument("robot", required=False)
-@xacro_arguments
+@options.xacro_arguments
 @click.option("--robot", "robot_option", metavar="ROBOT", help="Same as the argument.")
-@rate_option
-@seconds_option
+@options.rate_option
+@options.seconds_option
 def demo_command(
     robot: str | None,
     xacro_args: dict[str, str],

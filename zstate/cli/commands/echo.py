@@ -9,24 +9,26 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from zstate.cli.options import named_robot, refuse_topic, session_options, timeout_option, wire_option
+from zstate.cli import options
+from zstate.cli.options import named_robot, refuse_topic
 from zstate.cli.output.console import print_json, print_result
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.cli.output.joint_state_text import ChangeFilter
 
 
-def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> float:
+def _check_amount(amount: float) -> float:
     if not (math.isfinite(amount) and amount >= 0.0):
-        raise click.BadParameter(f"an amount is finite and at least 0; got {amount}")
+        raise InvalidInput(f"an amount is finite and at least 0; got {amount}")
     return amount
 
 
 @click.command("echo")
 @click.argument("robot", required=False)
 @click.option("--once", is_flag=True, help="Print one document; fail after --timeout with the reason.")
-@timeout_option("How long --once waits [s].")
+@options.timeout_option("How long --once waits [s].")
 @click.option("--field", metavar="NAME", help="Print only this: stamp, positions, positions.JOINT, or JOINT.")
 @click.option(
     "--changed",
@@ -35,16 +37,14 @@ def _checked_amount(_: click.Context, __: click.Parameter, amount: float) -> flo
 )
 @click.option(
     "--by",
-    type=float,
+    type=options.number("AMOUNT", _check_amount),
     default=0.0,
-    callback=_checked_amount,
-    metavar="AMOUNT",
     help="Skip documents without a number that changed by more than this since the last printed one.",
 )
 @click.option("--csv", "form", flag_value="csv", help="Comma-separated values below a line of names.")
 @click.option("--json", "form", flag_value="json", help="One JSON value per line.")
-@wire_option
-@session_options
+@options.wire_option
+@options.session_options
 def echo_command(
     *,
     network: SessionOptions,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from zstate._util.suggestions import did_you_mean
-from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import fail, print_json, print_result, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
@@ -27,9 +27,9 @@ _PROGRAM_FILL = "#eef2ff"
 
 @click.command("graph")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@form_options("One JSON object: programs and streams.", "A picture, from left to right.")
-@wire_option
-@session_options
+@options.form_options("One JSON object: programs and streams.", "A picture, from left to right.")
+@options.wire_option
+@options.session_options
 def graph_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the writers and readers of the streams of ROBOT, or of all robots.
 

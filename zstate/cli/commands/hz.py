@@ -8,14 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import (
-    json_option,
-    named_robot,
-    refuse_topic,
-    session_options,
-    timeout_option,
-    wire_option,
-)
+from zstate.cli import options
+from zstate.cli.options import named_robot, refuse_topic
 from zstate.cli.output.console import fail, print_json, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros
 from zstate.cli.session import SessionOptions, open_session
@@ -41,10 +35,10 @@ _SETTLING_S = 0.1
     help="Measure the last N samples.",
 )
 @click.option("--once", is_flag=True, help="Print one measurement, of the first second, and exit.")
-@timeout_option("How long --once waits for the first sample [s].")
-@json_option()
-@wire_option
-@session_options
+@options.timeout_option("How long --once waits for the first sample [s].")
+@options.json_option()
+@options.wire_option
+@options.session_options
 def hz_command(
     *,
     network: SessionOptions,

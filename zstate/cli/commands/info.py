@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zstate.cli.options import json_option
+from zstate.cli import options
 from zstate.cli.output.console import (
     count_text,
     files_text,
@@ -29,7 +29,7 @@ _ADVICE = "  cut off or damaged; `zstate recover {0}` makes a complete file of w
 
 @click.command("info")
 @click.argument("file")
-@json_option("One JSON object.")
+@options.json_option("One JSON object.")
 def info_command(file: str, as_json: bool) -> None:
     """Show the contents of the recording FILE: robots, streams, models, times and counts.
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import load_robot, name_option, xacro_arguments
+from zstate.cli import options
+from zstate.cli.options import load_robot
 from zstate.cli.output.console import fail, print_result, print_status
 from zstate.cli.output.text_layout import in_columns
 
@@ -21,10 +22,10 @@ if TYPE_CHECKING:
 
 @click.command("init")
 @click.argument("robot", default="rrbot", metavar="[ROBOT]")
-@xacro_arguments
+@options.xacro_arguments
 @click.option("-o", "--output", metavar="FILE", help="Default: NAME.toml; - is standard output.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
-@name_option
+@options.name_option
 def init_command(
     robot: str, xacro_args: dict[str, str], output: str | None, force: bool, name: str | None
 ) -> None:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import checked_seconds, session_options, takeover_option, wires_option
+from zstate.cli import options
 from zstate.cli.output.console import count_text, fail, is_terminal, print_status, print_wrapped
 from zstate.cli.session import SessionOptions, open_session
-from zstate.errors import InvalidInput, format_duration
+from zstate.errors import format_duration
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
@@ -22,13 +22,10 @@ _LINE_S = 1.0
 _REFRESH_S = 0.1
 
 
-def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
+def _check_speed(rate: float) -> float:
     from zstate.recording.player_clock import check_speed
 
-    try:
-        return check_speed(rate)
-    except InvalidInput as error:
-        raise click.BadParameter(str(error)) from None
+    return check_speed(rate)
 
 
 @click.command("replay")
@@ -36,11 +33,9 @@ def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
 @click.argument("robots", metavar="[ROBOT]...", nargs=-1)
 @click.option(
     "--rate",
-    type=float,
+    type=options.number("X", _check_speed),
     default=1.0,
     show_default=True,
-    callback=_checked_rate,
-    metavar="X",
     help="Playback speed, 1 is real time; inf: as fast as possible.",
 )
 @click.option(
@@ -50,13 +45,11 @@ def _checked_rate(_: click.Context, __: click.Parameter, rate: float) -> float:
     metavar="S",
     help="Start S seconds after the start of the recording.",
 )
-@click.option(
-    "--duration", type=float, callback=checked_seconds, metavar="S", help="Replay S seconds of the recording."
-)
+@click.option("--duration", type=options.SECONDS, help="Replay S seconds of the recording.")
 @click.option("--loop", is_flag=True, help="Start again at the end, until Ctrl-C.")
-@wires_option
-@takeover_option
-@session_options
+@options.wires_option
+@options.takeover_option
+@options.session_options
 def replay_command(
     *,
     file: str,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zstate.cli import options
 from zstate.cli.metrics import connection_collector, serve_metrics, writer_collector
-from zstate.cli.options import config_option, metrics_option, router_identity_options
 from zstate.cli.output.console import fail, print_result, print_status, print_wrapped
 from zstate.cli.robot_directory import RobotDirectory
 from zstate.cli.session import SessionOptions, open_session
@@ -48,9 +48,9 @@ if TYPE_CHECKING:
 )
 @click.option("--namespace", default="", metavar="KEY", help="Zenoh namespace of the --robot sessions.")
 @click.option("--ros2", is_flag=True, help="Use the settings of rmw_zenohd, to replace it.")
-@router_identity_options
-@config_option
-@metrics_option
+@options.router_identity_options
+@options.config_option
+@options.metrics_option
 @click.option("--print", "only_print", is_flag=True, help="Print the configuration (JSON5) and exit.")
 @click.option(
     "--output",

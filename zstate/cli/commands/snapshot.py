@@ -9,23 +9,13 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from zstate.cli.options import (
-    checked_rate,
-    seconds_option,
-    session_options,
-    takeover_option,
-    timeout_option,
-    wire_option,
-    wires_option,
-)
+from zstate.cli import options
 from zstate.cli.output import logs
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
     from zstate.cli.snapshot import Configuration
-
-_RATE_HZ = 10.0
 
 
 @click.group("snapshot")
@@ -43,9 +33,9 @@ def snapshot_command() -> None:
 @click.argument("file", metavar="FILE")
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
 @click.option("--force", is_flag=True, help="Replace an existing FILE.")
-@timeout_option("How long to wait for announced streams [s].", 3.0)
-@wire_option
-@session_options
+@options.timeout_option("How long to wait for announced streams [s].", 3.0)
+@options.wire_option
+@options.session_options
 def save_command(
     *, file: str, robots: tuple[str, ...], force: bool, timeout: float, wire: str, network: SessionOptions
 ) -> None:
@@ -80,24 +70,16 @@ def save_command(
 @snapshot_command.command("load")
 @click.argument("file", type=click.Path(exists=True, dir_okay=False))
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
-@click.option(
-    "--rate",
-    type=float,
-    callback=checked_rate,
-    default=_RATE_HZ,
-    show_default=True,
-    metavar="HZ",
-    help="Rate of the joint states.",
-)
+@click.option("--rate", type=options.RATE, default=10.0, show_default=True, help="Rate of the joint states.")
 @click.option(
     "--as-saved",
     is_flag=True,
     help="Use the session options and the wire with which FILE was saved; options below take precedence.",
 )
-@seconds_option
-@takeover_option
-@wires_option
-@session_options
+@options.seconds_option
+@options.takeover_option
+@options.wires_option
+@options.session_options
 def load_command(
     *,
     file: str,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import session_options, takeover_option, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import fail, print_status, print_wrapped
 from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     "--writer", metavar="NAME", help="Name of the writer; default: this program and its process id."
 )
 @click.option("--new", is_flag=True, help="TARGET is a new frame: do not warn that the robot lacks it.")
-@takeover_option
-@wire_option
-@session_options
+@options.takeover_option
+@options.wire_option
+@options.session_options
 def static_command(
     *,
     target: str | None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zstate.cli.options import form_options, session_options, wire_option
+from zstate.cli import options
 from zstate.cli.output.console import (
     count_text,
     fail,
@@ -46,9 +46,9 @@ _NARROW_HEADINGS = ("frame", "rate and age", "writer")
 
 @click.command("tree")
 @click.argument("robot", default="*", metavar="[ROBOT]")
-@form_options("One JSON array of frames.", "A picture, from the top down.")
-@wire_option
-@session_options
+@options.form_options("One JSON array of frames.", "A picture, from the top down.")
+@options.wire_option
+@options.session_options
 def tree_command(network: SessionOptions, robot: str, form: str | None, wire: str) -> None:
     """Show the frames of ROBOT, or of all announced robots, as a tree.
 

@@ -14,17 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from zstate.cli.options import (
-    checked_rate,
-    load_robot,
-    open_clock,
-    parse_models,
-    reading_clock_option,
-    session_options,
-    wire_option,
-)
+from zstate.cli import options
+from zstate.cli.options import load_robot, open_clock, parse_models
 from zstate.cli.output.console import count_text, fail, print_result, print_status
 from zstate.cli.session import SessionOptions, open_session
+from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
     from zstate.cli.processes import BackgroundCall
@@ -46,21 +40,19 @@ _ENDS_WITHIN_S = 0.8
 _MAX_NAMED = 3
 
 
-def _checked_picture(_: click.Context, __: click.Parameter, file: str | None) -> Path | None:
-    if file is not None and Path(file).suffix.lower() != ".png":
-        raise click.BadParameter(f"{file!r} does not end with .png")
-    return None if file is None else Path(file)
+def _check_picture(file: str) -> Path:
+    if Path(file).suffix.lower() != ".png":
+        raise InvalidInput(f"{file!r} does not end with .png")
+    return Path(file)
 
 
-def _checked_camera(_: click.Context, __: click.Parameter, text: str | None) -> Camera | None:
-    if text is None:
-        return None
+def _parse_camera(text: str) -> Camera:
     from zstate.view.camera import Camera
 
     eye, separator, target = text.partition(":")
     camera = Camera(_point(eye), _point(target) if separator else None)
     if camera.look_at == camera.position:
-        raise click.BadParameter(f"a camera at {eye} cannot look at the same point")
+        raise InvalidInput(f"a camera at {eye} cannot look at the same point")
     return camera
 
 
@@ -70,7 +62,7 @@ def _point(text: str) -> tuple[float, float, float]:
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
-        raise click.BadParameter(f"{text!r} is not three numbers with commas between, such as 2,1.5,1")
+        raise InvalidInput(f"{text!r} is not three numbers with commas between, such as 2,1.5,1")
     return x, y, z
 
 
@@ -85,13 +77,17 @@ def _point(text: str) -> tuple[float, float, float]:
 )
 @click.option(
     "--rate",
-    type=float,
+    type=options.RATE,
     default=30.0,
     show_default=True,
-    callback=checked_rate,
     help="Updates per second [Hz].",
 )
-@click.option("--snapshot", callback=_checked_picture, metavar="FILE.png", help="Write one picture and exit.")
+@click.option(
+    "--snapshot",
+    type=options.Checked("file", _check_picture),
+    metavar="FILE.png",
+    help="Write one picture and exit.",
+)
 @click.option(
     "--size",
     nargs=2,
@@ -104,14 +100,13 @@ def _point(text: str) -> tuple[float, float, float]:
 @click.option("--fixed-frame", default="", metavar="FRAME", help="Initial fixed frame.")
 @click.option(
     "--camera",
-    callback=_checked_camera,
-    metavar="X,Y,Z[:X,Y,Z]",
+    type=options.Checked("X,Y,Z[:X,Y,Z]", _parse_camera),
     help="Initial position of the camera and, after the colon, the point it looks at [m, fixed frame]; "
     "default: all robots in sight.",
 )
-@wire_option
-@reading_clock_option
-@session_options
+@options.wire_option
+@options.reading_clock_option
+@options.session_options
 def view_command(
     *,
     network: SessionOptions,
