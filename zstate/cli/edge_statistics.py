@@ -69,7 +69,6 @@ class EdgeStatistics(Closeable):
         self.topic.subscribe(stream, robot)
 
     def close(self) -> None:
-        """Unsubscribe. A second call does nothing."""
         self.topic.close()
 
     def measure(self, edge: FrameInfo) -> EdgeMeasure | None:

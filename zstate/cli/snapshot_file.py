@@ -130,7 +130,6 @@ class StaticTransformSnapshot(_Table, frozen=True):
         self.transform()
 
     def transform(self) -> Transform:
-        """The edge."""
         return Transform(self.target, self.source, self.xyz, self.quat_xyzw)
 
 
@@ -162,7 +161,6 @@ class Snapshot(_Table, frozen=True):
         )
 
     def as_json(self) -> str:
-        """The text of a JSON file."""
         return json.dumps(_without_empty(msgspec.to_builtins(self)), indent=2) + "\n"
 
     def as_toml(self) -> str:
@@ -280,7 +278,6 @@ class _RobotCapture(Closeable):
         self._waiter.notify()
 
     def missing(self) -> list[str]:
-        """What is announced and has not arrived."""
         streams = {stream for stream, _ in self.info.writers}
         if self._source is not None:
             self._reading = self._source.read(0) or self._reading
@@ -293,7 +290,6 @@ class _RobotCapture(Closeable):
         return [text for text, is_missing in conditions.items() if is_missing]
 
     def robot(self) -> RobotSnapshot | None:
-        """The robot; None without a description."""
         model, reading = self._model, self._reading
         if model is None:
             return None

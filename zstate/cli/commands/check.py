@@ -6,6 +6,7 @@ import math
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,6 +18,8 @@ from zstate.errors import FindingLike, ModelError
 
 if TYPE_CHECKING:
     from zstate.model.robot import Joint, RobotModel
+
+Findings = Sequence[FindingLike]
 
 _STDIN = "standard input"
 _WITHOUT_AXIS = ("fixed", "floating")
@@ -64,12 +67,7 @@ def check_command(
 
 
 def _report(
-    name: str,
-    model: RobotModel | None,
-    findings: Sequence[FindingLike],
-    *,
-    fix_hints: bool,
-    joint_table: bool,
+    name: str, model: RobotModel | None, findings: Findings, *, fix_hints: bool, joint_table: bool
 ) -> str:
     if model is None:
         errors = sum(finding.severity == "error" for finding in findings)
@@ -80,10 +78,8 @@ def _report(
             f"{count_text(len(model.joints), 'joint')} ({len(model.joint_names)} driven)"
         ]
     places = ("file" if finding.line is None else f"line {finding.line}" for finding in findings)
-    rows = in_columns(
-        [(place, one.severity, one.message) for place, one in zip(places, findings, strict=True)]
-    )
-    for row, finding in zip(rows, findings, strict=True):
+    cells = [(place, one.severity, one.message) for place, one in zip(places, findings, strict=True)]
+    for row, finding in zip(in_columns(cells), findings, strict=True):
         lines += [f"  {row}"]
         if fix_hints and finding.fix:
             lines += [f"      fix: {finding.fix}"]
@@ -158,33 +154,24 @@ def _limits_text(joint: Joint) -> str:
     return f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}"
 
 
-def _facts(name: str, model: RobotModel | None, findings: Sequence[FindingLike]) -> dict[str, Any]:
+def _facts(name: str, model: RobotModel | None, findings: Findings) -> dict[str, Any]:
+    def joint_facts(joint: Joint) -> dict[str, Any]:
+        lower, upper = joint.limits.lower, joint.limits.upper
+        facts: dict[str, Any] = {
+            **{key: getattr(joint, key) for key in ("name", "type", "parent", "child", "line")},
+            # JSON has no infinity; a missing limit is null.
+            "lower": lower if math.isfinite(lower) else None,
+            "upper": upper if math.isfinite(upper) else None,
+        }
+        return facts if joint.mimic is None else {**facts, "mimic": asdict(joint.mimic)}
+
+    keys = ("line", "severity", "message", "fix")
     facts: dict[str, Any] = {
         "source": name,
         "usable": model is not None,
-        "findings": [
-            {"line": one.line, "severity": one.severity, "message": one.message, "fix": one.fix}
-            for one in findings
-        ],
+        "findings": [{key: getattr(one, key) for key in keys} for one in findings],
     }
     if model is not None:
         facts |= {"robot": model.name, "digest": model.digest, "root": model.root, "links": model.links}
-        facts["joints"] = [_joint_facts(joint) for joint in model.joints]
-    return facts
-
-
-def _joint_facts(joint: Joint) -> dict[str, Any]:
-    facts: dict[str, Any] = {
-        "name": joint.name,
-        "type": joint.type,
-        "parent": joint.parent,
-        "child": joint.child,
-        "line": joint.line,
-        # JSON has no infinity; a missing limit is null.
-        "lower": joint.limits.lower if math.isfinite(joint.limits.lower) else None,
-        "upper": joint.limits.upper if math.isfinite(joint.limits.upper) else None,
-    }
-    if joint.mimic is not None:
-        mimic = joint.mimic
-        facts["mimic"] = {"joint": mimic.joint, "multiplier": mimic.multiplier, "offset": mimic.offset}
+        facts["joints"] = [joint_facts(joint) for joint in model.joints]
     return facts

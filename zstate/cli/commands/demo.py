@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from math import degrees
 from typing import TYPE_CHECKING
 
@@ -147,16 +148,12 @@ class DemoTable:
     def __init__(
         self, listener: TransformListener, buffer: MeteredBuffer, robot: str, root: str, links: Sequence[str]
     ) -> None:
-        self._listener = listener
-        self._buffer = buffer
+        self._listener, self._buffer = listener, buffer
+        self._robot, self._root, self._links = robot, root, links
         self._statistics = buffer.statistics_of(robot)
-        self._robot = robot
-        self._root = root
-        self._links = links
         self._start = time.monotonic_ns(), self._statistics.count
 
     def show(self, ended: threading.Event, seconds: float | None) -> None:
-        """Update until ``ended`` is set, or for ``seconds``."""
         from zstate.clock import wait_interruptible
 
         until = float("inf") if seconds is None else time.monotonic() + seconds
@@ -176,7 +173,6 @@ class DemoTable:
                 live.update(self.table(), refresh=True)
 
     def summary(self) -> str:
-        """Samples, rate, losses and latency since the start."""
         stats, (start, before) = self._listener.stats, self._start
         count, now = self._statistics.count - before, time.monotonic_ns()
         seconds = (now - start) * 1e-9
@@ -202,11 +198,8 @@ class DemoTable:
         """The transforms now, without those that cannot be looked up yet."""
         found: list[Transform] = []
         for link in self._links:
-            try:
-                transform = self._buffer.lookup(f"{self._robot}/{self._root}", f"{self._robot}/{link}")
-            except LookupFailed:
-                continue
-            found.append(transform)
+            with suppress(LookupFailed):
+                found.append(self._buffer.lookup(f"{self._robot}/{self._root}", f"{self._robot}/{link}"))
         return found
 
     def table(self) -> Table:
@@ -235,12 +228,13 @@ class DemoTable:
 
     def line(self) -> str:
         """The first transform on one line."""
+        from zstate.cli.commands.tf import numbers_text
+
         text = self._freshness
         for one in self.transforms()[:1]:
-            # Adding zero turns -0 into 0.
-            xyz = ", ".join(f"{round(value, 3) + 0.0:.3f}" for value in one.translation.tolist())
-            rpy = ", ".join(f"{round(degrees(angle), 1) + 0.0:.1f}" for angle in one.rpy)
-            text += f"; {_link(one)} in {self._root}: xyz [{xyz}] m, rpy [{rpy}] deg"
+            xyz = numbers_text(one.translation.tolist(), 3)
+            rpy = numbers_text([degrees(angle) for angle in one.rpy], 1)
+            text += f"; {_link(one)} in {self._root}: xyz {xyz} m, rpy {rpy} deg"
         return text
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, cast
 
 import click
@@ -75,11 +74,11 @@ def echo_command(
     from zstate.wire.messages import JointState
 
     refuse_topic(robot, wire)
-    with ExitStack() as opened:
-        session = opened.enter_context(open_session(network, (wire,)))
-        selected = named_robot(session, robot, wire)
-        states = opened.enter_context(DescribedJointStates(session, selected, wire))
-        reader = opened.enter_context(StreamReader(session, selected, "joint_states", wire))
+    with (
+        open_session(network, (wire,)) as session,
+        DescribedJointStates(session, selected := named_robot(session, robot, wire), wire) as states,
+        StreamReader(session, selected, "joint_states", wire) as reader,
+    ):
         show = _printer(form, field, ChangeFilter(by) if changed or by else None)
         received = reader.first(timeout if once else None)
         while True:

@@ -61,7 +61,7 @@ def graph_command(network: SessionOptions, robot: str, form: str | None, wire: s
             fail(f"no stream of {robot!r} has a writer or a reader{hint}")
         graph = replace(graph, streams=streams)
     if form == "json":
-        print_json(graph_facts(graph))
+        print_json(_graph_facts(graph))
     elif not graph.streams:
         print_status(messages_for(wire).announced(()))
     elif form is None:
@@ -149,8 +149,7 @@ def graph_drawing(graph: Graph) -> Drawing:
     return Drawing("zstate", "flow", nodes, edges)
 
 
-def graph_facts(graph: Graph) -> dict[str, Any]:
-    """The graph as JSON."""
+def _graph_facts(graph: Graph) -> dict[str, Any]:
     streams = [
         {
             "robot": stream.robot,

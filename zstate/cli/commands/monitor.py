@@ -126,7 +126,7 @@ def monitor_command(
         if target is None or source is None:
             monitored = AllEdges(listener, statistics, directory)
         else:
-            monitored = PathEdges(listener, statistics, directory, target, source)
+            monitored = PathEdges(listener, statistics, directory, (target, source))
         _report_edges(monitored, once_s, as_json=as_json)
 
 
@@ -193,13 +193,11 @@ class AllEdges:
             fail(f"gave up after {timeout_s:g} s: {reason()}")
 
     def text(self, width: int | None) -> str:
-        """A report for a terminal of this ``width``."""
         from zstate.cli.edge_statistics import overview_text
 
         return self._directory.messages.translate(overview_text(self._rows(), width=width))
 
     def json(self) -> dict[str, Any]:
-        """A report as a JSON object."""
         return {"edges": [row.json() for row in self._rows()]}
 
     def _rows(self) -> list[EdgeRow]:
@@ -223,14 +221,13 @@ class PathEdges(AllEdges):
         listener: TransformListener,
         statistics: EdgeStatistics,
         directory: RobotDirectory,
-        target: str,
-        source: str,
+        frames: tuple[str, str],
     ) -> None:
         from zstate.cli.waiting import PoseWaiter
 
         super().__init__(listener, statistics, directory)
-        self._target, self._source = target, source
-        self._pose = PoseWaiter(listener, directory, target, source)
+        self._frames = frames
+        self._pose = PoseWaiter(listener, directory, *frames)
 
     def wait(self, timeout_s: float | None) -> None:
         self._pose.wait(timeout_s=timeout_s)
@@ -238,26 +235,26 @@ class PathEdges(AllEdges):
     def text(self, width: int | None) -> str:
         from zstate.cli.edge_statistics import path_text, time_text
 
-        transform = self._pose.wait()
+        transform, (target, source) = self._pose.wait(), self._frames
         age_s = self._pose.age_s(transform)
         newest = "at any time (static)" if transform.stamp is None else "there"
         if age_s is not None:
             newest = f"the newest is {time_text(age_s)} old"
         table = path_text(self._rows(), width=width)
-        return self._pose.translate(f"pose of {self._source} in {self._target}: {newest}\n{table}")
+        return self._pose.translate(f"pose of {source} in {target}: {newest}\n{table}")
 
     def json(self) -> dict[str, Any]:
-        transform = self._pose.wait()
+        transform, (target, source) = self._pose.wait(), self._frames
         return {
-            "target": self._target,
-            "source": self._source,
+            "target": target,
+            "source": source,
             "stamp": transform.stamp,
             "age_s": self._pose.age_s(transform),
             "edges": [row.json() for row in self._rows()[1:]],
         }
 
     def _rows(self) -> list[EdgeRow]:
-        frames = self._listener.buffer.path_frames(self._target, self._source)
+        frames = self._listener.buffer.path_frames(*self._frames)
         return [self._row(name, edge) for name, edge in frames]
 
 
@@ -271,7 +268,6 @@ class MonitoredRobot:
 
     @property
     def stats(self) -> ListenerStats:
-        """The counts of its samples."""
         return self.listener.stats_of(self.robot)
 
 
@@ -293,7 +289,6 @@ class RobotMonitor(Closeable):
         self._opened.close()
 
     def robots(self) -> list[MonitoredRobot]:
-        """The monitored robots, by name."""
         return sorted(dict(self._robots).values(), key=lambda one: one.robot)
 
     def update(self) -> str:
@@ -334,7 +329,6 @@ class RobotMonitor(Closeable):
         print_status(f"following {place}", event="following", robot=robot)
 
     def report(self, *, as_json: bool) -> None:
-        """Print one line for each robot."""
         from zstate.cli.edge_statistics import time_text
 
         for one in self.robots():

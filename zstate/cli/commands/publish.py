@@ -122,14 +122,14 @@ def publish_command(
             )
         if not network.is_explicit and len(set(map(is_ros, wires))) == 2:
             print_status("ROS 2 nodes are behind their router; pass --connect, such as tcp/127.0.0.1:7447")
+        rate_hz = rate or _RATE_HZ
         if derived_wires:
             _publish_joint_states(session, derived_wires[0], derived, whole, rate, seconds)
         elif source == "sine":
-            run_publisher(whole, SineSource(model), rate or _RATE_HZ, seconds)
+            run_publisher(whole, SineSource(model), rate_hz, seconds)
         else:
             from zstate.recording.source import RecordedSource
 
-            rate_hz = rate or _RATE_HZ
             with RecordedSource(source, None, model) as recorded:
                 # One tick more than the recording is long, for its last sample.
                 run_publisher(whole, recorded, rate_hz, seconds or recorded.duration_s + 1.0 / rate_hz)

@@ -149,9 +149,7 @@ class RecordProgress:
     """Progress of a recorder: its streams, its rate, and the robots it waits for."""
 
     def __init__(self, recorder: Recorder, directory: RobotDirectory, robots: Sequence[str]) -> None:
-        self._recorder = recorder
-        self._directory = directory
-        self._robots = robots
+        self._recorder, self._directory, self._robots = recorder, directory, robots
         self._listed: set[tuple[str, str]] = set()
         self._waiting = ""
         self._start = time.monotonic()
@@ -160,14 +158,12 @@ class RecordProgress:
     def line(self) -> str:
         """Duration, messages, rate since the last call, size and robots."""
         stats, now = self._recorder.stats, time.monotonic()
-        count = sum(stats.messages.values())
-        before, count_before = self._before
+        count, (before, count_before) = sum(stats.messages.values()), self._before
         self._before = (now, count)
         rate = (count - count_before) / max(now - before, 1e-9)
-        robots = ", ".join(_robots(stats)) or "no robot yet"
-        lost = f"  lost {_lost(stats)}" if _lost(stats) else ""
-        took = f"{now - self._start:.0f} s"
-        return f"{took}  {count} messages  {rate:.1f}/s  {size_text(stats.bytes)}  {robots}{lost}"
+        robots, lost = ", ".join(_robots(stats)) or "no robot yet", _lost(stats)
+        size, took = size_text(stats.bytes), f"{now - self._start:.0f} s"
+        return f"{took}  {count} messages  {rate:.1f}/s  {size}  {robots}{f'  lost {lost}' if lost else ''}"
 
     def changes(self) -> Iterator[str]:
         """Streams recorded since the last call, and robots that are missing."""
@@ -195,12 +191,11 @@ class RecordProgress:
         return "; ".join(messages.unknown(robot, announced) for robot in sorted(missing))
 
     def summary(self) -> str:
-        """Messages, robots, files and losses at the end."""
         stats, took = self._recorder.stats, time.monotonic() - self._start
         messages = count_text(sum(stats.messages.values()), "message")
         robots = f" of {', '.join(_robots(stats))}" if _robots(stats) else ""
-        lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
         where = f"{files_text(stats.files)} ({size_text(stats.bytes)})"
+        lost = f"lost {_lost(stats)}" if _lost(stats) else "nothing lost"
         return f"recorded {messages}{robots} in {took:.1f} s into {where}; {lost}"
 
 

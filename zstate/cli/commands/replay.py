@@ -73,6 +73,7 @@ def replay_command(
     zstate replay bag_folder --wire ros2:domain=5
     """
     from zstate.cli.processes import BackgroundCall
+    from zstate.clock import format_stamp
     from zstate.recording.player import Player
 
     with (
@@ -92,7 +93,11 @@ def replay_command(
         conflicts = _conflicting_writers(session, player.robots, wires)
         if conflicts and not takeover:
             fail(f"already published on the network: {'; '.join(conflicts)}; stop that, or use --takeover")
-        print_wrapped(_heading(player, file))
+        first, last = player.span
+        names = ", ".join(map(repr, player.robots))
+        speed = "as fast as possible" if rate == float("inf") else f"at {rate:g} times its speed"
+        span = f"{(last - first) / 1e9:.1f} s, {format_stamp(first)} to {format_stamp(last)}"
+        print_wrapped(f"replaying {names} from {file}: {span}, {speed}")
         call = BackgroundCall("zstate replay", player.run)
         try:
             report = _show(player, call)
@@ -144,21 +149,7 @@ def _conflicting_writers(session: Session, robots: Sequence[str], wires: Sequenc
     return conflicts
 
 
-def _heading(player: Player, file: str) -> str:
-    """Robots, time span and rate."""
-    from zstate.clock import format_stamp
-
-    first, last = player.span
-    robots = ", ".join(map(repr, player.robots))
-    rate = "as fast as possible" if player.rate == float("inf") else f"at {player.rate:g} times its speed"
-    duration = f"{(last - first) / 1e9:.1f} s"
-    return (
-        f"replaying {robots} from {file}: {duration}, {format_stamp(first)} to {format_stamp(last)}, {rate}"
-    )
-
-
 def _line(player: Player) -> str:
-    """Position, rate and lateness."""
     from zstate.clock import format_stamp
 
     first, last = player.span
@@ -169,7 +160,6 @@ def _line(player: Player) -> str:
 
 
 def _summary(report: PlayerReport) -> str:
-    """Samples, rate, lateness and refusals at the end."""
     late = (
         f"late by {format_duration(report.lateness_p50)} (median), {format_duration(report.lateness_p99)} "
         f"(p99), {format_duration(report.lateness_max)} (maximum)"

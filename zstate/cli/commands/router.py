@@ -93,14 +93,9 @@ def router_command(
 
     file = config or (None if ros2 else os.environ.get("ZENOH_CONFIG"))
     if file:
-        exclusive = {
-            "--ros2": ros2,
-            "--acl": acl,
-            "--downsample": downsample,
-            "--print": only_print,
-            "--output": output,
-        }
-        conflicts = [option for option, value in exclusive.items() if value]
+        names = ("ros2", "acl", "downsample", "print", "output")
+        values = (ros2, acl, downsample, only_print, output)
+        conflicts = [f"--{name}" for name, value in zip(names, values, strict=True) if value]
         if conflicts:
             raise click.UsageError(
                 f"{' and '.join(conflicts)} and the file {file!r} (--config, ZENOH_CONFIG) exclude each "
@@ -110,7 +105,15 @@ def router_command(
         return
     downsampling = None
     if downsample:
-        rates = dict(map(_parse_stream_rate, downsample))
+        rates: dict[str, float] = {}
+        for text in downsample:
+            stream, _, rate = text.partition("=")
+            try:
+                rates[stream] = float(rate)
+            except ValueError:
+                raise click.UsageError(
+                    f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10"
+                ) from None
         downsampling = Downsampling(rates, robot, wan, namespace)
     elif robot or wan or namespace:
         raise click.UsageError("--robot, --wan and --namespace need --downsample STREAM=HZ")
@@ -129,14 +132,6 @@ def router_command(
     if not only_print and output is None:
         network = SessionOptions("router", config=router.settings(), credentials=credentials)
         _run(network, router.listen, metrics)
-
-
-def _parse_stream_rate(text: str) -> tuple[str, float]:
-    stream, _, rate = text.partition("=")
-    try:
-        return stream, float(rate)
-    except ValueError:
-        raise click.UsageError(f"--downsample {text!r}: write STREAM=HZ, such as joint_states=10") from None
 
 
 def _run(

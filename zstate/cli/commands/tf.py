@@ -118,8 +118,14 @@ def tf_command(
                 print_json(facts)
             else:
                 print_result(transform_text(transform, precision))
-                if twist:
-                    print_result(_twist_text(velocity, precision))
+                if velocity is not None:
+                    for kind, vector, unit in (
+                        ("linear", velocity.linear, "m/s"),
+                        ("angular", velocity.angular, "rad/s"),
+                    ):
+                        print_result(f"- Twist: {kind} {numbers_text(vector.tolist(), precision)} {unit}")
+                elif twist:
+                    print_result("- Twist: not known yet")
 
         if not as_json:
             print_result(f"pose of {source} in {target}")
@@ -165,24 +171,18 @@ def transform_text(transform: Transform, precision: int = 3) -> str:
     rows = [[_digits(value, precision) for value in row] for row in transform.matrix.tolist()]
     lines = [
         when,
-        f"- Translation: {_listed(pose[:3], precision)}",
-        f"- Rotation: in Quaternion (xyzw) {_listed(pose[3:], precision)}",
-        f"- Rotation: in RPY (radian) {_listed(rpy, precision)}",
-        f"- Rotation: in RPY (degree) {_listed([degrees(angle) for angle in rpy], precision)}",
+        f"- Translation: {numbers_text(pose[:3], precision)}",
+        f"- Rotation: in Quaternion (xyzw) {numbers_text(pose[3:], precision)}",
+        f"- Rotation: in RPY (radian) {numbers_text(rpy, precision)}",
+        f"- Rotation: in RPY (degree) {numbers_text([degrees(angle) for angle in rpy], precision)}",
         "- Matrix:",
         *(" " + " ".join(cell.rjust(precision + 3) for cell in row) for row in rows),
     ]
     return "\n".join(lines)
 
 
-def _twist_text(twist: Twist | None, precision: int) -> str:
-    if twist is None:
-        return "- Twist: not known yet"
-    linear, angular = (_listed(vector.tolist(), precision) for vector in (twist.linear, twist.angular))
-    return f"- Twist: linear {linear} m/s\n- Twist: angular {angular} rad/s"
-
-
-def _listed(values: list[float], precision: int) -> str:
+def numbers_text(values: list[float], precision: int) -> str:
+    """Numbers with ``precision`` decimals, as in [0.100, -2.000]."""
     return f"[{', '.join(_digits(value, precision) for value in values)}]"
 
 

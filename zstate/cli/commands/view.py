@@ -6,8 +6,8 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,7 +21,6 @@ from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
 
 if TYPE_CHECKING:
-    from zstate.cli.processes import BackgroundCall
     from zstate.model.robot import RobotModel
     from zstate.net.session import Session
     from zstate.view.camera import Camera
@@ -148,7 +147,9 @@ def view_command(
     """
     import_module("zstate.view")  # reports a missing viser before anything starts
 
+    from zstate.cli.processes import BackgroundCall
     from zstate.model.load import is_path
+    from zstate.view.access import is_loopback
     from zstate.view.data_source import ViewSource
     from zstate.view.server import ViewServer
     from zstate.view.view import View
@@ -191,13 +192,26 @@ def view_command(
                 aspect=size[0] / size[1] if snapshot else 1.0,
             )
         )
-        with _running(view) as call:
+        stop = threading.Event()
+        call = BackgroundCall("zstate view", lambda: view.run(stop))
+        try:
             if snapshot is None:
-                _print_address(page)
+                print_result(f"the view is at {page.url}")
+                if not is_loopback(page.host):
+                    print_status(
+                        "anyone with this address can see the view and move sliders; it is sent unencrypted"
+                    )
+                elif os.environ.get("SSH_CONNECTION"):
+                    tunnel = f"ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}"
+                    print_status(f"from your own machine: {tunnel}")
                 call.result()
             else:
                 names = tuple(one.robot for one in named)
                 _write_snapshot(source, view, page, names, path=snapshot, size=size, fixed_frame=fixed_frame)
+        finally:
+            stop.set()
+            with suppress(TimeoutError):
+                call.result(_ENDS_WITHIN_S)
 
 
 class NamedRobot(NamedTuple):
@@ -250,30 +264,6 @@ def _receive_model(session: Session, robot: str, wire: str) -> RobotModel:
         if not _wait_for(source, lambda: robot in source.models, _ANNOUNCED_WITHIN_S):
             fail(f"{robot!r} is announced, but its model does not arrive; `zstate doctor {robot}` shows why")
         return source.models[robot]
-
-
-@contextmanager
-def _running(view: View) -> Generator[BackgroundCall[None]]:
-    from zstate.cli.processes import BackgroundCall
-
-    stop = threading.Event()
-    call = BackgroundCall("zstate view", lambda: view.run(stop))
-    try:
-        yield call
-    finally:
-        stop.set()
-        with suppress(TimeoutError):
-            call.result(_ENDS_WITHIN_S)
-
-
-def _print_address(page: ViewServer) -> None:
-    from zstate.view.access import is_loopback
-
-    print_result(f"the view is at {page.url}")
-    if not is_loopback(page.host):
-        print_status("anyone with this address can see the view and move sliders; it is sent unencrypted")
-    elif os.environ.get("SSH_CONNECTION"):
-        print_status(f"from your own machine: ssh -L {page.port}:127.0.0.1:{page.port} {os.uname().nodename}")
 
 
 def _write_snapshot(
