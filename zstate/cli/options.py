@@ -61,43 +61,42 @@ def _check_seconds(seconds: float) -> float:
 RATE = number("HZ", _check_rate)
 SECONDS = number("S", _check_seconds)
 
+EXISTING_FILE = click.Path(exists=True, dir_okay=False)
+
+
 _IDENTITY_OPTIONS = (
     click.option(
         "--certs",
+        envvar="ZSTATE_CERTS",
         type=click.Path(exists=True, file_okay=False),
         metavar="DIR",
-        envvar="ZSTATE_CERTS",
         help="Encrypt with ca.pem, NAME.pem and NAME.key of this folder (`zstate certs` makes them).",
     ),
     click.option(
         "--identity",
-        metavar="NAME",
         envvar="ZSTATE_IDENTITY",
+        metavar="NAME",
         help="The certificate in --certs to use; access control identifies this command by it.",
     ),
     click.option(
         "--user",
-        metavar="NAME",
         envvar="ZSTATE_USER",
+        metavar="NAME",
         help=f"User name for a router; its password is in {PASSWORD_VARIABLE}, or in --password-file.",
     ),
     click.option(
         "--password-file",
-        type=click.Path(exists=True, dir_okay=False),
-        metavar="FILE",
         envvar="ZSTATE_PASSWORD_FILE",
+        type=EXISTING_FILE,
         help="A file that only you can read; its first line is the password of --user.",
     ),
 )
 _USERS_OPTION = click.option(
     "--users",
-    type=click.Path(exists=True, dir_okay=False),
-    metavar="FILE",
     envvar="ZSTATE_USERS",
+    type=EXISTING_FILE,
     help="The users that may connect: user:password lines in a file that only you can read; default: all.",
 )
-
-
 _CREDENTIALS = ("certs", "identity", "user", "password_file", "users")
 _NETWORK = (*_CREDENTIALS, "mode", "connect", "listen", "config")
 
@@ -175,33 +174,31 @@ def _password(user: str, file: str | None) -> str:
 
 config_option = click.option(
     "--config",
-    type=click.Path(exists=True, dir_okay=False),
-    metavar="FILE",
     envvar="ZSTATE_CONFIG",
+    type=EXISTING_FILE,
     help="A Zenoh configuration (JSON5); default: the file that ZENOH_CONFIG names.",
 )
-
 _SESSION_OPTIONS = (
     click.option(
         "--mode",
-        type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
         envvar="ZSTATE_MODE",
+        type=click.Choice(["peer", "loopback", "lan", "client", "router"]),
         help="How to join the network: loopback never leaves this host, lan is open to the local network and "
         "found by multicast; default: client with --connect alone, client of tcp/127.0.0.1:7447 for a ROS "
         "wire alone, else peer.",
     ),
     click.option(
         "--connect",
+        envvar="ZSTATE_CONNECT",
         multiple=True,
         metavar="ENDPOINT",
-        envvar="ZSTATE_CONNECT",
         help="An endpoint to connect to, such as tcp/192.168.1.10:7447; may be repeated.",
     ),
     click.option(
         "--listen",
+        envvar="ZSTATE_LISTEN",
         multiple=True,
         metavar="ENDPOINT",
-        envvar="ZSTATE_LISTEN",
         help="An endpoint to listen on, such as tcp/0.0.0.0:7448; may be repeated.",
     ),
     config_option,
@@ -219,21 +216,21 @@ _WIRE = Checked("WIRE", _check_wire)
 
 wire_option = click.option(
     "--wire",
+    envvar="ZSTATE_WIRE",
     type=_WIRE,
     default="native",
     show_default=True,
-    envvar="ZSTATE_WIRE",
     help="The wire format: native, ros2 (for rmw_zenoh nodes) or ros2dds (through its bridge); with "
     "options, such as ros2:domain=5,namespace=r1.",
 )
 wires_option = click.option(
     "--wire",
     "wires",
+    envvar="ZSTATE_WIRE",
     type=_WIRE,
     multiple=True,
     default=("native",),
     show_default=True,
-    envvar="ZSTATE_WIRE",
     help="The wire format, as in `--wire native --wire ros2:domain=5,namespace=r1`; may be repeated.",
 )
 
@@ -359,16 +356,16 @@ _CLOCKS = click.Choice(["system", "sim"])
 
 clock_option = click.option(
     "--clock",
+    envvar="ZSTATE_CLOCK",
     type=_CLOCKS,
     default="system",
     show_default=True,
-    envvar="ZSTATE_CLOCK",
     help="The clock for stamps and rates: the system's, or the simulated time on zstate/clock or /clock.",
 )
 reading_clock_option = click.option(
     "--clock",
-    type=_CLOCKS,
     envvar="ZSTATE_CLOCK",
+    type=_CLOCKS,
     help="The clock that ages are measured with, and that is preferred if robots have different clocks.",
 )
 rate_option = click.option("--rate", type=RATE, default=100.0, show_default=True, help="Samples a second.")

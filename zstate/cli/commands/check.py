@@ -102,7 +102,7 @@ def _link_lines(model: RobotModel) -> list[str]:
         found: list[tuple[str, ...]] = [(root, "", "", "")]
         for guide, link in links:
             joint = joints[link]
-            found.append((guide + link, joint.name, joint.type, _mimic_text(joint) or _limits_text(joint)))
+            found.append((guide + link, joint.name, joint.type, _range_text(joint)))
         return found
 
     headings = ("link", "joint", "type", "range")
@@ -127,7 +127,7 @@ def _joint_lines(model: RobotModel) -> list[str]:
     rows = [
         (
             *(joint.name, joint.type, joint.parent, joint.child, indices.get(joint.name, "-")),
-            _mimic_text(joint) or _limits_text(joint) or "-",
+            _range_text(joint) or "-",
             *(
                 f"{limit:g}" if joint.type != "fixed" and math.isfinite(limit) else "-"
                 for limit in (joint.limits.velocity, joint.limits.effort)
@@ -140,18 +140,13 @@ def _joint_lines(model: RobotModel) -> list[str]:
     return Table(_JOINT_HEADINGS, rows, optional).lines(output_width())
 
 
-def _mimic_text(joint: Joint) -> str:
-    if joint.mimic is None:
-        return ""
-    offset = f" {joint.mimic.offset:+g}" if joint.mimic.offset else ""
-    return f"{joint.mimic.multiplier:g} * {joint.mimic.joint}{offset}"
-
-
-def _limits_text(joint: Joint) -> str:
-    if joint.type not in ("revolute", "prismatic"):
-        return ""
-    unit = "rad" if joint.type == "revolute" else "m"
-    return f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}"
+def _range_text(joint: Joint) -> str:
+    """The mimic rule or the limits; empty for a joint without either."""
+    if joint.mimic is not None:
+        offset = f" {joint.mimic.offset:+g}" if joint.mimic.offset else ""
+        return f"{joint.mimic.multiplier:g} * {joint.mimic.joint}{offset}"
+    unit = {"revolute": "rad", "prismatic": "m"}.get(joint.type)
+    return f"{joint.limits.lower:g} to {joint.limits.upper:g} {unit}" if unit else ""
 
 
 def _facts(name: str, model: RobotModel | None, findings: Findings) -> dict[str, Any]:

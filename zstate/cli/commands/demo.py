@@ -109,12 +109,7 @@ def demo_command(
 
 
 def _show_transforms(  # noqa: PLR0917 - one use
-    endpoint: str,
-    robot: str,
-    root: str,
-    links: Sequence[str],
-    ended: threading.Event,
-    seconds: float | None,
+    endpoint: str, robot: str, root: str, links: Sequence[str], ended: threading.Event, seconds: float | None
 ) -> None:
     from zstate.metrics.buffer import MeteredBuffer
     from zstate.nodes.listener import TransformListener

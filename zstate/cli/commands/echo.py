@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import click
 
@@ -13,9 +12,6 @@ from zstate.cli.options import named_robot, refuse_topic
 from zstate.cli.output.console import print_json, print_result
 from zstate.cli.session import SessionOptions, open_session
 from zstate.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from zstate.cli.output.joint_state_text import ChangeFilter
 
 
 def _check_amount(amount: float) -> float:
@@ -68,10 +64,31 @@ def echo_command(
     zstate echo --wire ros2 --once                     # /joint_states
     zstate echo --wire ros2:namespace=r1               # /r1/joint_states
     """
-    from zstate.cli.output.joint_state_text import ChangeFilter, DescribedJointStates
+    from zstate.cli.output.joint_state_text import (
+        ChangeFilter,
+        CsvFormatter,
+        DescribedJointStates,
+        select_field,
+        yaml_text,
+    )
     from zstate.cli.stream_reader import StreamReader
     from zstate.clock import LONGEST_WAIT_S
     from zstate.wire.messages import JointState
+
+    table, changes = CsvFormatter(), ChangeFilter(by) if changed or by else None
+
+    def show(document: Any) -> None:
+        value = document if field is None else select_field(document, field)
+        if changes is not None and not changes.accepts(value):
+            return
+        if form == "json":
+            print_json(_with_nulls(value))
+        elif form == "csv":
+            print_result("\n".join(table.lines(value, field or "")))
+        elif field is not None and not isinstance(value, dict):
+            print_result(yaml_text(value))
+        else:
+            print_result(f"{yaml_text(value)}\n---")
 
     refuse_topic(robot, wire)
     with (
@@ -79,7 +96,6 @@ def echo_command(
         DescribedJointStates(session, selected := named_robot(session, robot, wire), wire) as states,
         StreamReader(session, selected, "joint_states", wire) as reader,
     ):
-        show = _printer(form, field, ChangeFilter(by) if changed or by else None)
         received = reader.first(timeout if once else None)
         while True:
             if received is not None:
@@ -97,24 +113,3 @@ def _with_nulls(value: Any) -> Any:
     if isinstance(value, list):
         return [_with_nulls(inner) for inner in cast("list[Any]", value)]
     return None if value != value else value  # noqa: PLR0124 - true of NaN only
-
-
-def _printer(form: str | None, field: str | None, changes: ChangeFilter | None) -> Callable[[Any], None]:
-    from zstate.cli.output.joint_state_text import CsvFormatter, select_field, yaml_text
-
-    table = CsvFormatter()
-
-    def show(document: Any) -> None:
-        value = document if field is None else select_field(document, field)
-        if changes is not None and not changes.accepts(value):
-            return
-        if form == "json":
-            print_json(_with_nulls(value))
-        elif form == "csv":
-            print_result("\n".join(table.lines(value, field or "")))
-        elif field is not None and not isinstance(value, dict):
-            print_result(yaml_text(value))
-        else:
-            print_result(f"{yaml_text(value)}\n---")
-
-    return show

@@ -114,9 +114,8 @@ def graph_text(graph: Graph) -> str:
         names = ", ".join(stream.label for stream in group.streams)
         lines.append(f"{group.robot}: {names}" if group.robot else names)
         for role, programs in (("written by", group.writers), ("read by", group.readers)):
-            shown = programs or ("none",)
-            heads = (role, *[""] * (len(shown) - 1))
-            lines += [f"  {head:<10}  {program}" for head, program in zip(heads, shown, strict=True)]
+            for number, program in enumerate(programs or ("none",)):
+                lines.append(f"  {'' if number else role:<10}  {program}")
     return "\n".join(lines)
 
 

@@ -27,12 +27,7 @@ if TYPE_CHECKING:
     help="Endpoint for clients; default: tcp/127.0.0.1:7447. May be repeated.",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Another router; may be repeated.")
-@click.option(
-    "--acl",
-    type=click.Path(exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Access control: the output of `zstate acl`.",
-)
+@click.option("--acl", type=options.EXISTING_FILE, help="Access control: the output of `zstate acl`.")
 @click.option(
     "--downsample",
     multiple=True,
@@ -55,7 +50,6 @@ if TYPE_CHECKING:
 @click.option(
     "--output",
     type=click.Path(dir_okay=False),
-    metavar="FILE",
     help="Write the configuration, with the password of --user, to a new FILE that only you can read.",
 )
 def router_command(

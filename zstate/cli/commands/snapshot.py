@@ -64,7 +64,7 @@ def save_command(
 
 
 @snapshot_command.command("load")
-@click.argument("file", type=click.Path(exists=True, dir_okay=False))
+@click.argument("file", type=options.EXISTING_FILE)
 @click.argument("robots", nargs=-1, metavar="[ROBOT]...")
 @click.option("--rate", type=options.RATE, default=10.0, show_default=True, help="Rate of the joint states.")
 @click.option(

@@ -74,13 +74,7 @@ def _point(text: str) -> tuple[float, float, float]:
 @click.option(
     "--port", type=click.IntRange(0, 65535), help="0: any free port; default: the first free one from 8080."
 )
-@click.option(
-    "--rate",
-    type=options.RATE,
-    default=30.0,
-    show_default=True,
-    help="Updates per second [Hz].",
-)
+@click.option("--rate", type=options.RATE, default=30.0, show_default=True, help="Updates per second [Hz].")
 @click.option(
     "--snapshot",
     type=options.Checked("file", _check_picture),
