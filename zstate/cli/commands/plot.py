@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -160,10 +161,8 @@ class TimeSeries:
         for joint in joints:
             found = [n for n, name in enumerate(self.names) if name == joint or name.startswith(f"{joint}.")]
             if not found:
-                hint = did_you_mean(joint, self.names)
-                raise InvalidInput(
-                    f"this robot has no joint {joint!r}{hint} (joints: {', '.join(self.names)})"
-                )
+                hint, known = did_you_mean(joint, self.names), ", ".join(self.names)
+                raise InvalidInput(f"this robot has no joint {joint!r}{hint} (joints: {known})")
             columns += found
         return self._columns(columns) if joints else self
 
@@ -268,9 +267,7 @@ def _recorded_joints(path: str, robot: str | None, start_s: float, seconds: floa
     from zstate.wire.messages import JointState, RobotDescription
 
     with RecordingReader(path) as reader:
-        decoded = DecodedRecording(
-            reader, lambda reason, text: _LOG.warning("left out (%s): %s", reason, text)
-        )
+        decoded = DecodedRecording(reader, partial(_LOG.warning, "left out (%s): %s"))
         robots = decoded.robots
         if robot is None and len(robots) != 1:
             content = f"robots {', '.join(robots)}: name one of them" if robots else "no robot"
