@@ -84,7 +84,7 @@ HOMES = {
 EVERYWHERE = {"numpy"}
 GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
-    ("cli/snapshot.py", "msgspec"),
+    ("cli/snapshot_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
     ("cli/up/schema.py", "msgspec"),
 }

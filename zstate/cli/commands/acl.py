@@ -19,9 +19,8 @@ _ROLES = {
 
 def _role_options(command: Any) -> Any:
     for role, text in reversed(_ROLES.items()):
-        command = click.option(f"--{role}", multiple=True, metavar="NAME", help=f"{text}; may be repeated.")(
-            command
-        )
+        option = click.option(f"--{role}", multiple=True, metavar="NAME", help=f"{text}; may be repeated.")
+        command = option(command)
     return command
 
 
@@ -64,13 +63,6 @@ def acl_command(*, namespace: str, wires: tuple[str, ...], **roles: tuple[str, .
     if not any(roles.values()):
         *others, last = (f"--{role} NAME" for role in _ROLES)
         raise click.UsageError(f"give at least one of {', '.join(others)} and {last}")
-    fleet = AclRoles(
-        roles["robot"],
-        roles["viewer"],
-        roles["operator"],
-        roles["timekeeper"],
-        namespace,
-        wires,
-        roles["placer"],
-    )
+    robots, viewers, operators, timekeepers, placers = (roles[role] for role in _ROLES)
+    fleet = AclRoles(robots, viewers, operators, timekeepers, namespace, wires, placers)
     print_result(access_text(fleet).rstrip("\n"))

@@ -11,7 +11,7 @@ import pytest
 from helpers.cli_runner import RRBOT, failure, published_robot, zstate
 
 from zstate import StaticPublisher, Transform, TransformBuffer, connect, load_model
-from zstate.cli.plot import joint_series, path_series
+from zstate.cli.commands.plot import joint_series, path_series
 from zstate.errors import InvalidInput
 
 SECOND = 1_000_000_000
