@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from zstate.errors import InvalidInput
 from zstate.wire.joint_order import SampleLayout
-from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
     Edges,
@@ -27,29 +24,27 @@ from zstate.wire.ros2.joint_state import JointStateEncoder
 from zstate.wire.ros2.tf_message import TfMessageEncoder
 
 
-@dataclass(frozen=True)
-class TopicAddress:
-    """The key and liveliness token of one writer of a topic; ``gid`` is None if the wire sends none."""
-
-    key: str
-    token: str
-    gid: bytes | None
-
-
 class RosStreamEncoder:
-    """Encodes one stream of one writer as ROS 2 messages."""
+    """Encodes one stream of one writer as ROS 2 messages.
+
+    ``key`` and ``token`` are those of the topic and of its writer; ``gid`` is None if the wire sends none.
+    """
 
     encoding = ""
     can_withdraw = False  # ROS nodes log a Zenoh delete as a malformed message
 
     def __init__(
-        self, stream: Stream, address: TopicAddress, names: FrameNames, sample_names: SampleLayout
+        self,
+        names: FrameNames,
+        sample_names: SampleLayout,
+        key: str = "",
+        token: str = "",
+        gid: bytes | None = None,
     ) -> None:
-        self.key = address.key
-        self.token: str | None = address.token
-        self._gid = address.gid
+        self.key = key
+        self.token: str | None = token
+        self._gid = gid
         self._seq = 0
-        self._stream = stream
         self._names = names
         self._sample_names = sample_names
         self._joints: tuple[tuple[str, ...], JointStateEncoder] | None = None
