@@ -37,6 +37,8 @@ from zstate._util.suggestions import suggestion_text
 from zstate.checks import real_numbers
 from zstate.errors import FindingLike, InvalidInput
 
+Pose7 = tuple[float, float, float, float, float, float, float]
+Vector3 = tuple[float, float, float]
 JointType = Literal["fixed", "revolute", "continuous", "prismatic", "floating", "planar"]
 
 POSITION_COUNTS: dict[JointType, int] = {
@@ -90,8 +92,8 @@ class Joint:
     type: JointType
     parent: str
     child: str
-    origin: tuple[float, float, float, float, float, float, float]
-    axis: tuple[float, float, float]
+    origin: Pose7
+    axis: Vector3
     limits: Limits
     mimic: Mimic | None = None
     line: int | None = None
