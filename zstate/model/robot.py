@@ -28,6 +28,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
+from itertools import accumulate
 from typing import Literal
 
 import numpy as np
@@ -279,12 +280,8 @@ def _name_parts(name: str) -> tuple[str, ...]:
 
 
 def _offsets(joints: Sequence[Joint], counts: Mapping[JointType, int]) -> dict[str, int]:
-    starts: dict[str, int] = {}
-    total = 0
-    for joint in joints:
-        starts[joint.name] = total
-        total += counts[joint.type]
-    return starts
+    starts = accumulate((counts[joint.type] for joint in joints), initial=0)
+    return {joint.name: start for joint, start in zip(joints, starts, strict=False)}
 
 
 def coordinate_names(model: RobotModel) -> tuple[str, ...]:
