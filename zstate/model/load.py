@@ -161,9 +161,12 @@ def _count_warnings(xacro: Any) -> Generator[Counter[str]]:
         where = "" if file is None else f" ({Path(file).name})"
         counts[" ".join(map(str, parts)) + where] += 1
 
+    def print_location(*_: object, **__: object) -> None:
+        pass  # the warning names its file
+
     # All warnings, of xacro and of the expressions in a file, go through these two functions.
     kept_message, kept_location = color.message, xacro.print_location
-    color.message, xacro.print_location = message, lambda *_, **__: None  # the warning names its file
+    color.message, xacro.print_location = message, print_location
     try:
         yield counts
     finally:

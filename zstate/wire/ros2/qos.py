@@ -143,13 +143,13 @@ def _parse(text: str, chunks: list[str], encoding: _Encoding) -> Qos:
     """The QoS in the three ``chunks`` of ``text``: reliability, durability, and history with depth."""
     try:
         reliability, durability, kept = chunks
-        history, depth = kept.split(",")
-        history, count = _parse_policy(encoding.history, history, "keep_last"), _parse_depth(depth)
+        first, second = kept.split(",")
+        history, depth = _parse_policy(encoding.history, first, "keep_last"), _parse_depth(second)
         return Qos(
             _parse_policy(encoding.reliability, reliability, "reliable"),
             _parse_policy(encoding.durability, durability, "volatile"),
             history,
-            0 if history == "keep_all" else encoding.depth if count is None else count,
+            0 if history == "keep_all" else encoding.depth if depth is None else depth,
         )
     except (LookupError, ValueError):
         raise MessageError(
