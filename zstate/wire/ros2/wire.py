@@ -45,6 +45,7 @@ class Ros2Wire:
     name = "ros2"
     shared: frozenset[Stream] = frozenset({"tf", "tf_static"})
     _topic_keys = RmwKeys
+    _has_gids = True
 
     def __init__(self, options: Ros2Options | None = None) -> None:
         self.options = options or Ros2Options()
@@ -61,7 +62,7 @@ class Ros2Wire:
     ) -> RosStreamEncoder:
         token = self._endpoint_token(node, stream, "MP", number)
         names, key = self._frame_names(node.robot), self._keys.key(node.robot, stream)
-        return RosStreamEncoder(names, node.sample_names, key, token, self._gid(token))
+        return RosStreamEncoder(names, node.sample_names, key, token, gid(token) if self._has_gids else None)
 
     def _node(self, node: WriterNode) -> NodeToken:
         namespace = f"/{self.options.robot_namespace(node.robot)}"
@@ -87,9 +88,6 @@ class Ros2Wire:
         type_hash = self._keys.key(node.robot, stream).rpartition("/")[2]
         token = EndpointToken(self._node(node), number, kind, topic, dds_type, type_hash, STREAM_QOS[stream])
         return token.key
-
-    def _gid(self, token: str) -> bytes | None:
-        return gid(token)
 
     def expression(self, robot: str, stream: Stream) -> str:
         return self._keys.expression(robot, stream)
@@ -147,6 +145,7 @@ class Ros2DdsWire(Ros2Wire):
 
     name = "ros2dds"
     _topic_keys = DdsKeys
+    _has_gids = False  # its messages have no attachment
 
     def __init__(self, options: Ros2Options | None = None) -> None:
         super().__init__(options)
@@ -161,9 +160,6 @@ class Ros2DdsWire(Ros2Wire):
     ) -> str:
         ros, topic = ros_type(stream), self._keys.key(node.robot, stream)
         return DdsToken(node.zid, kind, topic, ros.name, STREAM_QOS[stream], ros.hash).key
-
-    def _gid(self, token: str) -> None:
-        """None: their messages have no attachment."""
 
     def _origin(self, arrival: SerializedSample) -> tuple[int, int]:
         self._received[arrival.key] += 1
