@@ -235,8 +235,8 @@ class StatePublisher(Closeable):
             for stream, writer in self._writers.items()
         }
         rate = None if self._rate is None else self._rate.report()
-        outside = () if self._limits is None else (self._limits.count, self._limits.last)
-        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, *outside)
+        outside, excess = (0, "") if self._limits is None else (self._limits.count, self._limits.last)
+        return PublisherStats(self._seq, self._refused, self._last_refusal, streams, rate, outside, excess)
 
     def publish(
         self,

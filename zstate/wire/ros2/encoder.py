@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
@@ -118,9 +119,7 @@ class JointStateEncoder:
         self._count = len(names)
         self._size = 8 * len(names)
         self._prefix_blocks = {
-            (has_velocities, has_efforts): _prefix_blocks(names, frame_id, has_velocities, has_efforts)
-            for has_velocities in (False, True)
-            for has_efforts in (False, True)
+            sent: _prefix_blocks(names, frame_id, *sent) for sent in product((False, True), repeat=2)
         }
 
     def encode(

@@ -144,7 +144,8 @@ def _parse(text: str, chunks: list[str], encoding: _Encoding) -> Qos:
     try:
         reliability, durability, kept = chunks
         first, second = kept.split(",")
-        history, depth = _parse_policy(encoding.history, first, "keep_last"), _parse_depth(second)
+        history: History = _parse_policy(encoding.history, first, "keep_last")
+        depth = _parse_depth(second)
         return Qos(
             _parse_policy(encoding.reliability, reliability, "reliable"),
             _parse_policy(encoding.durability, durability, "volatile"),

@@ -79,10 +79,8 @@ class RmwKeys:
 
     def _topic(self, namespace: str, stream: Stream) -> str:
         ros_type(stream)
-        return f"/{namespace}/{stream}" if namespace and not self._is_global(stream) else f"/{stream}"
-
-    def _is_global(self, stream: Stream) -> bool:
-        return stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
+        is_global = stream == "clock" or (stream.startswith("tf") and self._options.tf == "global")
+        return f"/{namespace}/{stream}" if namespace and not is_global else f"/{stream}"
 
 
 class DdsKeys(RmwKeys):
@@ -101,8 +99,9 @@ class DdsKeys(RmwKeys):
     def robot_from_key(self, key: str) -> str:
         return robot_from_topic(key)
 
-    def _is_global(self, stream: Stream) -> bool:
-        return False
+    def _topic(self, namespace: str, stream: Stream) -> str:
+        ros_type(stream)
+        return f"/{namespace}/{stream}" if namespace else f"/{stream}"
 
 
 def robot_from_topic(topic: str) -> str:
