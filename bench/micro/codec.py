@@ -22,8 +22,8 @@ from rosbags.typesys import Stores, get_typestore
 from bench.micro.timing import Call, mean_times_us
 from zstate.wire.messages import to_block
 from zstate.wire.ros2.cdr import to_time
-from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder
-from zstate.wire.ros2.tf_message import TfMessageDecoder, TfMessageEncoder
+from zstate.wire.ros2.decoder import JointStateDecoder, TfMessageDecoder
+from zstate.wire.ros2.encoder import JointStateEncoder, TfMessageEncoder
 from zstate.wire.ros2.types import JOINT_STATE, TF_MESSAGE
 
 STAMP = 1_700_000_000_123_456_789

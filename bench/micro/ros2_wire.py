@@ -27,7 +27,7 @@ from zstate.net.session import Session
 from zstate.net.writer import WireWriter
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, RobotDescription, Sample, order_digest, to_block
-from zstate.wire.protocol import EntityId, SerializedSample
+from zstate.wire.protocol import SerializedSample, WriterNode
 from zstate.wire.registry import get_wire
 
 JOINTS = 30
@@ -84,10 +84,8 @@ def write_cases(wire: str, session: Session, model: RobotModel) -> dict[str, Cal
 def read_cases(wire: str, model: RobotModel) -> dict[str, Call]:
     """The cases of decoding consecutive samples, and of inserting them into a buffer."""
     wire_format = get_wire(wire)
-    node, names = EntityId("1", 0), sample_names(model)
-    encoder = wire_format.stream_encoder(
-        "r1", local_writer(1), "joint_states", node=node, number=1, sample_names=names
-    )
+    node = WriterNode("r1", local_writer(1), "1", 0, sample_names(model))
+    encoder = wire_format.stream_encoder(node, "joint_states", number=1)
     stamps = count(STAMP, 10_000_000)
 
     def arrivals() -> list[SerializedSample]:

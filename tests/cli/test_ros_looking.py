@@ -10,9 +10,8 @@ from helpers.robots import wait_for_reader
 
 from zstate import StaticPublisher, Transform, connect
 from zstate.wire.identity import WriterId
-from zstate.wire.joint_order import SampleLayout
 from zstate.wire.messages import JointState, order_digest, to_block
-from zstate.wire.protocol import EntityId
+from zstate.wire.protocol import WriterNode
 from zstate.wire.ros2.wire import Ros2Wire
 
 pytestmark = pytest.mark.processes
@@ -96,10 +95,8 @@ def test_unmeasured_values_are_null_in_json(spawn: Spawn, ros_router: str):
     )
     wire = Ros2Wire()
     with connect(mode="client", endpoints=ros_router) as session:
-        writer, node = WriterId("driver", "", 0, 0, 1), EntityId(session.zid, 0)
-        encoder = wire.stream_encoder(
-            "r", writer, "joint_states", node=node, number=1, sample_names=SampleLayout()
-        )
+        node = WriterNode("r", WriterId("driver", "", 0, 0, 1), session.zid, 0)
+        encoder = wire.stream_encoder(node, "joint_states", number=1)
         wait_for_reader(session, encoder.key)
         session.zenoh.put(encoder.key, encoder.encode(unmeasured), attachment=encoder.attachment(5))
         document = json.loads(command.line(), parse_constant=pytest.fail)

@@ -22,8 +22,7 @@ from helpers import manual_cdr
 
 from zstate.errors import MessageError
 from zstate.wire.ros2.cdr import decode_clock, decode_string
-from zstate.wire.ros2.joint_state import JointStateDecoder
-from zstate.wire.ros2.tf_message import TfMessageDecoder
+from zstate.wire.ros2.decoder import JointStateDecoder, TfMessageDecoder
 
 REASONS = {"truncated", "malformed", "no positions"}
 COUNTS = (0, 1, 2, 3, 4, 5, 255, 256, 10**9, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from zstate.errors import MessageError
 from zstate.wire.identity import Announcement, WriterId
-from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import (
     ClockMessage,
@@ -24,7 +23,7 @@ from zstate.wire.messages import (
     to_block,
 )
 from zstate.wire.native import ENCODINGS, STREAM_TYPES, NativeWire, decode, encode
-from zstate.wire.protocol import EntityId, SerializedSample, StreamEncoder, Wire
+from zstate.wire.protocol import SerializedSample, StreamEncoder, Wire, WriterNode
 
 WRITER = WriterId("arm", "jetson", 412, 5, 7)
 NAMES = ("j1", "j2")
@@ -239,10 +238,7 @@ def test_one_changed_byte_raises_only_message_error(message: Message, at: int, v
 
 
 def encoder_of(stream: Stream, name: str = "") -> StreamEncoder:
-    node = EntityId("z1", 0)
-    return NativeWire().stream_encoder(
-        "r1", WRITER, stream, node=node, number=0, sample_names=SampleLayout(), name=name
-    )
+    return NativeWire().stream_encoder(WriterNode("r1", WRITER, "z1", 0), stream, number=0, name=name)
 
 
 def test_native_wire_implements_the_protocol_for_every_stream():

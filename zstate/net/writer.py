@@ -23,7 +23,7 @@ from zstate.wire.identity import WriterId
 from zstate.wire.joint_order import SampleLayout
 from zstate.wire.keys import Stream
 from zstate.wire.messages import Message
-from zstate.wire.protocol import EntityId, StreamEncoder, Wire
+from zstate.wire.protocol import StreamEncoder, Wire, WriterNode
 
 _PERMISSION_TIMEOUT_S = 1.0
 _PERMISSION_ROUND_S = 0.02
@@ -90,13 +90,11 @@ class WireWriter(Closeable):
     ) -> None:
         self._session = session
         self._wire = wire
-        self._robot = robot
-        self._writer = writer
-        self._sample_names = sample_names or SampleLayout()
-        self._node = EntityId(session.zid, session.next_number())
+        names = sample_names or SampleLayout()
+        self._node = WriterNode(robot, writer, session.zid, session.next_number(), names)
         self._is_permitted = wire.name == "ros2dds"  # the permissions of these are the bridges' own
         self._opened = ExitStack()
-        token = wire.node_token(robot, writer, self._node)
+        token = wire.node_token(self._node)
         if token is not None:
             self._opened.enter_context(announce(session, token))
 
@@ -109,15 +107,7 @@ class WireWriter(Closeable):
         return self._announced(LatchedWriter(self._session, self._encoder(stream, name)))
 
     def _encoder(self, stream: Stream, name: str = "") -> StreamEncoder:
-        return self._wire.stream_encoder(
-            self._robot,
-            self._writer,
-            stream,
-            node=self._node,
-            number=self._session.next_number(),
-            sample_names=self._sample_names,
-            name=name,
-        )
+        return self._wire.stream_encoder(self._node, stream, self._session.next_number(), name)
 
     def _announced(self, writer: W) -> W:
         self._opened.enter_context(writer)
@@ -126,7 +116,7 @@ class WireWriter(Closeable):
             self._opened.enter_context(announce(self._session, token))
             if not self._is_permitted:
                 # One check is enough: all streams of a robot have the same permissions.
-                check_may_write(self._session, self._robot, token)
+                check_may_write(self._session, self._node.robot, token)
                 self._is_permitted = True
         return writer
 

@@ -109,12 +109,13 @@ class TransformListener(Closeable):
         self._observers: tuple[Callable[[], object], ...] = ()
         with ExitStack() as opening:
             opening.enter_context(self._events)
-            expression = self._wire.expression
-            key = expression(robot, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_description)))
-            key = expression(robot, "tf_static")
-            opening.enter_context(LatchedSubscriber(session, key, self._observed(self._on_statics)))
-            key = expression(robot, follow)
+            description, statics, key = (self._wire.expression(robot, stream) for stream in streams)
+            on_description, on_statics = (
+                self._observed(self._on_description),
+                self._observed(self._on_statics),
+            )
+            opening.enter_context(LatchedSubscriber(session, description, on_description))
+            opening.enter_context(LatchedSubscriber(session, statics, on_statics))
             self._capacity = capacity_for(key)
             opening.enter_context(StreamSubscriber(session, key, self._on_samples))
             if history_on_join and self._wire.name == "native":

@@ -28,7 +28,7 @@ from zstate.wire.messages import (
     order_digest,
 )
 from zstate.wire.ros2.cdr import to_time
-from zstate.wire.ros2.encoder import RosStreamEncoder, TopicAddress
+from zstate.wire.ros2.encoder import RosStreamEncoder
 from zstate.wire.ros2.frame_names import FrameNames
 from zstate.wire.ros2.options import Ros2Options
 from zstate.wire.ros2.qos import STREAM_QOS
@@ -55,7 +55,6 @@ _STREAMS: dict[type[Message], Stream] = {
     RobotDescription: "robot_description",
     ClockMessage: "clock",
 }
-_NO_ADDRESS = TopicAddress("", "", None)
 _NAMED = SampleLayout()
 
 
@@ -247,7 +246,7 @@ class ChannelEncoder:
         self._stream: Stream = stream
         self._names = names
         self._sample_names = _NAMED
-        self._encoder = RosStreamEncoder(stream, _NO_ADDRESS, names, _NAMED)
+        self._encoder = RosStreamEncoder(names, _NAMED)
 
     def encode(self, message: Message, sample_names: SampleLayout = _NAMED) -> bytes:
         """The payload of ``message``; slow for a large latched one. ``sample_names`` names its numbers.
@@ -256,7 +255,7 @@ class ChannelEncoder:
         """
         if sample_names is not self._sample_names:
             self._sample_names = sample_names
-            self._encoder = RosStreamEncoder(self._stream, _NO_ADDRESS, self._names, sample_names)
+            self._encoder = RosStreamEncoder(self._names, sample_names)
         return self._encoder.encode(message)
 
 

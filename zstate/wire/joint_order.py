@@ -13,6 +13,7 @@ from zstate.errors import MessageError
 from zstate.wire.messages import Edges, JointState, from_block, order_digest
 
 Floats = NDArray[np.float64]
+_Indices = NDArray[np.intp]
 
 
 class JointNumbers(NamedTuple):
@@ -21,13 +22,6 @@ class JointNumbers(NamedTuple):
     positions: Floats
     velocities: Floats | None
     efforts: Floats | None
-
-
-class _Permutation(NamedTuple):
-    """The index in a writer's order of each number in the reader's."""
-
-    positions: NDArray[np.intp]
-    velocities: NDArray[np.intp]
 
 
 class JointOrder:
@@ -45,7 +39,7 @@ class JointOrder:
         self.digest = order_digest(tuple(names))
         self._coordinates = tuple(coordinates or names)
         self._slots = np.array(velocity_slots or range(len(self._coordinates)), dtype=np.intp)
-        self._permutations: dict[tuple[str, ...], _Permutation] = {}
+        self._permutations: dict[tuple[str, ...], tuple[_Indices, _Indices]] = {}
 
     def is_plain(self, state: JointState) -> bool:
         """Whether ``state`` has only positions, in the reader's order: the usual case."""
@@ -57,15 +51,16 @@ class JointOrder:
         velocities = None if state.velocities is None else from_block(state.velocities)
         efforts = None if state.efforts is None else from_block(state.efforts)
         if state.order != self.digest:
-            order = self._permutation(state.names)
-            positions = positions[order.positions]
-            velocities = None if velocities is None else velocities[order.velocities]
-            efforts = None if efforts is None else efforts[order.velocities]
+            order, rate_order = self._permutation(state.names)
+            positions = positions[order]
+            velocities = None if velocities is None else velocities[rate_order]
+            efforts = None if efforts is None else efforts[rate_order]
         if state.names is not None:
             velocities, efforts = _none_if_nan(velocities), _none_if_nan(efforts)
         return JointNumbers(positions, velocities, efforts)
 
-    def _permutation(self, names: tuple[str, ...] | None) -> _Permutation:
+    def _permutation(self, names: tuple[str, ...] | None) -> tuple[_Indices, _Indices]:
+        """The index in a writer's order of each position, and of each velocity, of the reader's."""
         if names is None:
             raise MessageError(
                 "a joint state in an order of another model; do both sides use the same URDF?",
@@ -80,7 +75,7 @@ class JointOrder:
                 )
             # One order per writer is usual; a writer that shuffles must not fill the memory.
             positions = np.array([names.index(name) for name in self._coordinates], dtype=np.intp)
-            found = _Permutation(positions, positions[self._slots])
+            found = positions, positions[self._slots]
             self._permutations = {names: found}
         return found
 

@@ -54,17 +54,13 @@ _STREAMS: dict[str, Stream] = {stream: stream for stream in get_args(Stream)}
 _RESERVED = frozenset("/*$?#")
 
 
-def check_robot(name: str) -> str:
-    """``name`` if it can be one chunk of a key. Raises InvalidInput with the reason otherwise."""
-    return _check_chunk("robot", name)
-
-
 def check_writer(name: str) -> str:
-    """The same for the name under which static edges are written."""
-    return _check_chunk("writer", name)
+    """``check_robot`` for the name under which static edges are written."""
+    return check_robot(name, "writer")
 
 
-def _check_chunk(what: str, name: str) -> str:
+def check_robot(name: str, what: str = "robot") -> str:
+    """``name`` if it can be one chunk of a key. Raises InvalidInput with the reason otherwise."""
     problem = _chunk_problem(name)
     if problem:
         raise InvalidInput(

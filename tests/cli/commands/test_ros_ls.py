@@ -34,7 +34,7 @@ def test_subscribers_and_nodes_of_others_are_listed_too(ros_router: str):
     with connect(mode="client", endpoints=ros_router) as session:
         node = NodeToken(0, session.zid, 0, "/", "/cell", "rviz")
         ends = [
-            EndpointToken(0, session.zid, 0, 1, "MS", "/", "/cell", "rviz", topic, kind.dds, kind.hash, qos)
+            EndpointToken(node, 1, "MS", topic, kind.dds, kind.hash, qos)
             for topic, kind in (("/tf", TF_MESSAGE), ("/chatter", STRING))
         ]
         liveliness = session.zenoh.liveliness()

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block
-from zstate.wire.ros2.joint_state import JointStateDecoder, JointStateEncoder, RosJointState
+from zstate.wire.ros2.decoder import JointStateDecoder, RosJointState
+from zstate.wire.ros2.encoder import JointStateEncoder
 
 STAMP = 1_700_000_000_123_456_789
 STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from zstate.errors import InvalidInput, MessageError
 from zstate.wire.messages import to_block
-from zstate.wire.ros2.tf_message import RosTransforms, TfMessageDecoder, TfMessageEncoder
+from zstate.wire.ros2.decoder import RosTransforms, TfMessageDecoder
+from zstate.wire.ros2.encoder import TfMessageEncoder
 
 STAMP = 1_700_000_000_123_456_789
 STAMPS = st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
