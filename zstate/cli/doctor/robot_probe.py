@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,28 +42,32 @@ _ROS_STREAMS: tuple[Stream, ...] = ("joint_states", "tf")
 _ALL = ""
 
 
-class PositionRanges:
-    """The least and greatest positions of the samples of one writer."""
+class WriterSamples:
+    """Samples of one writer: ``statistics``, ``names`` of joints or child frames, and ranges of positions."""
 
-    def __init__(self) -> None:
-        self._kind: object = None
-        self._names: tuple[str, ...] | None = None
+    def __init__(self, statistics: IntervalStatistics) -> None:
+        self.statistics = statistics
+        self.names: dict[str, None] = {}
+        self._joints: tuple[str, ...] | None = None
         self._order = b""
         self._extremes = np.empty((2, 0))
 
-    def add(self, state: JointState) -> None:
-        """Include the positions of ``state``; those of another writer or joint order replace all before."""
-        positions = from_block(state.positions)
-        kind = (state.session, state.order, positions.size)
-        if kind != self._kind:
-            self._kind, self._names, self._order = kind, state.names, state.order
-            self._extremes = np.stack((positions, positions))
-        np.fmin(self._extremes[0], positions, out=self._extremes[0])
-        np.fmax(self._extremes[1], positions, out=self._extremes[1])
+    def add(self, sample: Sample) -> None:
+        """Include ``sample``; positions in another joint order replace all before."""
+        if isinstance(sample, TransformSample):
+            self.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
+        elif isinstance(sample, JointState):
+            self.names.update(dict.fromkeys(sample.names or ()))
+            positions = from_block(sample.positions)
+            if (sample.order, positions.size) != (self._order, self._extremes.shape[1]):
+                self._joints, self._order = sample.names, sample.order
+                self._extremes = np.stack((positions, positions))
+            np.fmin(self._extremes[0], positions, out=self._extremes[0])
+            np.fmax(self._extremes[1], positions, out=self._extremes[1])
 
     def positions(self, model: RobotModel) -> NDArray[np.float64]:
         """Two position vectors of ``model``, the least and the greatest; NaN for what the samples lack."""
-        coordinates, names = coordinate_names(model), self._names
+        coordinates, names = coordinate_names(model), self._joints
         if names is None:
             names = coordinates if self._order == order_digest(model.joint_names) else ()
         columns = {name: column for column, name in enumerate(names)}
@@ -73,15 +76,6 @@ class PositionRanges:
             if name in columns:
                 found[:, column] = self._extremes[:, columns[name]]
         return found
-
-
-@dataclass
-class WriterSamples:
-    """Statistics of one writer, its joints or child frames, and the ranges of its joint positions."""
-
-    statistics: IntervalStatistics
-    names: dict[str, None] = field(default_factory=dict[str, None])
-    ranges: PositionRanges = field(default_factory=PositionRanges)
 
 
 class StreamSamples(Closeable):
@@ -96,30 +90,23 @@ class StreamSamples(Closeable):
         on_change: Callable[[], object] = lambda: None,
     ) -> None:
         self._writers: dict[int, WriterSamples] = {}
-        self._on_change = on_change
+
+        def on_sample(_: Stream, sample: Sample) -> None:
+            writer = self._writers.get(sample.session)
+            if writer is None:
+                statistics = self.topic.get(sample.session)
+                assert statistics is not None
+                writer = self._writers[sample.session] = WriterSamples(statistics)
+            writer.add(sample)
+            on_change()
+
         self.topic = TopicStatistics(
-            session,
-            wire,
-            sources=lambda _, __, sample: iter((_ALL, sample.session)),
-            on_sample=self._on_sample,
+            session, wire, sources=lambda _, __, sample: iter((_ALL, sample.session)), on_sample=on_sample
         )
         self.topic.subscribe(stream, robot)
 
     def close(self) -> None:
         self.topic.close()
-
-    def _on_sample(self, stream: Stream, sample: Sample) -> None:
-        writer = self._writers.get(sample.session)
-        if writer is None:
-            statistics = self.topic.get(sample.session)
-            assert statistics is not None
-            writer = self._writers[sample.session] = WriterSamples(statistics)
-        if isinstance(sample, JointState):
-            writer.names.update(dict.fromkeys(sample.names or ()))
-            writer.ranges.add(sample)
-        elif isinstance(sample, TransformSample):
-            writer.names.update(dict.fromkeys(child for _, child in sample.edges or ()))
-        self._on_change()
 
     @property
     def statistics(self) -> IntervalStatistics:
