@@ -16,7 +16,7 @@ from zstate.cli.output.wire_text import is_ros, messages_for
 from zstate.cli.session import SessionOptions, open_session
 
 if TYPE_CHECKING:
-    from zstate.cli.up.schema import Quaternion, Vector3
+    from zstate.cli.up.cell import Quaternion, Vector3
     from zstate.cli.up.static_edges import OwnedEdge
     from zstate.net.session import Session
     from zstate.nodes.static_publisher import StaticPublisher
@@ -92,7 +92,7 @@ def static_command(
     elif target is None or source is None or (xyz, rpy_deg, rpy, quat_xyzw) == (None,) * 4:
         raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
-        from zstate.cli.up.schema import StaticSection
+        from zstate.cli.up.cell import StaticSection
         from zstate.cli.up.static_edges import OwnedEdge
 
         edge = StaticSection(target, source, xyz, rpy_deg, rpy, quat_xyzw).transform()
