@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zstate._util.closeable import Closeable
 from zstate.cli.waiting import ConditionWaiter
-from zstate.errors import MessageError
 from zstate.ingest.events import WriterEvent
 from zstate.model.robot import RobotModel, coordinate_names
 from zstate.net.clock_offset import MeasuredOffset
-from zstate.net.latched import LatchedSubscriber
 from zstate.net.presence import RobotInfo
 from zstate.net.queryable import query
 from zstate.net.session import Session
 from zstate.net.status import watch_status
+from zstate.net.subscription import Received, subscribe
 from zstate.net.topic_statistics import IntervalStatistics, TopicStatistics
 from zstate.nodes.listener import Follow, TransformListener
 from zstate.wire.identity import WriterId
@@ -33,7 +32,7 @@ from zstate.wire.messages import (
     from_block,
     order_digest,
 )
-from zstate.wire.protocol import SerializedSample, Wire
+from zstate.wire.protocol import Wire
 from zstate.wire.registry import get_wire
 
 _MIN_WINDOW_S = 1.2  # writers publish their status once a second
@@ -131,10 +130,10 @@ class RobotProbe(Closeable):
         session: Session,
         info: RobotInfo,
         wire: str,
-        neighbours: Iterable[RobotInfo] = (),
-        on_change: Callable[[], object] = lambda: None,
+        neighbours: Sequence[RobotInfo],
+        on_change: Callable[[], object],
     ) -> None:
-        self.info, self.neighbours = info, tuple(neighbours)
+        self.info, self.neighbours = info, neighbours
         self.streams = frozenset(stream for stream, _ in info.writers)
         is_native = wire == "native"
         moves_by_joints = "joint_states" in self.streams or "tf" not in self.streams
@@ -145,18 +144,19 @@ class RobotProbe(Closeable):
         self.offsets: tuple[MeasuredOffset, ...] = ()
         self.unresponsive: set[WriterId] = set()
         self.nodes: dict[Stream, StreamSamples] = {}
-        self._session, self._wire, self._on_change = session, get_wire(wire), on_change
+        self._session, self._on_change, wire_format = session, on_change, get_wire(wire)
         with ExitStack() as opening:
-            key = self._wire.expression(info.name, "robot_description")
-            opening.enter_context(LatchedSubscriber(session, key, self._on_description))
-            samples = StreamSamples(session, info.name, self.followed, self._wire, on_change)
+            description = subscribe(
+                session, wire_format, info.name, "robot_description", self._on_description
+            )
+            opening.enter_context(description)
+            samples = StreamSamples(session, info.name, self.followed, wire_format, on_change)
             self.samples = opening.enter_context(samples)
             if is_native:
                 opening.enter_context(watch_status(session, info.name, self._on_status))
-            else:
-                for stream in _ROS_STREAMS:
-                    nodes = StreamSamples(session, info.name, stream, self._wire)
-                    self.nodes[stream] = opening.enter_context(nodes)
+            for stream in () if is_native else _ROS_STREAMS:
+                nodes = StreamSamples(session, info.name, stream, wire_format)
+                self.nodes[stream] = opening.enter_context(nodes)
             listener = TransformListener(
                 session, info.name, wire=wire, follow=self.followed, on_event=self.events.append
             )
@@ -166,12 +166,11 @@ class RobotProbe(Closeable):
     def close(self) -> None:
         self._opened.close()
 
-    def _on_description(self, arrival: SerializedSample) -> None:
-        with suppress(MessageError):  # withdrawn; or invalid, which the listener counts and reports
-            for message in self._wire.decode("robot_description", arrival, self.info.name):
-                if isinstance(message, RobotDescription):
-                    self.description = message
-                    self._on_change()
+    def _on_description(self, received: list[Received]) -> None:
+        for _, _, message in received:
+            if isinstance(message, RobotDescription):
+                self.description = message
+                self._on_change()
 
     def _on_status(self, _: str, status: Status) -> None:
         self.statuses[status.session] = status
