@@ -47,7 +47,7 @@ _NOT_RECEIVED = (
 class ConditionWaiter:
     """Wakes the waiting main thread when a condition may have become true.
 
-    ``notify`` is a callback for subscriptions: any thread, any arguments. ``noted`` is the last reason that
+    ``notify`` is a callback for subscriptions: any thread, any arguments. ``last_reason`` is the one that
     the latest ``wait_for`` printed, empty if it printed none.
     """
 
@@ -163,13 +163,21 @@ class RobotReadiness(Closeable):
         streams, directory = self._directory.streams(robot), self._directory
         if not streams:
             return directory.messages.unknown(robot, directory.robots())
+        from zstate.nodes.listener import TransformListener
+
         stream: Stream = "joint_states" if "robot_description" in streams else "robot_description"
         # Without a writer of joint states, transforms may be published instead.
         follows: list[Follow] = ["joint_states"] if "joint_states" in streams else ["joint_states", "tf"]
         if is_ros(self._wire):
             stream, follows = "tf", ["tf"]
         if robot not in self._listeners:
-            self._listeners[robot] = [self._listen(robot, follow) for follow in follows]
+            self._listeners[robot] = []
+            for follow in follows:
+                listener = TransformListener(
+                    self._session, robot, wire=self._wire, follow=follow, history_on_join=False
+                )
+                listener.add_observer(self._waiter.notify)
+                self._listeners[robot].append(self._opened.enter_context(listener))
         for listener in self._listeners[robot]:
             moving = [frame for frame in listener.buffer.frames() if frame.kind in ("joint", "pose")]
             if (moving or robot in self._rigid) and all(frame.count for frame in moving):
@@ -185,15 +193,6 @@ class RobotReadiness(Closeable):
             if isinstance(message, RobotDescription) and not message.moving_edges:
                 self._rigid.add(robot)
                 self._waiter.notify()
-
-    def _listen(self, robot: str, follow: Follow) -> TransformListener:
-        from zstate.nodes.listener import TransformListener
-
-        listener = TransformListener(
-            self._session, robot, wire=self._wire, follow=follow, history_on_join=False
-        )
-        listener.add_observer(self._waiter.notify)
-        return self._opened.enter_context(listener)
 
 
 class PoseWaiter:

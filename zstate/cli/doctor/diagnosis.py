@@ -173,8 +173,8 @@ def _rendezvous_check(session: Session) -> Check:
 
         def found() -> list[str]:
             # Zenoh's stub declares a bool; it is an object that is always true.
-            matching = [one.matching_status.matching for one in publishers]  # pyright: ignore
-            return [address for address, matches in zip(addresses, matching, strict=True) if matches]
+            pairs = zip(addresses, publishers, strict=True)
+            return [address for address, one in pairs if one.matching_status.matching]  # pyright: ignore
 
         waiter.wait_for(found, _RENDEZVOUS_WITHIN_S)
         address = next(iter(found()), None)

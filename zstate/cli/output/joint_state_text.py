@@ -45,14 +45,10 @@ class JointStateFormatter:
     """
 
     def __init__(self) -> None:
-        self._model: RobotModel | None = None
+        self.model: RobotModel | None = None
+        """The model of the newest description, or None if its URDF cannot be parsed."""
         self._names: tuple[str, ...] = ()
         self._order = b""
-
-    @property
-    def model(self) -> RobotModel | None:
-        """The model of the newest description, or None if its URDF cannot be parsed."""
-        return self._model
 
     def set_description(self, description: RobotDescription) -> None:
         """Use the joint names of ``description``."""
@@ -60,9 +56,9 @@ class JointStateFormatter:
         self._order = order_digest(self._names)
         try:
             # Plain URDF only: input from the network opens no files and runs no xacro.
-            self._model = parse_urdf(description.urdf, "its URDF")
+            self.model = parse_urdf(description.urdf, "its URDF")
         except ModelError:
-            self._model = None  # the names suffice for joints with one number
+            self.model = None  # the names suffice for joints with one number
 
     def has_names(self, state: JointState) -> bool:
         """Whether the joint names of ``state`` are known."""
@@ -81,7 +77,7 @@ class JointStateFormatter:
         names = state.names if state.names is not None else self._names if self.has_names(state) else ()
         if len(names) == len(numbers):
             return dict(zip(names, numbers, strict=True))
-        model = self._model
+        model = self.model
         if state.names is not None or model is None or model.joint_names != names:
             return numbers
         is_position = block == "positions"

@@ -29,40 +29,42 @@ class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 
 
-class RouterSection(_Section, frozen=True):
-    """``[router]``: the options of `zstate router`."""
+class _SessionSection(_Section, frozen=True):
+    """The keys that a router has like any other process."""
 
-    listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
-    ros2: bool = False
-    acl: str | None = None
+    listen: tuple[str, ...] = ()
     certs: str | None = None
     identity: str | None = None
     user: str | None = None
     password_file: str | None = None
+
+    def __post_init__(self) -> None:
+        endpoint_list((*self.connect, *self.listen))
+
+
+class RouterSection(_SessionSection, frozen=True):
+    """``[router]``: the options of `zstate router`."""
+
+    ros2: bool = False
+    acl: str | None = None
     users: str | None = None
     metrics: str | int | None = None
     restart: Restart = "never"
 
     def __post_init__(self) -> None:
-        endpoint_list((*self.connect, *self.listen))
+        super().__post_init__()
         _check_metrics(self.metrics)
 
 
-class NetworkSection(_Section, frozen=True):
+class NetworkSection(_SessionSection, frozen=True):
     """``[network]``: the session options of every process."""
 
     mode: Literal["peer", "loopback", "lan", "client", "router"] | None = None
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
     config: str | None = None
-    certs: str | None = None
-    identity: str | None = None
-    user: str | None = None
-    password_file: str | None = None
 
     def __post_init__(self) -> None:
-        endpoint_list((*self.connect, *self.listen))
+        super().__post_init__()
         if self.mode == "client" and not self.connect and not self.config:
             raise InvalidInput("mode 'client' needs connect, for instance ['tcp/192.168.1.10:7447']")
 

@@ -223,8 +223,9 @@ def _session_values(cell: Cell, identity: str | None = None) -> _Values:
     values: _Values = {}
     for key in ("mode", "config", "certs", "identity", "user", "password_file"):
         if (value := getattr(network, key)) is not None:
-            is_path = cell.network is not None and key in _NETWORK_PATHS
-            values[key] = (cell.network.resolve(value) if is_path else value,)
+            values[key] = (value,)
+    if cell.network is not None:
+        values |= {key: (cell.network.resolve(values[key][0]),) for key in _NETWORK_PATHS if key in values}
     if identity is not None:
         values["identity"] = (identity,)
     if "certs" not in values:
