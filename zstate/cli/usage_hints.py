@@ -103,9 +103,8 @@ def _ros_static_hint(arguments: Sequence[str]) -> str:
     if not arguments or arguments[0] != "static":
         return ""
     static = _from_options(arguments[1:]) or _from_positions(arguments[1:])
-    if not static:
-        return ""
-    return f"that is the form of ROS's static_transform_publisher; here it is\n  zstate static {static}"
+    form = "that is the form of ROS's static_transform_publisher; here it is"
+    return f"{form}\n  zstate static {static}" if static else ""
 
 
 def _from_positions(arguments: Sequence[str]) -> str:
