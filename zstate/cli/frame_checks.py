@@ -96,7 +96,7 @@ class _KnownFrames(Closeable):
         return frozenset(full_name(self._robot, link) for link in links).union(*self._statics.values())
 
     def warnings(self, target: str, source: str, known: frozenset[str]) -> Iterator[str]:
-        """The warning about an unknown ``target``, if there is enough to say about it."""
+        """The warning about an unknown ``target``; none without a model and a similar name."""
         bare, robot = target.removeprefix(f"{self._robot}/"), self._robot
         if near := similar_frames(target, known):
             which = " or ".join(map(repr, near))

@@ -11,24 +11,18 @@ from dataclasses import replace
 from difflib import get_close_matches
 from importlib import import_module, metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from zstate import __version__
-from zstate.buffer.frame_tree import FrameInfo
 from zstate.cli.doctor.check import Check, broken, ok, warning
-from zstate.cli.doctor.clock_checks import domains_check
-from zstate.cli.doctor.robot_checks import robot_checks, shared_roots_checks, static_roots
-from zstate.cli.doctor.robot_probe import RobotProbe, wait_for_probes
-from zstate.cli.doctor.ros_checks import ros_checks
 from zstate.cli.output.console import count_text
 from zstate.cli.output.wire_text import RosMessages, is_ros, messages_for, publish_command_for
 from zstate.cli.session import SessionOptions, open_session
 from zstate.cli.waiting import ConditionWaiter
 from zstate.errors import AccessDenied, Unreachable, ZStateError
 from zstate.extension import VARIABLE, kernel
-from zstate.model.catalog import example_name
-from zstate.net.clock_offset import measure_offsets
 from zstate.net.config import ROUTER_ENDPOINT
 from zstate.net.presence import RobotInfo, announce, connections, discover
 from zstate.net.rendezvous import rendezvous_addresses, rendezvous_key, silent_addresses
@@ -39,9 +33,11 @@ from zstate.net.security.connection_check import (
     check_rendezvous,
     check_tcp,
 )
-from zstate.net.security.write_permission import check_may_write
 from zstate.net.session import Session
 from zstate.wire.keys import ANY
+
+if TYPE_CHECKING:
+    from zstate.buffer.frame_tree import FrameInfo
 
 _GROUP = 50
 """The number of robots probed at the same time: each takes eight threads."""
@@ -192,6 +188,8 @@ def _rendezvous_check(session: Session) -> Check:
 
 def _access_check(session: Session, network: SessionOptions, robot: str) -> Check | None:
     """Whether an identity named ``robot`` may write as that robot; None for other identities."""
+    from zstate.net.security.write_permission import check_may_write
+
     credentials = network.credentials
     if robot == ANY or session.probe is None or credentials is None:
         return None
@@ -230,6 +228,8 @@ def _missing_robot_check(
     if session.probe is not None:
         what += f", or the router shows none to {session.probe.identity}"
     if robot == ANY:
+        from zstate.model.catalog import example_name
+
         return broken("robots", what, f"zstate publish {example_name()} --source sine{options}")
     command = publish_command_for("publish", robot)
     source = "" if "FILE" in command else " --source sine"
@@ -270,6 +270,13 @@ def _robots_checks(
     *,
     model_name: str,
 ) -> Iterator[Check]:
+    # Loaded after discovery, so that the first checks appear at once.
+    from zstate.cli.doctor.clock_checks import domains_check
+    from zstate.cli.doctor.robot_checks import robot_checks, shared_roots_checks, static_roots
+    from zstate.cli.doctor.robot_probe import RobotProbe, wait_for_probes
+    from zstate.cli.doctor.ros_checks import ros_checks
+    from zstate.net.clock_offset import measure_offsets
+
     messages, is_native = messages_for(wire), wire == "native"
     offsets = measure_offsets(session, ANY) if is_native else ()
     tops: list[FrameInfo] = []
