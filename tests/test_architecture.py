@@ -86,7 +86,6 @@ GUESTS = {
     # `zstate up FILE.toml`: a file is read into frozen types as a message is
     ("cli/snapshot_file.py", "msgspec"),
     ("cli/up/cell.py", "msgspec"),
-    ("cli/up/schema.py", "msgspec"),
 }
 
 PURE = {"model", "buffer", "wire"}

@@ -8,7 +8,7 @@ from helpers.processes import until
 
 from zstate import StaticPublisher, Transform, TransformListener, connect
 from zstate.cli.frame_checks import unknown_target_warnings
-from zstate.cli.up.schema import StaticSection
+from zstate.cli.up.cell import StaticSection
 
 pytestmark = pytest.mark.processes
 

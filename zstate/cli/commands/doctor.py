@@ -39,14 +39,14 @@ def doctor_command(
     zstate doctor panda --connect tcp/192.168.1.10:7447
     zstate doctor --json | jq .first_broken.text
     """
-    from zstate.cli.doctor.check import first_broken
-    from zstate.cli.doctor.diagnosis import (
+    from zstate.cli.doctor.check import (
         check_text,
         conclusion_text,
-        diagnosis,
         diagnosis_json,
+        first_broken,
         robot_lines,
     )
+    from zstate.cli.doctor.diagnosis import diagnosis
     from zstate.cli.output.logs import suppress_library_warnings
     from zstate.wire.keys import ANY, check_robot
 

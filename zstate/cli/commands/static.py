@@ -88,7 +88,7 @@ def static_command(
     elif target is None or source is None or all(part is None for part in pose.values()):
         raise click.UsageError("give TARGET, SOURCE and --xyz, a rotation or both; or --file")
     else:
-        from zstate.cli.up.schema import StaticSection
+        from zstate.cli.up.cell import StaticSection
         from zstate.cli.up.static_edges import OwnedEdge
 
         edges = [OwnedEdge(StaticSection(target, source, **pose).transform(), robot)]
